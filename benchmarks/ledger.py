@@ -70,7 +70,7 @@ def store_attempt(ledger: Ledger, plan: Plan, folder: Path, repeat: RepeatId) ->
     (attempt_folder / "ping.txt").write_text(_PING, encoding="ascii")
     ledger.measured(attempt)
     judged = gates.judge(plan, repeat, AttemptEvidence(attempt_folder))
-    ledger.keep(attempt_folder, replace(attempt, status=Status.VALID), judged.measured)
+    ledger.commit(attempt_folder, replace(attempt, status=Status.VALID), judged.measured)
     return time.perf_counter() - started_s
 
 

@@ -100,7 +100,7 @@ def by_fieldkit(sender: Path, receiver: Path) -> int:
     sent, received = pcap.read(sender).packets, pcap.read(receiver).packets
     paper.frames_from(sent, TRANSFER.sender_address, TRANSFER.port)
     paper.frames_to(received, TRANSFER.receiver_address, TRANSFER.port)
-    counts = udp.count(udp.cross(sent, received, TRANSFER))
+    counts = udp.count(udp.match_transfer(sent, received, TRANSFER))
     return counts.packets_sent - counts.packets_received
 
 

@@ -25,7 +25,7 @@ from typing import Any, Final
 
 from benchmarks.bridge import HOST, SIZE, TYPE, Running, Way, free_port, spread
 from fieldkit.analysis import statistics
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.measure.transfers import topic_log
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
@@ -119,7 +119,7 @@ def stream_together(plain: Sequence[Running], agent_pair: AgentPair, rates_hz: S
         rates_hz: Rates of the pairs, the agent's last.
     """
     with agent_pair.stream(LASTS_S, rates_hz[-1]):
-        plain_arrivals = together(
+        plain_arrivals = run_parallel(
             lambda pair: pair[0].run(LASTS_S, pair[1])[1], list(zip(plain, rates_hz, strict=False))
         )
     streams = [*plain_arrivals, agent_pair.arrived()]

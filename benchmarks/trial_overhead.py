@@ -37,7 +37,7 @@ from fieldkit.config import schema
 from fieldkit.config.site import Site
 from fieldkit.core.events import Event, PhaseStarted, RepeatEnded
 from fieldkit.core.model import Protocol, Role, Status
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from fieldkit.core.units import parse_distance, parse_duration_s
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
@@ -171,7 +171,7 @@ def measure(rounds: int, record_s: float, round_trip_s: float) -> Turns:
     with (
         slow_control(round_trip_s) if round_trip_s else nullcontext() as slow,
         tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as folder,
-        backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed,
+        backend.open(cast, seed=1, sink=lambda _: None, operator=Unattended()) as testbed,
     ):
         assert isinstance(testbed, EmulatedTestbed)
         with open_match(testbed, Path(folder), record_s, slow) as match:

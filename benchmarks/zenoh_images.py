@@ -65,7 +65,11 @@ SETTINGS: Final = (
     ImageSetting("agent, `default` (reliable)", "default", {}),
     ImageSetting("plain pair, `DROP`, waits 500 ms", "", {WAITS: str(LONG_WAIT_US)}),
     ImageSetting("agent, `default`, waits 500 ms", "default", {WAITS: str(LONG_WAIT_US)}),
-    ImageSetting("agent, `default`, tuned (`block_first`)", "default", tuning.tuned("zenoh", "tcp")),
+    ImageSetting(
+        "agent, `default`, tuned (`block_first`)",
+        "default",
+        tuning.recommended_settings("zenoh", "tcp"),
+    ),
 )
 
 

@@ -73,10 +73,10 @@ _LONG: Final = (
 def _no_reader_waits() -> Iterator[None]:
     """End the readers of files: each would wait a minute for another one, and the watch on processes for it."""
     yield
-    bag._READER.end()
-    contents._WORKER.end()
-    recorded._GPX_READER.end()
-    tlog._READER.end()
+    bag._READER.stop()
+    contents._WORKER.stop()
+    recorded._GPX_READER.stop()
+    tlog._READER.stop()
 
 
 # What collecting makes lives to the end of the run: nobody is to look through it, then or later.

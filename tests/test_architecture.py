@@ -247,7 +247,7 @@ def test_no_room_is_needed_by_the_one_it_needs(folder: str) -> None:
 def test_a_room_is_not_crowded(folder: Path) -> None:
     names = {path.stem for path in folder.glob("*.py")} - {"__init__"}
     if folder.name == "steps":
-        names -= kinds.own()  # the module of a kind is found by the name that procedures give
+        names -= kinds.builtin()  # the module of a kind is found by the name that procedures give
     assert len(names) <= MOST_MODULES
 
 

@@ -78,17 +78,17 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
         lines = NumberedLines(file)
         logged_s, velocity = -math.inf, ZERO_VELOCITY
         if task.origin is not None and task.frame_id != boot_id():
-            driver.odometry(*poses.pop(0))
+            driver.on_odometry(*poses.pop(0))
             driver.refuse(
                 "its computer was restarted after its origin was recorded, so its odometry has another frame"
             )
         try:
-            while not driver.over and not stop_event.is_set():
+            while not driver.is_finished and not stop_event.is_set():
                 iteration_s = now_s()
                 while poses:
-                    driver.odometry(*poses.pop(0))
+                    driver.on_odometry(*poses.pop(0))
                 if orders.poll():
-                    driver.renewed(iteration_s, orders.order)
+                    driver.on_order(iteration_s, orders.order)
                 velocity = driver.tick(iteration_s)
                 if stop_event.is_set():  # the signal may have come while this process was suspended
                     velocity = ZERO_VELOCITY

@@ -70,7 +70,7 @@ class DriveTask:
         return cls(**{**data, "legs": [(float(ahead), float(left)) for ahead, left in data["legs"]]})
 
 
-def way_s(task: DriveTask) -> float:
+def path_duration_s(task: DriveTask) -> float:
     """Return the duration of the path in seconds, for a base that follows commands without delay."""
     heading_rad, duration_s = 0.0, 0.0
     for ahead_m, left_m in task.legs:

@@ -115,7 +115,7 @@ class Driver:
     @property
     def ready(self) -> bool:
         """Whether it is stationary at a place where it may start."""
-        return self._start is not None and self._pose is not None and not self.over and self._is_still
+        return self._start is not None and self._pose is not None and not self.is_finished and self._is_still
 
     @property
     def _is_still(self) -> bool:
@@ -127,7 +127,7 @@ class Driver:
         return self._now_s - self._created_s
 
     @property
-    def over(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether the drive has ended: at its origin, or by an early stop."""
         return bool(self.stopped) or self.phase == "home"
 
@@ -141,7 +141,7 @@ class Driver:
             else math.hypot(goal[0] - relative_pose.x_m, goal[1] - relative_pose.y_m)
         )
 
-    def odometry(self, now_s: float, pose: OdometryPose) -> None:
+    def on_odometry(self, now_s: float, pose: OdometryPose) -> None:
         """Process a pose; a pose with a value that is not finite is ignored."""
         if not all(map(math.isfinite, pose)):
             return
@@ -217,10 +217,10 @@ class Driver:
         self._legs = [*zip(self._corners, self._corners[1:])]
         self.phase, self._phase_s, self.driven_m, self._turning = OUT, now_s, 0.0, True
 
-    def renewed(self, now_s: float, order: str) -> None:
+    def on_order(self, now_s: float, order: str) -> None:
         """Process an order of the laptop, which also renews the lease."""
         self._order_s = now_s
-        if order == END and not self.over:
+        if order == END and not self.is_finished:
             self._stop("ordered to stop")
         elif order == BACK and self._order != BACK and not self.stopped:
             self._order = BACK
@@ -246,7 +246,7 @@ class Driver:
     def _check_limits(self, now_s: float, elapsed_s: float) -> None:
         """Stop the robot if a limit is exceeded."""
         task, relative_pose = self._task, self.relative_pose
-        if self.over:
+        if self.is_finished:
             return
         if elapsed_s > GAP_S:
             self._stop(f"its program was suspended for {elapsed_s:.1f} s")

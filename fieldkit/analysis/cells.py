@@ -123,7 +123,7 @@ class Cell:
     estimates: Mapping[str, Estimate]
     tallies: Mapping[str, Tally] = field(default_factory=dict)
     payload_bytes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    lacking: tuple[Quantity, ...] = ()
+    quantities_without_value: tuple[Quantity, ...] = ()
 
 
 def aggregate(

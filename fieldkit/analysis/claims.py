@@ -13,7 +13,9 @@ _USUAL_SHARE = 0.9
 """Share of all repeats that is used to show the difference between `every` repeat of a trial and all repeats."""
 
 
-def shortfalls(expectations: Iterable[Expectation], figures: Iterable[Quantity], repeats: int) -> Iterator[str]:
+def unmet_requirements(
+    expectations: Iterable[Expectation], figures: Iterable[Quantity], repeats: int
+) -> Iterator[str]:
     """Yield a sentence for each expectation that needs more repeats or packets than a trial has.
 
     Args:

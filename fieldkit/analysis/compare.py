@@ -48,7 +48,7 @@ class Difference:
         return None if self.a is None or self.b is None else self.b.value - self.a.value
 
     @property
-    def seen(self) -> bool:
+    def excludes_zero(self) -> bool:
         """Whether 0 is outside of the interval."""
         return self.interval is not None and not self.interval.low <= 0 <= self.interval.high
 
@@ -111,7 +111,7 @@ class Comparison:
         return tuple(difference for pair in self.pairs for difference in pair.differences)
 
     @property
-    def made(self) -> int:
+    def n_compared(self) -> int:
         """Number of differences that have an interval, for which `p_holm` is corrected."""
         return sum(difference.interval is not None for difference in self.differences)
 
@@ -132,7 +132,7 @@ class Comparison:
         )
 
     @property
-    def missed(self) -> bool:
+    def exceeds_threshold(self) -> bool:
         """Whether any difference with a threshold is not shown to be within it."""
         return any(difference.within is False for difference in self.differences)
 

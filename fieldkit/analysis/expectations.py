@@ -8,7 +8,7 @@ from typing import Final
 
 from fieldkit.analysis.quantities import Quantity, parse_amount
 from fieldkit.core.columns import Kind
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Protocol
 
 _TEXT: Final = re.compile(
@@ -18,7 +18,7 @@ _TEXT: Final = re.compile(
     re.ASCII,
 )
 _FORMS: Final = "ip_loss < 2 %; every rtt_gap_s < 300 ms; 90 % of rtt_gap_s < 300 ms; ip_loss < 2 % of all packets"
-MOST_SHARE: Final = 0.9999
+MAX_SHARE: Final = 0.9999
 """Largest share of all repeats that an expectation may demand."""
 _MIN_LOSS: Final = 1e-9
 
@@ -86,7 +86,7 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
     if (name := match["name"]) not in by_name:
         raise ConfigurationError(
             f"the expected figure {name!r} does not exist",
-            remedy=nearest(name, by_name, f"figures are: {', '.join(by_name)}"),
+            remedy=did_you_mean(name, by_name, f"figures are: {', '.join(by_name)}"),
         )
     quantity, amount = by_name[name], match["amount"].strip()
     is_below = match["sign"].startswith("<")
@@ -120,7 +120,7 @@ def _scope(match: re.Match[str], quantity: Quantity, *, is_below: bool) -> tuple
         return Scope.PACKETS, None
     if match["share"]:
         share = parse_amount(match["share"], "share", "share of repeats")
-        if not 0 < share <= MOST_SHARE:
+        if not 0 < share <= MAX_SHARE:
             raise ConfigurationError(
                 f"{match['share']} is not a share that repeats can show",
                 remedy="write a share above 0 % and below 100 %; or every, for every repeat of the trial",

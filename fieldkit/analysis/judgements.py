@@ -41,7 +41,7 @@ class Judgement:
     expectation: Expectation
     cell: Cell | None
     ruling: Ruling
-    found: Estimate | None
+    estimate: Estimate | None
     why: str = ""
     met: int | None = None
     limit: float | None = None
@@ -67,7 +67,7 @@ def judge(expectations: Sequence[Expectation], cells: Sequence[Cell]) -> tuple[J
     return tuple(judgement for expectation in expectations for judgement in _judge_cells(expectation, cells))
 
 
-def judge_own(cells: Iterable[tuple[Cell, Iterable[Expectation]]]) -> tuple[Judgement, ...]:
+def judge_by_trial(cells: Iterable[tuple[Cell, Iterable[Expectation]]]) -> tuple[Judgement, ...]:
     """Return the judgements of cells by the expectations of their trials, in the order of expectations.
 
     Trials under one condition are judged together.

@@ -8,7 +8,7 @@ from typing import Final
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.quantities import Quantity, in_order
-from fieldkit.core.columns import plain_name, prefixed
+from fieldkit.core.columns import plain_name, step_prefixed
 
 _RADIO: Final = ("ip_loss", "tcp_byte_loss")
 """Loss on the radio by protocol: IP packets of UDP; bytes of TCP, which TCP retransmitted."""
@@ -68,7 +68,11 @@ class TableLine:
         return (
             self._includes(cell)
             and self.estimate(cell) is None
-            and any(quantity.name == missing.name for quantity in self.quantities for missing in cell.lacking)
+            and any(
+                quantity.name == missing.name
+                for quantity in self.quantities
+                for missing in cell.quantities_without_value
+            )
         )
 
     def scale(self, cells: Sequence[Cell]) -> wording.Scale:
@@ -111,7 +115,7 @@ def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -
     """
     # A dict keeps the order of columns for quantities of equal rank; the order of a set changes from run to run.
     available = dict.fromkeys(estimate.quantity for cell in cells for estimate in cell.estimates.values())
-    available |= dict.fromkeys(quantity for cell in cells for quantity in cell.lacking)
+    available |= dict.fromkeys(quantity for cell in cells for quantity in cell.quantities_without_value)
     shown = (
         in_order(available) if quantities is None else [quantity for quantity in quantities if quantity in available]
     )
@@ -120,7 +124,9 @@ def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -
 
 def _quantity_lines(quantity: Quantity, cells: Sequence[Cell]) -> Iterator[TableLine]:
     label = wording.label(quantity)
-    concerned = [cell for cell in cells if quantity.name in cell.estimates or quantity in cell.lacking]
+    concerned = [
+        cell for cell in cells if quantity.name in cell.estimates or quantity in cell.quantities_without_value
+    ]
     sizes = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in concerned})
     if not any(sizes):
         yield TableLine(label, (quantity,))
@@ -135,7 +141,7 @@ def _payload_label(quantity: Quantity, sizes: Sequence[int]) -> str:
     return wording.label(replace(quantity, label=f"{quantity.label}, {size}-byte ping"))
 
 
-def of_operator(cells: Sequence[Cell], expected: Collection[str] = ()) -> list[TableLine]:
+def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> list[TableLine]:
     """Return the lines for an operator during a trial, in order; all lines if there are none of these.
 
     These are losses, delays, throughput and signal; quantities with an expectation; and quantities that the lab added
@@ -187,7 +193,7 @@ def sent(cells: Sequence[Cell]) -> dict[str, list[str]]:
     counts_by_label: dict[str, list[str]] = {}
     for step in steps:
         for label, names in _SENT.items():
-            counts = [_trial_count(cell, [prefixed(step, name) for name in names]) for cell in cells]
+            counts = [_trial_count(cell, [step_prefixed(step, name) for name in names]) for cell in cells]
             if any(counts):
                 counts_by_label[_with_step(step, label)] = counts
     return counts_by_label

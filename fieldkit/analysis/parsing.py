@@ -15,7 +15,7 @@ from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.core.columns import MISSING, SCHEMA_VERSION, Column, Kind
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError
 from fieldkit.core.model import ENDED
-from fieldkit.core.text import unguarded
+from fieldkit.core.text import unescape_formula
 
 Numbers = NDArray[np.float64]
 Texts = NDArray[np.object_]
@@ -139,7 +139,7 @@ def _numpy_type(column: Column) -> type[np.float64] | type[np.longdouble]:
 
 def _texts(column: pa.ChunkedArray) -> Texts:
     encoded = column.unify_dictionaries().combine_chunks()
-    distinct = np.array([*map(unguarded, encoded.dictionary.to_pylist()), ""], dtype=np.object_)
+    distinct = np.array([*map(unescape_formula, encoded.dictionary.to_pylist()), ""], dtype=np.object_)
     return np.asarray(distinct[_buffer_values(encoded.indices, np.int32)], dtype=np.object_)
 
 
@@ -172,7 +172,7 @@ def _explain_row(
     cells = dict(zip(names, row, strict=True))
     for name, column in declared.items():
         value = cells.get(name, "")
-        if (problem := column.problem(value)) is not None:
+        if (problem := column.invalid_value_reason(value)) is not None:
             remedy = _SPREADSHEET_REMEDY if column.unit == "ns" and "e" in value.lower() else _REMEDY
             return EvidenceError(f"{name} is {shown(value)}, {problem}", where=where, remedy=remedy)
     numeric = (name for name, column in declared.items() if column.type in {int, float})

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Self
 
-from fieldkit.core.columns import BACKGROUND, FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name, prefixed
+from fieldkit.core.columns import BACKGROUND, FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name, step_prefixed
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
@@ -82,13 +82,13 @@ class Quantity:
     @property
     def payload(self) -> str | None:
         """Column with the ICMP payload size, on which a round-trip time depends; None for other quantities."""
-        return prefixed(self.step, "rtt_payload_bytes") if plain_name(self.name) == "rtt_median_s" else None
+        return step_prefixed(self.step, "rtt_payload_bytes") if plain_name(self.name) == "rtt_median_s" else None
 
     @property
     def implied_by(self) -> str | None:
         """Column whose value implies that this quantity was measured, even if it has no value; None if unknown."""
         name = _IMPLIED_BY.get(plain_name(self.name))
-        return name and prefixed(self.step, name)
+        return name and step_prefixed(self.step, name)
 
     @property
     def needed(self) -> tuple[str, ...]:
@@ -119,7 +119,7 @@ def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:
     return in_order(quantity for column in columns if (quantity := Quantity.of(column)) is not None)
 
 
-def alike(quantities: Iterable[Quantity], name: str) -> list[Quantity]:
+def with_plain_name(quantities: Iterable[Quantity], name: str) -> list[Quantity]:
     """Return the quantities with a name, disregarding the names of steps; that of an unnamed step comes first."""
     return sorted(
         (quantity for quantity in quantities if plain_name(quantity.name) == name),

@@ -17,9 +17,9 @@ from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.words import worded
 from fieldkit.core.columns import SCHEMA_VERSION, Column
-from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
+from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
-from fieldkit.core.text import unguarded
+from fieldkit.core.text import unescape_formula
 
 Key = tuple[str | float | None, ...]
 """Values of some columns in one row; a missing text is empty, a missing number None."""
@@ -155,7 +155,7 @@ class Repeats:
         if not rows:
             remedy = "name a folder below repeats/ of a trial, for example udp-07"
             raise ConfigurationError(
-                f"there is no repeat {attempt!r}", remedy=nearest(attempt, self._by_folder, remedy)
+                f"there is no repeat {attempt!r}", remedy=did_you_mean(attempt, self._by_folder, remedy)
             )
         if len(rows) > 1:
             names = [f"{self.texts['trial'][row]}/{attempt}" for row in rows]
@@ -346,7 +346,7 @@ def _readable(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise ConfigurationError(
-            f"cannot be read: {error.strerror}", where=str(path), remedy=typed("ls", "-l", path)
+            f"cannot be read: {error.strerror}", where=str(path), remedy=shell_command("ls", "-l", path)
         ) from error
 
 
@@ -374,7 +374,7 @@ def _check_line_end(path: Path, body: bytes) -> None:
 def _names(header: bytes) -> tuple[str, ...]:
     """Return the names in a header line; an empty tuple if a name exceeds the 128 kB limit of the csv module."""
     try:
-        return tuple(map(unguarded, next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ())))
+        return tuple(map(unescape_formula, next(csv.reader([header.decode("utf-8-sig", errors="replace")]), ())))
     except csv.Error:
         return ()
 

@@ -107,7 +107,7 @@ def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRo
     """Yield each condition with each of its rows: one per quantity, or a single row if neither run measured one."""
     for pair in comparison.pairs:
         missing_in = pair.missing_in or None
-        rows = [_difference_row(difference, missing_in, comparison.made) for difference in pair.differences]
+        rows = [_difference_row(difference, missing_in, comparison.n_compared) for difference in pair.differences]
         rows += [row for a, b in pair.words for row in _word_rows(a, b, missing_in)]
         yield from ((pair, row) for row in rows or [DifferenceRow(missing_in=missing_in)])
 
@@ -129,7 +129,7 @@ def comparison_json(comparison: Comparison) -> str:
             "by": list(comparison.by),
             "conclusions": list(wording.conclusions(comparison)),
             "concerns": [asdict(concern) for concern in comparison.concerns],
-            "missed": comparison.missed,
+            "missed": comparison.exceeds_threshold,
             "differences": [
                 {**pair.key, **{name: _round(value) for name, value in asdict(row).items()}}
                 for pair, row in difference_rows(comparison)
@@ -185,7 +185,7 @@ def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Q
 
     The values that all cells have in common are in a line above the table.
     """
-    varying, common = wording.told_by(by, cells)
+    varying, common = wording.varying_and_common(by, cells)
     shown = [(line, line.scale(cells)) for line in lines(cells, quantities)]
     words = wording.worded(cells)
     head = [*varying, "repeats", *(scale.head(line.label) for line, scale in shown), *words.values()]
@@ -227,7 +227,9 @@ class _Column:
 
 def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
     """Return a LaTeX `table` of column width (needs booktabs and graphicx); columns without a figure are omitted."""
-    down, common = ([name for name in names if name not in _ACROSS_COLUMNS] for names in wording.told_by(by, cells))
+    down, common = (
+        [name for name in names if name not in _ACROSS_COLUMNS] for names in wording.varying_and_common(by, cells)
+    )
     scales = {line: line.scale(cells) for line in lines(cells, quantities)}
     scenarios, protocols = (dict.fromkeys(values) for values in zip(*map(_scenario_and_protocol, cells), strict=True))
     columns = [

@@ -119,15 +119,15 @@ def quoted(figure: str, scale: Scale, estimate: Estimate, between: str = " ") ->
     return between.join(filter(None, (figure, interval(scale, estimate), f"({part})" if part else "")))
 
 
-def judged(judgement: Judgement) -> tuple[str, str, str, str, str]:
+def judgement_texts(judgement: Judgement) -> tuple[str, str, str, str, str]:
     """Return texts of the expectation, the protocol, the measured value, its interval, and the ruling."""
     expectation = judgement.expectation
     protocol = str((judgement.cell and judgement.cell.key.get("protocol")) or expectation.protocol or "").upper()
     ruling = f"{judgement.ruling}: {judgement.why}" if judgement.why else str(judgement.ruling)
-    if judgement.found is None:
+    if judgement.estimate is None:
         return expectation.text, protocol, "nothing", "", ruling
-    value, bounds = _measured(judgement, judgement.found)
-    part = incomplete(judgement.found)
+    value, bounds = _measured(judgement, judgement.estimate)
+    part = incomplete(judgement.estimate)
     return expectation.text, protocol, f"{value} ({part})" if part else value, bounds, ruling
 
 
@@ -236,7 +236,7 @@ def key(cell: Cell, name: str) -> str:
     return columns.cell(cell.key[name]) or "-"
 
 
-def told_by(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:
+def varying_and_common(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:
     """Return the columns in which the cells differ, and those in which all are equal.
 
     Redundant columns are in neither: the distance in metres if the operator's text is there, and a procedure with the
@@ -251,7 +251,7 @@ def told_by(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[s
 
 def counts(cell: Cell) -> str:
     """Return the number of attempts of a cell by final status: `20 valid, 1 void`."""
-    return ended({Status.VALID: cell.n_valid, Status.VOID: cell.n_void, Status.FAILED: cell.n_failed})
+    return status_counts({Status.VALID: cell.n_valid, Status.VOID: cell.n_void, Status.FAILED: cell.n_failed})
 
 
 def worded(cells: Sequence[Cell]) -> dict[str, str]:
@@ -284,7 +284,7 @@ def _word_counts(words: Tally) -> Iterator[str]:
         yield f"{len(others)} others {sum(count for _, count in others)}"
 
 
-def ended(numbers: Mapping[str, int]) -> str:
+def status_counts(numbers: Mapping[str, int]) -> str:
     """Return the numbers of attempts by final status: `20 valid, 1 void`."""
     return ", ".join(f"{numbers[status]} {status}" for status in ENDED if numbers.get(status)) or "none"
 
@@ -300,7 +300,7 @@ def verdict(difference: Difference, comparisons: int) -> str:
         text = f"only {'B' if difference.a is None else 'A'} has it"
     elif difference.interval is None:
         text = "no interval, so no verdict"
-    elif difference.seen:
+    elif difference.excludes_zero:
         low, high = sorted((abs(difference.interval.low), abs(difference.interval.high)))
         more = "more" if difference.value > 0 else "less"
         interval_text = comparison_scale(difference).interval(low, high)
@@ -320,12 +320,12 @@ def is_significant(difference: Difference) -> bool:
 
 def conclusions(comparison: Comparison) -> Iterator[str]:
     """Yield the conclusions of a comparison, and the conditions that could not be compared."""
-    comparisons, differences = comparison.made, comparison.differences
-    seen = sum(difference.seen for difference in differences)
+    comparisons, differences = comparison.n_compared, comparison.differences
+    excludes_zero = sum(difference.excludes_zero for difference in differences)
     significant = sum(is_significant(difference) for difference in differences)
     yield (
-        f"{format_count(comparisons, 'comparison')}: {format_count(seen, 'difference')} seen, {significant} after "
-        f"correction for their number; were there none, about {(1 - CONFIDENCE) * comparisons:.1f} would be seen"
+        f"{format_count(comparisons, 'comparison')}: {format_count(excludes_zero, 'difference')} seen, {significant} "
+        f"after correction for their number; were there none, about {(1 - CONFIDENCE) * comparisons:.1f} would be seen"
     )
     for pair in comparison.pairs:
         if pair.missing_in:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from fieldkit.analysis.cells import Cell, Estimate
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class TrialCell:
             ConfigurationError: No valid repeat has it.
         """
         if name not in self._estimates:
-            remedy = nearest(name, self._estimates, f"its figures: {', '.join(self._estimates) or 'none'}")
+            remedy = did_you_mean(name, self._estimates, f"its figures: {', '.join(self._estimates) or 'none'}")
             raise ConfigurationError(f"none of {self.n_valid} valid repeats has a figure {name!r}", remedy=remedy)
         return _figure(self._estimates[name])
 

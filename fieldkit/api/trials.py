@@ -14,12 +14,12 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE
 from fieldkit.api.cell import TrialCell
 from fieldkit.core.columns import Column
-from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean
 from fieldkit.core.model import Protocol
 from fieldkit.export import table
 from fieldkit.export.table import Table
 from fieldkit.measure.transfers import crossings
-from fieldkit.report.evidence import Evidence, at_hand
+from fieldkit.report.evidence import Evidence, load_evidence
 from fieldkit.trial import sources
 from fieldkit.trial.sources import Sources
 
@@ -119,7 +119,7 @@ class Trials:
             raise ConfigurationError(
                 f"no transfer of {plan.procedure.name} is named {step!r}",
                 where=source,
-                remedy=nearest(step, transfers, f"its transfers: {named}"),
+                remedy=did_you_mean(step, transfers, f"its transfers: {named}"),
             )
         selected = transfers if step is None else {step: transfers[step]}
         return table.of_packets({name: crossings.read(attempt, transfer) for name, transfer in selected.items()})
@@ -141,7 +141,7 @@ class Trials:
         source = self._attempts.texts[SOURCE][row]
         rows = np.flatnonzero(self._attempts.texts[SOURCE] == source)
         if source not in self._evidence:
-            self._evidence[source] = at_hand(self._attempts.where(rows))
+            self._evidence[source] = load_evidence(self._attempts.where(rows))
         return self._evidence[source], int(np.searchsorted(rows, row))
 
 

@@ -92,7 +92,7 @@ class FieldBackend:
                 shell.close()
 
     @contextmanager
-    def standing(self, *, sink: Sink) -> Iterator[Mapping[str, Shell | FieldkitError]]:
+    def persistent_shells(self, *, sink: Sink) -> Iterator[Mapping[str, Shell | FieldkitError]]:
         """Yield the connection or the error of each robot; see `Backend.standing`.
 
         Each robot is connected at its first command.
@@ -169,7 +169,7 @@ class FieldTestbed:
             text = f"move {sender} to {distance} from {receiver}"
             wall = "behind the wall"
         posts = "".join(
-            f"; put {names[post.role]} {geometry.leg_in_words(post.leg)} of {names[post.near]}, as seen from "
+            f"; put {names[post.role]} {geometry.describe_leg(post.leg)} of {names[post.near]}, as seen from "
             + names[geometry.other_end(post.near, placement.topology)]
             for post in placement.posts
         )
@@ -212,7 +212,7 @@ class FieldTestbed:
         topology = Topology.MASTER if Role.RELAY in self._cast else Topology.MASTERLESS
         other = self._cast[geometry.other_end(move.role, topology)].name
         self.operator.ask(
-            f"move {name}, as seen from {other}: {geometry.in_words(move)}; answer when it starts to move"
+            f"move {name}, as seen from {other}: {geometry.describe_move(move)}; answer when it starts to move"
         )
         try:
             yield

@@ -23,7 +23,7 @@ from fieldkit.core.model import (
     Placement,
     Role,
     Topology,
-    Whereabouts,
+    TrackPoint,
 )
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
@@ -78,7 +78,7 @@ Cast = Mapping[Role, Robot]
 class Oracle(Protocol):
     """Data that only a modelled radio has: lateness and delays of packets, and positions of robots."""
 
-    def track(self, since_utc_ns: int) -> Sequence[Whereabouts]:
+    def track(self, since_utc_ns: int) -> Sequence[TrackPoint]:
         """Return the positions of the robots from a time of the laptop's clock until now.
 
         `since_utc_ns` must not decrease from call to call, because older positions may be deleted.
@@ -213,7 +213,7 @@ class Testbed(Protocol):
 class Transient(Protocol):
     """Optional capability of a `Testbed` whose robots, with all their files, disappear when it is closed."""
 
-    def demand_up(self) -> None:
+    def check_alive(self) -> None:
         """Check that every process that the robots need is running.
 
         Raises:
@@ -286,7 +286,7 @@ class Backend(Protocol):
         """
         ...
 
-    def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
+    def persistent_shells(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
         """Return a context with control connections to the robots that keep running without fieldkit, in any role.
 
         Args:

@@ -8,8 +8,8 @@ from fieldkit.config.profiles import RobotProfile, load_profile
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site
 from fieldkit.core import plugins
-from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.model import Topology, in_order
+from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.model import Topology, sort_roles
 
 
 def load_backend(name: str, site: Site | None, document: Document | None) -> Backend:
@@ -19,9 +19,9 @@ def load_backend(name: str, site: Site | None, document: Document | None) -> Bac
         ConfigurationError: No such backend is installed, it cannot be loaded, or the site file lacks an entry that it
             needs.
     """
-    installed = {point.name: point for point in plugins.points(plugins.BACKENDS)}
+    installed = {point.name: point for point in plugins.entry_points(plugins.BACKENDS)}
     if name not in installed:
-        remedy = nearest(name, installed, f"installed: {', '.join(installed)}")
+        remedy = did_you_mean(name, installed, f"installed: {', '.join(installed)}")
         raise ConfigurationError(f"there is no backend {name!r}", remedy=remedy)
     factory: BackendFactory = plugins.load(installed[name])
     return factory(site, document)
@@ -63,7 +63,7 @@ def cast_of(site: Site, document: Document | None, topology: Topology, addresses
             control=site.control,
             ros_master=addresses[master] if master and _runs_ros1(profiles[names[role]]) else "",
         )
-        for role in in_order(names)
+        for role in sort_roles(names)
     }
 
 
@@ -86,6 +86,6 @@ def profiles_of(site: Site, document: Document | None, robots: Iterable[str]) ->
     profiles = {}
     for robot in robots:
         name = site.robots[robot].profile
-        with document.naming("robots", robot, "profile") if document else nullcontext():
+        with document.locating_errors("robots", robot, "profile") if document else nullcontext():
             profiles[robot] = loaded[name] if name in loaded else loaded.setdefault(name, load_profile(name))
     return profiles

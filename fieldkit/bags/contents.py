@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.bags.formats import LAST_RESORT, BagFiles, BagFormat, find
-from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
-from fieldkit.measure.evidence.bag import given_bytes
-from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError, Json
+from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
+from fieldkit.measure.evidence.bag import allocated_bytes
+from fieldkit.measure.evidence.confined import Json, ReaderError, SandboxedReader
 
-_WORKER: Final = Confined("fieldkit.bags.worker")
+_WORKER: Final = SandboxedReader("fieldkit.bags.worker")
 
 _MAX_GROWTH: Final = 4
 """Maximum ratio of written to read bytes: the output may be uncompressed, and has an index."""
@@ -57,7 +57,7 @@ class BagContents:
     duration_s: float
     compression: str
     problems: tuple[str, ...]
-    savable: int | None
+    recoverable_messages: int | None
 
     @property
     def messages(self) -> int:
@@ -66,7 +66,7 @@ class BagContents:
 
 
 @dataclass(frozen=True)
-class Written:
+class WriteResult:
     """The result of a repair or a conversion.
 
     Attributes:
@@ -103,7 +103,7 @@ def inspect(path: Path, *, read_all: bool = False) -> BagContents:
     )
 
 
-def repair(path: Path, to: Path) -> Written:
+def repair(path: Path, to: Path) -> WriteResult:
     """Write the readable messages of a damaged bag to a new bag of the same format; the damaged bag is not changed.
 
     Raises:
@@ -117,17 +117,17 @@ def repair(path: Path, to: Path) -> Written:
             f"a repaired bag keeps its format, {bag.format}: the new one must be {required}", where=str(to)
         )
 
-    def write(temporary_path: Path) -> Written:
+    def write(temporary_path: Path) -> WriteResult:
         answer = _ask_worker(bag, {"do": "repair", "to": str(temporary_path)})
         if not answer["messages"]:
             what = f"no message can be saved: {answer['why']}"
             raise EvidenceError(what, where=str(path), remedy=LAST_RESORT.get(bag.format, ""))
-        return Written(answer["messages"], (answer["why"],) if answer["why"] else ())
+        return WriteResult(answer["messages"], (answer["why"],) if answer["why"] else ())
 
     return _write_atomically(to, write)
 
 
-def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distribution: str = "") -> Written:
+def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distribution: str = "") -> WriteResult:
     """Write a bag in another format: `NAME.bag` for ROS 1, otherwise a folder for ROS 2.
 
     Args:
@@ -153,16 +153,18 @@ def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distri
         raise EvidenceError(
             f"the bag is damaged: {contents.problems[0]}",
             where=str(path),
-            remedy=typed("fieldkit", "bag", "repair", path, "NEW"),
+            remedy=shell_command("fieldkit", "bag", "repair", path, "NEW"),
         )
     request = {"do": "convert", "storage": storage.value, "distribution": distribution}
     return _write_atomically(
         to,
-        lambda temporary_path: Written(None, tuple(_ask_worker(bag, request | {"to": str(temporary_path)})["notes"])),
+        lambda temporary_path: WriteResult(
+            None, tuple(_ask_worker(bag, request | {"to": str(temporary_path)})["notes"])
+        ),
     )
 
 
-def _write_atomically(to: Path, write: Callable[[Path], Written]) -> Written:
+def _write_atomically(to: Path, write: Callable[[Path], WriteResult]) -> WriteResult:
     """Write a bag to a temporary folder beside its destination, and rename it when it is complete."""
     if to.exists() or to.is_symlink():
         raise ConfigurationError("it exists already", where=str(to), remedy="choose another name")
@@ -181,8 +183,8 @@ def _write_atomically(to: Path, write: Callable[[Path], Written]) -> Written:
 
 
 def _ask_worker(bag: BagFiles, request: Json) -> Json:
-    size_bytes = _MAX_GROWTH * sum(given_bytes(file) for file in bag.files)
+    size_bytes = _MAX_GROWTH * sum(allocated_bytes(file) for file in bag.files)
     try:
-        return _WORKER.ask({"path": str(bag.path.absolute()), **request}, size_bytes)
-    except ConfinedAnswerError as error:
+        return _WORKER.query({"path": str(bag.path.absolute()), **request}, size_bytes)
+    except ReaderError as error:
         raise EvidenceError(f"the bag cannot be read: {error}", where=str(bag.path)) from error

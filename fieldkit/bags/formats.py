@@ -6,7 +6,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
+from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
 from fieldkit.measure.evidence.bag import METADATA
 
 _ROS1_SUFFIXES: Final = {".bag", ".active"}
@@ -87,7 +87,7 @@ def find(path: Path) -> BagFiles:
         raise ConfigurationError(
             f"the bag cannot be read: {error.strerror or error}",
             where=str(where),
-            remedy=typed("ls", "-l", where.parent),
+            remedy=shell_command("ls", "-l", where.parent),
         ) from error
 
 
@@ -95,7 +95,7 @@ def _of_file(path: Path, bag_format: BagFormat) -> BagFiles:
     if bag_format is BagFormat.ROS1:
         if path.suffix not in _ROS1_SUFFIXES:
             raise ConfigurationError(
-                "a ROS 1 bag must be named NAME.bag", where=str(path), remedy=typed("mv", path, f"{path}.bag")
+                "a ROS 1 bag must be named NAME.bag", where=str(path), remedy=shell_command("mv", path, f"{path}.bag")
             )
         return BagFiles(path, bag_format, (path,), closed=True)
     if not (path.parent / METADATA).is_file():
@@ -141,7 +141,10 @@ def _format(file: Path) -> BagFormat:
         remedy = "was the recorder stopped, or its power cut, before the file was written to disk?"
         raise EvidenceError(problem, where=str(file), remedy=remedy)
     if unpack := next((program for magic, program in _COMPRESSED.items() if head.startswith(magic)), ""):
-        problem, remedy = "this file is compressed as a whole", f"{typed(*unpack.split(), file)}, then try again"
+        problem, remedy = (
+            "this file is compressed as a whole",
+            f"{shell_command(*unpack.split(), file)}, then try again",
+        )
     else:
         problem, remedy = "this is not a bag of ROS 1, SQLite or MCAP", _WHAT_TO_NAME
     raise ConfigurationError(problem, where=str(file), remedy=remedy)

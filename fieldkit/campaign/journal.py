@@ -75,15 +75,15 @@ class CampaignJournal:
         self._entries = self._read()
 
     @contextmanager
-    def kept(self, plan: CampaignPlan) -> Iterator[None]:
+    def claimed(self, plan: CampaignPlan) -> Iterator[None]:
         """Store the journal on disk and lock the campaign against other processes while the body runs.
 
         Raises:
             ConfigurationError: Another process runs the campaign, or the folder cannot be written.
         """
         store.prepare(self.folder)
-        with jsonl.claimed(self._path, "campaign"):
-            jsonl.mend(self._path, _CODEC.parse)
+        with jsonl.locked(self._path, "campaign"):
+            jsonl.repair_last_line(self._path, _CODEC.parse)
             self._entries = self._read()
             if not (self.folder / CAMPAIGN_FILE).is_file():
                 files.write(self.folder / CAMPAIGN_FILE, schema.dump(plan).encode())

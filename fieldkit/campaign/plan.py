@@ -23,7 +23,7 @@ Item = TypeVar("Item")
 def _distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
     def check(items: tuple[Item, ...]) -> tuple[Item, ...]:
         if len({key(item) for item in items}) < len(items):
-            raise schema.complaint("an entry occurs twice")
+            raise schema.validation_error("an entry occurs twice")
         return items
 
     return AfterValidator(check)
@@ -76,7 +76,7 @@ class CampaignFile(Strict):
     """
 
     name: Annotated[
-        str, schema.shaped(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: letters, digits, - and _, 61 in all")
+        str, schema.pattern_field(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: letters, digits, - and _, 61 in all")
     ]
     procedures: Annotated[tuple[str, ...], *_ONCE]
     distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda distance: distance.metres)]
@@ -105,10 +105,10 @@ def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedu
     """
     procedures = []
     for index, name in enumerate(campaign.procedures):
-        with document.naming("procedures", index):
+        with document.locating_errors("procedures", index):
             procedures.append(load_procedure(name))
     for index, text in enumerate(campaign.expect):
-        with document.naming("expect", index):
+        with document.locating_errors("expect", index):
             procedures = with_expectation(procedures, text)
     return tuple(procedures)
 

@@ -24,7 +24,7 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running.opening import opened
 from fieldkit.trial.running.resumption import demand_cast, resumable
-from fieldkit.trial.running.runner import begin, go_on, place
+from fieldkit.trial.running.runner import begin, continue_trial, place
 from fieldkit.trial.running.stop import Stop
 from fieldkit.trial.size import trial_bytes
 
@@ -115,7 +115,7 @@ class CampaignRun:
             RobotError: A robot cannot do what a trial needs.
             KeyboardInterrupt: A stop was requested.
         """
-        with self._journal.kept(self._plan):
+        with self._journal.claimed(self._plan):
             try:
                 self._demand_space()
                 self._reopen()
@@ -172,7 +172,7 @@ class CampaignRun:
                 plan = plan.with_note(placement.answer.note)
                 outcome = begin(plan, testbed, self._journal.folder, self._sink, stop, report_resume=False)
             else:
-                outcome = go_on(folder, testbed, self._sink, stop, report_resume=False, failed=self._failed)
+                outcome = continue_trial(folder, testbed, self._sink, stop, report_resume=False, failed=self._failed)
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
             unmet = sum(not judgement.holds for judgement in outcome.judgements)
             self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed, unmet=unmet)

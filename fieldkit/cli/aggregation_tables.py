@@ -9,7 +9,7 @@ from fieldkit.analysis import lines, tables, wording
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.comparable import MIXED_BY, mixtures
 from fieldkit.analysis.expectations import Expectation
-from fieldkit.analysis.judgements import Judgement, judge_own
+from fieldkit.analysis.judgements import Judgement, judge_by_trial
 from fieldkit.analysis.lines import TableLine
 from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
@@ -18,7 +18,7 @@ from fieldkit.cli import summary
 from fieldkit.cli.display import prose, show_note, table
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import parse_quantity
 from fieldkit.trial import sources
 from fieldkit.trial.sources import Sources
@@ -62,16 +62,16 @@ def show(arguments: argparse.Namespace) -> int:
     cells = aggregate(repeats, by, quantities=quantities, words=counted)
     more = more_wanted_of(cells, widths) if widths else ()
     if form in _FOR_PROGRAMS:
-        say(_FOR_PROGRAMS[form](by, cells, more), end="")
+        print_text(_FOR_PROGRAMS[form](by, cells, more), end="")
     elif form in _FOR_PAPERS:
         if form == "latex":
             _require_figures(cells, quantities)
-        say(_FOR_PAPERS[form](by, cells, quantities), end="")
+        print_text(_FOR_PAPERS[form](by, cells, quantities), end="")
     else:
         judgements = _judged(data, repeats, cells, quantities)
         expected = {judgement.expectation.quantity for judgement in judgements}
         show_all = arguments.all or chosen is not None or bool(widths)
-        shown = lines.lines(cells, quantities) if show_all else lines.of_operator(cells, expected)
+        shown = lines.lines(cells, quantities) if show_all else lines.operator_lines(cells, expected)
         _show(by, cells, shown, more)
         _show_expected(by, cells, judgements)
         _note_rest(cells, shown)
@@ -132,7 +132,7 @@ def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], 
     """Print a table of the repeats, and a table for each line of `shown`."""
     counts = [{"valid": str(cell.n_valid), "void": str(cell.n_void), "failed": str(cell.n_failed)} for cell in cells]
     _show_table("repeats", by, cells, counts)
-    differing, _ = wording.told_by(by, cells)
+    differing, _ = wording.varying_and_common(by, cells)
     for line in shown:
         measured_cells = [cell for cell in cells if line.estimate(cell) or line.is_lacking(cell)]
         scale = line.scale(measured_cells)
@@ -168,15 +168,15 @@ def _judged(
         for source in dict.fromkeys(repeats.texts[SOURCE][rows[tuple(cell.key.values())]]):
             yield from (item for item in expected.get(source, ()) if item.quantity in shown)
 
-    return judge_own((cell, expectations_of(cell)) for cell in cells)
+    return judge_by_trial((cell, expectations_of(cell)) for cell in cells)
 
 
 def _show_expected(by: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]) -> None:
     """Print for each condition if its expectations hold. Without expectations, print nothing."""
-    differing, _ = wording.told_by(by, cells)
+    differing, _ = wording.varying_and_common(by, cells)
     rows = []
     for judgement in judgements:
-        expected, _, *judged = wording.judged(judgement)
+        expected, _, *judged = wording.judgement_texts(judgement)
         rows.append(
             (expected, *(wording.key(judgement.cell, name) if judgement.cell else "" for name in differing), *judged)
         )
@@ -189,7 +189,7 @@ def _show_table(
     title: str, by: Sequence[str], cells: Sequence[Cell], figures: Sequence[Mapping[str, str]], *, words: int = 0
 ) -> None:
     """Print a row per cell. Key columns that all cells share go into the title. The last `words` columns are text."""
-    differing, common = wording.told_by(by, cells)
+    differing, common = wording.varying_and_common(by, cells)
     full_title = ", ".join([title, *dict.fromkeys(wording.key(cells[0], name) for name in common)])
     head = [*differing, *figures[0]]
     rows = [

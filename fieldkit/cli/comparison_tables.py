@@ -12,8 +12,8 @@ from fieldkit.analysis.comparable import VARIED, Concern
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
 from fieldkit.cli.display import show_note, table
-from fieldkit.core.errors import ConfigurationError, nearest, typed
-from fieldkit.core.printing import say
+from fieldkit.core.errors import ConfigurationError, did_you_mean, shell_command
+from fieldkit.core.printing import print_text
 from fieldkit.trial import sources
 
 MISSED: Final = 1
@@ -48,13 +48,13 @@ def show(arguments: argparse.Namespace) -> int:
     if arguments.format == "table":
         _table(comparison)
     else:
-        say(_FORMATS[arguments.format](comparison), end="")
-    return MISSED if comparison.missed else 0
+        print_text(_FORMATS[arguments.format](comparison), end="")
+    return MISSED if comparison.exceeds_threshold else 0
 
 
 def _require_two(paths: Sequence[Path]) -> None:
     if len(paths) > 2:
-        command = typed("fieldkit", "aggregate", *paths, "--by", "trial,protocol")
+        command = shell_command("fieldkit", "aggregate", *paths, "--by", "trial,protocol")
         raise ConfigurationError(
             f"compare takes two runs, A and B, and {len(paths)} are given",
             remedy="for a run of several trials give their folder, or their table from fieldkit export; "
@@ -67,7 +67,9 @@ def _threshold(text: str, quantities: Mapping[str, Quantity]) -> tuple[str, floa
     if name not in quantities:
         raise ConfigurationError(
             f"--threshold: there is no quantity {name!r}",
-            remedy=nearest(name, quantities, f"write for example ip_loss=2%; quantities are {', '.join(quantities)}"),
+            remedy=did_you_mean(
+                name, quantities, f"write for example ip_loss=2%; quantities are {', '.join(quantities)}"
+            ),
         )
     unit = quantities[name].unit
     if not value:
@@ -114,9 +116,11 @@ def _pairing_remedy(comparison: Comparison, arguments: argparse.Namespace) -> st
         and set(disjoint) <= VARIED
         and all(len(side_values) == 1 for side_values in values[disjoint[0]])
     ):
-        return f"only {disjoint[0]} differs; to compare one with the other: {typed(*words)}"
+        return f"only {disjoint[0]} differs; to compare one with the other: {shell_command(*words)}"
     differing = f"they differ in {', '.join(disjoint)}; " if disjoint else ""
-    return f"{differing}give two runs with the same conditions; or, to compare these: {typed(*words, '--force')}"
+    return (
+        f"{differing}give two runs with the same conditions; or, to compare these: {shell_command(*words, '--force')}"
+    )
 
 
 def _require_measured(comparison: Comparison, thresholds: Mapping[str, float]) -> None:
@@ -125,7 +129,7 @@ def _require_measured(comparison: Comparison, thresholds: Mapping[str, float]) -
         if name not in measured:
             raise ConfigurationError(
                 f"--threshold: neither A nor B has {name}",
-                remedy=nearest(name, measured, f"they have {', '.join(sorted(measured)) or 'no valid repeat'}"),
+                remedy=did_you_mean(name, measured, f"they have {', '.join(sorted(measured)) or 'no valid repeat'}"),
             )
 
 
@@ -133,8 +137,8 @@ def _table(comparison: Comparison) -> None:
     for pair in comparison.pairs:
         if not pair.missing_in:
             table(_HEAD, _lines(comparison, pair), title=f"{pair.name}: {_repeats(pair)}", right=(1, 2, 3))
-    say(_DELTA)
-    say("\n".join(wording.conclusions(comparison)))
+    print_text(_DELTA)
+    print_text("\n".join(wording.conclusions(comparison)))
 
 
 def _markdown(comparison: Comparison) -> str:
@@ -173,7 +177,7 @@ def _lines(comparison: Comparison, pair: Pair) -> list[tuple[str, ...]]:
             _value(difference, difference.a),
             _value(difference, difference.b),
             _delta(difference),
-            wording.verdict(difference, comparison.made),
+            wording.verdict(difference, comparison.n_compared),
         )
         for difference in pair.differences
     ]

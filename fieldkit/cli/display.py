@@ -24,7 +24,7 @@ from typing_extensions import override
 from fieldkit.cli.hints import completed
 from fieldkit.cli.progress import ProgressBar, Words
 from fieldkit.core import prompts
-from fieldkit.core.errors import typed
+from fieldkit.core.errors import shell_command
 from fieldkit.core.events import (
     NOTHING_ARRIVED,
     Asked,
@@ -43,7 +43,7 @@ from fieldkit.core.events import (
     TrialStopped,
 )
 from fieldkit.core.model import Status, Verdict
-from fieldkit.core.text import harmless, json_text
+from fieldkit.core.text import json_text, sanitized
 from fieldkit.core.units import TimeEstimate, format_bytes
 
 _PLAIN_WIDTH: Final = 160
@@ -82,7 +82,7 @@ def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
 
 def prose(text: str) -> None:
     """Print a text. On a terminal, lines are folded between words."""
-    text = harmless(text)
+    text = sanitized(text)
     print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
 
 
@@ -101,7 +101,7 @@ def table(
     folded table, each row is printed as a block with a line per cell.
     """
     console = _console()
-    cells = [[harmless(cell) for cell in row] for row in (head, *rows)]
+    cells = [[sanitized(cell) for cell in row] for row in (head, *rows)]
     widths = _widths(cells)
     last = len(head) - 1
     for index in fold if fold is not None else () if last in right else (last,):
@@ -112,7 +112,7 @@ def table(
         _print_blocks(cells, title, console)
         return
     if title:
-        console.print(Text(harmless(title), style="bold"))
+        console.print(Text(sanitized(title), style="bold"))
     lines = _render_lines(cells, widths, right)
     rule = next(index for index, line in enumerate(lines) if line.startswith(_RULE))
     console.print(Text("\n".join(lines[:rule]), style="bold"))
@@ -147,7 +147,7 @@ def _print_blocks(cells: Sequence[Sequence[str]], title: str, console: Console) 
     head, *rows = cells
     indent = 2 + max(map(cell_len, head[1:]), default=0) + 2
     if title:
-        console.print(Text(harmless(title), style="bold"))
+        console.print(Text(sanitized(title), style="bold"))
     for first, *others in rows:
         console.print(Text("\n".join(_fold_words(first.split() or [head[0]], console.width)), style="bold"))
         for name, cell in zip(head[1:], others, strict=True):
@@ -287,7 +287,7 @@ def words_of(event: Event, width: int | None = None) -> Words:
         case Note(text):
             words = ((text, ""),)
         case Request(text, may_skip):
-            words = (f"\n>>> {text}\n", "bold"), (f"    {prompts.how(may_skip=may_skip)}", "")
+            words = (f"\n>>> {text}\n", "bold"), (f"    {prompts.answer_hint(may_skip=may_skip)}", "")
         case Asked(text, how):
             words = (f"\n>>> {text}?\n", "bold"), (f"    {how}", "")
         case Finding(status=Verdict.WARN):
@@ -305,7 +305,7 @@ def words_of(event: Event, width: int | None = None) -> Words:
             )
             words = ((f"{counts}: {folder}", "bold"),)
         case TrialStopped(folder, done, total):
-            command = f"to continue: {typed('fieldkit', 'resume', folder)}"
+            command = f"to continue: {shell_command('fieldkit', 'resume', folder)}"
             words = ((f"stopped, {done} of {total} repeats are done; {command}", "bold"),)
         case CampaignPlanned() | CampaignTrial() | CampaignWent() | CampaignEnded():
             words = _campaign(event)
@@ -365,7 +365,7 @@ def _fold_after(text: str, begin: int, width: int) -> str:
 
 
 def _harmless(text: Text) -> Text:
-    text.plain = harmless(text.plain)
+    text.plain = sanitized(text.plain)
     return text
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.events import CommandPlanned, Note, Sink
 from fieldkit.core.model import Protocol, RepeatId
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import quote
@@ -20,18 +20,18 @@ def print_commands(plan: Plan) -> None:
     Jobs are shown as a person would type them. In a trial `job.sh` starts them detached.
     """
     each = f"{format_count(plan.repeats, 'repeat')} per protocol"
-    say(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {each}")
+    print_text(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {each}")
     for remark in _remarks(plan):
-        say(f"# {remark}")
+        print_text(f"# {remark}")
     commands = list(_commands(plan))
     for protocol in plan.protocols:
         for role, robot in plan.cast.items():
             own_commands = [command for command in commands if (command.protocol, command.role) == (protocol, role)]
-            say(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {_folder(plan, protocol)}")
+            print_text(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {_folder(plan, protocol)}")
             if not own_commands:
-                say("only the checks before repeat 1")
+                print_text("only the checks before repeat 1")
             for command in own_commands:
-                say(f"{command.number}. {command.name}: {command.command}")
+                print_text(f"{command.number}. {command.name}: {command.command}")
 
 
 def report_commands(plan: Plan, sink: Sink) -> None:

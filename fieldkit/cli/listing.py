@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from fieldkit.cli.display import table
 from fieldkit.config import locations
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 
 
 def list_or_show(kind: locations.Kind, summary: Callable[[str], str], name: str | None) -> int:
@@ -14,5 +14,5 @@ def list_or_show(kind: locations.Kind, summary: Callable[[str], str], name: str 
         table(("name", "file", "summary"), rows)  # only the last column may be folded; a path must not be
     else:
         summary(name)  # raises if the file has an error
-        say(locations.find(kind, name).read_text(encoding="utf-8"), end="")
+        print_text(locations.find(kind, name).read_text(encoding="utf-8"), end="")
     return 0

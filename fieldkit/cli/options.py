@@ -15,7 +15,7 @@ from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Distance, Protocol, Topology
-from fieldkit.core.prompts import Nobody, Operator, Script
+from fieldkit.core.prompts import Operator, Script, Unattended
 from fieldkit.core.units import parse_duration_s
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest
@@ -52,7 +52,7 @@ def operator(arguments: argparse.Namespace, sink: Sink) -> Iterator[Operator]:
         ConfigurationError: The answers cannot be read.
     """
     if arguments.yes:
-        yield Nobody()
+        yield Unattended()
     elif arguments.answers is None:
         yield Terminal(sink)
     elif arguments.answers == _STANDARD_INPUT:

@@ -39,7 +39,7 @@ def load(name: str, target: str) -> Any:  # noqa: ANN401 (an object of any type)
 def names() -> Mapping[str, Sequence[str]]:
     """Return the entry points of each command by its name. Several entry points mean that packages conflict."""
     targets: dict[str, dict[str, None]] = {}
-    for point in plugins.points(plugins.COMMANDS):
+    for point in plugins.entry_points(plugins.COMMANDS):
         targets.setdefault(point.name, {})[point.value] = None
     return {name: tuple(values) for name, values in targets.items()}
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, NoReturn
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 Commands = Any  # argparse has no public name for the object that add_subparsers returns
 
@@ -150,5 +150,5 @@ class Parser(argparse.ArgumentParser):
         if typed not in choices:
             raise ConfigurationError(
                 f"{argument} cannot be {typed!r}; it is one of: {', '.join(choices)}",
-                remedy=nearest(typed, choices, f"{self.prog} --help"),
+                remedy=did_you_mean(typed, choices, f"{self.prog} --help"),
             )

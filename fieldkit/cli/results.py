@@ -13,8 +13,8 @@ from fieldkit.cli import summary
 from fieldkit.cli.display import show_error, table
 from fieldkit.cli.hints import completed
 from fieldkit.core.columns import plain_name
-from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, typed
-from fieldkit.core.printing import say
+from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 from fieldkit.export import junit
 from fieldkit.trial import store
@@ -41,7 +41,7 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
         if outcome.failed:
             reasons = outcome.folder / store.TRIAL_CSV
             failed = format_count(outcome.failed, "repeat")
-            command = typed("fieldkit", "resume", outcome.folder, "--failed")
+            command = shell_command("fieldkit", "resume", outcome.folder, "--failed")
             remedy = f"correct what the reasons name, then redo them: {command}"
             show_error(f"{failed} failed; reasons in {reasons}\n  remedy: {remedy}")
     if not is_json:
@@ -70,14 +70,14 @@ def write_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
         raise ConfigurationError(
             f"cannot be written: {error.strerror}",
             where=str(arguments.junit),
-            remedy=typed("fieldkit", "export", "--format", "junit", "-o", "FILE", *folders),
+            remedy=shell_command("fieldkit", "export", "--format", "junit", "-o", "FILE", *folders),
         ) from error
 
 
 def expectation_table(judgements: Sequence[Judgement]) -> None:
     """Print a row for each expectation with its judgement. Without expectations, print nothing."""
     if judgements:
-        rows = [wording.judged(judgement) for judgement in judgements]
+        rows = [wording.judgement_texts(judgement) for judgement in judgements]
         table(("expected", "of", "measured", "[95 % interval]", ""), rows, fold=(0, 4))
 
 
@@ -85,18 +85,20 @@ def _show_next(ended: Sequence[Outcome], left_out: int) -> None:
     """Print likely next commands, unless all trials are without a valid repeat."""
     if any(outcome.valid for outcome in ended):
         for index, command in enumerate(_next_commands(ended, left_out)):
-            say(f"{'      ' if index else 'next: '}{completed(command)}")  # not folded, so that it can be copied
+            print_text(
+                f"{'      ' if index else 'next: '}{completed(command)}"
+            )  # not folded, so that it can be copied
 
 
 def _next_commands(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
     folders = [outcome.folder for outcome in ended]
-    yield typed("fieldkit", "report", *folders)
+    yield shell_command("fieldkit", "report", *folders)
     if left_out:
-        yield f"{typed('fieldkit', 'aggregate', *folders, '--all')}  # {summary.more(left_out)}"
+        yield f"{shell_command('fieldkit', 'aggregate', *folders, '--all')}  # {summary.more(left_out)}"
     cells = [cell for outcome in ended for cell in outcome.cells[:1]]
     farther = _farther([str(cell.key["distance"]) for cell in cells])
     if farther and not any(_lost_all(cell) for outcome in ended for cell in outcome.cells):
-        yield f"{typed('fieldkit', 'trial', cells[-1].key['procedure'], farther)}  # another distance"
+        yield f"{shell_command('fieldkit', 'trial', cells[-1].key['procedure'], farther)}  # another distance"
 
 
 def _lost_all(cell: Cell) -> bool:

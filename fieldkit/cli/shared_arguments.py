@@ -7,8 +7,8 @@ from typing import Final
 from fieldkit.cli.parser import Parser
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.core import plugins
-from fieldkit.core.model import MOST_REPEATS, Protocol, Topology
-from fieldkit.core.text import harmless
+from fieldkit.core.model import MAX_REPEATS, Protocol, Topology
+from fieldkit.core.text import sanitized
 
 TABLES: Final = ("table", "csv", "json", "markdown")
 PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
@@ -22,7 +22,7 @@ _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 
 def add_site(parser: Parser) -> None:
     """Add the options that select robots."""
-    names = ", ".join(point.name for point in plugins.points(plugins.BACKENDS))
+    names = ", ".join(point.name for point in plugins.entry_points(plugins.BACKENDS))
     parser.add_argument(
         "--backend", metavar="NAME", help=f"one of: {names} (default: the site file's; without one, emulated)"
     )
@@ -161,11 +161,11 @@ def natural(text: str) -> int:
 
 def repeats(text: str) -> int:
     """Return a number of repeats from 1; argparse reports other texts."""
-    if not 1 <= natural(text) <= MOST_REPEATS:
-        raise argparse.ArgumentTypeError(f"must be at least 1, and at most {MOST_REPEATS}")
+    if not 1 <= natural(text) <= MAX_REPEATS:
+        raise argparse.ArgumentTypeError(f"must be at least 1, and at most {MAX_REPEATS}")
     return int(text)
 
 
 def free_text(text: str) -> str:
     """Return a text with `?` in place of bytes that are not UTF-8 and of control characters."""
-    return harmless(text)
+    return sanitized(text)

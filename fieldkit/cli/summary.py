@@ -30,7 +30,7 @@ def show(cells: Sequence[Cell], *, every: bool = False, expected: Collection[str
     left_out, names = set[str](), set[str]()
     for condition, group in groups.items():
         title = ", ".join(str(part) for part in condition)
-        shown = lines.lines(group) if every else lines.with_radio_loss(lines.of_operator(group, expected), group)
+        shown = lines.lines(group) if every else lines.with_radio_loss(lines.operator_lines(group, expected), group)
         names |= (group_names := {quantity.name for line in shown for quantity in line.quantities})
         left_out |= {quantity.name for quantity in wording.measured(group)} - group_names
         layouts: Sequence[tuple[list[_Table], Sequence[int]]] = (

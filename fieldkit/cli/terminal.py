@@ -42,7 +42,7 @@ class Terminal:
         )
         self._sink(Request(request, may_skip))
         while (answer := prompts.parse(_read_line(), may_skip=may_skip)) is None:
-            print(prompts.how(may_skip=may_skip), file=sys.stderr)
+            print(prompts.answer_hint(may_skip=may_skip), file=sys.stderr)
         self._sink(Answered(answer.skip, answer.note))
         return answer
 
@@ -52,9 +52,9 @@ class Terminal:
             f"a person must answer: {question.text}",
             "give the answers by --answers FILE; with --yes no question is asked",
         )
-        self._sink(Asked(question.text, question.how))
+        self._sink(Asked(question.text, question.answer_hint))
         while (answer := question.read(_read_line())) is None:
-            print(question.how, file=sys.stderr)
+            print(question.answer_hint, file=sys.stderr)
         self._sink(Entered(answer))
         return answer
 
@@ -112,11 +112,11 @@ def interruptible() -> Iterator[Stop]:
     def handle(number: int, _frame: FrameType | None) -> None:
         nonlocal stopping
         if stopping:
-            if stop.motions.called:
+            if stop.motions.is_ordered:
                 stop.motions.abandon()
                 _say(_ABANDONED)
             return
-        if stop.motions.order(_say):
+        if stop.motions.order_stop(_say):
             stopping = stop.due = True
             if not stop.saving:
                 raise KeyboardInterrupt
@@ -149,7 +149,7 @@ def _stop_thread(stop: Stop) -> Iterator[None]:
     def watch() -> None:
         while numbers := receiver.recv(64):
             if any(number in _SIGNALS for number in numbers):
-                stop.motions.order(_say)
+                stop.motions.order_stop(_say)
 
     thread = threading.Thread(target=watch, name="signals", daemon=True)
     with receiver, sender:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 _FOLDERS: Final = ("", "reference", "studies")
@@ -68,7 +68,7 @@ def find(topic: str) -> Page:
     if reference is not None and topic in _commands(reference):
         return Page(reference, heading)
     raise ConfigurationError(
-        f"there is no topic {topic!r}", remedy=nearest(topic, pages, "list all topics: fieldkit docs --list")
+        f"there is no topic {topic!r}", remedy=did_you_mean(topic, pages, "list all topics: fieldkit docs --list")
     )
 
 

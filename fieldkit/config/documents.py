@@ -22,7 +22,7 @@ from yaml.reader import Reader
 from yaml.resolver import Resolver
 from yaml.scanner import Scanner
 
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 
 _MAX_BYTES: Final = 1 << 20
 _MAX_DEPTH: Final = 50
@@ -158,7 +158,7 @@ class Document:
         return existing
 
     @contextmanager
-    def naming(self, *location: str | int) -> Iterator[None]:
+    def locating_errors(self, *location: str | int) -> Iterator[None]:
         """Add `file:line` of a location to errors that the body raises without a place."""
         try:
             yield
@@ -197,7 +197,7 @@ def _text(path: Path) -> str:
         raise ConfigurationError(
             f"cannot be read: {error.strerror}",
             where=str(path),
-            remedy=f"check its name and rights: {typed('ls', '-l', path)}",
+            remedy=f"check its name and rights: {shell_command('ls', '-l', path)}",
         ) from error
     try:
         return data.decode()

@@ -6,7 +6,7 @@ It imports no YAML reader, so that the command line can list and complete the na
 from pathlib import Path
 from typing import Final, Literal
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 Kind = Literal["robots", "procedures"]
 
@@ -45,7 +45,7 @@ def _is_empty(path: Path) -> bool:
     return path.is_file() and not path.stat().st_size
 
 
-def own_copy(name: str) -> str:
+def copy_profile_command(name: str) -> str:
     """Return the command that copies a robot profile into the lab, where it can be edited."""
     return f"mkdir -p robots; fieldkit robots show {name} > robots/{name}.yaml; then edit that copy"
 
@@ -62,5 +62,5 @@ def find(kind: Kind, name: str) -> Path:
     singular = kind.removesuffix("s")
     raise ConfigurationError(
         f"there is no {'robot profile' if kind == 'robots' else singular} {name!r}",
-        remedy=nearest(name, paths, f"names: {', '.join(paths)}; see fieldkit {kind}"),
+        remedy=did_you_mean(name, paths, f"names: {', '.join(paths)}; see fieldkit {kind}"),
     )

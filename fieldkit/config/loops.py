@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from fieldkit.config.documents import Document, Location
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 MOST: Final = 1000
 """Most steps of a file after its loops are expanded."""
@@ -32,7 +32,7 @@ Values = Mapping[str, Scalar]
 """Values by variable."""
 
 
-def written_out(document: Document, key: str) -> Document:
+def expand_loops(document: Document, key: str) -> Document:
     """Return a document with every `for:` expanded; each value keeps its line.
 
     Args:
@@ -169,7 +169,7 @@ class _Expander:
             if (name := match["name"]) is None:
                 return match[0][0]
             if name not in values:
-                suggestion = nearest(name, values, f"the variables are: {', '.join(values)}")
+                suggestion = did_you_mean(name, values, f"the variables are: {', '.join(values)}")
                 remedy = f"write {{{{{name}}}}} for the text {{{name}}}, or use a variable"
                 raise self._problem(f"there is no variable {name}; {suggestion}", at, remedy)
             return values[name]

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, get_args
 
-from fieldkit.core.errors import nearest
+from fieldkit.core.errors import did_you_mean
 
 Fields = Mapping[str, Any]
 """Types by key of a mapping, from its model."""
@@ -43,7 +43,7 @@ def hint(key: str, data: Mapping[Any, Any], fields: Fields, outer: Sequence[Fiel
             f"{''.join(similar) or f'{valid}; '}if it is a key of {preceding[-1]}, indent it below {preceding[-1]}:",
             -1,
         )
-    return nearest(key, fields, valid), -1
+    return did_you_mean(key, fields, valid), -1
 
 
 def _inner_keys(kind: Any, depth: int = 0) -> Iterator[Sequence[str]]:  # noqa: ANN401 (any type)

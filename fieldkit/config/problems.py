@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from fieldkit.config.documents import Document, Location
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.units import format_count
 
 SHAPES: Final[dict[str, str]] = {}
@@ -101,7 +101,7 @@ def _message(problem: Mapping[str, Any]) -> str:
             message = f"required key {context['discriminator']} is missing"
         case "union_tag_invalid":
             kinds = re.findall(r"'([^']+)'", context["expected_tags"])
-            message = f"there is no kind {context['tag']!r}; {nearest(context['tag'], kinds, _kinds(kinds))}"
+            message = f"there is no kind {context['tag']!r}; {did_you_mean(context['tag'], kinds, _kinds(kinds))}"
         case "string_pattern_mismatch":
             message = _pattern_message(str(value), context["pattern"])
         case "too_short":

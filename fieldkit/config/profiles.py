@@ -15,13 +15,13 @@ from fieldkit.config.schema import (
     Int,
     Number,
     Strict,
-    shaped,
+    pattern_field,
 )
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
 TopicName = Annotated[
-    str, shaped(r"^(/[A-Za-z][A-Za-z0-9_]*)+$", "the name of a topic, such as /scan or /camera/image")
+    str, pattern_field(r"^(/[A-Za-z][A-Za-z0-9_]*)+$", "the name of a topic, such as /scan or /camera/image")
 ]
 
 
@@ -44,7 +44,7 @@ class PublishedTopic(Strict):
 
     name: TopicName
     type: Annotated[
-        str, shaped(r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$", "a message type, such as sensor_msgs/LaserScan")
+        str, pattern_field(r"^[a-z][a-z0-9_]*/[A-Z][A-Za-z0-9]*$", "a message type, such as sensor_msgs/LaserScan")
     ]
     rate: Hertz
     frame: str = ""
@@ -68,15 +68,15 @@ def _known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:
         for _, name, form, conversion in string.Formatter().parse(word):
             if name is not None and (name not in RECORD_PLACEHOLDERS or form or conversion):
                 valid = ", ".join(f"{{{placeholder}}}" for placeholder in sorted(RECORD_PLACEHOLDERS))
-                raise schema.complaint(f"{word!r} has an unknown placeholder; valid: {valid}")
+                raise schema.validation_error(f"{word!r} has an unknown placeholder; valid: {valid}")
     if "{topics}" not in argv:
-        raise schema.complaint("the word {topics} is missing; it becomes one word per topic")
+        raise schema.validation_error("the word {topics} is missing; it becomes one word per topic")
     return argv
 
 
 def _absolute_path(text: str) -> str:
     if not text.startswith("/") or posixpath.normpath(text) != text or "\0" in text:
-        raise schema.complaint(
+        raise schema.validation_error(
             f"{text!r} is not an absolute path without . and .., such as "
             "/opt/ros/noetic/setup.bash; no shell expands it"
         )
@@ -110,7 +110,7 @@ class RecordCommand(Strict):
 
 _Crossing = Annotated[
     str,
-    shaped(
+    pattern_field(
         r"^(/[A-Za-z]\w*)+:[a-z]\w*/(msg/)?[A-Z]\w*(:[a-z0-9_=,]+)?$",
         "NAME:TYPE or NAME:TYPE:QOS, such as /scan:sensor_msgs/LaserScan",
     ),
@@ -139,9 +139,9 @@ class RobotBridge(Strict):
     @schema.model_validator(mode="after")
     def _carries_something(self) -> "RobotBridge":
         if not self.topics and not self.back:
-            raise schema.complaint("it carries no topics; add topics or back", "topics")
+            raise schema.validation_error("it carries no topics; add topics or back", "topics")
         if self.router is not None and self.to != "zenoh":
-            raise schema.complaint("only Zenoh has a router; write to: zenoh", "router")
+            raise schema.validation_error("only Zenoh has a router; write to: zenoh", "router")
         return self
 
     def command(self, address: str, master: str, patience_s: int) -> tuple[str, ...]:
@@ -186,9 +186,9 @@ class Ros(Strict):
     @schema.model_validator(mode="after")
     def _variant_exists(self) -> "Ros":
         if self.variant not in self.variants:
-            raise schema.complaint(f"variant {self.variant!r} has no entry under variants")
+            raise schema.validation_error(f"variant {self.variant!r} has no entry under variants")
         if self.bridge is not None and self.variant != "ros1":
-            raise schema.complaint("a robot with ROS 2 needs no bridge; omit it", "bridge")
+            raise schema.validation_error("a robot with ROS 2 needs no bridge; omit it", "bridge")
         return self
 
     @schema.model_validator(mode="after")
@@ -196,7 +196,7 @@ class Ros(Strict):
         text = self.environment.get("ROS_DOMAIN_ID") or "0"
         if not (text.isascii() and text.isdecimal() and int(text) <= MOST_DOMAIN):
             message = f"{text!r} is not a domain of ROS 2; use a whole number from 0 to {MOST_DOMAIN}"
-            raise schema.complaint(message, "environment", "ROS_DOMAIN_ID")
+            raise schema.validation_error(message, "environment", "ROS_DOMAIN_ID")
         return self
 
     @property
@@ -249,7 +249,9 @@ class Radio(Strict):
             report a weak signal.
     """
 
-    interface: Annotated[str, shaped(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, such as wlan0")]
+    interface: Annotated[
+        str, pattern_field(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, such as wlan0")
+    ]
     standard: str
     access_point: schema.Bool = False
     tx_power_dbm: Number | Int
@@ -282,7 +284,9 @@ class Mavlink(Strict):
 
     port: Annotated[Int, Field(gt=0, lt=65536)]
     connection: (
-        Annotated[str, shaped(_CONNECTION, "a connection, such as udpout:127.0.0.1:14550 or /dev/ttyAMA0:921600")]
+        Annotated[
+            str, pattern_field(_CONNECTION, "a connection, such as udpout:127.0.0.1:14550 or /dev/ttyAMA0:921600")
+        ]
         | None
     ) = None
     autopilot: Annotated[str, Field(pattern="^(px4|ardupilot)$", exclude_if=lambda name: name == "px4")] = "px4"
@@ -291,7 +295,7 @@ class Mavlink(Strict):
     least_charge: Annotated[Fraction, Field(exclude_if=lambda share: share == LEAST_CHARGE)] = LEAST_CHARGE
 
     @property
-    def own(self) -> str:
+    def onboard_connection(self) -> str:
         """The connection from the robot's computer."""
         return self.connection or f"udpout:127.0.0.1:{self.port}"
 
@@ -369,7 +373,7 @@ class RobotProfile(catalog.Named):
     @schema.model_validator(mode="after")
     def _has_a_fence(self) -> "RobotProfile":
         if self.drive is not None and self.limits.fence_m is None:
-            raise schema.complaint("a robot with drive needs a fence; set limits.fence_m")
+            raise schema.validation_error("a robot with drive needs a fence; set limits.fence_m")
         return self
 
 

@@ -13,7 +13,7 @@ from typing import Annotated, Final
 from fieldkit.config import schema
 from fieldkit.config.schema import BeforeValidator, Bool, Field, Int, Strict
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.units import format_bytes
 
 MOST_BYTES: Final = 8 << 20
@@ -70,14 +70,14 @@ def _find(value: object) -> object:
     if isinstance(value, dict | LabProgram):
         return value
     if not isinstance(value, str):
-        raise schema.complaint("the path of a file is needed here, tools/probe.py for example")
+        raise schema.validation_error("the path of a file is needed here, tools/probe.py for example")
     _require_valid_name(value)
     searched = list(dict.fromkeys((schema.folder(), Path())))
     for folder in searched:
         if os.path.lexists(path := folder / value):
             return _record(value, path, folder)
-    folders = " and ".join(f"{typed(folder.absolute())}" for folder in searched)
-    raise schema.complaint(f"there is no file {value!r}; searched in {folders}")
+    folders = " and ".join(f"{shell_command(folder.absolute())}" for folder in searched)
+    raise schema.validation_error(f"there is no file {value!r}; searched in {folders}")
 
 
 def _resolve(path: Path) -> Path:
@@ -88,11 +88,11 @@ def _resolve(path: Path) -> Path:
 def _require_valid_name(name: str) -> None:
     path = PurePosixPath(name)
     if not path.name or path.is_absolute() or ".." in path.parts:
-        raise schema.complaint(
+        raise schema.validation_error(
             f"{name!r} is not the relative path of a file in the folder of the procedure or of the lab (without ..)"
         )
     if not path.name.isprintable():
-        raise schema.complaint(f"{name!r} has a character in its name that cannot be printed")
+        raise schema.validation_error(f"{name!r} has a character in its name that cannot be printed")
 
 
 def _record(name: str, path: Path, folder: Path) -> dict[str, object]:
@@ -102,15 +102,15 @@ def _record(name: str, path: Path, folder: Path) -> dict[str, object]:
         target = _resolve(path)
         status = target.stat()
         if not target.is_relative_to(inside):
-            raise schema.complaint(f"{name!r} is a link to a file outside of {inside}; copy the file there")
+            raise schema.validation_error(f"{name!r} is a link to a file outside of {inside}; copy the file there")
         if target.is_dir():
-            raise schema.complaint(f"{name!r} is a folder; name one file")
+            raise schema.validation_error(f"{name!r} is a folder; name one file")
         if status.st_size > MOST_BYTES:
             sizes = f"{format_bytes(status.st_size)}, more than {format_bytes(MOST_BYTES)}"
-            raise schema.complaint(f"{name!r} has {sizes}; install it on the robot")
+            raise schema.validation_error(f"{name!r} has {sizes}; install it on the robot")
         content = files.read(target, MOST_BYTES)
     except OSError as error:
-        raise schema.complaint(f"{name!r} cannot be read: {error.strerror}") from None
+        raise schema.validation_error(f"{name!r} cannot be read: {error.strerror}") from None
     return {
         "file": str(target.relative_to(lab) if target.is_relative_to(lab) else target),
         "sha256": hashlib.sha256(content).hexdigest(),

@@ -37,7 +37,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, core
 from fieldkit.config import misplaced, problems
 from fieldkit.config.documents import Document, Location, parse, read, to_text
 from fieldkit.core import units
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Distance
 
 __all__ = [
@@ -62,7 +62,6 @@ __all__ = [
     "Speed",
     "Strict",
     "by_kind",
-    "complaint",
     "dump",
     "folder",
     "is_empty",
@@ -70,9 +69,10 @@ __all__ = [
     "model_serializer",
     "model_validator",
     "parse",
+    "pattern_field",
     "read",
-    "shaped",
     "validate",
+    "validation_error",
 ]
 
 # Before it builds its first model, pydantic searches the files of all installed packages for plugins: 25 ms.
@@ -85,7 +85,7 @@ _ENCLOSING: ContextVar[tuple[type["Strict"], ...]] = ContextVar("_ENCLOSING", de
 _FOLDER: ContextVar[Path] = ContextVar("_FOLDER", default=Path())
 
 
-def complaint(text: str, *at: str | int) -> Exception:
+def validation_error(text: str, *at: str | int) -> Exception:
     """Return the exception that a validator raises. The user gets `text` with file and line.
 
     Args:
@@ -95,7 +95,7 @@ def complaint(text: str, *at: str | int) -> Exception:
     return PydanticCustomError("complaint", "{text}", {"text": text, "at": at})
 
 
-def shaped(pattern: str, words: str) -> Any:  # noqa: ANN401 (as pydantic's own `Field`)
+def pattern_field(pattern: str, words: str) -> Any:  # noqa: ANN401 (as pydantic's own `Field`)
     """Return the `Field` of a text that must match a pattern.
 
     Args:
@@ -109,11 +109,11 @@ def shaped(pattern: str, words: str) -> Any:  # noqa: ANN401 (as pydantic's own 
 def _converter(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator:
     def convert(value: object) -> Quantity:
         if isinstance(value, bool) or not isinstance(value, str | int | float):
-            raise complaint(f"a number with a unit is needed here; write for example 20{symbol}")
+            raise validation_error(f"a number with a unit is needed here; write for example 20{symbol}")
         try:
             return parse(str(value))
         except ConfigurationError as error:
-            raise complaint(f"{error.what}; {error.remedy}") from None
+            raise validation_error(f"{error.what}; {error.remedy}") from None
 
     return BeforeValidator(convert)
 
@@ -165,7 +165,7 @@ class Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, defer_build=True)
 
     @classmethod
-    def written_out(cls, document: Document) -> Document:
+    def expanded(cls, document: Document) -> Document:
         """Return a document with constructs such as `for:` expanded; most models have none.
 
         Raises:
@@ -249,11 +249,11 @@ def by_kind(
         if unknown := next((str(key) for key in data if key not in models), None):
             parent = next((str(key) for key in data if key in models and unknown in _types(models[key])), None)
             valid = f"valid keys: {', '.join(models)}; other kinds of {what} need a package that is not installed"
-            hint = f"it is a key of {parent}: write it inside" if parent else nearest(unknown, models, valid)
+            hint = f"it is a key of {parent}: write it inside" if parent else did_you_mean(unknown, models, valid)
             outer = [] if parent else [types for model in _ENCLOSING.get() if unknown in (types := _types(model))]
             raise _unknown(unknown, hint, outer[-1] if outer else ())
         if len(data) != 1:
-            raise complaint(f"a {what} has one kind, one of: {', '.join(models)}")
+            raise validation_error(f"a {what} has one kind, one of: {', '.join(models)}")
         ((kind, value),) = data.items()
         # Validated under its key, so that the location of an error includes the key.
         located = SchemaValidator(core_schema.typed_dict_schema({kind: _field_of(models[kind])}))
@@ -263,7 +263,7 @@ def by_kind(
         try:
             take(data)
         except AttributeError:
-            raise complaint(f"a {what} is a mapping with one key, one of: {', '.join(kinds())}") from None
+            raise validation_error(f"a {what} is a mapping with one key, one of: {', '.join(kinds())}") from None
         made: Item = data
         return made
 
@@ -298,7 +298,7 @@ def validate(document: Document, model: type[Model]) -> Model:
         ConfigurationError: The first problem in the file, with file, line, key path and, for an unknown key, the
             nearest valid one.
     """
-    document = model.written_out(document)
+    document = model.expanded(document)
     token = _FOLDER.set(Path(document.source).parent)
     try:
         return model.model_validate(document.data)

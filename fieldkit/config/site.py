@@ -6,13 +6,15 @@ from typing import Annotated
 
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, BeforeValidator, Duration, Field, Int, Strict
-from fieldkit.core.errors import nearest
+from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import FIXED_ROLES, Control, Role, Topology
 
 
 def _no_plain_password(value: object) -> object:
     if value not in ("ask", "keyring"):
-        raise schema.complaint("a password must not be in a file; write `password: ask` or `password: keyring`")
+        raise schema.validation_error(
+            "a password must not be in a file; write `password: ask` or `password: keyring`"
+        )
     return value
 
 
@@ -26,13 +28,13 @@ def is_ipv4(text: str) -> bool:
 
 def _ipv4(text: str) -> str:
     if not is_ipv4(text):
-        raise schema.complaint(f"{text!r} is not an IPv4 address; the radio under test needs one")
+        raise schema.validation_error(f"{text!r} is not an IPv4 address; the radio under test needs one")
     return text
 
 
 RobotName = Annotated[
     str,
-    schema.shaped(
+    schema.pattern_field(
         r"^[a-z][a-z0-9-]{0,30}$", "a name of at most 31 lower-case letters, digits and -, with a letter first"
     ),
 ]
@@ -65,7 +67,7 @@ class SiteRobot(Strict):
     @schema.model_validator(mode="after")
     def _has_one_login_method(self) -> "SiteRobot":
         if self.key is not None and self.password is not None:
-            raise schema.complaint("it has a key and a password; remove one of them")
+            raise schema.validation_error("it has a key and a password; remove one of them")
         return self
 
 
@@ -111,7 +113,7 @@ class Site(Strict):
         for name, robot in self.robots.items():
             other = names.setdefault((robot.host or name, robot.port), name)
             if other != name:
-                raise schema.complaint(f"{name} and {other} are the same machine", "robots", name, "host")
+                raise schema.validation_error(f"{name} and {other} are the same machine", "robots", name, "host")
         return self
 
     @schema.model_validator(mode="after")
@@ -120,15 +122,15 @@ class Site(Strict):
             for role, name in cast.items():
                 if name not in self.robots:
                     robots = ", ".join(self.robots)
-                    raise schema.complaint(
+                    raise schema.validation_error(
                         f"roles.{topology}.{role} names {name!r}; the robots are: {robots}", "roles", topology, role
                     )
                 # A procedure may define other roles. A role that resembles an unassigned fixed role is a misspelling.
                 unassigned = [fixed for fixed in FIXED_ROLES if fixed not in cast]
-                if role not in FIXED_ROLES and (suggestion := nearest(role, unassigned, "")):
-                    raise schema.complaint(f"roles.{topology}.{role}: {suggestion}", "roles", topology, role)
+                if role not in FIXED_ROLES and (suggestion := did_you_mean(role, unassigned, "")):
+                    raise schema.validation_error(f"roles.{topology}.{role}: {suggestion}", "roles", topology, role)
             if len(set(cast.values())) < len(cast):
-                raise schema.complaint(f"roles.{topology}: one robot has two roles", "roles", topology)
+                raise schema.validation_error(f"roles.{topology}: one robot has two roles", "roles", topology)
         return self
 
     @schema.model_validator(mode="after")
@@ -136,7 +138,7 @@ class Site(Strict):
         # A role of a procedure exists only in trials of that procedure, so it cannot be the master.
         assigned = [role for role in FIXED_ROLES if any(role in cast for cast in self.roles.values())]
         if self.ros_master is not None and self.ros_master not in assigned:
-            raise schema.complaint(
+            raise schema.validation_error(
                 f"ros_master must be one of the assigned roles: {', '.join(assigned)}", "ros_master"
             )
         return self

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from fieldkit.config import documents
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 
 _TEMPLATE: Final = "site_template.yaml"
 _KEY: Final = "host_key"
@@ -26,7 +26,7 @@ def create(path: Path) -> None:
         raise ConfigurationError(
             "this file exists and is not overwritten",
             where=str(path),
-            remedy=f"fieldkit init --out other.yaml; or {typed('mv', path, f'{path}.old')}",
+            remedy=f"fieldkit init --out other.yaml; or {shell_command('mv', path, f'{path}.old')}",
         ) from error
     except OSError as error:
         raise ConfigurationError(
@@ -54,7 +54,9 @@ def pin(path: Path, robot: str, host_key: str) -> None:
         files.write(path, new.encode())
     except OSError as error:
         raise ConfigurationError(
-            f"cannot be written: {error.strerror}", where=str(path), remedy=typed("ls", "-ld", path.parent, path)
+            f"cannot be written: {error.strerror}",
+            where=str(path),
+            remedy=shell_command("ls", "-ld", path.parent, path),
         ) from error
 
 

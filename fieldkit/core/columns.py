@@ -15,7 +15,7 @@ from enum import StrEnum
 from typing import Any, Final, Self
 
 from fieldkit.core.model import FaultKind
-from fieldkit.core.text import guarded, one_line
+from fieldkit.core.text import escape_formula, one_line
 
 SCHEMA_VERSION: Final = 6
 """Version of the columns of trial.csv that fieldkit itself declares."""
@@ -38,10 +38,10 @@ _UNIT_BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
 }
 """Smallest and largest possible value by unit; values of other units can be any finite number."""
 
-OVERCOUNTED: Final = (-1000.0, 1.0)
+NEGATIVE_LOSS_BOUNDS: Final = (-1000.0, 1.0)
 """Bounds of a loss that may be negative because more can be counted as received than as sent: duplicated datagrams,
 or the segments of one super-frame (at most about a hundred)."""
-EITHER_WAY_S: Final = (-_MAX_TIME_S, _MAX_TIME_S)
+CLOCK_DIFFERENCE_BOUNDS_S: Final = (-_MAX_TIME_S, _MAX_TIME_S)
 """Bounds of the difference between two clocks."""
 
 # No two adjacent parts match the same digits, so matching takes linear time.
@@ -146,7 +146,7 @@ class Column:
             return min(low, float(cell(float(low)))), max(high, float(cell(float(high))))
         return low, high
 
-    def flaw(self) -> str | None:
+    def declaration_error(self) -> str | None:
         """Return why other programs cannot read or show the column, or None if they can."""
         if not _NAME.fullmatch(self.name):
             return "its name is not made of lower-case letters, digits and _, with points between parts"
@@ -173,7 +173,7 @@ class Column:
             return "a counted figure needs the columns arrived and sent, and no other figure can have them"
         return "the unit of a counted figure must be share" if is_counted and self.unit != "share" else None
 
-    def problem(self, text: str) -> str | None:
+    def invalid_value_reason(self, text: str) -> str | None:
         """Return why a cell's text is not a possible value, such as `not a number`; None if it is one, or missing."""
         if self.type is str or text in MISSING:
             return None
@@ -210,19 +210,19 @@ def _make_column(rank: int, name: str, unit: str, meaning: str, *optional: Figur
     return Column(name, unit, meaning, rank, bounds, figure)
 
 
-def named(name: str, column: Column) -> Column:
+def with_step_name(name: str, column: Column) -> Column:
     """Return a column with the name of its step as prefix, `up.file_loss`; unchanged if the step has no name."""
     if not name:
         return column
     figure = column.figure
     if figure is not None:
         arrived, sent, at_least, of_sent = (
-            other and prefixed(name, other)
+            other and step_prefixed(name, other)
             for other in (figure.arrived, figure.sent, figure.at_least, figure.of_sent)
         )
         label = f"{name}: {figure.label}"
         figure = replace(figure, label=label, arrived=arrived, sent=sent, at_least=at_least, of_sent=of_sent)
-    return replace(column, name=prefixed(name, column.name), figure=figure)
+    return replace(column, name=step_prefixed(name, column.name), figure=figure)
 
 
 def plain_name(name: str) -> str:
@@ -230,12 +230,12 @@ def plain_name(name: str) -> str:
     return name.rpartition(".")[2]
 
 
-def prefixed(name: str, plain: str) -> str:
+def step_prefixed(name: str, plain: str) -> str:
     """Return the name of a step's column, job or file: `up.file_loss`; `plain` if the step has no name."""
     return f"{name}.{plain}" if name else plain
 
 
-def of_fault(kind: FaultKind, quantity: str) -> str:
+def fault_column_name(kind: FaultKind, quantity: str) -> str:
     """Return the name of a fault's column; `quantity` is for example `outage_s`, `recovery_s` or `recovered`."""
     return f"{kind.replace('-', '_')}_{quantity}"
 
@@ -254,7 +254,7 @@ class Measured:
     missing: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, values: Mapping[str, Value | None], reason: str) -> Self:
+    def from_optional(cls, values: Mapping[str, Value | None], reason: str) -> Self:
         """Return the values that are not None; the other columns are missing for `reason`."""
         return cls(
             {name: value for name, value in values.items() if value is not None},
@@ -262,14 +262,14 @@ class Measured:
         )
 
     @classmethod
-    def nothing(cls, declared: Iterable[Column], reason: str) -> Self:
+    def all_missing(cls, declared: Iterable[Column], reason: str) -> Self:
         """Return a result in which all of these columns are missing for `reason`."""
         return cls(missing={column.name: reason for column in declared})
 
-    def named(self, name: str) -> Self:
-        """Return a copy whose columns have the name of a step as prefix (see `prefixed`)."""
-        values = {prefixed(name, column): value for column, value in self.values.items()}
-        return type(self)(values, {prefixed(name, column): reason for column, reason in self.missing.items()})
+    def with_step_name(self, name: str) -> Self:
+        """Return a copy whose columns have the name of a step as prefix (see `step_prefixed`)."""
+        values = {step_prefixed(name, column): value for column, value in self.values.items()}
+        return type(self)(values, {step_prefixed(name, column): reason for column, reason in self.missing.items()})
 
     def without(self, reasons: Mapping[str, str]) -> Self:
         """Return a copy in which some columns are missing.
@@ -404,6 +404,6 @@ def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 def csv_line(values: Iterable[object]) -> str:
     """Return values as one CSV line with line end; text that a spreadsheet would read as a formula is `guarded`."""
     out = io.StringIO()
-    cells = (guarded(cell(value)) if isinstance(value, str) else cell(value) for value in values)
+    cells = (escape_formula(cell(value)) if isinstance(value, str) else cell(value) for value in values)
     csv.writer(out, lineterminator="\n").writerow(cells)
     return out.getvalue()

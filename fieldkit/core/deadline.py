@@ -38,15 +38,15 @@ class Deadline:
         """Whether the deadline has passed."""
         return time.monotonic() >= self.at_s
 
-    def sooner(self, seconds: float) -> "Deadline":
+    def earlier_of(self, seconds: float) -> "Deadline":
         """Return the earlier of this deadline and `seconds` from now."""
         return Deadline(min(self.at_s, time.monotonic() + seconds))
 
-    def later(self, seconds: float) -> "Deadline":
+    def later_of(self, seconds: float) -> "Deadline":
         """Return the later of this deadline and `seconds` from now."""
         return Deadline(max(self.at_s, time.monotonic() + seconds))
 
-    def after_wait(self, began_s: float, wait_s: float) -> "Deadline":
+    def extended_by_suspension(self, began_s: float, wait_s: float) -> "Deadline":
         """Return the deadline, extended by the time for which this process was suspended during a wait.
 
         The suspension says nothing about the awaited program, whose answer may have arrived already.
@@ -67,7 +67,9 @@ class ExpiredError(TimeoutError):
     """
 
 
-def bounded(call: Callable[[], T], deadline: Deadline, ended: threading.Event, *, what: str = "answer") -> T:
+def call_with_deadline(
+    call: Callable[[], T], deadline: Deadline, ended: threading.Event, *, what: str = "answer"
+) -> T:
     """Call a function that has no time-out parameter, such as a name look-up; return its result or raise its error.
 
     Args:
@@ -94,7 +96,7 @@ def bounded(call: Callable[[], T], deadline: Deadline, ended: threading.Event, *
     while not ended.is_set() and not deadline.expired:
         began_s, wait_s = time.monotonic(), min(_POLL_INTERVAL_S, deadline.remaining_s)
         is_done = done.wait(wait_s)
-        deadline = deadline.after_wait(began_s, wait_s)
+        deadline = deadline.extended_by_suspension(began_s, wait_s)
         if is_done:
             for error in errors:
                 raise error

@@ -90,20 +90,22 @@ class EvidenceError(FieldkitError):
     exit_code = 4
 
 
-def nearest(name: str, known: Iterable[str], otherwise: str) -> str:
+def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:
     """Return the remedy for an unknown name: `did you mean 'rtt_loss'?`, or `otherwise` if no known name is similar.
 
     Similar are all names that contain `name` as a whole word, as `rtt_loss` contains `rtt`, or that end with it after
     the name of a step, as `up.rtt`; otherwise the closest match. The case of letters is ignored.
     """
     names = {candidate.lower(): candidate for candidate in known}
-    typed = name.lower()
+    shell_command = name.lower()
     matches = [
-        candidate for lower, candidate in names.items() if typed in lower.split("_") or lower.endswith(f".{typed}")
-    ] or [names[lower] for lower in difflib.get_close_matches(typed, names, n=1)]
+        candidate
+        for lower, candidate in names.items()
+        if shell_command in lower.split("_") or lower.endswith(f".{shell_command}")
+    ] or [names[lower] for lower in difflib.get_close_matches(shell_command, names, n=1)]
     return f"did you mean {' or '.join(map(repr, matches))}?" if matches else otherwise
 
 
-def typed(*words: object) -> str:
+def shell_command(*words: object) -> str:
     """Return a command line with shell quoting, for a remedy; file names may contain blanks."""
     return shlex.join(map(str, words))

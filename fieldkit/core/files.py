@@ -75,7 +75,7 @@ def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
         descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
     except OSError as error:
         # ELOOP is the error for a symbolic link, ENXIO the one for a pipe or a socket opened for writing.
-        if error.errno in {errno.ELOOP, errno.ENXIO} and (reason := foreign(path)):
+        if error.errno in {errno.ELOOP, errno.ENXIO} and (reason := unexpected_type(path)):
             raise OSError(error.errno, reason, str(path)) from error
         raise
     status = os.fstat(descriptor)
@@ -109,7 +109,7 @@ def special_file_type(mode: int) -> str:
     return next((f"{text}, not a regular file" for is_type, text in types if is_type(mode)), "")
 
 
-def foreign(path: Path) -> str:
+def unexpected_type(path: Path) -> str:
     """Return the type of a special file, or an empty text if `path` is a regular file or directory, or is missing."""
     try:
         return special_file_type(path.lstat().st_mode)

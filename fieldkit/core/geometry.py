@@ -53,7 +53,7 @@ def other_end(role: Role, topology: Topology) -> Role:
     return Role.RECEIVER if role == Role.SENDER else Role.SENDER
 
 
-def way_m(move: Move) -> tuple[tuple[float, float], ...]:
+def path_corners_m(move: Move) -> tuple[tuple[float, float], ...]:
     """Return the corners of a path; the first is the robot's initial position, (0, 0).
 
     Each is given in metres along the line from sender to receiver, and metres to its left.
@@ -64,7 +64,7 @@ def way_m(move: Move) -> tuple[tuple[float, float], ...]:
     )
 
 
-def within(legs: Sequence[Leg], radius_m: float) -> tuple[Leg, ...]:
+def clip_path(legs: Sequence[Leg], radius_m: float) -> tuple[Leg, ...]:
     """Return the part of a path before it first leaves a circle around its start.
 
     Args:
@@ -98,12 +98,12 @@ def length_m(move: Move) -> float:
     return sum(math.hypot(leg.away_m, leg.left_m) for leg in move.legs)
 
 
-def in_words(move: Move) -> str:
+def describe_move(move: Move) -> str:
     """Return a description of a path and its speed: `10 m away, then 2 m left, at 0.2 m/s`."""
-    return f"{', then '.join(map(leg_in_words, move.legs))}, at {move.speed_m_s:g} m/s"
+    return f"{', then '.join(map(describe_leg, move.legs))}, at {move.speed_m_s:g} m/s"
 
 
-def leg_in_words(leg: Leg) -> str:
+def describe_leg(leg: Leg) -> str:
     """Return a description of one leg of a path: `10 m away and 2 m left`."""
     directions = (leg.away_m, ("away", "towards")), (leg.left_m, ("left", "right"))
     return " and ".join(f"{abs(metres):g} m {words[metres < 0]}" for metres, words in directions if metres)

@@ -22,7 +22,7 @@ _LIMIT_BYTES: Final = 1 << 28
 
 
 @contextmanager
-def claimed(path: Path, what: str) -> Iterator[None]:
+def locked(path: Path, what: str) -> Iterator[None]:
     """Lock a file against other fieldkit processes while the body runs.
 
     Args:
@@ -72,7 +72,7 @@ def append(path: Path, *records: Mapping[str, Any]) -> None:
         os.close(descriptor)
 
 
-def mend(path: Path, parse: Parse[object]) -> None:
+def repair_last_line(path: Path, parse: Parse[object]) -> None:
     """Remove an incomplete last line that a crash left, or add its missing line feed, before lines are appended."""
     try:
         content = files.read(path, _LIMIT_BYTES)

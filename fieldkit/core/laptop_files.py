@@ -41,11 +41,11 @@ _RESERVED: Final = re.compile(
 )
 
 
-def answer(column: str) -> str:
+def answer_file(column: str) -> str:
     """Return the name of the file with the operator's answer for a column."""
     return f"{ANSWER}{column}.txt"
 
 
-def reserved(name: str) -> bool:
+def is_reserved(name: str) -> bool:
     """Return True if any part of a path is a name that only the laptop writes; the case of letters is ignored."""
     return any(_RESERVED.match(part.strip()) for part in re.split(r"[/\\]", name))

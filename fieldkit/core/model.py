@@ -51,7 +51,7 @@ FIXED_ROLES: Final = (Role.SENDER, Role.RECEIVER, Role.RELAY)
 """The predefined roles, in the order in which they are listed."""
 
 
-def in_order(roles: Iterable[Role]) -> list[Role]:
+def sort_roles(roles: Iterable[Role]) -> list[Role]:
     """Return roles in the order in which they are listed: those of `FIXED_ROLES`, then additional roles by name."""
     return sorted(
         roles, key=lambda role: (FIXED_ROLES.index(role) if role in FIXED_ROLES else len(FIXED_ROLES), role)
@@ -107,7 +107,7 @@ class Status(StrEnum):
     FAILED = "failed"
 
 
-MOST_REPEATS: Final = 100_000
+MAX_REPEATS: Final = 100_000
 """Largest number of repeats per protocol of one trial; they would take weeks."""
 
 ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
@@ -258,7 +258,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Whereabouts:
+class TrackPoint:
     """Position and velocity of a robot, valid until the next entry of the same robot.
 
     Attributes:

@@ -16,14 +16,14 @@ COMMANDS: Final = "fieldkit.commands"
 REMEDY: Final = "fix or uninstall its package"
 
 
-def points(group: str) -> list[EntryPoint]:
+def entry_points(group: str) -> list[EntryPoint]:
     """Return the entry points of a group sorted by name, without importing their targets."""
     return sorted(metadata.entry_points(group=group), key=lambda point: (point.name, point.value))
 
 
 def versions() -> dict[str, str]:
     """Return the version of each package that adds backends or steps, fieldkit included."""
-    packages = (point.dist for group in (BACKENDS, STEPS) for point in points(group))
+    packages = (point.dist for group in (BACKENDS, STEPS) for point in entry_points(group))
     return {package.name: package.version for package in packages if package is not None}
 
 
@@ -45,10 +45,10 @@ def load(point: EntryPoint) -> Any:  # noqa: ANN401 (any object of another packa
         return point.load()
     except Exception as error:
         raise ConfigurationError(
-            f"it cannot be loaded: {type(error).__name__}: {error}", where=where(point), remedy=REMEDY
+            f"it cannot be loaded: {type(error).__name__}: {error}", where=location(point), remedy=REMEDY
         ) from error
 
 
-def where(point: EntryPoint) -> str:
+def location(point: EntryPoint) -> str:
     """Return the description of an entry point for error messages."""
     return f"entry point {point.name} = {point.value}"

@@ -2,11 +2,11 @@
 
 import sys
 
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 
 
-def say(text: object = "", *, end: str = "\n", flush: bool = False) -> None:
+def print_text(text: object = "", *, end: str = "\n", flush: bool = False) -> None:
     """Print a text with its control characters replaced, except tabs, which files that are shown may contain."""
-    sys.stdout.write("\t".join(map(harmless, str(text).split("\t"))) + end)
+    sys.stdout.write("\t".join(map(sanitized, str(text).split("\t"))) + end)
     if flush:
         sys.stdout.flush()

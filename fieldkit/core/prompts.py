@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Answered, Asked, Entered, Request, Sink
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 
 SKIP: Final = "s"
 NOTE: Final = "n "
@@ -67,7 +67,7 @@ class Question:
         return f"{value:.9g}" if math.isfinite(value) and low <= value <= high else None
 
     @property
-    def how(self) -> str:
+    def answer_hint(self) -> str:
         """Description of the possible answers."""
         if self.choices:
             words = ", ".join(f"{number} {choice}" for number, choice in enumerate(self.choices, start=1))
@@ -99,7 +99,7 @@ class Operator(Protocol):
         ...
 
 
-class Nobody(Operator):
+class Unattended(Operator):
     """Substitute for the operator with `--yes`: each request is done, and each question has its default answer."""
 
     @override
@@ -111,7 +111,7 @@ class Nobody(Operator):
         return question.usual or UNKNOWN
 
 
-NOBODY: Final = Nobody()
+UNATTENDED: Final = Unattended()
 
 
 class Script(Operator):
@@ -138,17 +138,17 @@ class Script(Operator):
         line = self._next(request)
         answer = parse(line, may_skip=may_skip)
         if answer is None:
-            raise self._no_answer(line, request, how(may_skip=may_skip))
+            raise self._no_answer(line, request, answer_hint(may_skip=may_skip))
         self._sink(Answered(answer.skip, answer.note))
         return answer
 
     @override
     def enter(self, question: Question) -> str:
-        self._sink(Asked(question.text, question.how))
+        self._sink(Asked(question.text, question.answer_hint))
         line = self._next(question.text)
         answer = question.read(line)
         if answer is None:
-            raise self._no_answer(line, question.text, question.how)
+            raise self._no_answer(line, question.text, question.answer_hint)
         self._sink(Entered(answer))
         return answer
 
@@ -171,7 +171,7 @@ class Script(Operator):
         return f"{self._source}:{self._asked}"
 
 
-def how(*, may_skip: bool) -> str:
+def answer_hint(*, may_skip: bool) -> str:
     """Return a description of the possible answers to a request."""
     return f"Enter when done, {f'{SKIP} to leave it for later, ' * may_skip}{NOTE}TEXT when done, with a note"
 
@@ -183,5 +183,5 @@ def parse(line: str, *, may_skip: bool) -> Answer | None:
         return DONE
     if text == SKIP and may_skip:
         return Answer(skip=True)
-    note = harmless(text.removeprefix(NOTE).strip())
+    note = sanitized(text.removeprefix(NOTE).strip())
     return Answer(note=note) if text.startswith(NOTE) and note else None

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, NoReturn
 
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 
 _MAX_BASE_BYTES: Final = 60
 """Maximum length of the base folder's path, because the path of a Unix socket has at most 107 bytes (unix(7))."""
@@ -32,7 +32,7 @@ class NameHeldError(ConfigurationError):
     """Another process holds the lock."""
 
 
-def me() -> str:
+def user_at_host() -> str:
     """Return `user@laptop`, the name of the lock holder on robots."""
     try:
         user = getpass.getuser()
@@ -82,12 +82,12 @@ def is_private(status: os.stat_result) -> bool:
 
 def not_private(path: Path) -> ConfigurationError:
     """Return the error for a path that another user owns or has access to."""
-    remedy = f"remove it, or set XDG_RUNTIME_DIR to your private folder: {typed('ls', '-ld', path)}"
+    remedy = f"remove it, or set XDG_RUNTIME_DIR to your private folder: {shell_command('ls', '-ld', path)}"
     return ConfigurationError("other users own it or have access to it", where=str(path), remedy=remedy)
 
 
 @contextmanager
-def held(name: str) -> Iterator[None]:
+def hold_lock(name: str) -> Iterator[None]:
     """Hold a named lock while the body runs; its file is removed afterwards.
 
     Args:

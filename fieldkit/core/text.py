@@ -1,6 +1,6 @@
 """Sanitizing of text of unknown origin, and the exceptions that reading untrusted JSON can raise.
 
-All output passes through `harmless`, or `json_text` if it is JSON: tables, CSV, Markdown, LaTeX, JUnit, the report's
+All output passes through `sanitized`, or `json_text` if it is JSON: tables, CSV, Markdown, LaTeX, JUnit, the report's
 HTML, and printed text. `tests/e2e/test_hostile_text.py` lists the outputs.
 """
 
@@ -17,7 +17,7 @@ _FORMULA: Final = re.compile(r"'*[=+@-].")
 _NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
-def harmless(text: str) -> str:
+def sanitized(text: str) -> str:
     """Return `text` with a `?` for each character that is not printable.
 
     These are the control characters C0 and C1, which start terminal escapes; format characters, some of which change
@@ -33,7 +33,7 @@ def _replace_unprintable(line: str) -> str:
 
 def one_line(text: str) -> str:
     """Return `text` as one line without control characters, for a cell of a table."""
-    return harmless(" ".join(text.splitlines()))
+    return sanitized(" ".join(text.splitlines()))
 
 
 def json_text(value: Any, **options: Any) -> str:  # noqa: ANN401 (any JSON value; options of `json.dumps`)
@@ -49,21 +49,21 @@ def _json_escape(char: str) -> str:
     return json.dumps(char)[1:-1] if ord(char) != 0x7F else "\\u007f"
 
 
-def guarded(text: str) -> str:
+def escape_formula(text: str) -> str:
     """Return a text as a CSV cell that no spreadsheet reads as a formula: with a `'` before `=`, `+`, `-` or `@`.
 
-    Numbers are unchanged. `unguarded` removes the `'`, so that reading the table again gives the same values. See
-    OWASP, "CSV Injection".
+    Numbers are unchanged. `unescape_formula` removes the `'`, so that reading the table again gives the same values.
+    See OWASP, "CSV Injection".
     """
     return f"'{text}" if _FORMULA.match(text) and not _NUMBER.fullmatch(text) else text
 
 
-def unguarded(text: str) -> str:
-    """Return the original text of a cell that `guarded` returned."""
+def unescape_formula(text: str) -> str:
+    """Return the original text of a cell that `escape_formula` returned."""
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
-def brief(text: str, most: int = 200) -> str:
+def shorten(text: str, most: int = 200) -> str:
     """Return `text` as one line of at most `most` characters, with a `?` for each unprintable one."""
     return "".join(char if char.isprintable() else "?" for char in " ".join(text.split())[:most])
 

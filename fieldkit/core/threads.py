@@ -14,30 +14,30 @@ _HANG_UP_WAIT_S: Final = 10.0
 _POLL_INTERVAL_S: Final = 0.5
 
 
-class Halt:
+class StopSignal:
     """Signal that ends the waits of concurrent work; it can have child signals."""
 
     def __init__(self) -> None:
         self._event = Event()
-        self._children: list[Halt] = []
+        self._children: list[StopSignal] = []
 
     @property
-    def called(self) -> bool:
+    def is_set(self) -> bool:
         """Whether the signal is set."""
         return self._event.is_set()
 
-    def call(self) -> None:
+    def set(self) -> None:
         """Set the signal and its children, which ends all waits."""
         self._event.set()
         for child in self._children:
-            child.call()
+            child.set()
 
-    def inside(self) -> "Halt":
+    def child(self) -> "StopSignal":
         """Return a child signal, which is set together with this one and can also be set alone."""
-        child = Halt()
+        child = StopSignal()
         self._children.append(child)
-        if self.called:
-            child.call()
+        if self.is_set:
+            child.set()
         return child
 
     def wait(self, duration_s: float) -> bool:
@@ -45,7 +45,7 @@ class Halt:
         return self._event.wait(duration_s)
 
 
-def together(
+def run_parallel(
     call: Callable[[Item], T],
     items: Collection[Item],
     *,

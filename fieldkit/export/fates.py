@@ -36,9 +36,9 @@ def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer])
         if matched is None:
             continue
         sent, received = marked[here], marked[there]
-        forward = sent.packets.are_from(sender) & sent.packets.are_to(receiver) & ~matched.doubtful
+        forward = sent.packets.are_from(sender) & sent.packets.are_to(receiver) & ~matched.ambiguous
         sent.lost[forward] = ~matched.arrived[forward]
-        is_ambiguous = np.append(matched.doubtful, False)[matched.sent_index]  # the last entry is for match.NONE
+        is_ambiguous = np.append(matched.ambiguous, False)[matched.sent_index]  # the last entry is for match.NONE
         forward = received.packets.are_from(sender) & received.packets.are_to(receiver) & ~is_ambiguous
         received.copy[forward] = matched.duplicates[forward]
     return marked

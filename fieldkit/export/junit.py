@@ -15,7 +15,7 @@ from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import quantities
 from fieldkit.core import files
 from fieldkit.core.model import ENDED, RepeatId, Status
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
@@ -45,8 +45,8 @@ def text(folders: Iterable[Path]) -> bytes:
     # A list, because `extend` converts an exception of an iterator into a TypeError.
     top.extend([_suite(folder) for folder in folders])
     for element in top.iter():  # all texts and attributes, from any source
-        element.text = element.text and harmless(element.text)
-        element.attrib.update({name: harmless(value) for name, value in element.attrib.items()})
+        element.text = element.text and sanitized(element.text)
+        element.attrib.update({name: sanitized(value) for name, value in element.attrib.items()})
     ET.indent(top)
     return bytes(ET.tostring(top, encoding="utf-8", xml_declaration=True)) + b"\n"
 
@@ -99,7 +99,7 @@ def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
 
 
 def _expectation_case(judgement: Judgement) -> ET.Element:
-    expected, subject, measured, interval, ruling = wording.judged(judgement)
+    expected, subject, measured, interval, ruling = wording.judgement_texts(judgement)
     case = ET.Element("testcase", name=f"{expected} ({subject})" if subject else expected, time="0")
     if not judgement.holds:
         _add(case, "failure", f"{ruling}: {measured} {interval}".rstrip())

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fieldkit.export.mcap import Channel, Message
 from fieldkit.export.schemas import time
 from fieldkit.measure.captures.arrays import NO_TIME
-from fieldkit.measure.captures.ip import written
+from fieldkit.measure.captures.ip import address_text
 from fieldkit.measure.captures.packets import NO_PORT, Packets
 
 NOT_KNOWN: Final = -1
@@ -60,8 +60,8 @@ def _contents(packets: Packets) -> Iterator[dict[str, object]]:
     """Yield the header fields of each packet."""
     columns = {
         "protocol": packets.protocol.tolist(),
-        "source": [written(*halves) for halves in packets.src.tolist()],
-        "destination": [written(*halves) for halves in packets.dst.tolist()],
+        "source": [address_text(*halves) for halves in packets.src.tolist()],
+        "destination": [address_text(*halves) for halves in packets.dst.tolist()],
         "source_port": packets.sport.tolist(),
         "destination_port": packets.dport.tolist(),
         "wire_bytes": packets.wire_bytes.tolist(),

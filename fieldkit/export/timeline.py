@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core import geometry
-from fieldkit.core.errors import EvidenceError, typed
+from fieldkit.core.errors import EvidenceError, shell_command
 from fieldkit.core.model import ENDED, Role, Status, Vector
 from fieldkit.export import robot, schemas
 from fieldkit.export.mcap import Channel, Json, Message
@@ -69,7 +69,9 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
     entries = journal.history(folder, plan)
     attempts = journal.ended(entries)
     if not attempts:
-        raise EvidenceError("no repeat has ended yet", where=str(folder), remedy=typed("fieldkit", "resume", folder))
+        raise EvidenceError(
+            "no repeat has ended yet", where=str(folder), remedy=shell_command("fieldkit", "resume", folder)
+        )
     # Planned and measured positions have different origins, so a file has only one kind.
     places = (folder, *(store.attempt_folder(folder, attempt.folder) for attempt in attempts))
     has_positions = any((place / name).exists() for place in places for name in (track.FILE, accounts.FILE))
@@ -116,7 +118,7 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, int]]) -> Iterator[Message]:
     """Yield the positions of robots by attempt, each from the best source according to `where`."""
     for attempt, ended_ns in attempts:
-        samples_by_role = where.told_of(evidence(attempt))
+        samples_by_role = where.readable_samples(evidence(attempt))
         # A position from before the start of the attempt is reported at the start.
         messages_of_attempt = [
             _place(plan, whereabouts.role, max(whereabouts.utc_ns, attempt.started_utc_ns), whereabouts.position_m)

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-Leave = Callable[[Path], None]
+OnReady = Callable[[Path], None]
 """Called when start-up is complete, with the log file for all further output."""
 
 _READY: Final = b"+"
 
 
-def detached(work: Callable[[Leave], int]) -> int:
+def run_detached(work: Callable[[OnReady], int]) -> int:
     """Run `work` in a child process; return when its start-up is complete or it has exited.
 
     During start-up the child keeps this terminal: its output is shown here, and it receives Ctrl-C.

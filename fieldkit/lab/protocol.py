@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from fieldkit.backends.protocols import Backend
 from fieldkit.config.profiles import RobotProfile
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.events import Sink
 from fieldkit.core.model import Vector
 
@@ -182,11 +182,11 @@ class LabBackend(Protocol):
 def unknown_robot(name: str, names: Iterable[str]) -> ConfigurationError:
     """Return the error for a robot that is not in the lab, with the nearest name as a hint."""
     return ConfigurationError(
-        f"there is no robot {name!r} in this lab", remedy=nearest(name, names, "fieldkit lab ps lists them")
+        f"there is no robot {name!r} in this lab", remedy=did_you_mean(name, names, "fieldkit lab ps lists them")
     )
 
 
-def of(name: str, backend: Backend) -> LabBackend:
+def as_lab_backend(name: str, backend: Backend) -> LabBackend:
     """Return a backend as a `LabBackend`.
 
     Raises:

@@ -59,7 +59,7 @@ def _claimed(folder: LabFolder) -> Iterator[None]:
     """Hold the lock that allows only one lab per directory."""
     with ExitStack() as stack:
         try:
-            stack.enter_context(runtime.held(folder.claim))
+            stack.enter_context(runtime.hold_lock(folder.claim))
         except NameHeldError as error:
             raise ConfigurationError("this directory has a lab that is up", remedy="fieldkit lab down") from error
         yield

@@ -90,7 +90,7 @@ class AttemptEvidence:
     def links(self, role: Role) -> Sequence[LinkSample]:
         """Return a robot's link samples in order of time: the testbed's if there are any, else the robot's."""
         modelled = self.read_or_none(link_samples.read, link_samples.FILE) or {}
-        return modelled.get(role) or self.read_or_none(link_samples.read_own, "", role) or ()
+        return modelled.get(role) or self.read_or_none(link_samples.read_robot, "", role) or ()
 
     def counters(self, role: Role) -> Counters:
         """Return the increments of a robot's kernel counters during the attempt; an unknown one is None."""

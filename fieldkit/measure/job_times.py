@@ -18,7 +18,7 @@ def ended_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
     before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
     if before is None or after is None or before.boot != after.boot:
         return None
-    if before.clock is None or after.clock is None or clock.problem(before.clock, after.clock):
+    if before.clock is None or after.clock is None or clock.step_description(before.clock, after.clock):
         return None
     ending = (after.endings or {}).get(job)
     if ending is None or ending.ended_s is None:

@@ -12,7 +12,7 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Finding, Note, PhaseStarted, RepeatEnded, Request
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 from fieldkit.pytest import options
 from fieldkit.pytest.options import Keep
 
@@ -64,7 +64,7 @@ class EvidenceFolder:
 
     def add(self, text: str) -> None:
         """Add lines to the log; the first has the time of day."""
-        lines = "\n".join(map(harmless, text.splitlines()))  # output of robots may contain control characters
+        lines = "\n".join(map(sanitized, text.splitlines()))  # output of robots may contain control characters
         with (self.path / LOG).open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now(UTC):%H:%M:%S.%f} {lines}\n")
 

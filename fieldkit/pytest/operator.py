@@ -9,7 +9,7 @@ import pytest
 from fieldkit.cli.terminal import Terminal
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Asked, Event, Request, Sink
-from fieldkit.core.prompts import NOBODY, Answer, Operator, Question
+from fieldkit.core.prompts import UNATTENDED, Answer, Operator, Question
 from fieldkit.pytest.options import LabOptions
 
 T = TypeVar("T")
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 def operator_of(config: pytest.Config, options: LabOptions, sink: Sink) -> Operator:
     """Return the operator: none if the options say so, else the person at the terminal."""
-    return NOBODY if options.yes else Uncaptured(config, sink)
+    return UNATTENDED if options.yes else Uncaptured(config, sink)
 
 
 class Uncaptured:

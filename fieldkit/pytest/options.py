@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 
 import pytest
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 Word = TypeVar("Word", bound=StrEnum)
 
@@ -84,7 +84,7 @@ def one_of(words: type[Word], text: str, what: str) -> Word:
     try:
         return words(text)
     except ValueError as error:
-        remedy = nearest(text, words, f"choose from {', '.join(words)}")
+        remedy = did_you_mean(text, words, f"choose from {', '.join(words)}")
         raise ConfigurationError(f"{what}: there is no {text!r}", remedy=remedy) from error
 
 

@@ -9,9 +9,9 @@ from typing import Final, Protocol
 
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import ConfigurationError, LinkError, LinkLostError, nearest
+from fieldkit.core.errors import ConfigurationError, LinkError, LinkLostError, did_you_mean
 from fieldkit.core.model import LinkSample, Role
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 from fieldkit.measure.evidence import iw
 from fieldkit.pytest.programs import ProgramError, ProgramOutput, RunningProgram, until_closed
 from fieldkit.remote.command import quote, with_environment
@@ -235,7 +235,7 @@ class RobotHandle:
         out, err = (text.decode(errors="replace") for text in (done.stdout, done.stderr))
         self._lab.log(f"{words}\n{out}{err}exit code {done.exit_code}")
         if check and done.exit_code != 0:
-            excerpt = harmless((err or out).strip())[-_SHOWN:] or "it printed nothing"
+            excerpt = sanitized((err or out).strip())[-_SHOWN:] or "it printed nothing"
             raise ProgramError(f"{self.name}: `{quote(argv)}` exited with code {done.exit_code}: {excerpt}")
         return ProgramOutput(tuple(argv), done.exit_code, out, err)
 
@@ -265,7 +265,8 @@ class RobotHandles:
                 return RobotHandle(role, self._lab)
         names = [*cast, *(robot.name for robot in cast.values())]
         raise ConfigurationError(
-            f"there is no robot {name!r} in this lab", remedy=nearest(name, names, f"its robots: {', '.join(names)}")
+            f"there is no robot {name!r} in this lab",
+            remedy=did_you_mean(name, names, f"its robots: {', '.join(names)}"),
         )
 
     def __getattr__(self, name: str) -> RobotHandle:

@@ -113,6 +113,8 @@ def _checked(outcome: Outcome) -> Trials:
 
 def _demand_expected(judgements: Sequence[Judgement]) -> None:
     __tracebackhide__ = True
-    unmet = [" ".join(filter(None, wording.judged(judgement))) for judgement in judgements if not judgement.holds]
+    unmet = [
+        " ".join(filter(None, wording.judgement_texts(judgement))) for judgement in judgements if not judgement.holds
+    ]
     if unmet:
         raise ExpectationError("; ".join(unmet))

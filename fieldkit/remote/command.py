@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 
 _STYLE: Final = re.compile(r"\x1b\[[0-9;]*m")
 """Escape sequences of colours, which some tools write even to logs."""
@@ -34,7 +34,7 @@ def with_environment(
 
 def printable(data: bytes, limit: int = 300) -> str:
     """Return output of a robot as one line that is safe in a terminal, a log and a CSV; long output is shortened."""
-    words = harmless(" ".join(_STYLE.sub("", data.decode("utf-8", "replace")).split()))
+    words = sanitized(" ".join(_STYLE.sub("", data.decode("utf-8", "replace")).split()))
     if len(words) <= limit:
         return words
     end = words[-limit:]

@@ -72,7 +72,7 @@ class Connection:
 
     def link(self, deadline: Deadline) -> Link:
         """Return the link, which is opened again if it is not alive; raises as `log_in`."""
-        ended, within = self._ended, deadline.sooner(self._timing.connect_s)
+        ended, within = self._ended, deadline.earlier_of(self._timing.connect_s)
         if not self._connecting.acquire(timeout=within.remaining_s):
             raise LinkLostError("another command is still connecting", where=self.address.robot)
         try:
@@ -119,7 +119,7 @@ class Connection:
                 if not isinstance(error, (LinkLostError, LoginRefusedError)) or not self._was_up:
                     raise
                 self._wait_for_link(error, final, ended)
-            deadline = deadline.later(self._timing.reply_s)
+            deadline = deadline.later_of(self._timing.reply_s)
 
     def _wait_for_link(
         self, error: LinkLostError | LoginRefusedError, final: Deadline, ended: threading.Event
@@ -144,7 +144,7 @@ class Connection:
             if ended.wait(min(pause_s, until.remaining_s)):
                 raise closed_error(self.address) from error
             try:
-                self.link(until.later(self._timing.connect_s))
+                self.link(until.later_of(self._timing.connect_s))
             except (LinkLostError, LoginRefusedError) as retry_error:
                 error, pause_s = retry_error, min(2 * pause_s, self._timing.probe_s)
                 if self._suppress_notices:

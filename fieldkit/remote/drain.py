@@ -29,7 +29,7 @@ def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, 
         try:
             piece = channel.recv(remaining)  # `select` would also report standard error, which only `drain` reads
         except TimeoutError:
-            deadline = deadline.after_wait(start_s, wait_s)
+            deadline = deadline.extended_by_suspension(start_s, wait_s)
             continue
         remaining -= len(piece)
         if not piece:
@@ -77,7 +77,7 @@ def drain(
         # The descriptor reports input on both streams and their end, but not whether sending is possible.
         start_s, wait_s = time.monotonic(), min(deadline.remaining_s, _MAX_WAIT_S if pending is None else 0.01)
         select.select([channel.fileno()], [], [], wait_s)
-        deadline = deadline.after_wait(start_s, wait_s)
+        deadline = deadline.extended_by_suspension(start_s, wait_s)
     raise ExpiredError("end")
 
 

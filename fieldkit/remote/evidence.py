@@ -60,7 +60,7 @@ def begin(
     return printable(done.stdout)
 
 
-def boot(shell: Shell) -> str:
+def boot_id(shell: Shell) -> str:
     """Return the boot ID of the robot's kernel.
 
     Raises:

@@ -292,7 +292,7 @@ def _require_own(name: str, robot: str, foreign: Callable[[str], str | None]) ->
     Raises:
         EvidenceError: The laptop or another robot writes it.
     """
-    reason = "only the laptop writes a file of this name" if laptop_files.reserved(name) else foreign(name)
+    reason = "only the laptop writes a file of this name" if laptop_files.is_reserved(name) else foreign(name)
     if reason:
         raise EvidenceError(
             f"sent {name}: {reason}", where=robot, remedy=f"find out what writes {name} on the robot, and rename it"

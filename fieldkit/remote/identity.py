@@ -49,7 +49,7 @@ class HostKey:
         return self.text.partition(" ")[0]
 
     @property
-    def by_hand(self) -> str:
+    def fingerprint_command(self) -> str:
         """The command that shows the fingerprint on the robot; dropbear has its own key format."""
         name = "ecdsa" if self.kind.startswith("ecdsa-") else self.kind.removeprefix("ssh-")
         if "dropbear" in self.server:

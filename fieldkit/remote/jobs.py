@@ -38,18 +38,18 @@ __all__ = [
     "abort",
     "begin",
     "begin_wait",
-    "bound",
     "command",
     "exit_file",
     "install",
-    "left",
+    "landing_marker_file",
     "limited_argv",
+    "list_running",
+    "ready_when_bound",
     "run",
     "serve",
     "start",
     "stationary_file",
     "stop",
-    "unhurried_file",
     "work_folder",
 ]
 
@@ -90,7 +90,7 @@ class Job:
         log: File in `folder` for its standard error, and for its standard output if `stdout` is None.
         stdin: File in `folder` for its standard input; None for none.
         stdout: File in `folder` for its standard output; None for the log.
-        ready: Condition for a started job to be ready: `log:TEXT`, or from `bound`; None for immediately.
+        ready: Condition for a started job to be ready: `log:TEXT`, or from `ready_when_bound`; None for immediately.
         as_root: Whether `sudo -n` runs it.
         ready_s: Time in which it must be ready, in whole seconds.
         output_limit_bytes: Maximum kept size of standard output, and of standard error; 0 for no limit.
@@ -119,7 +119,7 @@ def exit_file(job: Job) -> str:
     return f".jobs/{job.name}/exit"
 
 
-def unhurried_file(name: str) -> str:
+def landing_marker_file(name: str) -> str:
     """Return the path of the file that protects a job from SIGKILL, relative to the folder of its attempt.
 
     A job creates it while it must not be killed, for example while it lands a drone. When all jobs are stopped, it
@@ -133,7 +133,7 @@ def stationary_file(name: str) -> str:
     return f".jobs/{name}/stationary"
 
 
-def bound(protocol: Protocol, port: int) -> str:
+def ready_when_bound(protocol: Protocol, port: int) -> str:
     """Return the `ready` condition that a socket is bound to `port`."""
     return f"{protocol}:{port:04X}"
 
@@ -224,7 +224,7 @@ def serve(shell: Shell, job: Job) -> Pending:
         RobotError: As `start`.
     """
     session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_READY_OUTPUT)
-    if not session.told:
+    if not session.is_ready:
         done = session.end(deadline=Deadline.after(REPLY_S), check=False)
         require_success(shell, done, remedy=f"look into {job.folder} on the robot")
     return Pending(shell, job, session)
@@ -281,7 +281,7 @@ def stop(
     return _exit_code(shell, job, done)
 
 
-def left(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
+def list_running(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
     """Return one line per running job of fieldkit on the robot, from any trial and version."""
     return _lines(call(shell, "left", deadline=deadline))
 

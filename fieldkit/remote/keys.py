@@ -6,7 +6,7 @@ from pathlib import Path
 
 import paramiko
 
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 
 
 def private_keys(text: str | None, *, where: str) -> Sequence[paramiko.PKey]:
@@ -45,7 +45,7 @@ def read_private_key(path: str, *, where: str) -> str:
 def _on_key(command: str, path: str) -> str:
     """Return a shell command with a key file; `~/` stays outside the quotes, where the shell expands it."""
     home = "~/" if path.startswith("~/") else ""
-    return f"{command} {home}{typed(path.removeprefix(home))}"
+    return f"{command} {home}{shell_command(path.removeprefix(home))}"
 
 
 def _parse_private_key(text: str, *, where: str, path: str = "FILE") -> paramiko.PKey:

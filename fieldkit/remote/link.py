@@ -12,7 +12,7 @@ from typing import Final
 import paramiko
 from typing_extensions import override
 
-from fieldkit.core.deadline import Deadline, bounded
+from fieldkit.core.deadline import Deadline, call_with_deadline
 from fieldkit.core.errors import HostKeyError, RobotError
 from fieldkit.core.units import format_count
 from fieldkit.remote.identity import Address, Credentials, HostKey
@@ -251,8 +251,8 @@ class Link:
             OSError, SSHException, EOFError: The connection broke.
         """
         _, transport = self._connected()
-        channel = bounded(lambda: self._channel(transport), deadline, ended, what="get a channel")
-        bounded(lambda: channel.exec_command(command), deadline, ended, what="start")
+        channel = call_with_deadline(lambda: self._channel(transport), deadline, ended, what="get a channel")
+        call_with_deadline(lambda: channel.exec_command(command), deadline, ended, what="start")
         self.acknowledge()
         assert isinstance(transport.packetizer, _Packetizer)
         # From now on only necessary packets are sent, because the radio under test may be measured.

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Iterator
 from typing import Final
 
-from fieldkit.core.deadline import Deadline, bounded
+from fieldkit.core.deadline import Deadline, call_with_deadline
 from fieldkit.core.errors import FieldkitError, LinkError, LinkLostError, RobotError
 from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.link import BROKEN, Connect, Link, Timing, UnfitServerError
@@ -35,7 +35,7 @@ def log_in(
     """
     link = Link(connect, timing)
     with _converting_errors(link, address, ended):
-        bounded(lambda: link.log_in(address, credentials), deadline, ended)
+        call_with_deadline(lambda: link.log_in(address, credentials), deadline, ended)
     return link
 
 
@@ -47,7 +47,7 @@ def offered_key(address: Address, connect: Connect, *, deadline: Deadline, kind:
     """
     link, never = Link(connect, Timing()), threading.Event()
     with _converting_errors(link, address, never), contextlib.closing(link):
-        return bounded(lambda: link.exchange_keys(kind), deadline, never)
+        return call_with_deadline(lambda: link.exchange_keys(kind), deadline, never)
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.remote.script import SCRIPT, SCRIPT_PATH, call, require_success, word
 from fieldkit.remote.shell import Shell
 
@@ -40,9 +40,9 @@ class MotionState(StrEnum):
 
 
 _BY_SEVERITY: Final = tuple(MotionState)
-COMING_DOWN: Final = frozenset({MotionState.LAND, MotionState.RETURN})
+DESCENDING_STATES: Final = frozenset({MotionState.LAND, MotionState.RETURN})
 
-IN_WORDS: Final[Mapping[MotionState, str]] = {
+STATE_TEXTS: Final[Mapping[MotionState, str]] = {
     MotionState.NOTHING: "nothing of fieldkit moves it; nothing was sent to it",
     MotionState.STATIONARY: "stopped (standing)",
     MotionState.LANDED: "stopped (on the ground)",
@@ -107,12 +107,12 @@ def halt_attempt(shell: Shell, folder: str, who: str, deadline: Deadline) -> Hal
     return Halted(_states(call(shell, "halt_motion", word(who), folder, deadline=deadline)))
 
 
-def look(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Halted:
+def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Halted:
     """Return the present state of programs from `halt_attempt`; raises as that."""
     return Halted(_states(call(shell, "motion_states", *programs, deadline=deadline)))
 
 
-def life_signs(shell: Shell, file: str, deadline: Deadline) -> bytes:
+def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
     """Return the liveness file of the pilot and the guard of a drone, then /proc/uptime; raises as `halt_attempt`."""
     return call(shell, "life_signs", file, deadline=deadline)
 
@@ -145,7 +145,7 @@ def halt_all(
         report(name, halted)
         return halted
 
-    return dict(zip(robots, together(stop, list(robots)), strict=True))
+    return dict(zip(robots, run_parallel(stop, list(robots)), strict=True))
 
 
 def _states(output: bytes) -> tuple[tuple[str, MotionState], ...]:

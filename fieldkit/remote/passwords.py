@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 
 SERVICE: Final = "fieldkit"
 
@@ -54,4 +54,4 @@ def in_keyring(user: str, host: str, robot: str) -> str:
 def _store_command(user: str, host: str) -> str:
     """Return the command that stores a password; in an environment of pipx, `keyring` is not on the PATH."""
     program = ("keyring",) if shutil.which("keyring") else (sys.executable, "-m", "keyring")
-    return typed(*program, "set", SERVICE, f"{user}@{host}")
+    return shell_command(*program, "set", SERVICE, f"{user}@{host}")

@@ -28,7 +28,7 @@ def path(job: str, name: str) -> str:
     return f".put/{job}/{name}"
 
 
-def place(shell: Shell, folder: str, at: str, content: bytes, sha256: str, *, executable: bool) -> None:
+def copy(shell: Shell, folder: str, at: str, content: bytes, sha256: str, *, executable: bool) -> None:
     """Copy a program into the folder of an attempt; idempotent.
 
     Args:

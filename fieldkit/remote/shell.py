@@ -30,7 +30,7 @@ class Session(Protocol):
     """A running remote command. The connection is silent until `end` is called or the command writes output."""
 
     @property
-    def told(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether the command wrote the output for which `Shell.begin` waited; False if it ended before."""
         ...
 
@@ -62,7 +62,7 @@ class Shell(Protocol):
         ...
 
     @property
-    def by_hand(self) -> str:
+    def ssh_destination(self) -> str:
         """The arguments for `ssh` to this robot."""
         ...
 

@@ -78,7 +78,7 @@ class SshShell:
         return self._connection.address.robot
 
     @property
-    def by_hand(self) -> str:
+    def ssh_destination(self) -> str:
         """The arguments for `ssh` to this robot."""
         return self._connection.address.by_hand
 
@@ -112,7 +112,7 @@ class SshShell:
             )
             with _converting_errors(self._connection.address, link, argv), contextlib.ExitStack() as stack:
                 stack.enter_context(contextlib.closing(channel))
-                told = not until or wait_for_output(channel, until, deadline=within, robot=self.robot)
+                is_ready = not until or wait_for_output(channel, until, deadline=within, robot=self.robot)
                 link.acknowledge()
                 stack.pop_all()
             return SshSession(
@@ -121,7 +121,7 @@ class SshShell:
                 (link, channel),
                 ends_on_request=ends_on_request,
                 has_input=has_input,
-                told=told,
+                is_ready=is_ready,
             )
 
         return self._connection.run_with_retries(attempt, deadline)
@@ -144,7 +144,7 @@ class SshSession:
         running: The link, and the channel of the command on it.
         ends_on_request: Whether the robot reports the end of the command only on request.
         has_input: Whether the command has standard input.
-        told: Whether the command wrote the expected output, see `Session.told`.
+        is_ready: True if the command wrote the expected output, see `Session.is_ready`.
     """
 
     def __init__(
@@ -155,9 +155,9 @@ class SshSession:
         *,
         ends_on_request: bool,
         has_input: bool,
-        told: bool,
+        is_ready: bool,
     ) -> None:
-        self.told = told
+        self.is_ready = is_ready
         self._connection = connection
         self._argv = tuple(argv)
         self._running: tuple[Link, Execution] | None = running

@@ -13,7 +13,7 @@ import threading
 from contextlib import suppress
 from typing import Final, Self
 
-from fieldkit.core.deadline import Deadline, bounded
+from fieldkit.core.deadline import Deadline, call_with_deadline
 from fieldkit.remote.link import BROKEN, Channel, Link, Transport, UnfitServerError
 
 _READY: Final = b"ready\n"
@@ -55,7 +55,7 @@ class ShellPool:
         if shell is None:
             return None
         full_line = f"held {command_line}" if held else command_line
-        command = bounded(lambda: shell.start(full_line), deadline, ended, what="start")
+        command = call_with_deadline(lambda: shell.start(full_line), deadline, ended, what="start")
         link.acknowledge()
         return command
 

@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 
 from fieldkit.analysis.cells import Cell, aggregate
-from fieldkit.analysis.quantities import LOSSES, Quantity, alike
+from fieldkit.analysis.quantities import LOSSES, Quantity, with_plain_name
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.wording import measured as measured_in
 from fieldkit.analysis.wording import worded
-from fieldkit.core.columns import of_fault, plain_name
+from fieldkit.core.columns import fault_column_name, plain_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind
 from fieldkit.report import (
@@ -31,7 +31,7 @@ from fieldkit.report import (
 from fieldkit.report.charts import Chart
 from fieldkit.report.conditions import Identities
 from fieldkit.report.coverage import absences
-from fieldkit.report.evidence import Evidence, at_hand
+from fieldkit.report.evidence import Evidence, load_evidence
 from fieldkit.report.headlines import Headline, headlines
 from fieldkit.report.ranking import Ranking
 
@@ -41,7 +41,7 @@ _ALWAYS_VISIBLE: Final = frozenset(
         "file_loss",
         *distance.DELAY,
         *distance.RATE,
-        *(of_fault(kind, what) for kind in FaultKind for what in ("recovered", "recovery_s")),
+        *(fault_column_name(kind, what) for kind in FaultKind for what in ("recovered", "recovery_s")),
     )
 )
 """Quantities that are always visible in tables. The others are collapsed."""
@@ -160,7 +160,7 @@ def put_together(
         quantities: Names of quantities to draw in addition to the default ones.
         unmeasured: Planned conditions without any attempt, in words.
     """
-    evidence = at_hand(repeats)
+    evidence = load_evidence(repeats)
     is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
     cells = sorted(aggregate(repeats), key=_sort_key)
     identities = Identities(cells)
@@ -259,9 +259,11 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> in
             )
         return row
     measured = measured_in(cells)
-    names = [(quantity.name, 0.0) for name in LOSSES for quantity in alike(measured, name)]
+    names = [(quantity.name, 0.0) for name in LOSSES for quantity in with_plain_name(measured, name)]
     names += [
-        (quantity.name, -np.inf) for name in ("transfer_s", "rtt_median_s") for quantity in alike(measured, name)
+        (quantity.name, -np.inf)
+        for name in ("transfer_s", "rtt_median_s")
+        for quantity in with_plain_name(measured, name)
     ]
     for name, least in names:
         measured_cells = [cell for cell in cells if name in cell.estimates]

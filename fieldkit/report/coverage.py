@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.core.columns import plain_name, prefixed
+from fieldkit.core.columns import plain_name, step_prefixed
 from fieldkit.core.model import ENDED, Status
 from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
@@ -121,7 +121,7 @@ def nothing_arrived(repeats: Repeats, quantity: Quantity, rows: NDArray[np.int64
     A row without a loss that belongs to the quantity is judged by all its losses.
     """
     kind = plain_name(quantity.name).partition("_")[0]
-    related = {prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _OF_TRANSFERS)}
+    related = {step_prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _OF_TRANSFERS)}
     losses = {name: column[rows] for name, column in repeats.numbers.items() if plain_name(name) in _ALL_LOSSES}
     related_columns = [column for name, column in losses.items() if name in related]
     is_known = (

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import Quantity, alike
+from fieldkit.analysis.quantities import Quantity, with_plain_name
 from fieldkit.analysis.wording import scale_of
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.report import wording
@@ -44,7 +44,7 @@ def charts(
     """
     drawing = _CurveDrawing(cells, identities, evidence, Ranking(evidence))
     for name in names:
-        matches = alike(evidence.quantities.values(), name)
+        matches = with_plain_name(evidence.quantities.values(), name)
         cells_by_step = {
             quantity: measured for quantity in matches if quantity.step and (measured := _placed(cells, quantity))
         }

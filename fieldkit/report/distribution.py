@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import Quantity, alike
+from fieldkit.analysis.quantities import Quantity, with_plain_name
 from fieldkit.analysis.wording import Scale, time_scale
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
@@ -36,9 +36,9 @@ class _Sample:
 
 def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
     """Yield the distributions of round-trip time and transfer time from the table and the outputs of ping."""
-    for quantity in alike(evidence.quantities.values(), "rtt_median_s"):
+    for quantity in with_plain_name(evidence.quantities.values(), "rtt_median_s"):
         yield from _round_trips(quantity, cells, identities, evidence)
-    for quantity in alike(evidence.quantities.values(), "transfer_s"):
+    for quantity in with_plain_name(evidence.quantities.values(), "transfer_s"):
         name, title = _chart_name("transfer-distribution", quantity), _chart_title("Transfer time", quantity)
         yield from _chart(name, title, "repeats", _repeat_samples(quantity.name, cells, evidence), identities)
 

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.markers import CARETRIGHT, CARETUP
 from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullFormatter
 
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 from fieldkit.report.charts import EdgeMark, Panel, Series
 from fieldkit.report.theme import LIGHT, Style
 
@@ -192,7 +192,7 @@ def _draw_edge(axes: Axes, edge: EdgeMark, *, sideways: bool) -> None:
 
 
 def _shorten(text: str, most: int) -> str:
-    clean = harmless(text)
+    clean = sanitized(text)
     return clean if len(clean) <= most else f"{clean[: most - 1]}…"
 
 

@@ -120,7 +120,7 @@ class Evidence:
         return evidence.read_or_none(ping.read, pinging.file) if evidence and pinging else None
 
 
-def at_hand(repeats: Repeats) -> Evidence:
+def load_evidence(repeats: Repeats) -> Evidence:
     """Return a table of repeats with the evidence in its sources."""
     plans, unread, changed = {}, [], set[Path]()
     for source in dict.fromkeys(repeats.texts["source"].tolist()):
@@ -129,9 +129,8 @@ def at_hand(repeats: Repeats) -> Evidence:
         try:
             plans[source] = store.read_plan(Path(source))
             if differences := manifest.differences(Path(source)):
-                unread.append(
-                    f"{source}: evidence that differs from the manifest is left out: {manifest.few(differences)}"
-                )
+                summary = manifest.summarize(differences)
+                unread.append(f"{source}: evidence that differs from the manifest is left out: {summary}")
                 changed |= {Path(source, *Path(name).parts[:2]) for name in differences}
         except FieldkitError as error:
             unread.append(error.located)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.expectations import Expectation
-from fieldkit.analysis.judgements import Judgement, Ruling, judge_own
-from fieldkit.analysis.wording import judged
+from fieldkit.analysis.judgements import Judgement, Ruling, judge_by_trial
+from fieldkit.analysis.wording import judgement_texts
 from fieldkit.report import wording
 from fieldkit.report.evidence import Evidence
 
@@ -37,14 +37,14 @@ def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence
     """
     differing = wording.differing(cells)
     rows: dict[str, list[JudgementRow]] = {}
-    for judgement in judge_own((cell, _expectations_of(cell, evidence)) for cell in cells):
+    for judgement in judge_by_trial((cell, _expectations_of(cell, evidence)) for cell in cells):
         rows.setdefault(judgement.expectation.text, []).append(_verdict(judgement, differing))
     return rows
 
 
 def _verdict(judgement: Judgement, differing: Collection[str]) -> JudgementRow:
     place = wording.condition(judgement.cell, differing=differing) if judgement.cell else ""
-    _, _, value, interval, _ = judged(judgement)
+    _, _, value, interval, _ = judgement_texts(judgement)
     return JudgementRow(place, wording.unbroken(value), wording.unbroken(interval), judgement.ruling, judgement.why)
 
 

@@ -15,7 +15,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from fieldkit.core import files
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 from fieldkit.lab.protocol import Overview
 from fieldkit.report import drawing
 from fieldkit.report.charts import Chart, Panel
@@ -108,7 +108,7 @@ def overview(lab: Overview, form: Format) -> bytes:
     with _settings(8.0):
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _BOTH_COLUMNS_INCHES * 0.75), layout="constrained")
         axes = figure.add_subplot()
-        axes.set_title(harmless(f"{lab.world}, {len(lab.robots)} robots"), wrap=True)
+        axes.set_title(sanitized(f"{lab.world}, {len(lab.robots)} robots"), wrap=True)
         axes.set(
             xlim=(0, lab.area_m[0]), ylim=(0, lab.area_m[1]), aspect="equal", xlabel="east (m)", ylabel="north (m)"
         )
@@ -127,7 +127,7 @@ def overview(lab: Overview, form: Format) -> bytes:
             share = place_m[1] / lab.area_m[1]
             above = share < _EDGE or (place_m[1] >= fmean(north_m) and share <= 1 - _EDGE)
             axes.annotate(
-                harmless(name),
+                sanitized(name),
                 place_m,
                 (0, 4 if above else -4),
                 textcoords="offset points",
@@ -162,7 +162,7 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
         if len(lines) <= _MOST_LABELLED and math.dist(place_m, other_m) > _LEAST_LABELLED * max(lab.area_m):
             middle_m = (place_m[0] + other_m[0]) / 2, (place_m[1] + other_m[1]) / 2
             axes.annotate(
-                harmless(", ".join((f"{link.snr_db:.0f} dB", *link.through))),
+                sanitized(", ".join((f"{link.snr_db:.0f} dB", *link.through))),
                 middle_m,
                 fontsize=5,
                 ha=_side(middle_m[0], lab.area_m[0]),

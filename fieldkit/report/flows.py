@@ -43,13 +43,13 @@ def panels(evidence: AttemptEvidence, plan: Plan, times: Moments, zero_ns: int) 
 def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
     """Yield the payload rate that each end counted per second. The first second starts with the client."""
     step = placed.step
-    client = next((span for (_, job), span in times.jobs.items() if job == step.own_name("iperf3-client")), None)
+    client = next((span for (_, job), span in times.jobs.items() if job == step.prefixed_name("iperf3-client")), None)
     if client is None:
         return
     start_s = (client[0] - zero_ns) / 1e9
     series, words = [], []
     for role, style in zip((Role.SENDER, Role.RECEIVER), _ENDS, strict=True):
-        test = evidence.read_or_none(iperf3.read, step.own_name(iperf3.json_file(role)))
+        test = evidence.read_or_none(iperf3.read, step.prefixed_name(iperf3.json_file(role)))
         if test and test.intervals:
             at_s = start_s + np.cumsum([0.0, *(interval.lasted_s for interval in test.intervals)])
             rates = [interval.bit_s / 1e6 for interval in test.intervals]
@@ -57,7 +57,7 @@ def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_
             words.append(f"{role} {min(rates):.2f} to {max(rates):.2f}")
     if series:
         yield Panel(
-            title=f"payload of {step.own_name('iperf3')}",
+            title=f"payload of {step.prefixed_name('iperf3')}",
             x_label=_TIME,
             y_label="[Mbit/s]",
             series=series,
@@ -69,10 +69,10 @@ def _topic(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_n
     """Yield the delays of received samples, and the lost samples, by the time of sending."""
     step = placed.step
     logs = {
-        role: evidence.read_or_none(topic_log.read, step.own_name(f"{role}-topic.bin"))
+        role: evidence.read_or_none(topic_log.read, step.prefixed_name(f"{role}-topic.bin"))
         for verb in ("publish", "subscribe")
         for role, job in times.jobs
-        if job == step.own_name(verb)
+        if job == step.prefixed_name(verb)
     }
     complete = [log for log in logs.values() if log]
     if len(complete) != 2:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
-from fieldkit.analysis.quantities import Quantity, alike
+from fieldkit.analysis.quantities import Quantity, with_plain_name
 from fieldkit.analysis.wording import measured
 from fieldkit.core.columns import plain_name
 from fieldkit.core.units import format_count
@@ -80,7 +80,7 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
         yield from writer.quantity(quantity.label, [quantity], own_cells)
     for protocol, names in _OF_PROTOCOLS.items():
         of_protocol = [cell for cell in cells if cell.key["protocol"] == protocol]
-        with_topics = [cell for cell in of_protocol if alike(measured([cell]), _OF_TOPICS[0])]
+        with_topics = [cell for cell in of_protocol if with_plain_name(measured([cell]), _OF_TOPICS[0])]
         others = [cell for cell in of_protocol if cell not in with_topics]
         for own_cells, wanted in ((with_topics, _OF_TOPICS), (others, names)):
             for quantities_of_name in _chosen(measured(own_cells), wanted):
@@ -228,5 +228,5 @@ def _chosen(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Q
 
 def _of_name(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
     """Return the quantity called `name`, or those of named steps if no other step measures it."""
-    same = alike(quantities, name)
+    same = with_plain_name(quantities, name)
     return same[:1] if same and not same[0].step else same

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.core.columns import plain_name, prefixed
+from fieldkit.core.columns import plain_name, step_prefixed
 from fieldkit.core.model import FaultKind, Protocol, Role, StationSample
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import bag, host, link, ping, recovery, track
@@ -88,7 +88,7 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> M
         transfers, packets, ends, {transfer.name: _offset_s(repeats, row, transfer) for transfer in transfers}
     )
     ahead_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: offset_ns}
-    links = {role: link.line(evidence.links(role)) for role in ends}
+    links = {role: link.link_history(evidence.links(role)) for role in ends}
     moments = Moments(
         recorded={file: contents for file, contents in bags.items() if contents},
         transfers=[(transfer, _shifted(packet_fates, transfer, ahead_ns)) for transfer, packet_fates in packets],
@@ -117,7 +117,7 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> M
 
 def _offset_s(repeats: Repeats, row: int, transfer: Transfer) -> float:
     """Return the offset of the clock at a transfer's destination relative to its source, or NaN if it is unknown."""
-    column = repeats.numbers.get(prefixed(transfer.name, "clock_offset_s"))
+    column = repeats.numbers.get(step_prefixed(transfer.name, "clock_offset_s"))
     return math.nan if column is None else float(column[row])
 
 
@@ -173,7 +173,7 @@ def _activities_of_evidence(moments: Moments) -> Iterator[Activity]:
             reply.at_utc_ns - moments.ahead_ns[role] for reply in pings.answers if reply.at_utc_ns is not None
         ]
         # The time of the job includes requests without a reply, for which ping prints no time.
-        if times_ns := [*stamps_ns, *moments.jobs.get((role, prefixed(name, "ping")), ())]:
+        if times_ns := [*stamps_ns, *moments.jobs.get((role, step_prefixed(name, "ping")), ())]:
             yield Activity(_step_label("ping", name), min(times_ns), max(times_ns), "pink")
 
 
@@ -203,7 +203,7 @@ def _activities_of_faults(moments: Moments, evidence: AttemptEvidence) -> Iterat
         step, _, what = name.rpartition(".")
         kind = what.removeprefix("fault-").removesuffix(_HEALS)
         if what.startswith("fault-") and what.endswith(_HEALS) and kind in {str(fault) for fault in FaultKind}:
-            note = prefixed(step, recovery.note_file(FaultKind(kind)))
+            note = step_prefixed(step, recovery.note_file(FaultKind(kind)))
             lasted_s = evidence.read_or_none(recovery.cause_lasted_s, note) or 0.0
             yield Activity(f"fault {_step_label(kind, step)}", heals_ns - round(lasted_s * 1e9), heals_ns, "lost")
             yield from _outage(moments, evidence, role, FaultKind(kind), step)
@@ -213,11 +213,11 @@ def _outage(
     moments: Moments, evidence: AttemptEvidence, role: Role, kind: FaultKind, step: str
 ) -> Iterator[Activity]:
     """Yield the longest time without an answer to the observer's pings, up to the end if no more answers came."""
-    output = evidence.read_or_none(ping.read, prefixed(step, recovery.observed_file(kind)))
+    output = evidence.read_or_none(ping.read, step_prefixed(step, recovery.observed_file(kind)))
     stamps_ns = sorted(reply.at_utc_ns for reply in output.answers if reply.at_utc_ns is not None) if output else []
     if not stamps_ns or kind is FaultKind.KILL:
         return
-    end_ns = moments.jobs.get((role, prefixed(step, f"fault-{kind}")), (0, 0))[1]
+    end_ns = moments.jobs.get((role, step_prefixed(step, f"fault-{kind}")), (0, 0))[1]
     times_ns = [stamp_ns - moments.ahead_ns[role] for stamp_ns in stamps_ns]
     gaps = list(pairwise([*times_ns, max(end_ns, times_ns[-1])]))
     start_ns, stop_ns = max(gaps, key=lambda gap: gap[1] - gap[0])

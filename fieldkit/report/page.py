@@ -15,7 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fieldkit import __version__
 from fieldkit.analysis.wording import counts, label, tally
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 from fieldkit.report import figures, theme, wording
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import Contents
@@ -74,7 +74,7 @@ def _link(target: Path, *, base: Path) -> str:
 
 def _without_control_characters(value: Any) -> Any:  # noqa: ANN401 (any value in the template)
     """Return a value for the page, with control characters of texts replaced."""
-    return harmless(value) if type(value) is str else value
+    return sanitized(value) if type(value) is str else value
 
 
 class _Panels:
@@ -109,7 +109,7 @@ def inlined(document: str, prefix: str, words: str) -> str:
     for name in ("width", "height"):
         del root.attrib[name]
     root.set("role", "img")
-    root.set("aria-label", harmless(words))
+    root.set("aria-label", sanitized(words))
     return ET.tostring(root, encoding="unicode")
 
 

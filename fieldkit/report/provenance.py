@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.analysis.wording import ended
+from fieldkit.analysis.wording import status_counts
 from fieldkit.report import summary
 from fieldkit.report.evidence import Evidence
 
@@ -66,7 +66,7 @@ def _trial(name: str, source: Path, rows: list[int], evidence: Evidence) -> Prov
         has_evidence=plan is not None,
         began=summary.utc(float(np.nanmin(started))) if np.isfinite(started).any() else "",
         robots=f"{texts['sender'][first]} to {texts['receiver'][first]}" + (f" by {relay}" if relay else ""),
-        attempts=ended(Counter(texts["status"][rows])),
+        attempts=status_counts(Counter(texts["status"][rows])),
         seed="" if np.isnan(numbers["seed"][first]) else f"{numbers['seed'][first]:.0f}",
         hashes=[texts[name][first] for name in _HASHES],
         versions=", ".join(f"{program} {number}" for program, number in plan.versions.items()) if plan else "",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.quantities import LOSSES, Quantity, alike
+from fieldkit.analysis.quantities import LOSSES, Quantity, with_plain_name
 from fieldkit.core.model import Status
 from fieldkit.report import wording
 from fieldkit.report.conditions import Identities, panels
@@ -115,7 +115,7 @@ class _Heights:
 def _heights(group: Sequence[Cell], cells: Sequence[Cell]) -> _Heights:
     """Return the scale of a group of cells, which is equal for all groups of a protocol that show the same loss."""
     measured = dict.fromkeys(estimate.quantity for cell in group for estimate in cell.estimates.values())
-    loss = next((quantity for name in LOSSES for quantity in alike(measured, name)), None)
+    loss = next((quantity for name in LOSSES for quantity in with_plain_name(measured, name)), None)
     if loss is None:
         return _Heights(None, 0.0)
     return _Heights(loss, max(cell.estimates[loss.name].maximum for cell in cells if loss.name in cell.estimates))

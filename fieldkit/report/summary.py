@@ -10,7 +10,7 @@ import numpy as np
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.comparable import mixtures
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.analysis.wording import cautions, ended
+from fieldkit.analysis.wording import cautions, status_counts
 from fieldkit.core.columns import plain_name
 from fieldkit.core.model import Status
 from fieldkit.core.units import format_count
@@ -39,7 +39,7 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
         f"{trials} of {wording.listed(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
         f"{wording.listed([name.upper() for name in _values(cells, 'protocol')])}; "
         f"{_topologies(cells)}{wording.listed(_values(cells, 'backend'))} robots. "
-        f"{format_count(len(repeats), 'attempt')}: {ended(Counter(repeats.texts['status']))}. "
+        f"{format_count(len(repeats), 'attempt')}: {status_counts(Counter(repeats.texts['status']))}. "
         "All figures are of the valid ones."
     )
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.core.columns import prefixed
+from fieldkit.core.columns import step_prefixed
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers.fates import Fates
@@ -187,7 +187,7 @@ def _spread_over_job(
     number: NDArray[np.int64], name: str, role: Role, times: Moments, zero_ns: int
 ) -> NDArray[np.float64] | None:
     """Return approximate send times of requests without any reply, spread evenly over the job; None if unknown."""
-    if (span := times.jobs.get((role, prefixed(name, "ping")))) is None:
+    if (span := times.jobs.get((role, step_prefixed(name, "ping")))) is None:
         return None
     start_s, stop_s = ((at_ns - zero_ns) / 1e9 for at_ns in span)
     at_s: NDArray[np.float64] = start_s + (stop_s - start_s) * (number - number.min()) / len(number)

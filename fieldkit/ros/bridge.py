@@ -22,7 +22,7 @@ from fieldkit.agent.middleware import Middleware, MiddlewareError, Network, Publ
 from fieldkit.core.errors import ConfigurationError, LinkError
 from fieldkit.ros import counterparts, topics
 from fieldkit.ros.counterparts import Counterparts
-from fieldkit.ros.crossings import Crossed, Crossing, CrossingTally
+from fieldkit.ros.crossings import Crossing, CrossingCounts, CrossingTally
 from fieldkit.ros.types import MessageTypes
 
 Convert = Callable[[bytes], bytes]
@@ -100,7 +100,7 @@ class Carrier:
         sides = zip((self._source, self._target), self._described, strict=True)
         return [sentence for end, topic in sides for sentence in end.other_types(topic)]
 
-    def told(self) -> Crossed:
+    def counts(self) -> CrossingCounts:
         """Return the counters of the forwarded samples."""
         with self._lock:
             return self._tally.counts(self._crossing, self._source.over, self._target.over)

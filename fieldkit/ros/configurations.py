@@ -23,7 +23,7 @@ _TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
 _NAMESPACE: Final = "http://www.eprosima.com"
 
 
-def written(over: str, transport: str, settings: Mapping[str, str], comment: Sequence[str]) -> str:
+def configuration_text(over: str, transport: str, settings: Mapping[str, str], comment: Sequence[str]) -> str:
     """Return the text of a configuration file with the measured settings, and the evidence in a comment.
 
     Args:

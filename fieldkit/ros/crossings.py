@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.ros.qos import PROFILES, Durability, History, Policy, QosProfile, Reliability
 from fieldkit.ros.types import full_name
 
@@ -74,13 +74,13 @@ def parse_qos(text: str) -> QosProfile:
             choices = (*PROFILES, *_POLICIES, "depth=N")
             raise ConfigurationError(
                 f"{word!r} is not a quality of service; choose from {', '.join(choices)}",
-                remedy=nearest(word, choices, "leave it out for the default of ROS 2"),
+                remedy=did_you_mean(word, choices, "leave it out for the default of ROS 2"),
             )
     return profile
 
 
 @dataclass(frozen=True)
-class Crossed:
+class CrossingCounts:
     """Counters of a topic that a bridge forwards in one direction.
 
     Attributes:
@@ -131,11 +131,11 @@ class CrossingTally:
         # If the clock was set back, the delay counts as 0.
         self._classes[round(math.log(max(1, left_ns - arrived_ns)) / _BUCKET)] += 1
 
-    def counts(self, crossing: Crossing, source: str, target: str) -> Crossed:
+    def counts(self, crossing: Crossing, source: str, target: str) -> CrossingCounts:
         """Return the counters."""
         duration_s = (self._last_ns - self._first_ns) / 1e9
         has_rate = duration_s > 0
-        return Crossed(
+        return CrossingCounts(
             crossing.topic,
             crossing.type_name,
             source,

@@ -16,7 +16,7 @@ _ROS1_PORTS: Final = 3
 _PARTICIPANTS: Final = 4
 """Maximum number of participants of a domain on a robot: one of fieldkit, and some of the robot."""
 
-MOST_DOMAIN: Final = 101
+MAX_DOMAIN: Final = 101
 """Maximum domain: the DDS ports of higher domains are in the ephemeral port range of Linux."""
 
 

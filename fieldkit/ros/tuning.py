@@ -62,7 +62,7 @@ _TUNED: Final[Mapping[tuple[str, str], Mapping[str, str]]] = MappingProxyType(
 )
 
 
-def tuned(over: str, transport: str) -> Mapping[str, str]:
+def recommended_settings(over: str, transport: str) -> Mapping[str, str]:
     """Return the recommended settings of a middleware by their path.
 
     Args:

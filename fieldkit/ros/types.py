@@ -16,9 +16,9 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 
-LACKING: Final[Mapping[str, str]] = MappingProxyType(
+EXTRA_DEFINITIONS: Final[Mapping[str, str]] = MappingProxyType(
     {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
 )
 """Definitions of standard types that rosbags lacks."""
@@ -113,7 +113,7 @@ class MessageTypes:
         self.ros2 = get_typestore(_STORES[distribution])
         custom = {full_name(name): text for name, text in definitions.items()}
         for store in (self.ros1, self.ros2):
-            _add(store, {**LACKING, **custom})
+            _add(store, {**EXTRA_DEFINITIONS, **custom})
         # In .msg files of ROS 2 `char` is an alias of uint8, which the hash function of rosbags ignores.
         for name, (constants, members) in list(self.ros2.fielddefs.items()):
             self.ros2.fielddefs[name] = (constants, _char_as_uint8(members))
@@ -170,7 +170,7 @@ class MessageTypes:
     def _unknown(self, name: str) -> ConfigurationError:
         type_names = self.ros1.fielddefs.keys() | self.ros2.fielddefs.keys()
         full_names = {full.rpartition("/")[2]: full for full in type_names}
-        remedy = nearest(name, full_names.values(), "give its definition")
+        remedy = did_you_mean(name, full_names.values(), "give its definition")
         return ConfigurationError(f"there is no message type {name}", remedy=remedy)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
-from fieldkit.core.columns import Column, Measured, named
+from fieldkit.core.columns import Column, Measured, with_step_name
 from fieldkit.core.model import Fault, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.transfers.fault_times import FaultTimes
@@ -81,9 +81,9 @@ def declared(nest: Nest) -> tuple[Column, ...]:
     all_columns: list[Column] = []
     for pair in _pairs(nest):
         if isinstance(pair.flow, SendsFlow) and isinstance(pair.fault, CausesFault):
-            columns = recoveries.declared(pair.flow.flow_kind, pair.fault.cause.kind)
+            columns = recoveries.declare_columns(pair.flow.flow_kind, pair.fault.cause.kind)
             for prefix in pair.prefixes(nest):
-                columns = tuple(named(prefix, column) for column in columns)
+                columns = tuple(with_step_name(prefix, column) for column in columns)
             all_columns += columns
     return tuple(all_columns)
 
@@ -100,7 +100,7 @@ def measure(nest: Nest, view: View) -> Measured:
             deliveries = partial(pair.flow.deliveries, inside)
             recovery = recoveries.measure(pair.flow.flow_kind, kind, deliveries, times, pair.flow.destination)
             for prefix in pair.prefixes(nest):
-                recovery = recovery.named(prefix)
+                recovery = recovery.with_step_name(prefix)
             measured |= recovery
     return measured
 

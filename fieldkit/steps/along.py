@@ -29,7 +29,7 @@ class AlongStep(Step):
     @schema.model_validator(mode="after")
     def _has_one_duration(self) -> Self:
         if self.along and self.duration_key in self.model_fields_set:
-            raise schema.complaint(
+            raise schema.validation_error(
                 f"along and {self.duration_key} exclude each other; leave one out", self.duration_key
             )
         return self

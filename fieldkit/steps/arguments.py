@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from fieldkit.core.errors import nearest
+from fieldkit.core.errors import did_you_mean
 
 PUT: Final = "put"
 _VALUES: Final = ("distance", "repeat")
@@ -85,7 +85,7 @@ def suggestion(name: str) -> str:
         return ""
     kind, dot, role = name.strip().lower().partition(".")
     if dot:
-        near = nearest(kind, (_ADDRESS,), "")
+        near = did_you_mean(kind, (_ADDRESS,), "")
         return f"did you mean '{{address.{role}}}'?" if near else ""
     for variable in (*_VALUES, PUT):
         if kind == variable or (variable != PUT and _resembles(kind, variable)):

@@ -12,7 +12,7 @@ from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import CoreSchema, Field, Strict
 from fieldkit.core import plugins
-from fieldkit.core.columns import Column, Measured, Value, prefixed
+from fieldkit.core.columns import Column, Measured, Value, step_prefixed
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Role
@@ -27,11 +27,16 @@ if TYPE_CHECKING:
 
 StepName = Annotated[
     str,
-    schema.shaped(r"^[a-z][a-z0-9_]{0,30}$", "a name: small letters, digits and _, a small letter first, 31 in all"),
+    schema.pattern_field(
+        r"^[a-z][a-z0-9_]{0,30}$", "a name: small letters, digits and _, a small letter first, 31 in all"
+    ),
 ]
 """Name of a step or a bag."""
 FileName = Annotated[
-    str, schema.shaped(r"^[a-z][a-z0-9_.-]{0,40}$", "the name of a file: small letters, digits, _ . and -, 41 in all")
+    str,
+    schema.pattern_field(
+        r"^[a-z][a-z0-9_.-]{0,40}$", "the name of a file: small letters, digits, _ . and -, 41 in all"
+    ),
 ]
 """Name of a file in the folder of an attempt."""
 
@@ -71,9 +76,9 @@ class Step(Strict, ABC):
         """Prefix of the names of its jobs, files and columns; empty if they have none."""
         return self.name
 
-    def own_name(self, what: str) -> str:
+    def prefixed_name(self, what: str) -> str:
         """Return the name of a job or file of the step: `up.recv.bag`, or `recv.bag` for a step without a name."""
-        return prefixed(self.prefix, what)
+        return step_prefixed(self.prefix, what)
 
     @classmethod
     def kind_name(cls) -> str:
@@ -168,7 +173,7 @@ class Step(Strict, ABC):
         """
         return None
 
-    def asks(self) -> bool:
+    def may_prompt(self) -> bool:
         """Return True if the step may prompt the operator; then no other step may run at the same time."""
         return False
 
@@ -281,12 +286,12 @@ def step_types() -> Mapping[str, type[Step]]:
     """
     types: dict[str, type[Step]] = {}
     for point, loaded in kinds.load():
-        where, remedy = plugins.where(point), plugins.REMEDY
+        location, remedy = plugins.location(point), plugins.REMEDY
         if not (isinstance(loaded, type) and issubclass(loaded, Step)):
-            raise ConfigurationError("a kind of step must be a subclass of Step", where=where, remedy=remedy)
+            raise ConfigurationError("a kind of step must be a subclass of Step", where=location, remedy=remedy)
         if isabstract(loaded):
             missing = ", ".join(sorted(loaded.__abstractmethods__))
-            raise ConfigurationError(f"the kind of step lacks {missing}", where=where, remedy=remedy)
+            raise ConfigurationError(f"the kind of step lacks {missing}", where=location, remedy=remedy)
         types[point.name] = loaded
     return MappingProxyType(types)
 

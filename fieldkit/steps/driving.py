@@ -11,14 +11,14 @@ from typing_extensions import override
 
 from fieldkit.agent import drive_plan
 from fieldkit.agent.drive_plan import DriveTask
-from fieldkit.backends.driven import disturbed
+from fieldkit.backends.driven import topic_conflict
 from fieldkit.backends.protocols import Robot, Testbed
 from fieldkit.config.profiles import Drive
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError
 from fieldkit.core.model import MotionOrigin, Move
-from fieldkit.core.text import JSON_ERRORS, brief
+from fieldkit.core.text import JSON_ERRORS, shorten
 from fieldkit.measure.motion import drive_log
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
@@ -26,7 +26,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import lease, streams
 from fieldkit.steps.lease import LeaseKeeper, orders_file
-from fieldkit.steps.middlewares import Over
+from fieldkit.steps.middlewares import Middleware
 from fieldkit.steps.motions import Mover
 from fieldkit.steps.origins import RobotMotion
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
@@ -49,9 +49,9 @@ _ZENOH_PORT: Final = 7447
 
 _TOPIC_KEYS: Final = MappingProxyType(
     {
-        Over.ROS1: ("md5", "definition"),
-        Over.DDS: ("members", "dds_topic", "dds_types", "user_data"),
-        Over.ZENOH: ("key", "tokens"),
+        Middleware.ROS1: ("md5", "definition"),
+        Middleware.DDS: ("members", "dds_topic", "dds_types", "user_data"),
+        Middleware.ZENOH: ("key", "tokens"),
     }
 )
 """Keys of a topic description that each middleware needs; others are omitted to keep command lines readable."""
@@ -60,12 +60,12 @@ _STATUS: Final = "drive.status"
 _TEXT: Final = "drive.log"
 
 
-def middleware_of(robot: Robot) -> Over:
+def middleware_of(robot: Robot) -> Middleware:
     """Return the middleware through which a robot's base receives velocities."""
     ros = robot.profile.ros
     if ros is None or ros.variant == "ros1":
-        return Over.ROS1
-    return Over(ros.middleware)
+        return Middleware.ROS1
+    return Middleware(ros.middleware)
 
 
 def limit_s(move: Move) -> float:
@@ -75,7 +75,7 @@ def limit_s(move: Move) -> float:
 
 def path_duration_s(robot: Robot, move: Move) -> float:
     """Return the duration of the path of a move in one direction with its turns, in seconds, to the millisecond."""
-    return round(drive_plan.way_s(DriveTask.from_json(_task(robot, move))), 3)
+    return round(drive_plan.path_duration_s(DriveTask.from_json(_task(robot, move))), 3)
 
 
 def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
@@ -105,7 +105,7 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
         ready="log:up,",
     )
     program = robot.profile.tools.python
-    return Planned(move.role, job, program=program, setup=setup, ends=BY_ITSELF | BY_FIELDKIT)
+    return Planned(move.role, job, program=program, setup=setup, permitted_causes=BY_ITSELF | BY_FIELDKIT)
 
 
 def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
@@ -119,7 +119,7 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
             f"its fence is {limits.fence_m:g} m from its place, but its path leads {farthest_m:g} m away",
             "shorten the path in the procedure, or increase limits.fence_m in its profile if the area allows it",
         )
-    if why := disturbed(robot, scene.cast.values()):
+    if why := topic_conflict(robot, scene.cast.values()):
         remedy = "give each robot its own topics, ROS domain or master; or move it by hand: without --allow-motion"
         yield Refusal(move.role, why, remedy)
 
@@ -145,7 +145,7 @@ def _drive(robot: Robot) -> Drive:
 def _origin(scene: Scene, move: Move) -> dict[str, Any]:
     """Return the keys of a drive task that depend on the origin of the robot in this trial."""
     origin, last = scene.origins.get(move.role), scene.origins.last(move.role)
-    if origin is None or not scene.origins.kept:
+    if origin is None or not scene.origins.robots_stay:
         return {}
     places = {"origin": (origin.x_m, origin.y_m, origin.heading_rad)}
     if last is not None:
@@ -194,7 +194,7 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
     arguments = {
         "over": middleware.value,
         "network": network,
-        "cdr": middleware is not Over.ROS1,
+        "cdr": middleware is not Middleware.ROS1,
         "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default", 1),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
         "task": {**_task(robot, move), **_origin(scene, move)},
@@ -205,14 +205,14 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
     return streams.compact(arguments)
 
 
-def _network(robot: Robot, middleware: Over) -> dict[str, Any]:
+def _network(robot: Robot, middleware: Middleware) -> dict[str, Any]:
     """Return the settings with which the driver discovers the nodes of its robot without multicast."""
     network = {
         "address": robot.address,
         "domain": robot.profile.ros.domain if robot.profile.ros else 0,
         "node": f"fieldkit_drive_{robot.name}".replace("-", "_"),
     }
-    if middleware is not Over.ZENOH:
+    if middleware is not Middleware.ZENOH:
         return network | {"peers": [robot.address]}
     # The router of rmw_zenoh on the robot announces all sessions there. A session without a router may use its port.
     endpoints = [f"tcp/{address}:{_ZENOH_PORT}" for address in ("127.0.0.1", robot.address)]
@@ -264,22 +264,22 @@ class DriveLease(LeaseKeeper):
             return None
         if not isinstance(frame_id, str) or not all(map(math.isfinite, (x_m, y_m, yaw_rad))):
             return None
-        return MotionOrigin("odometry", brief(frame_id), x_m, y_m, yaw_rad)
+        return MotionOrigin("odometry", shorten(frame_id), x_m, y_m, yaw_rad)
 
     @property
     def status(self) -> dict[str, Any]:
         """The last status of the program; empty before the first one."""
-        return _parse_status(self.said)
+        return _parse_status(self.output)
 
     @property
-    def why(self) -> str:
+    def end_state(self) -> str:
         """Why the drive has ended, `home` if the robot is back at its place; empty while it drives.
 
         The driver writes its status ten times a second. A driver without a new status has exited or is out of reach.
         """
         status, silent_s = self.status, self.unchanged_s
         if isinstance(ended := status.get("ended"), str) and ended:
-            return brief(ended)
+            return shorten(ended)
         if silent_s > (_SILENT_S if status else _START_S):
             return f"its driver sent no status for {silent_s:.0f} s"
         return super().end_reason
@@ -287,7 +287,7 @@ class DriveLease(LeaseKeeper):
     @property
     @override
     def end_reason(self) -> str:
-        return "" if self.why in {"", drive_log.HOME} else f"it stopped on its path: {self.why}"
+        return "" if self.end_state in {"", drive_log.HOME} else f"it stopped on its path: {self.end_state}"
 
     def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
         """Wait until a condition holds or the deadline has passed."""
@@ -336,18 +336,18 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
 
 def _commit(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
     """Wait until a robot is stationary at its place, and record its origin before its first start there."""
-    drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.why, Deadline.after(_START_S))
+    drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.end_state, Deadline.after(_START_S))
     if drive_lease.is_refused:
-        scene.origins.refuse(move.role, drive_lease.why)
+        scene.origins.refuse(move.role, drive_lease.end_state)
         raise MotionHeldError(
-            f"it does not start: {drive_lease.why}",
+            f"it does not start: {drive_lease.end_state}",
             where=scene.robot(move.role).name,
             remedy="put it at its place with its initial direction, then resume without --yes and confirm it",
         )
     drive_lease.check_running()
     if not drive_lease.is_ready:
         raise drive_lease.failure(f"it was not stationary for {_START_S:g} s")
-    if scene.origins.kept and scene.origins.get(move.role) is None:
+    if scene.origins.robots_stay and scene.origins.get(move.role) is None:
         pose = drive_lease.pose
         if pose is None:
             raise drive_lease.failure("its driver does not report its position")
@@ -360,9 +360,9 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
     """Drive a robot out while the body runs, and back; see `driven`."""
 
     def bring_back() -> str:
-        why_ended = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not scene.origins.kept)
+        why_ended = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not scene.origins.robots_stay)
         if why_ended == drive_log.HOME:
-            motion.ended(drive_lease.pose)
+            motion.mark_ended(drive_lease.pose)
         elif drive_lease.status.get("ended"):
             motion.at = drive_lease.pose
         return why_ended
@@ -393,12 +393,12 @@ def _bring_back(
     put it at its place (`fieldkit.trial.running.motion_leave`).
     """
     drive_lease.turn_back()
-    drive_lease.wait(lambda: drive_lease.why, Deadline.after(_START_S + limit_s(move)))
-    why = drive_lease.why
+    drive_lease.wait(lambda: drive_lease.end_state, Deadline.after(_START_S + limit_s(move)))
+    end_state = drive_lease.end_state
     _end(shell, job)
-    if by_hand or why == drive_log.HOME:
-        testbed.bring_back(move.role, by_itself=why == drive_log.HOME)
-    return why
+    if by_hand or end_state == drive_log.HOME:
+        testbed.bring_back(move.role, by_itself=end_state == drive_log.HOME)
+    return end_state
 
 
 def _end(shell: Shell, job: Job) -> None:

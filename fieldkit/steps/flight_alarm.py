@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
-from fieldkit.core.text import JSON_ERRORS, brief
+from fieldkit.core.text import JSON_ERRORS, shorten
 from fieldkit.remote import jobs
 from fieldkit.steps.flight_rescue import MANUAL_ACTION, FlightRescue
 from fieldkit.steps.piloting import FlightLease
@@ -65,7 +65,7 @@ def _alarm(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, 
     places, guard_lines, rescue_lines, *_ = tails
     pilot_line = flight.last_lines[-1] if flight.last_lines else "none"
     guard_line, rescue_line = (
-        brief(lines[-1].partition(" ")[2]) if lines else "none" for lines in (guard_lines, rescue_lines)
+        shorten(lines[-1].partition(" ")[2]) if lines else "none" for lines in (guard_lines, rescue_lines)
     )
     return (
         f"ALARM: {flight.robot} MAY STILL BE IN THE AIR. LAST KNOWN: {_state(places)}. {MANUAL_ACTION}. "
@@ -79,6 +79,6 @@ def _state(lines: Sequence[str]) -> str:
         with suppress(*JSON_ERRORS):
             values = json.loads(line)
             ahead_m, left_m, up_m = (float(values[name]) for name in ("ahead_m", "left_m", "up_m"))
-            mode = brief(str(values.get("mode", "unknown")))
+            mode = shorten(str(values.get("mode", "unknown")))
             return f"{ahead_m:.1f} M AHEAD OF ITS ORIGIN, {left_m:.1f} M TO THE LEFT, {up_m:.1f} M UP, MODE {mode}"
     return "NOTHING"

@@ -11,7 +11,7 @@ from typing import Final, Self
 from fieldkit.agent.flying.liveness import FLYING, GUARD, LANDING, PILOT, SIZE, entries
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError
-from fieldkit.core.text import brief
+from fieldkit.core.text import shorten
 from fieldkit.remote import jobs, motion
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
@@ -95,7 +95,7 @@ class FlightRescue:
         signs = LifeSigns()
         while not self._left.wait(_POLL_S):
             try:
-                sample = motion.life_signs(self._shell, self._file, Deadline.after(jobs.REPLY_S))
+                sample = motion.read_liveness(self._shell, self._file, Deadline.after(jobs.REPLY_S))
             except FieldkitError:  # the link may be restored
                 continue
             if signs.update(sample):
@@ -111,5 +111,5 @@ class FlightRescue:
         try:
             jobs.start(self._shell, self.job)
         except FieldkitError as error:
-            self.failure = brief(error.what)
+            self.failure = shorten(error.what)
             self._alarm(f"ALARM: THE RESCUE OF {robot} DID NOT START: {self.failure}. {MANUAL_ACTION}")

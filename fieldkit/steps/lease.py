@@ -57,7 +57,7 @@ class LeaseKeeper:
         silent_lease_s: Time until an order expires if nothing may be sent meanwhile; None to renew the order.
 
     Attributes:
-        said: Content of the output file at the last renewal.
+        output: Content of the output file at the last renewal.
         exit_code: Exit code of the program at the last renewal, as text; empty while it runs.
     """
 
@@ -72,7 +72,7 @@ class LeaseKeeper:
         renewals: int,
         silent_lease_s: float | None = None,
     ) -> None:
-        self.said = b""
+        self.output = b""
         self.exit_code = ""
         self._shell = shell
         self._job = job
@@ -169,8 +169,8 @@ class LeaseKeeper:
         result = self._shell.run(argv, deadline=Deadline.after(within_s))
         *_, code = (b"", *result.stderr.splitlines())  # a login shell may print messages before it
         self.exit_code = code.decode() if code.isdigit() else ""
-        if result.stdout != self.said:
-            self.said, self._changed_s = result.stdout, time.monotonic()
+        if result.stdout != self.output:
+            self.output, self._changed_s = result.stdout, time.monotonic()
         return result.stdout
 
     def _renew_until_left(self) -> None:
@@ -184,14 +184,14 @@ class LeaseKeeper:
 
 def run_inside(nest: Nest, keeper: LeaseKeeper, scene: Scene, testbed: Testbed, announce: Announce) -> None:
     """Run the steps inside `nest`; abort them if its leased program ends. Errors as `run_while_leased`."""
-    inner = replace(scene, halt=scene.halt.inside())
+    inner = replace(scene, halt=scene.halt.child())
 
     def end() -> None:
-        inner.halt.call()
+        inner.halt.set()
         with suppress(FieldkitError):  # it is called again at the next renewal
             nest.end_inside(inner, testbed)
 
     with keeper.run_while_leased(end):
         for entry in nest.during:
-            if not inner.halt.called:
+            if not inner.halt.is_set:
                 entry.step.run(inner, testbed, announce)

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role, Verdict
-from fieldkit.core.text import JSON_ERRORS, harmless
+from fieldkit.core.text import JSON_ERRORS, sanitized
 from fieldkit.remote import agent
 from fieldkit.steps import streams
-from fieldkit.steps.scene import Need, Said
+from fieldkit.steps.scene import CommandResult, Need
 
 _KINDS = {
     "udpout": "UDP, the robot sends first",
@@ -28,23 +28,23 @@ def link_need(robot: Robot, role: Role, connection: str, programs: Sequence[str]
         programs: Names of the programs: `pilot`, `guard`, `recorder`.
     """
 
-    def judge(result: Said) -> tuple[Verdict, str, str]:
+    def judge(result: CommandResult) -> tuple[Verdict, str, str]:
         return _judge(connection, programs, result)
 
     argv = streams.python(robot, agent.path_from_home(), "survey", streams.compact({"connection": connection}))
-    return Need(role, "MAVLink", argv, judge, of=robot.profile.tools.python, agent=True)
+    return Need(role, "MAVLink", argv, judge, required_program=robot.profile.tools.python, agent=True)
 
 
-def _judge(connection: str, programs: Sequence[str], result: Said) -> tuple[Verdict, str, str]:
+def _judge(connection: str, programs: Sequence[str], result: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy from the output of the agent's `survey`."""
     kind = _KINDS.get(connection.partition(":")[0], "serial line")
     users = f"{' and '.join(programs)} {_SHARED[len(programs) > 1]}"
     try:
         survey = json.loads(result.text)
-        error, system = harmless(survey["error"]), int(survey["system"])
-        candidates = ", ".join(map(harmless, survey["candidates"]))
+        error, system = sanitized(survey["error"]), int(survey["system"])
+        candidates = ", ".join(map(sanitized, survey["candidates"]))
     except JSON_ERRORS:
-        last_line = harmless((result.text.splitlines() or ["no answer"])[-1]).removeprefix("error: ")
+        last_line = sanitized((result.text.splitlines() or ["no answer"])[-1]).removeprefix("error: ")
         return Verdict.FAIL, f"{connection} ({kind}): {last_line}", "correct mavlink.connection of the profile"
     available = f"this computer has {candidates}" if candidates else "this computer has no other common connection"
     remedy = f"{available}; write the connection of the autopilot as mavlink.connection in the profile"

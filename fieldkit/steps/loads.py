@@ -46,7 +46,7 @@ class LoadOptions(Strict):
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "LoadOptions":
         if self.sender == self.receiver:
-            raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
+            raise schema.validation_error(f"{self.sender} cannot send to itself; name another robot", "to")
         return self
 
     def carried_by(self, protocol: Protocol) -> Protocol:

@@ -57,8 +57,8 @@ class Motions:
     """
 
     def __init__(self) -> None:
-        self.ahead: tuple[str, ...] = ()
-        self.called = False
+        self.stop_notes: tuple[str, ...] = ()
+        self.is_ordered = False
         self._movers: list[Mover] = []
         self._first = threading.Lock()  # acquired once, by the first order
         self._abandoned = threading.Event()
@@ -71,25 +71,27 @@ class Motions:
         Raises:
             KeyboardInterrupt: The order was given before; the robot must not start to move.
         """
-        self._movers.append(mover)  # before `called` is read; `order` sets `called` before it reads the list
+        self._movers.append(
+            mover
+        )  # before `is_ordered` is read; `order_stop` sets `is_ordered` before it reads the list
         try:
-            if self.called:
+            if self.is_ordered:
                 raise KeyboardInterrupt
             yield
         finally:
-            while self.called and not self._done.wait(_SIGNAL_S):
+            while self.is_ordered and not self._done.wait(_SIGNAL_S):
                 pass  # Python handles a signal that arrived just before the wait only after the wait
             self._movers.remove(mover)
 
-    def order(self, report: Report) -> bool:
+    def order_stop(self, report: Report) -> bool:
         """Order all robots to stop; return False and do nothing if no robot moves or may start to move.
 
         Args:
             report: Receives a line for each change of state of a robot.
         """
-        if not (self._movers or self.ahead):
+        if not (self._movers or self.stop_notes):
             return False
-        self.called = True
+        self.is_ordered = True
         if self._first.acquire(blocking=False):
             movers = {mover.robot: mover for mover in reversed(self._movers)}
             threading.Thread(
@@ -106,7 +108,7 @@ class Motions:
         threads = [threading.Thread(target=self._halt, args=(mover, report), daemon=True) for mover in movers]
         for thread in threads:
             thread.start()
-        for line in self.ahead if movers else ():
+        for line in self.stop_notes if movers else ():
             report(f"stopping: {line}")
         if not movers:
             report("stopping: no robot moves; stopping the programs on the robots")
@@ -124,12 +126,12 @@ class Motions:
         try:
             halted = motion.halt_attempt(mover.shell, mover.folder, STOPPED_BY, Deadline.after(_REPLY_S))
             report(self._report_line(mover, halted, start_s))
-            while halted.state in motion.COMING_DOWN and time.monotonic() < start_s + _LANDING_S:
+            while halted.state in motion.DESCENDING_STATES and time.monotonic() < start_s + _LANDING_S:
                 if self._abandoned.wait(_POLL_S):
                     return
                 names = [name for name, _ in halted.programs]
-                halted = motion.look(mover.shell, names, Deadline.after(_REPLY_S))
-                if halted.state not in motion.COMING_DOWN:
+                halted = motion.poll_states(mover.shell, names, Deadline.after(_REPLY_S))
+                if halted.state not in motion.DESCENDING_STATES:
                     report(self._report_line(mover, halted, start_s))
         except FieldkitError as error:
             report(f"no answer from {mover.robot}: {mover.fallback} ({error.what})")
@@ -138,4 +140,6 @@ class Motions:
     def _report_line(mover: Mover, halted: "Halted", start_s: float) -> str:
         from fieldkit.remote import motion  # noqa: PLC0415
 
-        return f"{mover.robot}: {motion.IN_WORDS[halted.state]}, {time.monotonic() - start_s:.1f} s after the order"
+        return (
+            f"{mover.robot}: {motion.STATE_TEXTS[halted.state]}, {time.monotonic() - start_s:.1f} s after the order"
+        )

@@ -12,14 +12,14 @@ class RobotMotion:
 
     Attributes:
         at: Pose at which the robot stopped, in the frame of its origin; None if it did not report one.
-        is_over: Whether `ended` was called.
+        is_over: Whether `mark_ended` was called.
     """
 
     def __init__(self) -> None:
         self.at: MotionOrigin | None = None
         self.is_over = False
 
-    def ended(self, at: MotionOrigin | None = None) -> None:
+    def mark_ended(self, at: MotionOrigin | None = None) -> None:
         """Record that the motion ended as planned; `at` is as the attribute."""
         self.at, self.is_over = at, True
 
@@ -28,13 +28,13 @@ class Origins(Protocol):
     """Origins of the robots of a trial, by role.
 
     Attributes:
-        kept: Whether robots stay where a motion ended, as real robots do. False if the lab puts them back to their
-            places after each motion.
+        robots_stay: Whether robots stay where a motion ended, as real robots do. False if the lab puts them
+            back to their places after each motion.
         may_return: Whether a ground robot that is not at its place but within its fence may drive back to its place.
     """
 
     @property
-    def kept(self) -> bool:
+    def robots_stay(self) -> bool:
         """Whether robots stay where a motion ended."""
         ...
 
@@ -85,7 +85,7 @@ class Origins(Protocol):
 class MemoryOrigins:
     """Origins of the robots of a lab that puts them back to their places; kept in memory, without confirmations."""
 
-    kept = False
+    robots_stay = False
     may_return = False
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Control, MotionOrigin, OnAbort, Role
-from fieldkit.core.text import JSON_ERRORS, brief
+from fieldkit.core.text import JSON_ERRORS, shorten
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
@@ -57,7 +57,7 @@ def connection(robot: Robot) -> str:
         raise ConfigurationError(
             "it cannot fly: its profile has no mavlink", where=robot.name, remedy="use a drone in this role"
         )
-    return robot.profile.mavlink.own
+    return robot.profile.mavlink.onboard_connection
 
 
 def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: float) -> Planned:
@@ -70,11 +70,11 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
         plan: Argument of the program; the file of its orders is in the folder of the attempt.
         limit_s: Time limit of the job.
     """
-    robot, complete_plan = scene.robot(role), replace(plan, unhurried=jobs.unhurried_file(name))
+    robot, complete_plan = scene.robot(role), replace(plan, unhurried=jobs.landing_marker_file(name))
     argv = streams.agent_command(robot, "fly", streams.compact(asdict(complete_plan)))
     log = f"{name}.log"
     job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")
-    return Planned(role, job, program=robot.profile.tools.python, ends=BY_ITSELF)
+    return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_ITSELF)
 
 
 def guard(scene: Scene, role: Role, name: str, *, lease_s: float = LEASE_S, has_pilot: bool = False) -> Planned:
@@ -168,13 +168,13 @@ class FlightLease(LeaseKeeper):
 
     @property
     def _lines(self) -> Sequence[str]:
-        return self.said.decode("utf-8", "replace").splitlines()
+        return self.output.decode("utf-8", "replace").splitlines()
 
     @property
     def _reported_reason(self) -> str:
         """The reason for which the program ended the flight, from its log; empty if it did not."""
         match = next(filter(None, map(_END_LINE.match, self._lines)), None)
-        return brief(match["why"]) if match else ""
+        return shorten(match["why"]) if match else ""
 
     def release(self) -> None:
         """Order the program to exit without a command to the drone; errors as `give_order`."""
@@ -194,7 +194,7 @@ class FlightLease(LeaseKeeper):
     @property
     def last_lines(self) -> Sequence[str]:
         """The last two lines of the log without their times."""
-        return [brief(line.partition(" ")[2]) for line in self._lines[-2:]]
+        return [shorten(line.partition(" ")[2]) for line in self._lines[-2:]]
 
     def origin(self) -> MotionOrigin:
         """Return the origin that the program has reported, which it does before it moves the drone.
@@ -208,7 +208,7 @@ class FlightLease(LeaseKeeper):
                 try:
                     return _motion_origin(json.loads(text))
                 except JSON_ERRORS as error:
-                    raise self.failure(f"its origin is unreadable: {brief(text)}") from error
+                    raise self.failure(f"its origin is unreadable: {shorten(text)}") from error
         raise self.failure("it has not reported its origin")
 
     @property
@@ -224,7 +224,7 @@ class FlightLease(LeaseKeeper):
         files = [f"{self._job.folder}/{name}" for name in names]
         result = self._shell.run(("sh", "-c", _TAILS, "sh", *files), deadline=Deadline.after(_QUERY_S))
         tails = result.stdout.decode("utf-8", "replace").split(_SEPARATOR)[: len(names)]
-        return [[brief(line, 1000) for line in tail.splitlines()] for tail in tails]
+        return [[shorten(line, 1000) for line in tail.splitlines()] for tail in tails]
 
     def refresh(self) -> None:
         """Renew the order with a short timeout; errors as `give_order`."""
@@ -249,7 +249,7 @@ class FlightLease(LeaseKeeper):
             if why := self._reported_reason or self.lost or self.end_reason:
                 raise self.failure(why)
             if deadline.expired:
-                last = brief(self._lines[-1].partition(" ")[2]) if self._lines else "nothing"
+                last = shorten(self._lines[-1].partition(" ")[2]) if self._lines else "nothing"
                 raise self.failure(f"it is not {mark} after {within_s:.0f} s; its last line: {last}")
             self.pause()
 
@@ -260,7 +260,7 @@ def _motion_origin(values: Mapping[str, Any]) -> MotionOrigin:
     degrees = [None if values[name] is None else float(values[name]) for name in ("latitude_deg", "longitude_deg")]
     if not all(map(math.isfinite, (*numbers, *(value or 0.0 for value in degrees)))):
         raise ValueError(values)
-    return MotionOrigin(brief(str(values["frame"])), brief(str(values["frame_id"])), *numbers, *degrees)
+    return MotionOrigin(shorten(str(values["frame"])), shorten(str(values["frame_id"])), *numbers, *degrees)
 
 
 @contextmanager

@@ -58,12 +58,12 @@ class ProgramStep(Step):
         argv = tuple(self.argv(scene))
         job = Job(
             folder=scene.folder,
-            name=self.own_name(self.kind_name()),
+            name=self.prefixed_name(self.kind_name()),
             argv=argv,
             limit_s=self.limit_s,
             log=self._log,
             stdout=self._output,
-            output_limit_bytes=printed.MOST_BYTES,
+            output_limit_bytes=printed.MAX_OUTPUT_BYTES,
         )
         yield Planned(self.robot, job, program=argv[0], remedy=f"install {argv[0]}")
 
@@ -93,7 +93,7 @@ class ProgramStep(Step):
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the program failed, and for each column without a value."""
         after = view.evidence.read_or_none(host.state, host.after(self.robot))
-        ending = (after.endings or {}).get(self.own_name(self.kind_name())) if after else None
+        ending = (after.endings or {}).get(self.prefixed_name(self.kind_name())) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.exit_codes:
             yield f"{view.scene.robot(self.robot).name}: {self.kind_name()} ended with exit code {ending.code}"
         for name, reason in self.measure(view).missing.items():
@@ -105,17 +105,17 @@ class ProgramStep(Step):
         try:
             values = self.parse(view.evidence.read(printed.text, self._output))
         except EvidenceError as error:
-            return Measured.nothing(columns, error.what)
+            return Measured.all_missing(columns, error.what)
         except (ValueError, LookupError, ArithmeticError) as error:
-            return Measured.nothing(columns, f"the output is not as expected: {type(error).__name__}: {error}")
-        return Measured.of(
+            return Measured.all_missing(columns, f"the output is not as expected: {type(error).__name__}: {error}")
+        return Measured.from_optional(
             {column.name: values.get(column.name) for column in columns}, "the program did not print it"
         )
 
     @property
     def _output(self) -> str:
-        return self.own_name(f"{self.kind_name()}.txt")
+        return self.prefixed_name(f"{self.kind_name()}.txt")
 
     @property
     def _log(self) -> str:
-        return self.own_name(f"{self.robot}-{self.kind_name()}.log")
+        return self.prefixed_name(f"{self.robot}-{self.kind_name()}.log")

@@ -5,7 +5,7 @@ from typing import Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import ROS_MASTER_PORT, Role, Verdict
-from fieldkit.steps.scene import Need, Said, Scene
+from fieldkit.steps.scene import CommandResult, Need, Scene
 
 _TIMEOUT_S: Final = 5
 _OK: Final = " 200 "
@@ -33,10 +33,10 @@ def needs(scene: Scene, role: Role, *, explains: str) -> Iterator[Need]:
         master = next(other for other in scene.cast.values() if other.address == robot.ros_master)
         arguments = (robot.ros_master, str(ROS_MASTER_PORT), _POST)
         argv = ("timeout", str(_TIMEOUT_S), "bash", "-c", _REQUEST, "bash", *arguments)
-        yield Need(role, "ROS master", argv, lambda answer: judge(master, answer), explains=explains)
+        yield Need(role, "ROS master", argv, lambda answer: judge(master, answer), missing_program=explains)
 
 
-def judge(master: Robot, answer: Said) -> tuple[Verdict, str, str]:
+def judge(master: Robot, answer: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy from the first line of a master's HTTP answer."""
     where = f"{master.name}, {master.address}:{ROS_MASTER_PORT}"
     if answer.ok and _OK in answer.text:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from fieldkit.core.model import Verdict
-from fieldkit.steps.scene import Need, Said, Scene
+from fieldkit.steps.scene import CommandResult, Need, Scene
 
 DAEMONS: Final = ("babeld", "bird", "olsrd", "olsrd2", "bmx7", "batmand")
 """Routing daemons for ad-hoc networks in Debian and OpenWrt, by process name."""
@@ -29,7 +29,7 @@ def needs(scene: Scene) -> Iterator[Need]:
         yield Need(role, "routing", ("sh", "-c", script, "sh", robot.profile.radio.interface, *DAEMONS), judge)
 
 
-def judge(answer: Said) -> tuple[Verdict, str, str]:
+def judge(answer: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy from the names of the routing protocols found on a robot."""
     protocols = list(dict.fromkeys(answer.text.split()))
     if answer.ok and protocols:

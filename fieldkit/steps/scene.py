@@ -12,7 +12,7 @@ from fieldkit.config.programs import LabProgram
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import OnAbort, Placement, Protocol, Role, Vector, Verdict
-from fieldkit.core.threads import Halt
+from fieldkit.core.threads import StopSignal
 from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
@@ -55,7 +55,7 @@ class RecordedFile:
     role: Role
     name: str
     size_bytes: float
-    called: str = ""
+    alias: str = ""
 
 
 @dataclass(frozen=True)
@@ -83,12 +83,12 @@ class Scene:
     folder: str
     recorded: Mapping[Role, tuple[RecordedFile, ...]] = field(default_factory=lambda: MappingProxyType({}))
     variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
-    here: Path | None = None
+    laptop_folder: Path | None = None
     placement: Placement | None = None
     repeat: int | None = None
     flows: "tuple[Flow, ...]" = ()
     on_abort: Mapping[Role, OnAbort] = field(default_factory=lambda: MappingProxyType({}))
-    halt: Halt = field(default_factory=Halt, compare=False, repr=False)
+    halt: StopSignal = field(default_factory=StopSignal, compare=False, repr=False)
     motions: Motions = field(default_factory=Motions, compare=False, repr=False)
     origins: Origins = field(default_factory=MemoryOrigins, compare=False, repr=False)
 
@@ -151,7 +151,7 @@ class Planned:
     program: str
     setup: tuple[str, ...] = ()
     tool: Tool | None = None
-    ends: frozenset[Cause] = BY_ITSELF
+    permitted_causes: frozenset[Cause] = BY_ITSELF
     least_s: float = 0.0
     remedy: str = ""
     put: PutProgram | None = None
@@ -173,7 +173,7 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Said:
+class CommandResult:
     """Result of a command that preflight ran on a robot.
 
     Attributes:
@@ -210,9 +210,9 @@ class Need:
     role: Role
     name: str
     argv: tuple[str, ...]
-    judge: Callable[[Said], tuple[Verdict, str, str]]
-    of: str = ""
-    explains: str = ""
+    judge: Callable[[CommandResult], tuple[Verdict, str, str]]
+    required_program: str = ""
+    missing_program: str = ""
     agent: bool = False
 
 

@@ -19,7 +19,7 @@ from fieldkit.steps.middlewares import (
     DISCOVERY_METHODS,
     OVER_DDS,
     Discovery,
-    Over,
+    Middleware,
     invalid_setting_reason,
     judge_binding,
 )
@@ -39,7 +39,7 @@ def _is_profile(name: str) -> str:
     from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
 
     if name not in PROFILES:
-        raise schema.complaint(f"ROS 2 has no profile {name!r}; there are {', '.join(PROFILES)}")
+        raise schema.validation_error(f"ROS 2 has no profile {name!r}; there are {', '.join(PROFILES)}")
     return name
 
 
@@ -82,7 +82,9 @@ Settings = dict[Annotated[str, Field(pattern=r"^[A-Za-z_]\w*(/[A-Za-z_]\w*)*(@[A
 
 def _validate_settings(settings: Settings | str) -> Settings | str:
     if settings not in ("default", "tuned") and isinstance(settings, str):
-        raise schema.complaint(f"settings must be default, tuned, or a mapping of settings by path, not {settings!r}")
+        raise schema.validation_error(
+            f"settings must be default, tuned, or a mapping of settings by path, not {settings!r}"
+        )
     return settings
 
 
@@ -117,7 +119,7 @@ class StreamOptions(Strict):
 
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
-    over: Over = Over.DDS
+    over: Middleware = Middleware.DDS
     topic: TopicName = "/fieldkit/stream"
     rate: Annotated[Hertz, Field(gt=0, le=100_000)] = 10.0
     bytes: Annotated[Bytes, Field(ge=LEAST_BYTES, le=MOST_BYTES)] = 1000.0
@@ -126,28 +128,33 @@ class StreamOptions(Strict):
     server: Role = Role.RELAY
     duration: Annotated[Duration, Field(gt=0, le=LONGEST_S)] = 10.0
     patience: Annotated[Duration, Field(gt=0, le=600)] = 20.0
-    domain: Annotated[Int, Field(ge=0, le=ports.MOST_DOMAIN)] = 42
+    domain: Annotated[Int, Field(ge=0, le=ports.MAX_DOMAIN)] = 42
     transport: Annotated[str, Field(pattern="^(tcp|udp)$")] = "tcp"
     settings: Annotated[Settings | str, AfterValidator(_validate_settings)] = "default"
 
     @schema.model_validator(mode="after")
     def _is_consistent(self) -> "StreamOptions":
         if self.sender == self.receiver:
-            raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
+            raise schema.validation_error(f"{self.sender} cannot send to itself; name another robot", "to")
         methods = DISCOVERY_METHODS[self.over]
         if self.discovery is not None and self.discovery not in methods:
-            raise schema.complaint(f"{self.over} has {' and '.join(methods)}, not {self.discovery}", "discovery")
-        if self.transport != "tcp" and self.over is not Over.ZENOH:
-            raise schema.complaint("only zenoh has a choice of transport; leave it out", "transport")
-        if self.over is Over.ROS1 and (self.qos.reliability or self.qos.profile) in {"best_effort", "sensor_data"}:
-            raise schema.complaint("ROS 1 sends by TCP, which is reliable; leave it out", "qos")
+            raise schema.validation_error(
+                f"{self.over} has {' and '.join(methods)}, not {self.discovery}", "discovery"
+            )
+        if self.transport != "tcp" and self.over is not Middleware.ZENOH:
+            raise schema.validation_error("only zenoh has a choice of transport; leave it out", "transport")
+        if self.over is Middleware.ROS1 and (self.qos.reliability or self.qos.profile) in {
+            "best_effort",
+            "sensor_data",
+        }:
+            raise schema.validation_error("ROS 1 sends by TCP, which is reliable; leave it out", "qos")
         if self.rate * self.duration < 1:
-            raise schema.complaint(
+            raise schema.validation_error(
                 "it ends before its second sample; write a longer duration or a higher rate", "duration"
             )
-        for name in self.own_settings if self.over is Over.ROS2 else ():
+        for name in self.middleware_settings if self.over is Middleware.ROS2 else ():
             if why := invalid_setting_reason(name):
-                raise schema.complaint(why, "settings")
+                raise schema.validation_error(why, "settings")
         return self
 
     @property
@@ -171,27 +178,31 @@ class StreamOptions(Strict):
         multicast = self.discovery_method in {Discovery.MULTICAST, Discovery.ENVIRONMENT}
         if self.over in OVER_DDS:
             return ports.dds(self.domain, multicast=multicast)
-        return ports.zenoh(self.domain, multicast=multicast) if self.over is Over.ZENOH else ports.ros1(self.domain)
+        return (
+            ports.zenoh(self.domain, multicast=multicast)
+            if self.over is Middleware.ZENOH
+            else ports.ros1(self.domain)
+        )
 
     @property
     def listening_port(self) -> int:
         """Port of the router, of the master, or of Zenoh's listeners; 0 for DDS, which has no fixed one."""
         if self.over in OVER_DDS:
             return 0
-        return ports.zenoh_listener(self.domain) if self.over is Over.ZENOH else ports.ros1_master(self.domain)
+        return ports.zenoh_listener(self.domain) if self.over is Middleware.ZENOH else ports.ros1_master(self.domain)
 
     @property
-    def own_settings(self) -> Mapping[str, str]:
+    def middleware_settings(self) -> Mapping[str, str]:
         """Settings of the middleware by their path."""
         if isinstance(self.settings, dict):
             return self.settings
-        return tuning.tuned(self.over, self.transport) if self.settings == "tuned" else {}
+        return tuning.recommended_settings(self.over, self.transport) if self.settings == "tuned" else {}
 
     def network(self, scene: Scene, role: Role) -> dict[str, Any]:
         """Return the fields of a `fieldkit.agent.middleware.Network` for a robot."""
         other = self.receiver if role == self.sender else self.sender
-        node_ports = ports.ros1_node(self.domain) if self.over is Over.ROS1 else {}
-        settings = {**{name: str(port) for name, port in node_ports.items()}, **self.own_settings}
+        node_ports = ports.ros1_node(self.domain) if self.over is Middleware.ROS1 else {}
+        settings = {**{name: str(port) for name, port in node_ports.items()}, **self.middleware_settings}
         return {
             "address": scene.robot(role).address,
             "discovery": self.discovery_method.value,
@@ -201,12 +212,12 @@ class StreamOptions(Strict):
             "domain": self.domain,
             "node": f"fieldkit_{role}",
             "transport": self.transport,
-            "settings": {} if self.over is Over.ROS2 else settings,
+            "settings": {} if self.over is Middleware.ROS2 else settings,
         }
 
     def environment(self, robot: Robot) -> dict[str, str]:
         """Return the agent's environment variables: for ROS 2 those of the robot and the settings, else empty."""
-        return {**robot.ros_environment, **self.own_settings} if self.over is Over.ROS2 else {}
+        return {**robot.ros_environment, **self.middleware_settings} if self.over is Middleware.ROS2 else {}
 
     def need(self, role: Role, robot: Robot) -> Need:
         """Return the preflight check that a robot's Python has the middleware."""
@@ -250,7 +261,9 @@ def agent_command(robot: Robot, *words: str, environment: Mapping[str, str] | No
     return python(robot, agent.path_from_job(), *words, environment=environment)
 
 
-def need(role: Role, robot: Robot, over: Over, environment: Mapping[str, str] | None = None) -> Need:
+def need(role: Role, robot: Robot, over: Middleware, environment: Mapping[str, str] | None = None) -> Need:
     """Return the preflight check that a robot's Python has a middleware, run with these environment variables."""
     argv = python(robot, "-c", BINDINGS[over].load, environment=environment)
-    return Need(role, f"{over} for Python", argv, partial(judge_binding, over), of=robot.profile.tools.python)
+    return Need(
+        role, f"{over} for Python", argv, partial(judge_binding, over), required_program=robot.profile.tools.python
+    )

@@ -8,14 +8,14 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.checks import topic_captures, topic_checks
-from fieldkit.measure.checks.topic_captures import Captured
+from fieldkit.measure.checks.topic_captures import CapturedTopic
 from fieldkit.measure.checks.topic_checks import TopicPlan
 from fieldkit.measure.transfers import sample_heads, topic_log
 from fieldkit.measure.transfers.sample_heads import SampleFlow
 from fieldkit.measure.transfers.topic_log import TopicLog
 from fieldkit.measure.transfers.topics import first_arrivals
 from fieldkit.ros.qos import History, Reliability
-from fieldkit.steps.middlewares import Over
+from fieldkit.steps.middlewares import Middleware
 from fieldkit.steps.streams import StreamOptions
 from fieldkit.steps.view import View, capture_around
 
@@ -31,17 +31,18 @@ def plan(step: StreamOptions) -> TopicPlan:
     """Return the plan of a step's topic, with which its logs are compared."""
     quality = step.qos.resolved()
     keeps_last = quality.history is not History.KEEP_ALL and quality.depth > 0
-    depth = quality.depth if keeps_last else _ROS1_QUEUE if step.over is Over.ROS1 else None
+    depth = quality.depth if keeps_last else _ROS1_QUEUE if step.over is Middleware.ROS1 else None
     return TopicPlan(
         topic=step.topic,
         samples=round(step.duration * step.rate),
         size_bytes=round(step.bytes),
-        envelope_bytes=_ENVELOPE_BYTES if step.over is Over.ROS1 else _CDR_BYTES,
-        reliable=step.over in {Over.ROS1, Over.ZENOH} or quality.reliability is not Reliability.BEST_EFFORT,
+        envelope_bytes=_ENVELOPE_BYTES if step.over is Middleware.ROS1 else _CDR_BYTES,
+        reliable=step.over in {Middleware.ROS1, Middleware.ZENOH}
+        or quality.reliability is not Reliability.BEST_EFFORT,
         # Zenoh passes samples to the callback without a queue.
-        depth=None if step.over is Over.ZENOH else depth,
-        in_order=step.over in {Over.DDS, Over.ROS1},
-        on_ports=step.over is not Over.ROS2,
+        depth=None if step.over is Middleware.ZENOH else depth,
+        in_order=step.over in {Middleware.DDS, Middleware.ROS1},
+        on_ports=step.over is not Middleware.ROS2,
     )
 
 
@@ -53,22 +54,22 @@ def problems(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog]) -> 
         view: The attempt.
         logs: Complete logs by role.
     """
-    yield from topic_checks.of_window(logs, {role: view.attempt_window(role) for role in logs})
+    yield from topic_checks.check_times(logs, {role: view.attempt_window(role) for role in logs})
     if {step.sender, step.receiver} <= logs.keys():
         sent, received = logs[step.sender], logs[step.receiver]
         topic_plan = plan(step)
-        reasons = list(topic_checks.of_logs(topic_plan, sent, received))
+        reasons = list(topic_checks.check_logs(topic_plan, sent, received))
         yield from reasons
         # The same cause would also lead to many contradictions with the captures.
         if not reasons:
-            yield from topic_captures.of_captures(topic_plan, sent, received, captured(step, view))
+            yield from topic_captures.check_captures(topic_plan, sent, received, captured(step, view))
 
 
-def captured(step: StreamOptions, view: View) -> Captured:
+def captured(step: StreamOptions, view: View) -> CapturedTopic:
     """Return the samples of the topic in the captures of sender and receiver."""
     sent, received = (_flow(step, view, role) for role in (step.sender, step.receiver))
     complete = sent is not None and received is not None and topic_captures.is_complete(sent, received)
-    return Captured(sent, received, complete)
+    return CapturedTopic(sent, received, complete)
 
 
 def dropped(step: StreamOptions, view: View) -> str:

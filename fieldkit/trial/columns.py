@@ -5,7 +5,7 @@ from functools import cache
 from typing import Final
 
 from fieldkit.core import columns
-from fieldkit.core.columns import Column, Value, named
+from fieldkit.core.columns import Column, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.measure.evidence import lateness, link
 from fieldkit.steps import kinds
@@ -54,7 +54,7 @@ Row = Mapping[str, Value]
 @cache
 def measures() -> tuple[Column, ...]:
     """Return every column that evidence fills in every trial: those of the testbed and of fieldkit's step kinds."""
-    shipped = kinds.own()
+    shipped = kinds.builtin()
     of_kinds = (column for kind, step in step_types().items() if kind in shipped for column in step.columns)
     filled = dict.fromkeys((*ALWAYS, *of_kinds))
     return tuple(sorted(filled, key=lambda column: column.rank))
@@ -77,7 +77,7 @@ def _everywhere() -> Mapping[str, Column]:
 
 def of_step(step: Step) -> tuple[Column, ...]:
     """Return the columns that a step fills, with the prefix of the step."""
-    return tuple(named(step.prefix, column) for column in step.output_columns())
+    return tuple(with_step_name(step.prefix, column) for column in step.output_columns())
 
 
 def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
@@ -102,8 +102,8 @@ def clash(column: Column, filled: Collection[str]) -> str | None:
         column: The column.
         filled: Names of the columns that other steps fill.
     """
-    if flaw := column.flaw():
-        return f"a column {column.name!r}: {flaw}"
+    if declaration_error := column.declaration_error():
+        return f"a column {column.name!r}: {declaration_error}"
     if _everywhere().get(column.name, column) != column:
         return f"a column {column.name!r} is one of fieldkit's; give the step a name, or rename the column"
     if column.name in filled:
@@ -121,11 +121,11 @@ def installed() -> tuple[Column, ...]:
     by_name = dict(_everywhere())
     for kind, step in step_types().items():
         for column in step.columns:
-            flaw = column.flaw()
-            if flaw or by_name.setdefault(column.name, column) != column:
+            declaration_error = column.declaration_error()
+            if declaration_error or by_name.setdefault(column.name, column) != column:
                 raise ConfigurationError(
                     f"the kind of step {kind!r} declares a column {column.name!r}, "
-                    + (f"but {flaw}" if flaw else "which exists already"),
+                    + (f"but {declaration_error}" if declaration_error else "which exists already"),
                     where=f"{step.__module__}:{step.__name__}",
                     remedy="rename it there, or uninstall its package",
                 )

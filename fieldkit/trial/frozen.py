@@ -40,8 +40,8 @@ class FrozenColumn(Strict):
 
     @schema.model_validator(mode="after")
     def _is_valid_column(self) -> "FrozenColumn":
-        if flaw := self.column.flaw():
-            raise schema.complaint(flaw, "name")
+        if declaration_error := self.column.declaration_error():
+            raise schema.validation_error(declaration_error, "name")
         return self
 
     @property
@@ -54,7 +54,7 @@ class FrozenColumn(Strict):
 def _demand_unique_names(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColumn, ...]:
     for name, count in Counter(column.name for column in columns).items():
         if count > 1:
-            raise schema.complaint(f"the column {name} occurs twice")
+            raise schema.validation_error(f"the column {name} occurs twice")
     return columns
 
 

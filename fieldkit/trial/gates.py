@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import Measured, cell, prefixed
+from fieldkit.core.columns import Measured, cell, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
@@ -17,7 +17,7 @@ from fieldkit.trial.procedure import PlacedStep
 
 
 @dataclass(frozen=True)
-class Judged:
+class EvidenceVerdict:
     """Judgement on the evidence of an attempt.
 
     Attributes:
@@ -30,7 +30,7 @@ class Judged:
     measured: Measured
 
 
-def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
+def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVerdict:
     """Measure an attempt and check that its evidence is complete.
 
     The evidence of steps inside a fault may be incomplete, because the fault disturbs it. Each column that a step
@@ -66,10 +66,10 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
         except Exception as error:  # noqa: BLE001 (see the docstring)
             why = f"the evidence of {placed.called} cannot be measured: {type(error).__name__}: {error}"
             problems.append(why)
-            result = Measured.nothing(placed.step.output_columns(), why)
-        measured |= result.named(placed.step.prefix)
+            result = Measured.all_missing(placed.step.output_columns(), why)
+        measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
-    return Judged(tuple(problems), measured)
+    return EvidenceVerdict(tuple(problems), measured)
 
 
 def _of_step(placed: PlacedStep, why: str) -> str:
@@ -90,8 +90,11 @@ def _impossible(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, s
     """
     for column in placed.step.output_columns():
         text = "" if column.type is str else cell(measured.values.get(column.name))
-        if text and (problem := "not a number" if text == "nan" else column.problem(text)):
-            yield column.name, f"the evidence gives {prefixed(placed.step.prefix, column.name)} as {text}, {problem}"
+        if text and (problem := "not a number" if text == "nan" else column.invalid_value_reason(text)):
+            yield (
+                column.name,
+                f"the evidence gives {step_prefixed(placed.step.prefix, column.name)} as {text}, {problem}",
+            )
 
 
 _TESTBED_FILES: Final[tuple[tuple[Callable[[Path], object], str], ...]] = (

@@ -28,7 +28,7 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> I
             if state is None:
                 yield f"{name}: {file} is missing, or cannot be read"
         if before is not None and after is not None:
-            yield from (f"{name}: {_LOST.format(section)}" for section in host.lacking(before, after))
+            yield from (f"{name}: {_LOST.format(section)}" for section in host.incomplete_sections(before, after))
         if before is not None and after is not None and role not in restarted_roles:
             if rebooted(before.boot, after.boot):
                 yield f"{name}: {REBOOTED}"
@@ -58,7 +58,11 @@ def rebooted(before: str | None, after: str | None) -> bool:
 
 
 def _clock_problems(before: HostState, after: HostState) -> Iterator[str]:
-    if before.clock is not None and after.clock is not None and (why := clock.problem(before.clock, after.clock)):
+    if (
+        before.clock is not None
+        and after.clock is not None
+        and (why := clock.step_description(before.clock, after.clock))
+    ):
         yield why
 
 
@@ -77,5 +81,5 @@ def _job_problems(
                 and any(evidence.has(file) for file in (planned.job.log, planned.job.stdout) if file)
             ):
                 yield f"its job {planned.job.name} ran, but its exit was not recorded"
-            if ending and (why := endings.problem(ending, planned.ends, planned.least_s)):
+            if ending and (why := endings.termination_error(ending, planned.permitted_causes, planned.least_s)):
                 yield f"its job {planned.job.name} {why}"

@@ -90,7 +90,7 @@ class Attempt:
 
 def claimed(folder: Path) -> AbstractContextManager[None]:
     """Return a context that locks a trial against other processes of fieldkit; raises as `jsonl.claimed`."""
-    return jsonl.claimed(folder / JOURNAL_FILE, "trial")
+    return jsonl.locked(folder / JOURNAL_FILE, "trial")
 
 
 def append(folder: Path, *entries: JournalEntry) -> None:
@@ -107,16 +107,16 @@ def reopen_failed(folder: Path, plan: Plan) -> int:
         EvidenceError: As for `history`.
         OSError: The disk is full or was removed.
     """
-    mend(folder)
+    remove_torn_line(folder)
     now = time.time_ns()
     failed = [attempt.repeat for attempt in ended(history(folder, plan)) if attempt.status is Status.FAILED]
     append(folder, *(JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in failed))
     return len(failed)
 
 
-def mend(folder: Path) -> None:
+def remove_torn_line(folder: Path) -> None:
     """Remove an incomplete last line that a crash has left; see `jsonl.mend`."""
-    jsonl.mend(folder / JOURNAL_FILE, _CODEC.parse)
+    jsonl.repair_last_line(folder / JOURNAL_FILE, _CODEC.parse)
 
 
 def read(folder: Path) -> list[JournalEntry]:
@@ -187,7 +187,7 @@ def ended(entries: list[JournalEntry]) -> list[Attempt]:
     ]
 
 
-def cut_short(entries: list[JournalEntry]) -> list[Attempt]:
+def interrupted(entries: list[JournalEntry]) -> list[Attempt]:
     """Return the attempts that started and did not end, `running` or `measured`, because fieldkit was killed."""
     over = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
     started = {

@@ -12,7 +12,7 @@ from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.expectations import Expectation, Scope
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.core.columns import Kind, prefixed
+from fieldkit.core.columns import Kind, step_prefixed
 
 LEAST_REPEATS: Final = 5
 """Losses over TCP may be bimodal (docs/studies/middleware-link.md): fewer repeats may all be of one mode."""
@@ -126,7 +126,7 @@ def topic_columns(rows: Repeats, prefix: str) -> Repeats:
     nothing = np.full(len(rows), np.nan)
 
     def values(name: str) -> NDArray[np.float64]:
-        return np.asarray(rows.numbers.get(prefixed(prefix, name), nothing), dtype=np.float64)
+        return np.asarray(rows.numbers.get(step_prefixed(prefix, name), nothing), dtype=np.float64)
 
     names = ("topic_sent", "topic_refused", "topic_skipped", "topic_received", _DELAY.name, _DELAY.of_sent or "")
     texts = {"status": rows.texts["status"], SOURCE: rows.texts[SOURCE]}

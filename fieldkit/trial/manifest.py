@@ -12,7 +12,7 @@ from typing import Final
 
 from fieldkit.core import files, laptop_files
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 from fieldkit.measure.positions import accounts
 from fieldkit.trial import store
 from fieldkit.trial.journal import JOURNAL_FILE
@@ -191,7 +191,7 @@ def _unchanged_lines(path: Path, digest: str) -> int | None:
     return None
 
 
-def few(problems: Mapping[str, str]) -> str:
+def summarize(problems: Mapping[str, str]) -> str:
     """Return a sentence with the first differences and the number of further ones."""
     sentences = _sentences(problems)
     more = len(sentences) - _MAX_LISTED
@@ -207,7 +207,7 @@ def _compared(names: Iterable[str], listed: Sums, present: Mapping[str, Path]) -
 
 
 def _sentences(problems: Mapping[str, str]) -> list[str]:
-    return [f"{harmless(name).replace(chr(10), '?')}: {what}" for name, what in sorted(problems.items())]
+    return [f"{sanitized(name).replace(chr(10), '?')}: {what}" for name, what in sorted(problems.items())]
 
 
 def _by_attempt(sums: Sums) -> dict[str, dict[str, str]]:
@@ -229,7 +229,7 @@ def _plain_files(folder: Path) -> Iterator[Path]:
     for where, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         paths = (Path(where, name) for name in names if not name.startswith("."))
-        yield from (path for path in paths if not files.foreign(path))
+        yield from (path for path in paths if not files.unexpected_type(path))
 
 
 def _name(folder: Path, path: Path) -> str:
@@ -256,7 +256,7 @@ def _parse(line: bytes) -> tuple[str, str]:
     is_escaped = text.startswith("\\")
     digest, separator, name = text.removeprefix("\\").partition("  ")
     if not separator or len(digest) != 64 or not _HEX_DIGITS.issuperset(digest):
-        raise ValueError(harmless(text))
+        raise ValueError(sanitized(text))
     return _unescaped(name) if is_escaped else name, digest
 
 

@@ -14,9 +14,9 @@ from typing import Annotated, Final
 
 from fieldkit.config.schema import Codec, Field
 from fieldkit.core import jsonl, laptop_files
-from fieldkit.core.errors import FieldkitError, MotionHeldError, typed
+from fieldkit.core.errors import FieldkitError, MotionHeldError, shell_command
 from fieldkit.core.model import MotionOrigin, Placement, Role, Topology
-from fieldkit.core.text import brief
+from fieldkit.core.text import shorten
 from fieldkit.steps.motions import STOPPED
 from fieldkit.steps.origins import RobotMotion
 
@@ -139,7 +139,7 @@ class MotionJournal:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        jsonl.mend(path, _CODEC.parse)
+        jsonl.repair_last_line(path, _CODEC.parse)
         self._entries = read(path)
 
     @property
@@ -156,7 +156,7 @@ class MotionJournal:
         self, event: MotionEvent, robot: str, *, place: str = "", origin: MotionOrigin | None = None, reason: str = ""
     ) -> None:
         """Add an entry; raises as `jsonl.append`."""
-        entry = MotionEntry(time.time_ns(), event, robot, place, origin, brief(reason))
+        entry = MotionEntry(time.time_ns(), event, robot, place, origin, shorten(reason))
         jsonl.append(self._path, _CODEC.dump(entry))
         self._entries.append(entry)
 
@@ -188,7 +188,7 @@ class KeptOrigins:
         may_return: See `Origins`.
     """
 
-    kept = True
+    robots_stay = True
 
     def __init__(
         self,
@@ -265,7 +265,7 @@ def held_error(held: Sequence[MotionHold], folder: Path) -> MotionHeldError:
     """Return the error for robots that may not move before a person has confirmed."""
     robots = "; ".join(f"{hold.robot}: {hold.reason}" for hold in held)
     campaign = folder.parent / laptop_files.CAMPAIGN
-    command = "fieldkit campaign, as before" if campaign.is_file() else typed("fieldkit", "resume", folder)
+    command = "fieldkit campaign, as before" if campaign.is_file() else shell_command("fieldkit", "resume", folder)
     return MotionHeldError(
         f"a fault stopped a robot, and no robot moves before a person confirms: {robots}",
         remedy=f"put the robot at its place, check that its path is free, then without --yes: {command}; or, if "

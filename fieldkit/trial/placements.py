@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Role, in_order
+from fieldkit.core.model import Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Ints
 from fieldkit.measure.evidence import host
@@ -47,12 +47,12 @@ def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
 def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
     places_m = scene.places_m
     try:
-        accounts = where.given(evidence).robots
+        accounts = where.position_accounts(evidence).robots
     except EvidenceError:
         return
-    for ends in combinations([role for role in in_order(accounts) if role in places_m], 2):
+    for ends in combinations([role for role in sort_roles(accounts) if role in places_m], 2):
         try:
-            source, destination = where.of_two(evidence, (ends[0], ends[1]))
+            source, destination = where.trajectories_of_pair(evidence, (ends[0], ends[1]))
             satellites = where.samples_of(evidence, ends[0]).frame == WGS84
         except EvidenceError:
             continue  # there are no distances then

@@ -128,7 +128,7 @@ class Plan(Strict):
 
     def shortfalls(self) -> Iterator[str]:
         """Yield a sentence for each expectation that the plan cannot decide, for example with too few repeats."""
-        return claims.shortfalls(self.procedure.expectations, self.procedure.figures, self.repeats)
+        return claims.unmet_requirements(self.procedure.expectations, self.procedure.figures, self.repeats)
 
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
         """Return descriptions of what the testbed does in one repeat besides running the commands."""

@@ -9,7 +9,7 @@ from typing import Final
 
 from fieldkit.core import files
 from fieldkit.core.columns import Measured
-from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest
+from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean
 from fieldkit.core.model import Role, Status
 from fieldkit.core.units import format_bytes, parse_offset_m
 from fieldkit.measure.attempt import AttemptEvidence
@@ -25,7 +25,7 @@ MOST_BYTES: Final = 64 << 20
 
 
 @dataclass(frozen=True)
-class Spotted:
+class AttemptPositions:
     """The position columns of one attempt.
 
     Attributes:
@@ -36,12 +36,12 @@ class Spotted:
     """
 
     attempt: str
-    told_by: str | None
+    source: str | None
     distances_m: Mapping[str, tuple[float, float]]
     missing: Mapping[str, str]
 
 
-def give(
+def set_positions(
     folder: Path, sources: Mapping[Role, Path | Account], *, offset_s: float, gap_s: float, heights: bool
 ) -> Rebuilt:
     """Store positions of robots with a trial, replacing those added before, and rebuild its tables.
@@ -69,7 +69,7 @@ def give(
         name: change for name, change in manifest.differences(folder).items() if not manifest.is_positions(name)
     }
     if changes:
-        problem = f"the evidence is not what was measured: {manifest.few(changes)}"
+        problem = f"the evidence is not what was measured: {manifest.summarize(changes)}"
         raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
     with journal.claimed(folder):
         accounts_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
@@ -86,7 +86,7 @@ def give(
 
 def _demand_role(plan: Plan, role: Role) -> None:
     if role not in plan.cast:
-        remedy = nearest(role, plan.cast, f"roles of the trial: {', '.join(plan.cast)}")
+        remedy = did_you_mean(role, plan.cast, f"roles of the trial: {', '.join(plan.cast)}")
         raise ConfigurationError(f"the trial has no role {role}", remedy=remedy)
 
 
@@ -116,7 +116,7 @@ def _remove_others(folder: Path, names: set[str]) -> None:
             path.unlink()
 
 
-def told(text: str) -> tuple[Role, Path | Account]:
+def parse_source(text: str) -> tuple[Role, Path | Account]:
     """Return a role and the position source of its robot: `receiver=walk.gpx`, `sender=48.1,11.5`, `sender=0m,5m`.
 
     A third number is the height above the ellipsoid in metres.
@@ -157,7 +157,7 @@ def _degrees_or_m(text: str) -> tuple[float, bool]:
         raise ValueError from error
 
 
-def spotted(folder: Path) -> Iterator[Spotted]:
+def attempt_positions(folder: Path) -> Iterator[AttemptPositions]:
     """Yield the position columns of each valid attempt of a trial, measured again.
 
     Raises:
@@ -169,7 +169,9 @@ def spotted(folder: Path) -> Iterator[Spotted]:
         if attempt.status is Status.VALID:
             evidence = AttemptEvidence(store.attempt_folder(folder, attempt.folder))
             measured = gates.judge(plan, attempt.repeat, evidence).measured
-            yield Spotted(attempt.folder, where.in_words(evidence), dict(_distances_m(measured)), _missing(measured))
+            yield AttemptPositions(
+                attempt.folder, where.sources_text(evidence), dict(_distances_m(measured)), _missing(measured)
+            )
 
 
 _SMALLEST: Final = "_distance_min_m"

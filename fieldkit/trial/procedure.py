@@ -16,8 +16,18 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, loops, schema
 from fieldkit.config.schema import Bool, Field, Int
 from fieldkit.core import laptop_files
-from fieldkit.core.errors import ConfigurationError, nearest
-from fieldkit.core.model import FIXED_ROLES, MOST_REPEATS, OnAbort, Post, Protocol, Role, Scenario, Topology, in_order
+from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.model import (
+    FIXED_ROLES,
+    MAX_REPEATS,
+    OnAbort,
+    Post,
+    Protocol,
+    Role,
+    Scenario,
+    Topology,
+    sort_roles,
+)
 from fieldkit.measure.evidence import host, link_samples
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds.move import PathLeg
@@ -26,7 +36,7 @@ from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import columns
 
-Repeats = Annotated[Int, Field(gt=0, le=MOST_REPEATS)]
+Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
 """Number of repeats per protocol."""
 
 
@@ -43,7 +53,7 @@ class Place(PathLeg):
     @schema.model_validator(mode="after")
     def _is_near_a_fixed_role(self) -> "Place":
         if self.near not in FIXED_ROLES:
-            raise schema.complaint(f"near must be one of: {', '.join(FIXED_ROLES)}", "near")
+            raise schema.validation_error(f"near must be one of: {', '.join(FIXED_ROLES)}", "near")
         return self
 
 
@@ -89,26 +99,28 @@ class Procedure(catalog.Named):
 
     @classmethod
     @override
-    def written_out(cls, document: schema.Document) -> schema.Document:
+    def expanded(cls, document: schema.Document) -> schema.Document:
         """Return the document with every `for:` written out."""
-        return loops.written_out(document, "steps")
+        return loops.expand_loops(document, "steps")
 
     @schema.model_validator(mode="after")
     def _has_a_place_for_each_role(self) -> "Procedure":
         """Reject a role without a place, which is most likely misspelled."""
         known_roles = (*FIXED_ROLES, *self.places)
         for placed in self.walk():
-            for role in in_order(placed.step.roles() - set(known_roles)):
+            for role in sort_roles(placed.step.roles() - set(known_roles)):
                 remedy = f"give its place: places: {{{role}: {{near: sender, left: 5m}}}}"
-                raise schema.complaint(f"there is no role {role}; {nearest(role, known_roles, remedy)}", *placed.at)
+                raise schema.validation_error(
+                    f"there is no role {role}; {did_you_mean(role, known_roles, remedy)}", *placed.at
+                )
         for role in self.on_abort:
             if role not in self.roles():
-                raise schema.complaint(f"no step has the role {role}", "on_abort", role)
+                raise schema.validation_error(f"no step has the role {role}", "on_abort", role)
         for role in self.places:
             if role in FIXED_ROLES:
-                raise schema.complaint(f"the place of the {role} follows from the distance", "places", role)
+                raise schema.validation_error(f"the place of the {role} follows from the distance", "places", role)
             if role not in self.roles():
-                raise schema.complaint(f"no step has the role {role}", "places", role)
+                raise schema.validation_error(f"no step has the role {role}", "places", role)
         return self
 
     @schema.model_validator(mode="after")
@@ -121,20 +133,20 @@ class Procedure(catalog.Named):
             step = placed.step
             before = [other.step for other in earlier if not placed.runs_beside(other)]
             if why := step.placement_error(before, placed.within):
-                raise schema.complaint(why, *placed.at)
+                raise schema.validation_error(why, *placed.at)
             for claim in step.exclusive_resources():
                 if (step.prefix, claim) in claimed:
-                    raise schema.complaint(_claimed_twice(step, claim), *placed.at)
+                    raise schema.validation_error(_claimed_twice(step, claim), *placed.at)
                 claimed.add((step.prefix, claim))
             for name in step.files():
                 if why := _file_conflict(step, name, files):
-                    raise schema.complaint(why, *placed.at)
+                    raise schema.validation_error(why, *placed.at)
                 files.add(name)
             if why := next(filter(None, map(placed.port_conflict, earlier)), None):
-                raise schema.complaint(why, *placed.at, "port")
+                raise schema.validation_error(why, *placed.at, "port")
             for column in columns.of_step(step):
                 if why := columns.clash(column, filled):
-                    raise schema.complaint(why, *placed.at)
+                    raise schema.validation_error(why, *placed.at)
                 filled.add(column.name)
             earlier.append(placed)
         return self
@@ -145,7 +157,7 @@ class Procedure(catalog.Named):
             try:
                 self._expectation(index)
             except ConfigurationError as error:
-                raise schema.complaint(f"{error.what}; {error.remedy}", "expect", index) from None
+                raise schema.validation_error(f"{error.what}; {error.remedy}", "expect", index) from None
         return self
 
     @property
@@ -267,7 +279,7 @@ class PlacedStep:
 
 def _file_conflict(step: Step, name: str, files: Set[str]) -> str | None:
     """Return the reason why a step cannot have a file of this name, or None if it can."""
-    if laptop_files.reserved(name) and name not in step.laptop_files():
+    if laptop_files.is_reserved(name) and name not in step.laptop_files():
         return f"only the laptop writes a file {name}; give it another name"
     return f"there is already a file {name}; give it, or its step, another name" if name in files else None
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.core import files
-from fieldkit.core.errors import EvidenceError, typed
+from fieldkit.core.errors import EvidenceError, shell_command
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, manifest, rows, store
 from fieldkit.trial.columns import Row
@@ -41,10 +41,10 @@ def rebuild(folder: Path) -> Rebuilt:
     plan = store.read_plan(folder)
     if differences := manifest.differences(folder):
         raise EvidenceError(
-            f"the evidence is not what was measured; the tables are not changed: {manifest.few(differences)}",
+            f"the evidence is not what was measured; the tables are not changed: {manifest.summarize(differences)}",
             where=str(folder),
             remedy="restore it from a copy; or show the results of the evidence as it is now: "
-            + typed("fieldkit", "aggregate", folder, "--rebuild"),
+            + shell_command("fieldkit", "aggregate", folder, "--rebuild"),
         )
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
     before = {name: _content(folder / name) for name in names}

@@ -21,7 +21,7 @@ from fieldkit.analysis.judgements import Judgement, Ruling
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.measure.evidence import reading
 from fieldkit.steps.base import Step
-from fieldkit.steps.middlewares import Over
+from fieldkit.steps.middlewares import Middleware
 from fieldkit.steps.streams import StreamOptions
 from fieldkit.trial import store
 from fieldkit.trial.link_cells import LinkCell, LinkCriterion, figure, link_cell, topic_columns
@@ -124,9 +124,9 @@ def _measured(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, 
 
 def _rmw(folder: Path, step: StreamOptions) -> str:
     """Return the RMW that the publishers of a trial reported; `unknown` unless exactly one was reported."""
-    if step.over is not Over.ROS2 or not isinstance(step, Step):
+    if step.over is not Middleware.ROS2 or not isinstance(step, Step):
         return ""
-    logs = folder.glob(f"repeats/*/{step.own_name(f'{step.sender}-topic.log')}")
+    logs = folder.glob(f"repeats/*/{step.prefixed_name(f'{step.sender}-topic.log')}")
     reported = {match[0] for log in logs for match in _RMW.finditer(reading.text(log))}
     return reported.pop() if len(reported) == 1 else "unknown"
 
@@ -134,7 +134,10 @@ def _rmw(folder: Path, step: StreamOptions) -> str:
 def _candidate(stream: StreamOptions, rmw: str) -> Candidate:
     quality = stream.qos.resolved()
     words = (quality.reliability.name.lower(), quality.history.name.lower(), str(quality.depth))
-    by_path = {**stream.own_settings, **({"RMW_IMPLEMENTATION": rmw} if stream.over is Over.ROS2 else {})}
+    by_path = {
+        **stream.middleware_settings,
+        **({"RMW_IMPLEMENTATION": rmw} if stream.over is Middleware.ROS2 else {}),
+    }
     settings = json.dumps(by_path, sort_keys=True)
     return Candidate(stream.over.value, stream.transport, settings, " ".join(words))
 
@@ -167,10 +170,12 @@ def assess_candidate(
 def _reason(judgement: Judgement) -> str:
     """Return the reason why a judgement does not hold, with the measured values."""
     unknown, demand = judgement.why or "not shown", judgement.expectation.text
-    if judgement.found is None or judgement.met is None:
+    if judgement.estimate is None or judgement.met is None:
         return f"{demand}: {unknown}"
     why = f"; {judgement.why}" if judgement.why else ""
-    return f"{demand} in {judgement.met} of {judgement.found.n} repeats, up to {judgement.found.maximum:.3g}{why}"
+    return (
+        f"{demand} in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}{why}"
+    )
 
 
 def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:
@@ -181,8 +186,8 @@ def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:
     for cell in assessment.cells:
         yield f"{cell.place}, samples of {cell.size_bytes:g} B: {cell.cell.n_valid} of {cell.attempts} repeats count."
         for judgement in judgements.judge(criterion.expectations, [cell.cell]):
-            if judgement.found is not None and judgement.met is not None:
-                met, n = judgement.met, judgement.found.n
+            if judgement.estimate is not None and judgement.met is not None:
+                met, n = judgement.met, judgement.estimate.n
                 least = f"{100 * share_low(met, n):.0f} % of all repeats do, with 95 % confidence"
                 yield f"  {judgement.expectation.text} in {met} of {n} repeats: at least {least}"
         yield f"  loss in %: {figure(cell.loss, 100.0)}"

@@ -9,9 +9,9 @@ from fieldkit.analysis import repeats, tables
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
-from fieldkit.core.columns import Column, Measured, Value, prefixed
+from fieldkit.core.columns import Column, Measured, Value, step_prefixed
 from fieldkit.core.events import NOTHING_ARRIVED
-from fieldkit.core.model import FIXED_ROLES, Role, in_order
+from fieldkit.core.model import FIXED_ROLES, Role, sort_roles
 from fieldkit.core.text import encodable
 from fieldkit.steps.base import Step
 from fieldkit.steps.nest import Nest
@@ -57,7 +57,7 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
         "sender": names.get(Role.SENDER),
         "receiver": names.get(Role.RECEIVER),
         "relay": names.get(Role.RELAY),
-        "others": " ".join(f"{role}={names[role]}" for role in in_order(names) if role not in FIXED_ROLES) or None,
+        "others": " ".join(f"{role}={names[role]}" for role in sort_roles(names) if role not in FIXED_ROLES) or None,
         "profiles_sha256": plan.profiles_sha256,
         "procedure_sha256": plan.procedure_sha256,
         "code_sha256": plan.code_sha256,
@@ -65,7 +65,7 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
     return {name: value for name, value in identity.items() if value is not None} | dict(measured.values)
 
 
-def in_words(plan: Plan, row: Row) -> str:
+def describe(plan: Plan, row: Row) -> str:
     """Return the most important numbers of a row for display, losses first: `IP loss 3.2 %, RTT 12.1 ms`.
 
     The steps that a fault disturbs come before the duration of the fault itself.
@@ -81,7 +81,7 @@ def in_words(plan: Plan, row: Row) -> str:
 
 def _of_step(step: Step, row: Row) -> Iterator[str]:
     """Return the most important numbers of a step, from the columns with its prefix."""
-    prefix = prefixed(step.prefix, "")
+    prefix = step_prefixed(step.prefix, "")
     return iter(
         step.summary(
             {column.removeprefix(prefix): value for column, value in row.items() if column.startswith(prefix)}

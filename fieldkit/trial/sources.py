@@ -14,7 +14,7 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.analysis.words import worded
 from fieldkit.core import files
 from fieldkit.core.columns import Column
-from fieldkit.core.errors import ConfigurationError, EvidenceError, nearest, typed
+from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
 from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
 
@@ -66,7 +66,7 @@ class Sources:
             if name not in names_allowed:
                 raise ConfigurationError(
                     f"{asked}: there is no column {name!r}",
-                    remedy=nearest(name, names_allowed, "fieldkit columns lists them"),
+                    remedy=did_you_mean(name, names_allowed, "fieldkit columns lists them"),
                 )
         return tuple(dict.fromkeys(names))
 
@@ -92,7 +92,7 @@ class Sources:
         if name not in self.quantities:
             raise ConfigurationError(
                 f"{asked}: repeats are not aggregated over {name!r}",
-                remedy=nearest(name, self.quantities, f"it is one of: {', '.join(self.quantities)}"),
+                remedy=did_you_mean(name, self.quantities, f"it is one of: {', '.join(self.quantities)}"),
             )
         return self.quantities[name]
 
@@ -104,7 +104,7 @@ class Sources:
         """
         by_source: dict[str, list[Expectation]] = {}
         for folder in (table.parent for table in self.tables if table.name == store.TRIAL_CSV):
-            if (folder / PLAN_FILE).is_file() and not files.foreign(folder / PLAN_FILE):
+            if (folder / PLAN_FILE).is_file() and not files.unexpected_type(folder / PLAN_FILE):
                 for text in frozen.expected(folder / PLAN_FILE):
                     try:
                         expectation = expectations.parse(text, self.quantities.values())
@@ -143,7 +143,7 @@ class Sources:
             raise EvidenceError(
                 "no repeat has ended yet",
                 where=self.where,
-                remedy=typed("fieldkit", "resume", started) if started else "name a trial that ran",
+                remedy=shell_command("fieldkit", "resume", started) if started else "name a trial that ran",
             )
         return attempts
 
@@ -192,21 +192,23 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
         yield path
         return
     if not path.is_dir():
-        raise ConfigurationError("there is no such file or folder", where=str(path), remedy=typed("ls", path.parent))
+        raise ConfigurationError(
+            "there is no such file or folder", where=str(path), remedy=shell_command("ls", path.parent)
+        )
     folders = list(_trials(path, set()))
     if not folders:
         raise ConfigurationError(
             "no trial is there or below",
             where=str(path),
-            remedy=f"name the folder that trials are in, or CSV files: {typed(path)}/*.csv",
+            remedy=f"name the folder that trials are in, or CSV files: {shell_command(path)}/*.csv",
         )
     for folder in folders:
-        if not rebuild and (reason := files.foreign(folder / store.TRIAL_CSV)):
+        if not rebuild and (reason := files.unexpected_type(folder / store.TRIAL_CSV)):
             note(f"{folder / store.TRIAL_CSV}: {reason}, and is left out")
         elif rebuild or (folder / store.TRIAL_CSV).is_file():
             yield folder / store.TRIAL_CSV
         else:
-            command = typed("fieldkit", "rebuild", folder)
+            command = shell_command("fieldkit", "rebuild", folder)
             note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {command}")
 
 
@@ -253,4 +255,4 @@ def note_differences(folder: Path, note: Note) -> None:
     from fieldkit.trial import manifest  # noqa: PLC0415 (as above)
 
     if differences := manifest.differences(folder):
-        note(f"{folder}: measured from changed evidence: {manifest.few(differences)}")
+        note(f"{folder}: measured from changed evidence: {manifest.summarize(differences)}")

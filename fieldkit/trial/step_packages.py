@@ -29,12 +29,12 @@ class StepPackage(Strict):
 
 def of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
     """Return the package of each kind of step that does not ship with fieldkit."""
-    others = set(names) - kinds.own()
+    others = set(names) - kinds.builtin()
     return {
         point.name: StepPackage(
             package=point.dist.name, version=point.dist.version, code_sha256=_code_hash(point.module)
         )
-        for point in plugins.points(plugins.STEPS)
+        for point in plugins.entry_points(plugins.STEPS)
         if point.name in others and point.dist is not None
     }
 

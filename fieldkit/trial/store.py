@@ -9,7 +9,7 @@ from typing import Final
 
 from fieldkit.config import schema
 from fieldkit.core import files, laptop_files
-from fieldkit.core.errors import ConfigurationError, EvidenceError, typed
+from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
 from fieldkit.core.model import RepeatId
 from fieldkit.measure.positions import accounts
 from fieldkit.trial import step_packages
@@ -119,7 +119,7 @@ def demand_plain(folder: Path) -> None:
 def unexpected_files(folder: Path) -> Iterator[tuple[Path, str]]:
     """Yield each path in a trial's folder that is neither a plain file nor one of its folders, and its type."""
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if file_type := files.foreign(path):
+        if file_type := files.unexpected_type(path):
             yield path, file_type
         elif path.name == REPEATS and path.is_dir():
             yield from _unexpected_below(path, DEPTH)
@@ -136,7 +136,7 @@ def _unexpected_below(folder: Path, depth: int) -> Iterator[tuple[Path, str]]:
             else:
                 yield from _unexpected_below(path, depth - 1)
         elif not entry.is_file(follow_symlinks=False):
-            yield path, files.foreign(path)
+            yield path, files.unexpected_type(path)
 
 
 def attempt_folder(folder: Path, name: str) -> Path:
@@ -205,5 +205,5 @@ def demand_space(folder: Path, needed_bytes: int) -> None:
         raise ConfigurationError(
             f"{free_bytes >> 20} MiB are free on this machine, an attempt needs {needed_bytes >> 20} MiB",
             where=str(folder),
-            remedy=f"free some space, then: {typed('fieldkit', 'resume', folder)}",
+            remedy=f"free some space, then: {shell_command('fieldkit', 'resume', folder)}",
         )

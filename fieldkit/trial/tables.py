@@ -7,7 +7,7 @@ from pathlib import Path
 from fieldkit.analysis import repeats
 from fieldkit.analysis.repeats import SOURCE
 from fieldkit.core import files
-from fieldkit.core.columns import Column, named, plain_name
+from fieldkit.core.columns import Column, plain_name, with_step_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import frozen, store
 from fieldkit.trial.columns import installed, trial_columns
@@ -77,16 +77,16 @@ def _others(table: Path, everywhere: Iterable[str]) -> list[str]:
 def _frozen(table: Path) -> tuple[Column, ...]:
     """Return the columns in the plan in the folder of a table."""
     plan = table.parent / PLAN_FILE
-    return frozen.read(plan) if plan.exists() and not files.foreign(plan) else ()
+    return frozen.read(plan) if plan.exists() and not files.unexpected_type(plan) else ()
 
 
 def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
     """Return the column of a name that no plan declares."""
     step, _, plain = name.rpartition(".")
     column = installed_columns.get(name) or (
-        installed_columns.get(plain_name(name)) and named(step, installed_columns[plain])
+        installed_columns.get(plain_name(name)) and with_step_name(step, installed_columns[plain])
     )
-    return column if column and not column.flaw() else repeats.undeclared(name)
+    return column if column and not column.declaration_error() else repeats.undeclared(name)
 
 
 def _type_of(column: Column) -> tuple[object, ...]:

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
-from fieldkit.core.text import harmless
+from fieldkit.core.text import sanitized
 from fieldkit.report.theme import CYCLE, LIGHT, METADATA, SETTINGS, Colour, Format, Marker
 from sim_backends.cosim.from_above import ObstacleOutline, last_heading
 from sim_backends.cosim.label_placement import LabelBox, Point, curve_boxes, place_labels, stack_labels
@@ -159,7 +159,7 @@ def run_figure(
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _RUN_INCHES), layout="constrained")
         grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.25))
         map_axes = figure.add_subplot(grid[:, 0])
-        map_axes.set_title(harmless(title))
+        map_axes.set_title(sanitized(title))
         _draw_paths(map_axes, paths_m)
         for outline in outlines:
             # Added as an artist without data, so that distant obstacles do not change the limits of the axes.
@@ -313,7 +313,7 @@ def _label(
     groups: dict[tuple[Point, ...], list[int]] = {}
     for index, line in enumerate(drawn):
         groups.setdefault(_points(axes, line), []).append(index)
-    texts = [harmless("\n".join(labels[index] for index in group)) for group in groups.values()]
+    texts = [sanitized("\n".join(labels[index] for index in group)) for group in groups.values()]
     sizes = [_text_size(text) for text in texts]
     scale = _POINTS_PER_INCH / axes.figure.dpi
     window = axes.get_window_extent()

@@ -5,18 +5,18 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from fieldkit.backends.driven import disturbed
+from fieldkit.backends.driven import topic_conflict
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site, load_site
-from fieldkit.core.errors import ConfigurationError, FieldkitError, nearest
+from fieldkit.core.errors import ConfigurationError, FieldkitError, did_you_mean
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
-from fieldkit.ros.ports import MOST_DOMAIN
+from fieldkit.ros.ports import MAX_DOMAIN
 from sim_backends.emulated.options import EmulatedOptions, Ros2Options, RosChoice, load_options
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
@@ -61,7 +61,7 @@ class EmulatedBackend:
         self._site = site
         self._document = document
         self._options = load_options(document)
-        with document.naming("emulated", "world") if document else nullcontext():
+        with document.locating_errors("emulated", "world") if document else nullcontext():
             self._world = load_world(self._options.world)
         hosts = [str(host) for host in NETWORK.hosts() if host != LAPTOP_ADDRESS]
         if len(site.robots) > len(hosts):
@@ -75,14 +75,14 @@ class EmulatedBackend:
                 raise ConfigurationError(
                     f"emulated.robots names {name!r}, which the lab does not have",
                     where=document.where(("emulated", "robots", name)) if document else "",
-                    remedy=nearest(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
+                    remedy=did_you_mean(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
                 )
         router = self._options.ros2.router
         if router is not None and router not in site.robots:
             raise ConfigurationError(
                 f"emulated.ros2.router names {router!r}, which the lab does not have",
                 where=document.where(("emulated", "ros2", "router")) if document else "",
-                remedy=nearest(router, site.robots, f"the robots are: {', '.join(site.robots)}"),
+                remedy=did_you_mean(router, site.robots, f"the robots are: {', '.join(site.robots)}"),
             )
         if site.control is Control.RADIO and LAPTOP_NAME in site.robots:
             raise ConfigurationError(
@@ -117,7 +117,7 @@ class EmulatedBackend:
 
         If other robots of the cast would receive its velocities too, the lab moves the robot instead.
         """
-        return drives_by_topic(robot.profile, self._options) and disturbed(robot, cast.values()) is None
+        return drives_by_topic(robot.profile, self._options) and topic_conflict(robot, cast.values()) is None
 
     @contextmanager
     def open(
@@ -150,7 +150,7 @@ class EmulatedBackend:
         ) as up:
             yield up
 
-    def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:  # noqa: ARG002 (none)
+    def persistent_shells(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:  # noqa: ARG002 (none)
         """Implement `Backend.standing`: emulated robots stop with their lab, so there are none."""
         return nullcontext({})
 
@@ -245,10 +245,10 @@ def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:
             where=name,
             remedy="write rmw: zenoh in a copy of the profile, or discovery: peers in the site file",
         )
-    if ros.domain > MOST_DOMAIN:
+    if ros.domain > MAX_DOMAIN:
         raise ConfigurationError(
             f"the ports of ROS_DOMAIN_ID {ros.domain} of the profile are ephemeral ports of Linux, which any program "
             "may use",
             where=name,
-            remedy=f"use a domain from 0 to {MOST_DOMAIN}",
+            remedy=f"use a domain from 0 to {MAX_DOMAIN}",
         )

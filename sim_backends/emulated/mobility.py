@@ -11,7 +11,7 @@ from typing import Final, Self
 from fieldkit.backends.protocols import Cast
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import Move, Placement, Role, Vector, Whereabouts
+from fieldkit.core.model import Move, Placement, Role, TrackPoint, Vector
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
@@ -124,7 +124,7 @@ class Mobility:
         # Start of each robot's last assigned path; motion that refers to an earlier path is ignored.
         self._path_starts_ns: dict[Role, int] = {}
         self._last_steered: dict[Role, Steered] = {}
-        self._track: list[Whereabouts] = []
+        self._track: list[TrackPoint] = []
         # Each motion runs in a separate thread.
         self._lock = threading.RLock()
 
@@ -203,7 +203,7 @@ class Mobility:
     def _steered(self) -> dict[Role, Steered]:
         return self_steered(self._robots, self._path_starts_ns)
 
-    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
+    def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
         """Return the positions of all robots from a time on; earlier ones are discarded."""
         with self._lock:
             last = {
@@ -265,7 +265,7 @@ class Mobility:
             now = (None, STILL) if state is None else (state.position_m, state.velocity_m_s)
             before = last.get(role)
             if before is None or (before.position_m, before.velocity_m_s) != now:
-                self._track.append(Whereabouts(utc_ns, role, *now))
+                self._track.append(TrackPoint(utc_ns, role, *now))
 
     def _steered_state(self, role: Role, steered: Steered) -> State:
         """Return the state of a robot that steers itself; a ground robot is at the height of the ground."""

@@ -105,9 +105,9 @@ class Node:
             raise
         return stream
 
-    def demand_up(self) -> None:
-        """Raise the errors of `Worker.demand_up` if the node does not run."""
-        self._worker.demand_up()
+    def check_alive(self) -> None:
+        """Raise the errors of `Worker.check_alive` if the node does not run."""
+        self._worker.check_alive()
 
     def hang_up(self) -> None:
         """Request that the node stops, without waiting for it; requests under way fail immediately."""

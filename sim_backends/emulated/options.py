@@ -90,7 +90,9 @@ class Ros2Options(Strict):
     @schema.model_validator(mode="after")
     def _check_router(self) -> "Ros2Options":
         if (self.discovery == "router") != (self.router is not None):
-            raise schema.complaint("`discovery: router` and `router: ROBOT`, which runs it, go together", "router")
+            raise schema.validation_error(
+                "`discovery: router` and `router: ROBOT`, which runs it, go together", "router"
+            )
         return self
 
 

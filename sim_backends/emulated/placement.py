@@ -66,7 +66,9 @@ def assigned_path(placement: Placement, move: Move, world: World, start_ns: int)
 
 def _corners_m(placement: Placement, move: Move, world: World) -> list[tuple[float, float]]:
     line, (start_along_m, start_left_m) = _line(placement, world), _along_line_m(placement)[move.role]
-    return [line.at(start_along_m + along_m, start_left_m + left_m) for along_m, left_m in geometry.way_m(move)]
+    return [
+        line.at(start_along_m + along_m, start_left_m + left_m) for along_m, left_m in geometry.path_corners_m(move)
+    ]
 
 
 def _line(placement: Placement, world: World) -> Line:

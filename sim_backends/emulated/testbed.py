@@ -20,9 +20,9 @@ from fieldkit.core.model import (
     Placement,
     Protocol,
     Role,
-    Whereabouts,
+    TrackPoint,
 )
-from fieldkit.core.prompts import DONE, NOBODY, Answer, Operator
+from fieldkit.core.prompts import DONE, UNATTENDED, Answer, Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
 from sim_backends.emulated import placement as places
@@ -57,7 +57,7 @@ class EmulatedOracle:
         self._late_bound_s = options.late_bound
         self._records_air = options.record_air
 
-    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
+    def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
         """Implement `Oracle.track` from the places that the medium received."""
         return self._mobility.track(since_utc_ns)
 
@@ -124,12 +124,12 @@ class EmulatedTestbed:
         """Implement `Testbed.oracle`."""
         return self._oracle
 
-    def demand_up(self) -> None:
-        """Implement `Transient.demand_up`."""
-        self.medium.demand_up()
+    def check_alive(self) -> None:
+        """Implement `Transient.check_alive`."""
+        self.medium.check_alive()
         nodes: list[Node] = [*self.robots.values()]
         for node in nodes if self._laptop is None else [*nodes, self._laptop]:
-            node.demand_up()
+            node.check_alive()
 
     def place(self, placement: Placement) -> Answer:
         """Implement `Testbed.place`; robots arrive immediately."""
@@ -186,7 +186,7 @@ def bring_up(
     control: Control = Control.SEPARATE,
     patience_s: float = PATIENCE_S,
     notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
-    operator: Operator = NOBODY,
+    operator: Operator = UNATTENDED,
 ) -> Iterator[EmulatedTestbed]:
     """Yield the testbed of a cast; leaving the context stops all its processes.
 
@@ -239,9 +239,9 @@ def _shell(
     def connect(timeout_s: float) -> socket.socket:
         if laptop is None:
             return robot.connect(timeout_s)
-        up.medium.demand_up()  # fail now instead of waiting for an answer that no process carries
+        up.medium.check_alive()  # fail now instead of waiting for an answer that no process carries
 
-        robot.demand_up()
+        robot.check_alive()
         return laptop.reach(robot.spec.ip, timeout_s)
 
     return SshShell(

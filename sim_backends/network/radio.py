@@ -6,7 +6,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, Final
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.network import ip
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss, active, changes_ns
@@ -260,7 +260,7 @@ class RadioNetwork:
         if name not in self._transports:
             raise ConfigurationError(
                 f"there is no transport {name!r}",
-                remedy=nearest(name, self._transports, f"take one of {', '.join(self._transports)}"),
+                remedy=did_you_mean(name, self._transports, f"take one of {', '.join(self._transports)}"),
             )
         return self._transports[name]
 
@@ -275,5 +275,5 @@ class RadioNetwork:
             if name not in self._names:
                 raise ConfigurationError(
                     f"there is no station {name!r}",
-                    remedy=nearest(name, self._names, f"take one of {', '.join(self._names)}"),
+                    remedy=did_you_mean(name, self._names, f"take one of {', '.join(self._names)}"),
                 )

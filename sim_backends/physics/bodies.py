@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import Body, Pose
 from sim_backends.physics.collisions import move, of_cylinder, overlaps
@@ -121,7 +121,7 @@ class Bodies:
         tracks = {}
         for name, command in told.items():
             if name not in self._bodies:
-                remedy = nearest(name, self._bodies, f"bodies: {', '.join(self._bodies)}")
+                remedy = did_you_mean(name, self._bodies, f"bodies: {', '.join(self._bodies)}")
                 raise ConfigurationError(f"a command is for {name}, which is no body", remedy=remedy)
             if command != self._commands[name]:
                 self._commands[name] = command

@@ -15,7 +15,7 @@ from fieldkit.config.schema import (
     Strict,
 )
 from fieldkit.core import units
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.radio.links import LinkParameters
 from sim_backends.radio.modes import G_MODES, N_MODES
 
@@ -28,7 +28,9 @@ _HOP_S: Final = 0.0002
 def _checked_mode(name: str) -> str:
     known = [mode.name for mode in (*G_MODES, *N_MODES)]
     if name not in known:
-        raise schema.complaint(f"there is no mode {name!r}; {nearest(name, known, 'modes: ' + ', '.join(known))}")
+        raise schema.validation_error(
+            f"there is no mode {name!r}; {did_you_mean(name, known, 'modes: ' + ', '.join(known))}"
+        )
     return name
 
 
@@ -38,9 +40,11 @@ def _checked_rate(text: str) -> str:
     try:
         rate_bit_s = units.parse_quantity(text, units.BITS_PER_S_PER_UNIT, "bit rate")
     except ConfigurationError as error:
-        raise schema.complaint(f"{error.what}; {error.remedy}, or the word {UNLIMITED}") from None
+        raise schema.validation_error(f"{error.what}; {error.remedy}, or the word {UNLIMITED}") from None
     if rate_bit_s < 1:
-        raise schema.complaint(f"bit rate {text!r} is below 1bit/s; write for example 20Mbit/s, or {UNLIMITED}")
+        raise schema.validation_error(
+            f"bit rate {text!r} is below 1bit/s; write for example 20Mbit/s, or {UNLIMITED}"
+        )
     return text
 
 

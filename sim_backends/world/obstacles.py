@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Int, Length, Number, Strict
-from fieldkit.core.errors import nearest
+from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.world.materials import MATERIALS
 from sim_backends.world.shapes import Box, Cylinder, Shape
@@ -30,8 +30,8 @@ _STEPS: Final = 8
 
 def _known(name: str) -> str:
     if name not in MATERIALS:
-        hint = nearest(name, MATERIALS, f"materials: {', '.join(MATERIALS)}")
-        raise schema.complaint(f"there is no material {name!r}; {hint}")
+        hint = did_you_mean(name, MATERIALS, f"materials: {', '.join(MATERIALS)}")
+        raise schema.validation_error(f"there is no material {name!r}; {hint}")
     return name
 
 

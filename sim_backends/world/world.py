@@ -11,7 +11,7 @@ import numpy as np
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
 from fieldkit.config.schema import Field, Strict
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Scenario
 from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
 from sim_backends.world.obstacles import Obstacle, Part, Place, Raised, Ramp, Real
@@ -140,6 +140,6 @@ def load_world(name: str) -> World:
     known = {path.stem: path for folder in (_SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
     if name not in known:
         raise ConfigurationError(
-            f"there is no world {name!r}", remedy=nearest(name, known, f"worlds: {', '.join(known)}")
+            f"there is no world {name!r}", remedy=did_you_mean(name, known, f"worlds: {', '.join(known)}")
         )
     return schema.load(known[name], World)

@@ -23,7 +23,7 @@ from fieldkit.ros.types import shipped
 from tests.helpers import topic_logs
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
-from tests.helpers.two_hosts import TestHost, cabled
+from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
 TYPE = "std_msgs/msg/UInt8MultiArray"
 SAMPLES = 40
@@ -87,7 +87,7 @@ class Cable:
 def cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cable]:
     program = tmp_path_factory.mktemp("agent") / "agent.pyz"
     program.write_bytes(agent.content())
-    with cabled() as hosts:
+    with two_connected_hosts() as hosts:
         yield Cable(hosts, program)
 
 

@@ -44,7 +44,7 @@ class MemoryLink:
         raise AssertionError("nobody closes it")
 
 
-def talk(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState, MemoryLink]:
+def state_from(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState, MemoryLink]:
     """Return the state of an autopilot that has sent these messages after its heartbeat."""
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=system, srcComponent=1)
     beat = d.MAVLink_heartbeat_message(2, PX4, ARMED, 6 << 16, 4, 3)
@@ -55,7 +55,7 @@ def talk(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState,
 
 
 def test_state_from_messages_of_an_autopilot() -> None:
-    state, _ = talk(
+    state, _ = state_from(
         d.MAVLink_local_position_ned_message(1, 1.0, -2.0, -3.0, 0.3, 0.4, 0.0),
         d.MAVLink_attitude_message(1, 0.1, 0.2, 1.5, 0, 0, 0),
         d.MAVLink_command_ack_message(400, 4),
@@ -76,7 +76,7 @@ def test_state_from_messages_of_an_autopilot() -> None:
 
 
 def test_other_systems_and_damaged_frames_are_ignored() -> None:
-    state, link = talk(d.MAVLink_local_position_ned_message(1, 1.0, 2.0, 3.0, 0, 0, 0))
+    state, link = state_from(d.MAVLink_local_position_ned_message(1, 1.0, 2.0, 3.0, 0, 0, 0))
     stranger = d.MAVLink(None, srcSystem=9, srcComponent=1)
     elsewhere = d.MAVLink_local_position_ned_message(2, 99.0, 99.0, 99.0, 0, 0, 0)
     damaged = bytearray(elsewhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)))
@@ -93,7 +93,7 @@ def test_other_systems_and_damaged_frames_are_ignored() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from([*mavlink_frames.EXTRA]), st.binary(max_size=60)), max_size=5))
 def test_any_payload_is_tolerated(payloads: list[tuple[int, bytes]]) -> None:
-    state, link = talk()
+    state, link = state_from()
     check = ArmingCheck(state, FlightNeeds(3.0, 5.0, 30.0, 0.2, returns=True))
     for kind, payload in payloads:
         body = bytes((len(payload), 0, 0, 0, 7, 1)) + kind.to_bytes(3, "little") + payload
@@ -106,7 +106,7 @@ def test_any_payload_is_tolerated(payloads: list[tuple[int, bytes]]) -> None:
 
 
 def test_sent_messages_are_those_of_pymavlink() -> None:
-    state, link = talk()
+    state, link = state_from()
     state.send_heartbeat()
     assert state.dialect is not None
     state.command(*state.dialect.guided_command())
@@ -141,7 +141,7 @@ def plan(way: list[tuple[float, float, float]]) -> FlightPlan:
 
 def test_acknowledgements_for_others_and_in_progress_are_ignored() -> None:
     ours, other = (245, 191), (255, 190)
-    state, _ = talk(
+    state, _ = state_from(
         d.MAVLink_command_ack_message(400, d.MAV_RESULT_DENIED, 0, 0, *other),
         d.MAVLink_command_ack_message(22, d.MAV_RESULT_IN_PROGRESS, 40, 0, *ours),
         d.MAVLink_command_ack_message(176, d.MAV_RESULT_ACCEPTED, 0, 0, *ours),

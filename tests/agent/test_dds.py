@@ -96,7 +96,7 @@ def test_setting_may_be_an_attribute() -> None:
 
 def test_library_accepts_the_recommended_settings() -> None:
     """It does not start if it does not know an element."""
-    settings = dict(tuning.tuned("dds", "tcp"))
+    settings = dict(tuning.recommended_settings("dds", "tcp"))
     dds.start(Network("127.0.0.1", discovery="peers", domain=97, settings=settings)).close()
     with pytest.raises(MiddlewareError, match="does not start"):
         dds.start(Network("127.0.0.1", discovery="peers", domain=97, settings={**settings, "General/Mox": "1"}))

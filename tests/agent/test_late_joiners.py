@@ -13,7 +13,7 @@ from fieldkit.ros import topics
 from fieldkit.ros.crossings import parse_qos
 from fieldkit.ros.types import shipped
 from tests.helpers.paths import ROOT
-from tests.helpers.two_hosts import TestHost, cabled
+from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
 WIRE_END = ROOT / "tests" / "ros" / "wire_end.py"
 TYPE = "std_msgs/msg/String"
@@ -45,7 +45,7 @@ def test_late_subscription_receives_the_last_samples(over: str, tmp_path: Path) 
     published = [bytes(store.serialize_cdr(store.types[TYPE](text), TYPE)).hex() for text in ("one", "two", "three")]
     file = tmp_path / "samples"
     file.write_text("\n".join(published), encoding="ascii")
-    with cabled() as (near, far), end(near, "say", over, file) as publisher:
+    with two_connected_hosts() as (near, far), end(near, "say", over, file) as publisher:
         with end(far, "hear", over, file) as ears:
             assert ears.stdout is not None
             for line in ears.stdout:

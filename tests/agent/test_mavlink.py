@@ -388,7 +388,7 @@ def test_connection_that_cannot_be_opened_is_reported(
 def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
     serial: bool, program: Path, tmp_path: Path
 ) -> None:
-    damage = drones.hostile(1)
+    damage = drones.damage_randomly(1)
     drone = drones.at_terminal(damage) if serial else drones.at_udp(damage)
     with drone as where:
         connection = f"{where}:115200" if serial else f"udpout:127.0.0.1:{where}"

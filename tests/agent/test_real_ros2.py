@@ -16,7 +16,7 @@ from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 from tests.helpers.paths import ROOT
-from tests.helpers.two_hosts import TestHost, cabled
+from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
 ROS2 = ROOT / ".ros2" / "bin" / "python"
 NODE = ROOT / "tests" / "agent" / "ros2_node.py"
@@ -47,7 +47,7 @@ def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
     sent, came = tmp_path / "sent", tmp_path / "came"
     command = (sys.executable, str(program))
     with (
-        cabled() as (near, far),
+        two_connected_hosts() as (near, far),
         near.start((*command, "subscribe", arguments(near, "/again", "ears"), str(came))) as subscriber,
         near.start((*command, "publish", arguments(near, "/stream", "mouth"), str(sent))) as publisher,
     ):

@@ -18,7 +18,7 @@ from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 from tests.helpers.paths import ROOT
-from tests.helpers.two_hosts import TestHost, cabled
+from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
 ROS2: Final = str(ROOT / ".ros2" / "bin" / "python")
 PYTHONS: Final = {"ros2": ROS2, "dds": sys.executable}
@@ -69,7 +69,7 @@ def read(path: Path, kind: int) -> list[tuple[int, ...]]:
 
 def exchange(program: Path, folder: Path) -> bool:
     """Stream in both directions at the same time; return True if all endpoints matched."""
-    with cabled() as (near, far), ExitStack() as stack:
+    with two_connected_hosts() as (near, far), ExitStack() as stack:
 
         def start(host: TestHost, over: str, verb: str, topic: str) -> subprocess.Popen[bytes]:
             what = arguments(over, host, topic, SIZES[topic], durability="transient_local", depth=100)
@@ -104,7 +104,7 @@ def test_ros_2_node_leaves_no_file_in_the_home_of_its_robot(program: Path, tmp_p
     home, job = tmp_path / "home", tmp_path / "job"
     home.mkdir()
     job.mkdir()
-    with cabled() as (near, _):
+    with two_connected_hosts() as (near, _):
         for more, what, code in (
             ((), {"patience_s": 0.0}, 0),
             # rcl exits the process.

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit.agent.drive_plan import BACK, END, OUT, DriveTask, way_s
+from fieldkit.agent.drive_plan import BACK, END, OUT, DriveTask, path_duration_s
 from fieldkit.agent.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
 
 TICK_S = 0.05
@@ -56,11 +56,11 @@ def run(
     """Yield each velocity until the drive ends or the robot stops at the end of its path; the lease is renewed."""
     for number in range(ticks):
         at_s = now_s + number * TICK_S
-        driver.odometry(at_s, robot.odometry())
-        driver.renewed(at_s, order)
+        driver.on_odometry(at_s, robot.odometry())
+        driver.on_order(at_s, order)
         velocity = driver.tick(at_s)
         yield velocity
-        if driver.over or (order == OUT and driver.phase == "there"):
+        if driver.is_finished or (order == OUT and driver.phase == "there"):
             return
         robot.drive(velocity, TICK_S)
 
@@ -119,9 +119,9 @@ def test_any_odometry_and_order_keep_the_limits(
     for for_s, pose, order in leg:
         now_s += for_s
         if pose is not None:
-            driver.odometry(now_s, pose)
+            driver.on_odometry(now_s, pose)
         if order:
-            driver.renewed(now_s, order)
+            driver.on_order(now_s, order)
         velocity = driver.tick(now_s)
         assert 0 <= velocity.forward_m_s <= TASK.speed_m_s
         assert abs(velocity.turn_rad_s) <= TASK.turn_rad_s
@@ -143,14 +143,14 @@ def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: boo
     while not driver.stopped:
         now_s += TICK_S
         if hears:
-            driver.odometry(now_s, robot.odometry())
+            driver.on_odometry(now_s, robot.odometry())
         if renews:
-            driver.renewed(now_s, OUT)
+            driver.on_order(now_s, OUT)
         robot.drive(driver.tick(now_s), TICK_S)
         assert now_s < since_s + 100
     assert driver.tick(now_s) == ZERO_VELOCITY
-    driver.renewed(now_s, BACK)
-    driver.odometry(now_s, robot.odometry())
+    driver.on_order(now_s, BACK)
+    driver.on_odometry(now_s, robot.odometry())
     assert driver.tick(now_s + TICK_S) == ZERO_VELOCITY, "the stop is final"
     return now_s - since_s
 
@@ -180,17 +180,17 @@ def test_stops_at_its_fence_and_after_its_time_limit() -> None:
 def test_jumping_odometry_and_an_order_stop_it() -> None:
     driver, robot, since_s = moving()
     robot.pose = robot.pose._replace(x_m=robot.pose.x_m + 1.0)
-    driver.odometry(since_s + TICK_S, robot.odometry())
+    driver.on_odometry(since_s + TICK_S, robot.odometry())
     assert driver.tick(since_s + TICK_S) == ZERO_VELOCITY
     assert driver.stopped.startswith("odometry jumped by 1")
     driver, _, since_s = moving()
-    driver.renewed(since_s, END)
+    driver.on_order(since_s, END)
     assert (driver.tick(since_s), driver.stopped) == (ZERO_VELOCITY, "ordered to stop")
 
 
 def test_waits_for_its_laptop_and_turns_back_at_its_position() -> None:
     driver = Driver(TASK, 0.0)
-    driver.odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
+    driver.on_odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
     assert [driver.tick(number * TICK_S) for number in range(20)] == [ZERO_VELOCITY] * 20
     driver, robot, since_s = moving(replace(TASK, legs=[(2.0, 0.0), (0.0, 2.0)]))
     farthest = 0.0
@@ -216,18 +216,18 @@ def test_duration_of_a_path_is_predicted(
     driver = Driver(task, 0.0)
     took_s = len(list(run(driver, Robot(OdometryPose(1.0, 2.0, 0.5)), ticks=20_000))) * TICK_S
     assert driver.phase == "there"
-    assert way_s(task) == pytest.approx(took_s, rel=0.1, abs=0.5 + 0.5 * len(legs))
+    assert path_duration_s(task) == pytest.approx(took_s, rel=0.1, abs=0.5 + 0.5 * len(legs))
 
 
 @pytest.mark.parametrize("leg", [(1.0, 0.0), (0.0, 1.0)])
 def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
     driver, pose = Driver(replace(TASK, legs=[leg]), 0.0), OdometryPose(0.0, 0.0, math.atan2(*reversed(leg)))
-    driver.odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
+    driver.on_odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
     way_m = 0.0
     for number in range(1, 1200):
         at_s = number * TICK_S
-        driver.odometry(at_s, pose if driver.phase != "waits" else OdometryPose(0.0, 0.0, 0.0))
-        driver.renewed(at_s, OUT)
+        driver.on_odometry(at_s, pose if driver.phase != "waits" else OdometryPose(0.0, 0.0, 0.0))
+        driver.on_order(at_s, OUT)
         way_m += driver.tick(at_s).forward_m_s * TICK_S
         if driver.stopped:
             break
@@ -261,8 +261,8 @@ def test_later_repeats_use_the_heading_of_the_origin() -> None:
 
 def test_gap_between_two_iterations_stops_it() -> None:
     driver, robot, since_s = moving()
-    driver.renewed(since_s + 6.0, OUT)
-    driver.odometry(since_s + 6.0, robot.odometry())
+    driver.on_order(since_s + 6.0, OUT)
+    driver.on_odometry(since_s + 6.0, robot.odometry())
     assert driver.tick(since_s + 6.0) == ZERO_VELOCITY
     assert driver.stopped == "its program was suspended for 6.0 s"
 

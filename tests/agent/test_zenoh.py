@@ -64,10 +64,12 @@ def test_settings_are_json_values_or_texts() -> None:
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
 def test_library_accepts_the_recommended_settings(transport: str) -> None:
     """It refuses a path, or a value, that it does not know."""
-    tuned = tuning.tuned("zenoh", transport)
-    configuration = adapter.configuration(Network("10.0.0.1", transport=transport, settings=tuned), "peer")
+    recommended_settings = tuning.recommended_settings("zenoh", transport)
+    configuration = adapter.configuration(
+        Network("10.0.0.1", transport=transport, settings=recommended_settings), "peer"
+    )
     config = zenoh.Config()
-    for path in tuned:
+    for path in recommended_settings:
         config.insert_json5(path, json.dumps(configuration[path]))
     (publication,) = json.loads(config.get_json("qos/publication"))
     assert publication["config"]["congestion_control"] == "block_first"

@@ -40,7 +40,7 @@ def test_a_run_compared_with_itself_has_no_difference() -> None:
     assert {difference.value for difference in result.differences} == {0.0}
     assert {difference.cliffs_delta for difference in result.differences} == {0.0}
     assert {difference.p_holm for difference in result.differences} == {1.0}
-    assert not any(difference.seen for difference in result.differences)
+    assert not any(difference.excludes_zero for difference in result.differences)
 
 
 def test_a_known_shift_is_detected() -> None:
@@ -49,7 +49,7 @@ def test_a_known_shift_is_detected() -> None:
     assert difference.interval is not None
     assert difference.value == pytest.approx(0.005)
     assert difference.interval.low < 0.005 < difference.interval.high
-    assert difference.seen
+    assert difference.excludes_zero
     assert difference.cliffs_delta is not None
     assert difference.cliffs_delta > 0.5
 
@@ -113,22 +113,22 @@ def test_a_single_repeat_has_a_difference_and_no_interval() -> None:
 def test_the_whole_interval_must_be_within_a_threshold(limit_s: float, repeats: int, *, within: bool) -> None:
     result = compared(UDP, UDP[:repeats], thresholds={"rtt_median_s": limit_s})
     assert only(result, "rtt_median_s").within is within
-    assert result.missed is not within
+    assert result.exceeds_threshold is not within
 
 
 def test_a_point_within_a_threshold_is_not_enough() -> None:
     difference = only(compared(UDP, UDP), "rtt_median_s")
     assert difference.interval is not None
-    assert compared(UDP, UDP, thresholds={"rtt_median_s": 0.99 * difference.interval.high}).missed
-    assert not compared(UDP, UDP, thresholds={"rtt_median_s": 1.01 * difference.interval.high}).missed
+    assert compared(UDP, UDP, thresholds={"rtt_median_s": 0.99 * difference.interval.high}).exceeds_threshold
+    assert not compared(UDP, UDP, thresholds={"rtt_median_s": 1.01 * difference.interval.high}).exceeds_threshold
 
 
 def test_a_condition_of_only_one_run_is_not_within_the_threshold() -> None:
     far = moved(UDP, distance="55ft", distance_m=16.764)
-    assert compared([*UDP, *far], UDP, thresholds={"rtt_median_s": 1.0}).missed
-    assert compared(UDP, [*UDP, *far], thresholds={"rtt_median_s": 1.0}).missed
+    assert compared([*UDP, *far], UDP, thresholds={"rtt_median_s": 1.0}).exceeds_threshold
+    assert compared(UDP, [*UDP, *far], thresholds={"rtt_median_s": 1.0}).exceeds_threshold
     without = moved(far, rtt_median_s=None)
-    assert not compared([*UDP, *without], UDP, thresholds={"rtt_median_s": 1.0}).missed
+    assert not compared([*UDP, *without], UDP, thresholds={"rtt_median_s": 1.0}).exceeds_threshold
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_the_same_concern_of_many_conditions_is_reported_once() -> None:
 def test_swapping_the_runs_changes_all_signs(seed: int, n: int, m: int) -> None:
     a, b = bursty(COMPARABLE, n, seed=seed), bursty(COMPARABLE, m, seed=seed + 1)
     there, back = (compared(*runs, thresholds={"ip_loss": 0.1, "rtt_median_s": 0.002}) for runs in ((a, b), (b, a)))
-    assert there.missed == back.missed
+    assert there.exceeds_threshold == back.exceeds_threshold
     for difference, other in zip(there.differences, back.differences, strict=True):
         assert difference.value == -(other.value or 0)
         assert difference.cliffs_delta == -(other.cliffs_delta or 0)

@@ -15,7 +15,7 @@ from fieldkit.analysis.judgements import Judgement, Ruling
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.statistics import medians
-from fieldkit.core.columns import Column, Figure, Kind, columns, named
+from fieldkit.core.columns import Column, Figure, Kind, columns, with_step_name
 from fieldkit.core.model import ENDED
 from fieldkit.measure.evidence import ping
 
@@ -105,7 +105,7 @@ def test_missing_repeats_are_counted_in_all_outputs() -> None:
     cell = gaps([0.2] * 8, missing=2)
     result = judged("rtt_gap_s < 2 s", cell)
     assert (result.ruling, result.why) == (Ruling.OPEN, "2 of 10 repeats have no value")
-    assert wording.judged(result)[2] == "200 ms (8 of 10)"
+    assert wording.judgement_texts(result)[2] == "200 ms (8 of 10)"
     shown = [Quantity.of(column) for column in GAP]
     markdown = tables.to_markdown(BY, [cell], [quantity for quantity in shown if quantity])
     assert "(8 of 10)" in markdown
@@ -172,8 +172,8 @@ def test_a_median_rtt_of_the_answers_is_judged_over_all_requests(
     cell = rtt([0.1] * 10, of_sent_s)
     result = judged("rtt_median_s < 200 ms", cell, RTT)
     assert (result.ruling, result.why) == (ruling, why)
-    assert result.found is not None
-    assert (result.found.value, result.found.high) == (0.1, 0.1), "the figure itself is unchanged"
+    assert result.estimate is not None
+    assert (result.estimate.value, result.estimate.high) == (0.1, 0.1), "the figure itself is unchanged"
     assert judged("rtt_median_s < 50 ms", cell, RTT).ruling is Ruling.FAILS
     every = judged("every rtt_median_s < 200 ms", cell, RTT)
     assert every.holds is (ruling is Ruling.HOLDS)
@@ -193,12 +193,12 @@ def test_a_table_without_the_median_of_all_requests_gives_no_decision() -> None:
 
 
 def test_steps_with_names_have_separate_optional_columns() -> None:
-    (gap, *_) = (named("up", column) for column in GAP)
+    (gap, *_) = (with_step_name("up", column) for column in GAP)
     assert gap.figure is not None
     assert gap.figure.at_least == "up.rtt_gap_at_least_s"
 
 
 def test_means_have_no_lower_bounds() -> None:
     (column,) = columns(100, ("stalls", "count", "Stalls.", Figure("stalls", Kind.MEAN, at_least="other")))
-    flaw = "only a median can have a column of lower bounds (at_least) or of all sent items (of_sent)"
-    assert column.flaw() == flaw
+    error = "only a median can have a column of lower bounds (at_least) or of all sent items (of_sent)"
+    assert column.declaration_error() == error

@@ -18,7 +18,7 @@ KNOWN = (PACKETS, GAP, BACK, RATE, RETRIES)
 
 
 def warning(text: str, repeats: int) -> str:
-    return " ".join(claims.shortfalls([expectations.parse(text, KNOWN)], KNOWN, repeats))
+    return " ".join(claims.unmet_requirements([expectations.parse(text, KNOWN)], KNOWN, repeats))
 
 
 @pytest.mark.parametrize(

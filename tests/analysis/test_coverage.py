@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
-from tests.helpers.nightly import others_at_night
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
 
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
@@ -59,8 +59,8 @@ def in_method(*key: str) -> list[float]:
     return [float(number) for number in row.split("|")]
 
 
-@pytest.mark.parametrize("rate", others_at_night(RATES))
-@pytest.mark.parametrize("packets", others_at_night([36, 215]))
+@pytest.mark.parametrize("rate", mark_nightly(RATES))
+@pytest.mark.parametrize("packets", mark_nightly([36, 215]))
 def test_shares_cover_for_any_burst_length(
     packets: int, rate: float, record_property: Callable[[str, object], None]
 ) -> None:
@@ -82,7 +82,7 @@ def test_shares_cover_for_any_burst_length(
     )
 
 
-@pytest.mark.parametrize("n", others_at_night([2, 3, 5, 10]))
+@pytest.mark.parametrize("n", mark_nightly([2, 3, 5, 10]))
 def test_shares_of_few_repeats_cover_nearly_as_often(n: int, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(12)
     coverages = [
@@ -97,7 +97,7 @@ def test_shares_of_few_repeats_cover_nearly_as_often(n: int, record_property: Ca
     assert min(coverages) > 92
 
 
-@pytest.mark.parametrize("burst", others_at_night(BURSTS, in_ci=[5]))
+@pytest.mark.parametrize("burst", mark_nightly(BURSTS, in_ci=[5]))
 def test_shares_cover_if_repeats_send_different_numbers(
     burst: int, record_property: Callable[[str, object], None]
 ) -> None:
@@ -109,8 +109,8 @@ def test_shares_cover_if_repeats_send_different_numbers(
     assert BAND[0] <= coverages <= BAND[1]
 
 
-@pytest.mark.parametrize("rate", others_at_night([0.05, 0.35]))
-@pytest.mark.parametrize("largest", others_at_night([36, 540]))
+@pytest.mark.parametrize("rate", mark_nightly([0.05, 0.35]))
+@pytest.mark.parametrize("largest", mark_nightly([36, 540]))
 def test_shares_cover_less_if_repeats_differ_strongly(
     rate: float, largest: int, record_property: Callable[[str, object], None]
 ) -> None:
@@ -147,7 +147,7 @@ def percentile_bootstrap(random: np.random.Generator, values: Floats) -> Interva
     return Intervals(values.mean(axis=1), low, high)
 
 
-@pytest.mark.parametrize("name", others_at_night(TIMES, in_ci=["lognormal, sigma 1"]))
+@pytest.mark.parametrize("name", mark_nightly(TIMES, in_ci=["lognormal, sigma 1"]))
 def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(14)
     draw, mean, middle = TIMES[name]
@@ -163,7 +163,7 @@ def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Call
     assert in_method(name) == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
 
 
-@pytest.mark.parametrize("burst", others_at_night([5, 20]))
+@pytest.mark.parametrize("burst", mark_nightly([5, 20]))
 def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(15)
     packets, rate = 215, 0.35
@@ -199,7 +199,7 @@ SHAPES: Final[dict[str, tuple[Draw, float]]] = {
 FEW_AND_MANY: Final = (2, 3, 4, 5, 6, 7, 10, 20, 30)
 
 
-@pytest.mark.parametrize("name", others_at_night(SHAPES, in_ci=["two humps, 60:40"]))
+@pytest.mark.parametrize("name", mark_nightly(SHAPES, in_ci=["two humps, 60:40"]))
 def test_medians_have_the_assured_coverage_for_any_distribution(
     name: str, record_property: Callable[[str, object], None]
 ) -> None:

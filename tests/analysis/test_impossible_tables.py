@@ -156,7 +156,7 @@ def likely(column: Column) -> st.SearchStrategy[str]:
 
 def holed(column: Column) -> st.SearchStrategy[str]:
     """Possible or empty cells of a column."""
-    return likely(column).filter(lambda text: column.problem(text) is None)
+    return likely(column).filter(lambda text: column.invalid_value_reason(text) is None)
 
 
 CHOSEN = (
@@ -272,7 +272,7 @@ def test_every_column_accepts_exactly_its_possible_values(drawn: tuple[Column, s
     column, text = drawn
     line = dict.fromkeys(COLUMNS, "") | {"status": "valid", column.name: text}
     content = _text([line]).encode()
-    problem = column.problem(text)
+    problem = column.invalid_value_reason(text)
     if column.name == "schema_version" and not problem and float(text or "nan") > SCHEMA_VERSION:
         problem = "newer"
     if problem is None:

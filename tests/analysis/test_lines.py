@@ -74,10 +74,10 @@ def test_a_condition_without_any_reply_is_shown(tmp_path: Path, capsys: pytest.C
 
 def test_radio_losses_of_tcp_and_udp_are_one_line_unless_a_condition_has_both() -> None:
     cells = cells_of([TCP, PINGED])
-    figures = shown(cells, lines.with_radio_loss(lines.of_operator(cells), cells))
+    figures = shown(cells, lines.with_radio_loss(lines.operator_lines(cells), cells))
     assert figures["radio loss"] == ["1.00 %", "4.63 %"]
     together = cells_of([replace(PINGED, tcp_byte_loss=0.01)])
-    labels = shown(together, lines.with_radio_loss(lines.of_operator(together), together))
+    labels = shown(together, lines.with_radio_loss(lines.operator_lines(together), together))
     assert {"IP packet loss", "TCP byte loss before retransmission"} <= labels.keys()
     assert "radio loss" not in labels
 
@@ -89,7 +89,7 @@ def test_lines_for_an_operator_include_expected_and_additional_quantities() -> N
     row["probe.level"] = -60.0
     content = rows.to_csv([row], columns).encode()
     cells = aggregate(repeats.parse(content, columns))
-    labels = [line.label for line in lines.of_operator(cells)]
+    labels = [line.label for line in lines.operator_lines(cells)]
     assert "probe: level, median" in labels
     others = {
         "jitter_s": "last jitter value (RFC 3550), median",
@@ -98,7 +98,7 @@ def test_lines_for_an_operator_include_expected_and_additional_quantities() -> N
     }
     for name, label in others.items():
         assert label not in labels
-        assert label in [line.label for line in lines.of_operator(cells, {name})]
+        assert label in [line.label for line in lines.operator_lines(cells, {name})]
     assert labels.index("file loss") < labels.index("ping loss") < labels.index("RTT, 8192-byte ping, median")
 
 
@@ -107,13 +107,13 @@ def test_figures_of_equal_rank_are_in_the_order_of_columns() -> None:
     columns = (*trial_columns(), *additional)
     row = replace(PINGED) | {column.name: 7.4 for column in additional}
     cells = aggregate(repeats.parse(rows.to_csv([row], columns).encode(), columns))
-    labels = [line.label for line in lines.of_operator(cells)]
+    labels = [line.label for line in lines.operator_lines(cells)]
     assert [label for label in labels if label.startswith("m")] == [f"m{n}, median" for n in range(12)]
 
 
 def test_all_lines_are_shown_if_none_is_for_an_operator() -> None:
     bare = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
-    assert [line.label for line in lines.of_operator(cells_of([bare]))] == ["transfer time, median"]
+    assert [line.label for line in lines.operator_lines(cells_of([bare]))] == ["transfer time, median"]
 
 
 def test_sent_packets_are_summed_over_all_valid_repeats() -> None:

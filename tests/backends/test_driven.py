@@ -2,7 +2,7 @@
 
 import pytest
 
-from fieldkit.backends.driven import disturbed
+from fieldkit.backends.driven import topic_conflict
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import RobotProfile
 from tests.helpers.casts import DUCKIEDRONE, TURTLEBOT, ros_of
@@ -42,16 +42,16 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
     ],
 )
 def test_conflicts_of_robots_with_one_master(other: Robot, why: str | None) -> None:
-    reason = disturbed(robot("one", master=MASTER), [other])
+    reason = topic_conflict(robot("one", master=MASTER), [other])
     assert reason == why if why is None else reason is not None and reason.startswith(why)
 
 
 @pytest.mark.parametrize(("domain", "alone"), [("", False), ("0", False), ("7", True)])
 def test_conflicts_of_robots_with_ros2_domains(domain: str, alone: bool) -> None:
-    reason = disturbed(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
+    reason = topic_conflict(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
     assert (reason is None) is alone
     assert alone or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
 
 
 def test_robots_with_separate_masters_have_no_conflict() -> None:
-    assert disturbed(robot("one"), [robot("other")]) is None
+    assert topic_conflict(robot("one"), [robot("other")]) is None

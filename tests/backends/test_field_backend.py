@@ -11,7 +11,7 @@ from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Placement, Role, Scenario, Topology
-from fieldkit.core.prompts import DONE, Answer, Nobody, Question
+from fieldkit.core.prompts import DONE, Answer, Question, Unattended
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.running import preflight
 from tests.helpers.sshd import Server, make_key
@@ -79,10 +79,10 @@ def test_changed_host_key_is_an_error(tmp_path: Path, access: str) -> None:
     field = backend(tmp_path, re.sub(r"host_key: .*", f"host_key: {other}", access))
     cast = field.cast(Topology.MASTERLESS)
     with (
-        field.open(cast, seed=1, sink=lambda event: None, operator=Nobody()) as lab,
+        field.open(cast, seed=1, sink=lambda event: None, operator=Unattended()) as lab,
         pytest.raises(RobotError, match="host key changed") as caught,
     ):
-        preflight.meet(cast, lab.shells, lambda event: None)
+        preflight.connect_all(cast, lab.shells, lambda event: None)
     assert "turtlebot-1" in caught.value.what
     assert "duckiedrone-1" in caught.value.what, "all robots are tried"
 
@@ -106,7 +106,7 @@ def test_unreadable_key_file_is_named(tmp_path: Path, access: str) -> None:
     cast = field.cast(Topology.MASTERLESS)
     with (
         pytest.raises(ConfigurationError, match="/no/such/key cannot be read"),
-        field.open(cast, seed=1, sink=lambda event: None, operator=Nobody()),
+        field.open(cast, seed=1, sink=lambda event: None, operator=Unattended()),
     ):
         raise AssertionError("opened")
 

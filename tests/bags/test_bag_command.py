@@ -184,7 +184,7 @@ def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path)
     assert report.problems == (
         "there is no metadata.yaml: the recorder was stopped before it closed the bag, or it was not copied",
     )
-    assert report.savable == 41
+    assert report.recoverable_messages == 41
     contents.repair(remaining, tmp_path / "saved")
     assert [text for _, _, text in read(tmp_path / "saved")] == [*(text for _, _, text in messages), "late"]
     assert {path.name: path.read_bytes() for path in remaining.iterdir()} == before, "it is not changed"

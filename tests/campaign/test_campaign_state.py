@@ -16,7 +16,7 @@ from fieldkit.campaign.runner import PLACING_S, CampaignRun
 from fieldkit.config.site import load_site
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.events import CampaignEnded, CampaignPlanned, Event
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from fieldkit.trial.running.stop import Stop
 from tests.helpers.paths import ROOT
 
@@ -53,7 +53,7 @@ def begin(lawn: Path) -> tuple[CampaignPlan, CampaignJournal]:
 
 def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) -> None:
     asked, journal = begin(lawn)
-    with journal.kept(asked):
+    with journal.claimed(asked):
         lawn.write_text(f"# dry grass\n{LAWN}", encoding="utf-8")
     again, document = plan.make_plan(lawn, "field")
     frozen = plan.begun(journal.folder, again, document)
@@ -74,7 +74,7 @@ def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) 
 )
 def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str, line: int, named: str) -> None:
     asked, journal = begin(lawn)
-    with journal.kept(asked):
+    with journal.claimed(asked):
         lawn.write_text(LAWN.replace(old, new), encoding="utf-8")
     again, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
     with pytest.raises(ConfigurationError) as caught:
@@ -87,7 +87,7 @@ def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str,
 def test_a_changed_procedure_is_rejected(lawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(lawn.parent)
     asked, journal = begin(lawn)
-    with journal.kept(asked):
+    with journal.claimed(asked):
         Path("procedures").mkdir()
     shipped = ROOT / "procedures" / "los.yaml"
     changed = shipped.read_text(encoding="utf-8").replace("count: 10", "count: 11")
@@ -110,7 +110,7 @@ def test_an_impossible_walk_is_rejected_with_the_minimum(lawn: Path) -> None:
 def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
     asked, journal = begin(lawn)
     first, second, third, *_ = asked.trials()
-    with journal.kept(asked):
+    with journal.claimed(asked):
         for trial in (first, second, third):
             journal.add(trial, TrialProgress.STARTED, trial=f"trial of {trial}")
         journal.add(first, TrialProgress.PLACED, took_s=30.0, note="windy")
@@ -135,7 +135,7 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
     lawn.write_text(LAWN, encoding="utf-8")
     asked, journal = begin(lawn)
     trials = asked.trials()
-    with journal.kept(asked):
+    with journal.claimed(asked):
         for trial in trials[:-1]:
             journal.add(trial, TrialProgress.ENDED, valid=1)
     path = journal.folder / JOURNAL_FILE
@@ -144,7 +144,7 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
     kept = CampaignJournal(journal.folder)
     complete = len(kept.ended())
     assert complete >= path.read_bytes().count(b"\n")
-    with kept.kept(asked):
+    with kept.claimed(asked):
         kept.add(trials[-1], TrialProgress.ENDED, valid=1)
     assert list(CampaignJournal(journal.folder).ended()) == [*map(str, trials[:complete]), str(trials[-1])]
 
@@ -152,9 +152,9 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
 def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None:
     asked, journal = begin(lawn)
     with (
-        journal.kept(asked),
+        journal.claimed(asked),
         pytest.raises(ConfigurationError, match="another fieldkit runs this campaign"),
-        CampaignJournal(journal.folder).kept(asked),
+        CampaignJournal(journal.folder).claimed(asked),
     ):
         raise AssertionError("two at once")
     (journal.folder / JOURNAL_FILE).write_text('{"what": "lost"}\n{}\n', encoding="utf-8")
@@ -179,7 +179,7 @@ def test_the_estimate_uses_measured_placing_times(lawn: Path) -> None:
     assert work_s > 8 * 3 * 2 * 66, "8 trials, 3 repeats of 2 protocols, recordings of 66 s"
     assert planned(asked, journal, by_hand).left_s == pytest.approx(work_s + 8 * PLACING_S)
     first, second, *_ = asked.trials()
-    with journal.kept(asked):
+    with journal.claimed(asked):
         journal.add(first, TrialProgress.PLACED, took_s=10.0)
         journal.add(second, TrialProgress.PLACED, took_s=30.0)
         journal.add(first, TrialProgress.ENDED, valid=6)
@@ -195,7 +195,7 @@ def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(
     events: list[Event] = []
     campaign = CampaignRun(asked, journal, load_backend("emulated", None, None), events.append)
     with pytest.raises(ConfigurationError, match="GB are free"):
-        campaign.run(Nobody(), Stop())
+        campaign.run(Unattended(), Stop())
     assert [type(event) for event in events] == [CampaignEnded], "no robot was started"
     assert journal.folder.is_dir(), "the order is unchanged"
 
@@ -204,7 +204,7 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
     asked, journal = begin(lawn)
     backend = load_backend("emulated", None, None)
     whole, failed, *_ = asked.trials()
-    with journal.kept(asked):
+    with journal.claimed(asked):
         for trial, count in ((whole, 0), (failed, 2)):
             journal.add(trial, TrialProgress.STARTED, trial=str(count))
             journal.add(trial, TrialProgress.ENDED, trial=str(count), failed=count)
@@ -216,7 +216,7 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
     assert isinstance(event, CampaignPlanned)
     assert str(failed) in event.trials
     assert str(whole) not in event.trials
-    with journal.kept(asked):
+    with journal.claimed(asked):
         campaign._reopen()
     (journal.folder / "2").mkdir()
     (journal.folder / "2" / "trial.yaml").touch()

@@ -10,7 +10,7 @@ import pytest
 
 from fieldkit.cli import hints, main, parser
 from fieldkit.cli.display import show_error, show_findings, watching, words_of
-from fieldkit.core.errors import typed
+from fieldkit.core.errors import shell_command
 from fieldkit.core.events import Finding, TrialStopped
 from fieldkit.core.model import Verdict
 from tests.helpers.paths import ROOT
@@ -31,7 +31,7 @@ def messages() -> Iterator[tuple[str, str, bool]]:
                 parts = (part.value if isinstance(part, ast.Constant) else "x" for part in node.values)
                 yield where, "".join(map(str, parts)), False
             elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "typed":
-                yield where, typed(*(getattr(word, "value", "x") for word in node.args)), True
+                yield where, shell_command(*(getattr(word, "value", "x") for word in node.args)), True
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in excluded:
                 yield where, node.value, False
 

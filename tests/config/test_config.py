@@ -9,7 +9,7 @@ from fieldkit.config.locations import names
 from fieldkit.config.profiles import RobotProfile, Tools, load_profile
 from fieldkit.config.schema import Strict
 from fieldkit.config.site import Site
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Role
 from fieldkit.steps.kinds.ping import Payloads
 from fieldkit.trial.procedure import Procedure, load_procedure
@@ -215,7 +215,9 @@ def test_unknown_name_suggests_the_nearest() -> None:
 )
 def test_part_of_several_names_suggests_all(name: str, remedy: str) -> None:
     assert (
-        nearest(name, ("rtt_loss", "ip_loss", "delay_s", "cliffs_delta", "rtt_median_s", "up.topic_loss"), "look")
+        did_you_mean(
+            name, ("rtt_loss", "ip_loss", "delay_s", "cliffs_delta", "rtt_median_s", "up.topic_loss"), "look"
+        )
         == remedy
     )
 

@@ -47,7 +47,7 @@ def test_step_is_expanded_for_each_value_with_its_type() -> None:
 
 
 def test_all_combinations_are_expanded_with_the_last_variable_fastest() -> None:
-    expanded = loops.written_out(
+    expanded = loops.expand_loops(
         document('  - for: {each: {a: [1, 2], b: [x, y]}, during: [one: {is: "{a}-{b}"}, two: {}]}'), "steps"
     )
     assert [step.get("one", {}).get("is") for step in expanded.data["steps"]] == [
@@ -56,7 +56,7 @@ def test_all_combinations_are_expanded_with_the_last_variable_fastest() -> None:
 
 
 def test_nested_loops_use_the_values_of_enclosing_loops() -> None:
-    expanded = loops.written_out(
+    expanded = loops.expand_loops(
         document(
             """\
   - for:
@@ -84,7 +84,7 @@ def test_nested_loops_use_the_values_of_enclosing_loops() -> None:
 
 def test_file_without_loops_is_unchanged() -> None:
     before = document("  - a: {b: 1}\n  - c:\n      during:\n        - move:\n            during: [a: {b: 1}]\n")
-    assert loops.written_out(before, "steps") == before
+    assert loops.expand_loops(before, "steps") == before
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_order_equals_itertools_product_and_lines_are_those_of_the_loop(each: di
         "x.yaml",
         {(): 1, ("steps",): 1, ("steps", 0, "for", "during", 0): 7, ("steps", 1): 9},
     )
-    after = loops.written_out(before, "steps")
+    after = loops.expand_loops(before, "steps")
     combinations = [dict(zip(each, chosen, strict=True)) for chosen in itertools.product(*each.values())]
     assert after.data["steps"] == [*({"step": values} for values in combinations), step]
     assert [after.lines["steps", index] for index in range(len(combinations) + 1)] == [7] * len(combinations) + [9]

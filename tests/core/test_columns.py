@@ -49,12 +49,12 @@ def test_a_union_keeps_all_columns_and_each_is_either_measured_or_missing(first:
 
 
 def test_none_means_missing_but_zero_and_false_are_values() -> None:
-    measured = Measured.of({"a": 0, "b": None, "c": False, "d": ""}, "not available")
+    measured = Measured.from_optional({"a": 0, "b": None, "c": False, "d": ""}, "not available")
     assert measured == Measured({"a": 0, "c": False, "d": ""}, {"b": "not available"})
 
 
 def test_all_declared_columns_can_be_missing_for_one_reason() -> None:
-    assert Measured.nothing(DECLARED, "no capture") == Measured(missing=dict.fromkeys("abc", "no capture"))
+    assert Measured.all_missing(DECLARED, "no capture") == Measured(missing=dict.fromkeys("abc", "no capture"))
 
 
 def test_the_unit_determines_the_type_of_values() -> None:
@@ -66,6 +66,6 @@ def test_a_rounded_value_at_a_bound_is_still_possible() -> None:
     ends = 1.0000000004, 2.0000000006
     column = Column("level", "dBm", "x", bounds=ends)
     assert [cell(end) for end in ends] == ["1", "2"]
-    assert [column.problem(cell(end)) for end in ends] == [None, None]
-    assert column.problem("0.999999999") == "not from 1 to 2"
-    assert column.problem("2.00000001") is not None
+    assert [column.invalid_value_reason(cell(end)) for end in ends] == [None, None]
+    assert column.invalid_value_reason("0.999999999") == "not from 1 to 2"
+    assert column.invalid_value_reason("2.00000001") is not None

@@ -15,14 +15,14 @@ def test_entry_points_are_sorted_by_name(tmp_path: Path, monkeypatch: pytest.Mon
     write_package(tmp_path, "first", "[bench]\nlast = a.b:c\nmiddle = a.b:d [extra]\n")
     write_package(tmp_path, "second", "[bench]\nearly = e.f:g\n[other]\nelse = h:i\n")
     monkeypatch.syspath_prepend(tmp_path)
-    assert [point.name for point in plugins.points("bench")] == ["early", "last", "middle"]
+    assert [point.name for point in plugins.entry_points("bench")] == ["early", "last", "middle"]
 
 
 def test_the_first_of_two_versions_of_a_package_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for version in ("1.0", "2.0"):
         write_package(tmp_path / version, "bench-tools", f"[bench]\nbench = bench.v{version[0]}:run\n", version)
         monkeypatch.syspath_prepend(tmp_path / version)
-    assert [point.value for point in plugins.points("bench")] == ["bench.v2:run"]
+    assert [point.value for point in plugins.entry_points("bench")] == ["bench.v2:run"]
     assert plugins.version("Bench.Tools") == "2.0"
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.core.model import FIXED_ROLES, Role, in_order
+from fieldkit.core.model import FIXED_ROLES, Role, sort_roles
 
 
 @given(st.from_regex(Role.PATTERN, fullmatch=True))
@@ -25,4 +25,4 @@ def test_an_invalid_name_of_a_role_is_an_error(name: str) -> None:
 
 def test_additional_roles_are_listed_after_the_fixed_ones() -> None:
     additional = [Role("a"), Role("z")]
-    assert in_order([additional[1], *reversed(FIXED_ROLES), additional[0]]) == [*FIXED_ROLES, *additional]
+    assert sort_roles([additional[1], *reversed(FIXED_ROLES), additional[0]]) == [*FIXED_ROLES, *additional]

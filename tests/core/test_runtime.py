@@ -31,14 +31,14 @@ def private(base: Path) -> Path:
 
 
 def test_a_lock_is_exclusive_and_leaves_no_file(base: Path) -> None:
-    with runtime.held(NAME):
+    with runtime.hold_lock(NAME):
         assert private(base).stat().st_mode & 0o777 == 0o700
-        with runtime.held("another"):
+        with runtime.hold_lock("another"):
             assert len(list(private(base).iterdir())) == 2
-        with pytest.raises(NameHeldError), runtime.held(NAME):
+        with pytest.raises(NameHeldError), runtime.hold_lock(NAME):
             raise AssertionError("held twice")
     assert list(base.iterdir()) == []
-    with runtime.held(NAME):
+    with runtime.hold_lock(NAME):
         pass
 
 
@@ -46,18 +46,18 @@ def test_a_file_left_by_kill_9_is_not_locked_and_is_removed(base: Path) -> None:
     reader, writer = os.pipe()
     pid = os.fork()
     if pid == 0:
-        with runtime.held(NAME), runtime.held("another"):
+        with runtime.hold_lock(NAME), runtime.hold_lock("another"):
             os.write(writer, b"+")
             signal.pause()
     os.read(reader, 1)
-    with pytest.raises(NameHeldError), runtime.held(NAME):
+    with pytest.raises(NameHeldError), runtime.hold_lock(NAME):
         raise AssertionError("the other process holds it")
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
     os.close(reader)
     os.close(writer)
     assert len(list(private(base).iterdir())) == 2, "this is what a kill leaves"
-    with runtime.held(NAME):
+    with runtime.hold_lock(NAME):
         assert [path.name for path in private(base).iterdir()] == [f"{NAME}.lock"]
     assert list(base.iterdir()) == []
 
@@ -73,7 +73,7 @@ def test_one_of_many_processes_gets_the_lock(base: Path) -> None:
                 os.close(go[1])
                 os.close(stay[1])
                 os.read(go[0], 1)  # until the pipe is closed
-                with runtime.held(NAME):
+                with runtime.hold_lock(NAME):
                     os.read(stay[0], 1)
                 code = 0
             except NameHeldError:
@@ -108,7 +108,7 @@ def test_concurrent_processes_can_lock_while_others_remove_stale_files(base: Pat
             code = 1
             try:
                 for _ in range(100):
-                    with runtime.held(f"own-{number}"):
+                    with runtime.hold_lock(f"own-{number}"):
                         pass
                 code = 0
             finally:
@@ -138,7 +138,7 @@ def test_a_path_that_another_user_controls_is_refused_and_unchanged(base: Path, 
             path.touch(mode=0o600)
         case _:
             path.symlink_to(tmp_path / "nothing")
-    with pytest.raises(ConfigurationError) as caught, runtime.held(NAME):
+    with pytest.raises(ConfigurationError) as caught, runtime.hold_lock(NAME):
         raise AssertionError("held where others can write")
     assert not isinstance(caught.value, NameHeldError)
     assert "XDG_RUNTIME_DIR" in caught.value.remedy
@@ -149,7 +149,7 @@ def test_a_path_that_another_user_controls_is_refused_and_unchanged(base: Path, 
 def test_a_link_in_place_of_the_lock_file_is_not_followed(base: Path, tmp_path: Path) -> None:
     private(base).mkdir(mode=0o700)
     (private(base) / f"{NAME}.lock").symlink_to(tmp_path / "made")
-    with pytest.raises(ConfigurationError), runtime.held(NAME):
+    with pytest.raises(ConfigurationError), runtime.hold_lock(NAME):
         raise AssertionError("held by a link")
     assert not (tmp_path / "made").exists()
 

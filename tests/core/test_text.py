@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.core.text import guarded, harmless, json_text, one_line, unguarded
+from fieldkit.core.text import escape_formula, json_text, one_line, sanitized, unescape_formula
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from fieldkit.core.text import guarded, harmless, json_text, one_line, unguarded
     ],
 )
 def test_terminal_control_characters_are_replaced(text: str, shown: str) -> None:
-    assert harmless(text) == shown
+    assert sanitized(text) == shown
 
 
 def is_shown(text: str) -> bool:
@@ -29,16 +29,16 @@ def is_shown(text: str) -> bool:
 
 @given(st.text())
 def test_any_text_is_printable_in_every_form(text: str) -> None:
-    assert is_shown(harmless(text))
+    assert is_shown(sanitized(text))
     assert is_shown(json_text({"a": text}))
     assert is_shown(one_line(text))
     assert "\n" not in one_line(text)
-    assert harmless(harmless(text)) == harmless(text)
+    assert sanitized(sanitized(text)) == sanitized(text)
 
 
 @given(st.text().filter(str.isprintable))
 def test_a_printable_text_is_unchanged(text: str) -> None:
-    assert harmless(text) == one_line(text) == text
+    assert sanitized(text) == one_line(text) == text
 
 
 JSON = st.recursive(
@@ -62,8 +62,8 @@ CELLS = st.text() | st.from_regex(r"'{0,2}[=+@-][0-9a-z|!'\"]{0,5}", fullmatch=T
 
 @given(CELLS)
 def test_a_guarded_cell_is_no_formula_and_can_be_restored(text: str) -> None:
-    cell = guarded(text)
-    assert unguarded(cell) == text
+    cell = escape_formula(text)
+    assert unescape_formula(cell) == text
     if cell[:1] in {"=", "+", "-", "@"} and len(cell) > 1:
         float(cell)  # a number
 
@@ -82,4 +82,4 @@ def test_a_guarded_cell_is_no_formula_and_can_be_restored(text: str) -> None:
     ],
 )
 def test_a_possible_formula_is_marked_as_text(text: str, cell: str) -> None:
-    assert guarded(text) == cell
+    assert escape_formula(text) == cell

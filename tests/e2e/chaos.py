@@ -20,7 +20,7 @@ from fieldkit.core.model import Fault, FaultKind, Protocol, Role, Status
 from fieldkit.remote import jobs
 from fieldkit.trial import journal
 from sim_backends.emulated.backend import DEFAULT_SITE
-from tests.helpers.labs import own_procedure
+from tests.helpers.labs import write_procedure
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit, only_trial, rows, start
 
@@ -160,7 +160,7 @@ class Chaos:
 
     def run(self) -> Tally:
         lab = self._outside.folder
-        name = own_procedure(lab, PROCEDURE)
+        name = write_procedure(lab, PROCEDURE)
         words: tuple[str, ...] = ("trial", name, "5m", "--repeats", str(self._repeats), "--yes", "--json")
         while (ended := self._run_once(*words)).code != 0 and self.tally.starts < MAX_STARTS:
             if self._unexplained():
@@ -262,8 +262,8 @@ class Chaos:
         if "the same bytes" not in (rebuilt := fieldkit(lab, "rebuild", str(trial))).out:
             tally.problems.append(f"rebuild: {rebuilt.out} {rebuilt.err}")
         for role, shell in self._outside.testbed.shells.items():
-            if left := jobs.left(shell, Deadline.after(20)):
-                tally.problems.append(f"left on {role}: {left}")
+            if list_running := jobs.list_running(shell, Deadline.after(20)):
+                tally.problems.append(f"left on {role}: {list_running}")
 
 
 def _voids(trial: Path) -> list[Void]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.helpers import motion_table
-from tests.helpers.motion_cells import CELLS, MotionCell, chosen
+from tests.helpers.motion_cells import CELLS, MotionCell, select_cells
 from tests.helpers.motion_lab import motion_lab
 from tests.helpers.motion_outcomes import MotionOutcome
 from tests.helpers.motion_trials import MotionTrial
@@ -101,7 +101,7 @@ def main() -> int:
     parser.add_argument("--write", type=Path, help="page that gets the tables")
     parser.add_argument("--list", action="store_true", help="list the cells, and run nothing")
     arguments = parser.parse_args()
-    cells = chosen(arguments.cells)
+    cells = select_cells(arguments.cells)
     if arguments.list:
         print("\n".join(cell.name for cell in cells))
         return 0

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.helpers.cut_trials import calls_of_a_trial, cuts_in_a_row, robots_with_much_evidence
-from tests.helpers.disks import FILE_SYSTEMS, workplace
+from tests.helpers.disks import FILE_SYSTEMS, mount_workspace
 from tests.helpers.host import namespaces_of_our_own
 
 IN_A_ROW: Final = 6
@@ -28,7 +28,7 @@ def main() -> int:
     with (
         tempfile.TemporaryDirectory(prefix="fieldkit-power-") as folder,
         namespaces_of_our_own(),
-        workplace(Path(folder)) as place,
+        mount_workspace(Path(folder)) as place,
         robots_with_much_evidence(),
     ):
         print(f"cutting in {folder}", flush=True)

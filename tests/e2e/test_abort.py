@@ -11,7 +11,7 @@ from fieldkit.core.errors import LockLostError
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.trial.running.locks import Holder, taken
+from fieldkit.trial.running.locks import Holder, locked
 from tests.helpers.outside import robots_outside
 from tests.helpers.runs import fieldkit
 from tests.helpers.sshd import free_port, make_key
@@ -26,7 +26,7 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
     with robots_outside(tmp_path) as outside:
         shells = outside.testbed.shells
         sender, receiver = (outside.cast[role].name for role in (Role.SENDER, Role.RECEIVER))
-        with taken(shells, ANNA, sink=print):
+        with locked(shells, ANNA, sink=print):
             for role in (Role.SENDER, Role.RECEIVER):
                 evidence.begin(shells[role], FOLDER, role, "wlan0", token=ANNA.token)
                 jobs.start(shells[role], CAPTURE)
@@ -39,8 +39,8 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
             assert run.code == 3
             assert f"{sender}: lock broken, 1 job ended\n  {FOLDER}/capture " in run.out
             assert re.search(rf"error: {receiver}: .* cannot be reached", run.err)
-            assert jobs.left(shells[Role.SENDER], Deadline.after(30)) == ()
-            assert len(jobs.left(shells[Role.RECEIVER], Deadline.after(30))) == 1
+            assert jobs.list_running(shells[Role.SENDER], Deadline.after(30)) == ()
+            assert len(jobs.list_running(shells[Role.RECEIVER], Deadline.after(30))) == 1
 
             site.write_text(whole, encoding="utf-8")
             run = fieldkit(tmp_path, "abort", "--yes")

@@ -81,7 +81,7 @@ def _bare(cell: str) -> str:
 
 def site(text: str = LAB, *changes: str, command: str = DRY) -> Setup:
     def setup(lab: Path) -> str:
-        (lab / "fieldkit.yaml").write_text(labs.changed(text, *changes), encoding="utf-8")
+        (lab / "fieldkit.yaml").write_text(labs.replace_text(text, *changes), encoding="utf-8")
         return command
 
     return setup
@@ -89,7 +89,7 @@ def site(text: str = LAB, *changes: str, command: str = DRY) -> Setup:
 
 def own(kind: Kind, name: str, *changes: str, command: str = DRY) -> Setup:
     def setup(lab: Path) -> str:
-        labs.own(lab, kind, name, *changes)
+        labs.copy_shipped(lab, kind, name, *changes)
         return command
 
     return setup
@@ -102,7 +102,7 @@ def campaign(*changes: str, begun: bool = False) -> Setup:
         path.write_text(text, encoding="utf-8")
         if begun:
             asked, _ = plan.make_plan(path, "emulated")
-            with CampaignJournal(lab / "trials" / "campaign_lawn").kept(asked):
+            with CampaignJournal(lab / "trials" / "campaign_lawn").claimed(asked):
                 pass
         for old, new in zip(changes[::2], changes[1::2], strict=True):
             assert old in text

@@ -72,7 +72,7 @@ def site(pattern: str, by: str) -> Setup:
 
 def profile(old: str, new: str) -> Setup:
     def setup(lab: Testbed) -> str:
-        labs.own(lab.folder, "robots", "turtlebot3_burger", old, new)
+        labs.copy_shipped(lab.folder, "robots", "turtlebot3_burger", old, new)
         return TRIAL
 
     return setup
@@ -80,7 +80,7 @@ def profile(old: str, new: str) -> Setup:
 
 def procedure(old: str, new: str) -> Setup:
     def setup(lab: Testbed) -> str:
-        labs.own(lab.folder, "procedures", "los", old, new)
+        labs.copy_shipped(lab.folder, "procedures", "los", old, new)
         return TRIAL
 
     return setup

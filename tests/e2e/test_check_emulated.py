@@ -14,7 +14,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import Holder
 from sim_backends.emulated.backend import DEFAULT_SITE
-from tests.helpers.labs import own
+from tests.helpers.labs import copy_shipped
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit
 
@@ -77,14 +77,14 @@ def test_the_field_backend_is_ok_too_and_nothing_is_left_on_the_robots(outside: 
 
 
 def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside: Outside, lab: Path) -> None:
-    own(lab, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
-    own(lab, "robots", "duckiedrone", "capture_right: direct", "capture_right: sudo")
+    copy_shipped(lab, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
+    copy_shipped(lab, "robots", "duckiedrone", "capture_right: direct", "capture_right: sudo")
     receiver = outside.testbed.shells[Role.RECEIVER]
     folder = jobs.work_folder("20260101T000000.000000Z_los_5m_masterless", "udp-01-1")
     jobs.install(receiver, Deadline.after(30))
     receiver.run(("mkdir", "-p", f"{folder}/.jobs"), deadline=Deadline.after(30))
     listen = ("nc.traditional", "-l", "-p", "1234")
-    leftover = Job(folder, "listen", listen, limit_s=60, log="log", ready=jobs.bound(Protocol.TCP, 1234))
+    leftover = Job(folder, "listen", listen, limit_s=60, log="log", ready=jobs.ready_when_bound(Protocol.TCP, 1234))
     jobs.start(receiver, leftover)
     try:
         run = fieldkit(lab, *CHECK)
@@ -105,7 +105,7 @@ def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside
 
 
 def test_a_silent_topic_is_found_before_the_trial(lab: Path) -> None:
-    own(lab, "procedures", "los", "[/scan]", "[/scan, /nothing]")
+    copy_shipped(lab, "procedures", "los", "[/scan]", "[/scan, /nothing]")
     run = fieldkit(lab, *CHECK)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "topic /nothing")}
@@ -126,7 +126,7 @@ def test_a_robot_that_cannot_be_reached_does_not_hide_the_others(outside: Outsid
 
 def test_a_robot_that_somebody_else_holds_is_named_and_not_disturbed(outside: Outside, lab: Path) -> None:
     sender = {Role.SENDER: outside.testbed.shells[Role.SENDER]}
-    with locks.taken(sender, Holder("token", "anna@one", "trial-a"), sink=lambda _: None):
+    with locks.locked(sender, Holder("token", "anna@one", "trial-a"), sink=lambda _: None):
         job = Job(
             folder=jobs.work_folder("trial-a", "tcp-01-1"), name="work", argv=("sleep", "99"), limit_s=99, log="l"
         )
@@ -168,7 +168,7 @@ def test_a_home_without_room_fails(outside: Outside, lab: Path) -> None:
 
 
 def test_a_trial_tells_warnings_and_stops_at_failures(lab: Path) -> None:
-    own(
+    copy_shipped(
         lab,
         "robots",
         "turtlebot3_burger",

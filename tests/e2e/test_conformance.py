@@ -12,7 +12,7 @@ from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.backends.registry import load_backend
 from fieldkit.config.site import load_site
 from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from fieldkit.core.units import parse_distance
 from fieldkit.remote.link import Timing
 from fieldkit.remote.ssh import CONNECT_S
@@ -66,7 +66,7 @@ def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedTestbed
     site.write_text(text + more, encoding="utf-8")
     backend = EmulatedBackend(*load_site(site))
     cast = backend.cast(TOPOLOGY)
-    with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed:
+    with backend.open(cast, seed=1, sink=lambda _: None, operator=Unattended()) as testbed:
         assert isinstance(testbed, EmulatedTestbed)
         testbed.place(Placement(Scenario.LOS, TOPOLOGY, parse_distance("5m")))
         yield cast, testbed
@@ -151,7 +151,7 @@ class TestField(OfTestbed):
         site.write_text(f"patience: {PATIENCE_S:g}s\n{site.read_text(encoding='utf-8')}", encoding="utf-8")
         backend = load_backend("field", *load_site(site))
         cast = backend.cast(TOPOLOGY)
-        with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed:
+        with backend.open(cast, seed=1, sink=lambda _: None, operator=Unattended()) as testbed:
             yield cast, testbed
 
     @pytest.fixture(scope="class")

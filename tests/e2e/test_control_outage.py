@@ -17,7 +17,7 @@ from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, Note, PhaseStarted
 from fieldkit.core.model import Fault, FaultKind, Protocol, Role
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
@@ -135,7 +135,7 @@ def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way:
             case PhaseStarted("collect evidence"):
                 observed.after = jobs_of(testbed)
 
-    with backend.open(cast, seed=1, sink=watch, operator=Nobody()) as opened:
+    with backend.open(cast, seed=1, sink=watch, operator=Unattended()) as opened:
         assert isinstance(opened, EmulatedTestbed)
         testbed = opened
         with captured(testbed, lab_folder / "radio.pcap"):

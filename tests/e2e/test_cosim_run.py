@@ -123,7 +123,7 @@ def test_a_folder_has_a_recording_for_each_seed_and_equal_runs_are_equal(lab: Pa
         assert (row["sender"], row["receiver"], row["distance"]) == ("ann", "bob", "10m")
         declared: dict[str, Column] = {column.name: column for column in trial_columns()}
         assert row.keys() <= declared.keys()
-        assert not [name for name, text in row.items() if declared[name].problem(text)]
+        assert not [name for name, text in row.items() if declared[name].invalid_value_reason(text)]
     assert cosim(lab, "run", "one/sim/pass.yaml", "--format", "csv").out.count("\n") == 2, "it runs again"
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.model import Placement, Role, Scenario, Topology, Vector, Whereabouts
+from fieldkit.core.model import Placement, Role, Scenario, Topology, TrackPoint, Vector
 from fieldkit.core.units import parse_distance
 from fieldkit.lab.protocol import Destination
 from fieldkit.remote import jobs
@@ -127,11 +127,11 @@ def outside(rovers: Outside, monkeypatch: pytest.MonkeyPatch) -> Outside:
     return rovers
 
 
-def track_of(outside: Outside, role: Role) -> list[Whereabouts]:
+def track_of(outside: Outside, role: Role) -> list[TrackPoint]:
     return [one for one in outside.testbed.oracle.track(0) if one.role is role]
 
 
-def place_at(track: list[Whereabouts], utc_ns: int) -> Vector:
+def place_at(track: list[TrackPoint], utc_ns: int) -> Vector:
     """Where the oracle had the robot, on a straight line between what it says."""
     after = bisect_left(track, utc_ns, key=lambda one: one.utc_ns)
     before, now = track[max(after - 1, 0)], track[min(after, len(track) - 1)]

@@ -72,7 +72,7 @@ def assert_unmoved(lab: RoverLab, run: Run, reason: str, since_ns: int) -> None:
 def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_holds_over_all_trials(lab: RoverLab) -> None:
     out, site = "held", ("--site", RECEIVER_SITE)
     lab.write_procedure(Role.RECEIVER, WAY_M)
-    lab.put("5m")
+    lab.place_at("5m")
     home_m, begun_ns = lab.place_m, time.time_ns()
     process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
     try:
@@ -103,7 +103,7 @@ def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_holds_over_all_tria
 def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaign(lab: RoverLab) -> None:
     out, site = "outside", ("--site", RECEIVER_SITE)
     lab.write_procedure(Role.RECEIVER, 0.4)
-    lab.put("5m")
+    lab.place_at("5m")
     home_m = lab.place_m
     process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
     try:
@@ -113,13 +113,13 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
     finally:
         process.kill()
         wait_for_end({process.pid}, within_s=60.0)
-    lab.push(FENCE_M)
+    lab.drive_forward(FENCE_M)
     since_ns = time.time_ns()
     refused = campaign(lab, out, *site, *UNASKED, OPTION)
     assert_unmoved(lab, refused, f"outside its fence of {FENCE_M:g} m", since_ns)
 
     # A person puts it back and confirms it: a new origin, which holds for both trials.
-    lab.put("5m")
+    lab.place_at("5m")
     run = campaign(lab, out, *site, *MOTION, *answers(lab, "", "confirm", ""))
     assert run.code == 0, run.err
     assert motions(lab, out)[-6:] == ["confirmed", "origin", "begun", "ended", "begun", "ended"]
@@ -129,7 +129,7 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
 def test_with_yes_a_robot_does_not_start_at_a_place_where_no_person_put_it(lab: RoverLab) -> None:
     out = "places"
     lab.write_procedure(Role.SENDER, 0.4)
-    lab.put("5m")
+    lab.place_at("5m")
     since_ns = time.time_ns()
     several = fieldkit(lab.folder, "trial", "drive", "5m", "10m", "--out", out, *UNASKED)
     assert several.code == 2, several.err
@@ -144,7 +144,7 @@ def test_with_yes_a_robot_does_not_start_at_a_place_where_no_person_put_it(lab: 
 
     # A person who answers that it is there: its origin, and with it its fence, is the new place.
     (distance,) = (name for name in ("5m", "10m") if name in trials(lab, out)[1].name)
-    lab.put(distance)
+    lab.place_at(distance)
     home_m, begun_ns = lab.place_m, time.time_ns()
     second = campaign(lab, out, *MOTION, *answers(lab, ""))
     assert second.code == 0, second.err
@@ -155,7 +155,7 @@ def test_with_yes_a_robot_does_not_start_at_a_place_where_no_person_put_it(lab: 
 
 def test_stop_stops_a_robot_whose_fieldkit_was_killed(lab: RoverLab) -> None:
     lab.write_procedure(Role.SENDER, FENCE_M - BEYOND_M)
-    lab.put("5m")
+    lab.place_at("5m")
     process = start(lab.folder, "trial", "drive", "5m", "--out", "killed", *UNASKED)
     try:
         lab.wait_until_it_drives()

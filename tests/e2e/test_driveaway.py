@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.config.profiles import load_profile
-from fieldkit.core.model import Role, Whereabouts
+from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import track
 from sim_backends.radio.modes import N_MODES
 from sim_backends.radio.options import RadioOptions
@@ -64,7 +64,7 @@ def range_m() -> float:
     return near_m
 
 
-def frames(folder: Path, where: tuple[Whereabouts, ...]) -> list[tuple[float, str, bool]]:
+def frames(folder: Path, where: tuple[TrackPoint, ...]) -> list[tuple[float, str, bool]]:
     """Return each attempt to reach the receiver: how far it was as the medium was told before, mode, and success."""
     changes = track.distances_m(where, Role.SENDER, Role.RECEIVER)
     distances = [(utc_ns, metres) for utc_ns, metres in changes if metres is not None]

@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.remote import jobs
-from tests.helpers.labs import own, own_procedure
+from tests.helpers.labs import copy_shipped, write_procedure
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import fieldkit, only_trial, rows
 
@@ -47,14 +47,14 @@ def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
 @pytest.fixture
 def lab(outside: Outside, tmp_path: Path) -> Path:
     (tmp_path / "fieldkit.yaml").write_bytes((outside.folder / "fieldkit.yaml").read_bytes())
-    own_procedure(tmp_path, PROCEDURE)
+    write_procedure(tmp_path, PROCEDURE)
     return tmp_path
 
 
 def replace_tool(outside: Outside, lab: Path, tool: str, program: str, script: str) -> None:
     """Let the sender's profile name a program of the robot's own in place of a tool."""
     place_program(outside, tool, script.format(program=program))
-    own(lab, "robots", "turtlebot3_burger", f"  {tool}: {program}\n", f"  {tool}: /root/{tool}\n")
+    copy_shipped(lab, "robots", "turtlebot3_burger", f"  {tool}: {program}\n", f"  {tool}: /root/{tool}\n")
 
 
 def place_program(outside: Outside, name: str, script: str) -> None:
@@ -84,7 +84,7 @@ def test_a_tool_that_hangs_at_work_ends_at_its_limit(
         assert row["status"] == "failed"
         assert said in row["reason"]
     for shell in outside.testbed.shells.values():
-        assert jobs.left(shell, Deadline.after(30)) == ()
+        assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 @pytest.mark.parametrize(("tool", "program"), [("netcat", "nc.traditional"), ("ping", "ping")])
@@ -99,7 +99,9 @@ def test_a_tool_that_hangs_when_asked_is_refused_before_repeat_1(
 
 
 def test_a_recorder_that_hangs_is_ended_at_its_limit(outside: Outside, lab: Path) -> None:
-    own(lab, "robots", "turtlebot3_burger", '[rosbag, record, "--duration', '[/root/rosbag, record, "--duration')
+    copy_shipped(
+        lab, "robots", "turtlebot3_burger", '[rosbag, record, "--duration', '[/root/rosbag, record, "--duration'
+    )
     place_program(outside, "rosbag", HANGS_AT_WORK.replace("-V |", "*--help* | -V |").format(program="rosbag"))
     run = fieldkit(lab, "trial", "short", "5m", "--yes")
     assert run.code == 4, run.err

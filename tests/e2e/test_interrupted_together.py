@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.host import Untouched, descendants, wait_for_end
-from tests.helpers.labs import BOX, own_procedure
+from tests.helpers.labs import BOX, write_procedure
 from tests.helpers.runs import finish, only_trial, rows, start
 
 pytestmark = pytest.mark.emulated
@@ -54,7 +54,7 @@ def test_ctrl_c_ends_all_that_runs_at_the_same_time(tmp_path: Path, untouched: U
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    process = start(tmp_path, "trial", own_procedure(tmp_path, PROCEDURE), "5m", "--json")
+    process = start(tmp_path, "trial", write_procedure(tmp_path, PROCEDURE), "5m", "--json")
     try:
         wait_for_all(process, ["sleep", "sleep", "ping", "wait"])
     except BaseException:

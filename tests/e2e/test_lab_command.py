@@ -123,7 +123,7 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
             0,
             ["air-1: nothing of fieldkit moves it; nothing was sent to it", "ground-1: stopped (standing)"],
         )
-        assert not jobs.left(shells["ground-1"], Deadline.after(WITHIN_S))
+        assert not jobs.list_running(shells["ground-1"], Deadline.after(WITHIN_S))
     again = fieldkit(lab, "stop", "ground-1", "--backend", "emulated")
     assert (again.code, again.out) == (0, "ground-1: nothing of fieldkit moves it; nothing was sent to it\n")
     unknown = fieldkit(lab, "stop", "ground-2", "--backend", "emulated")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.labs import BOX, own_procedure
+from tests.helpers.labs import BOX, write_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
@@ -46,7 +46,7 @@ def lab(folder: Path, steps: str, radio: str = "{fading: false}") -> Path:
     (folder / "robots").mkdir(parents=True)
     (folder / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (folder / "fieldkit.yaml").write_text(SITE.replace("RADIO", radio), encoding="utf-8")
-    own_procedure(folder, HEAD + steps)
+    write_procedure(folder, HEAD + steps)
     return folder
 
 

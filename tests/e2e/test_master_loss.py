@@ -9,7 +9,7 @@ from rosbags.highlevel import AnyReader
 
 from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.host import Untouched
-from tests.helpers.labs import own
+from tests.helpers.labs import copy_shipped
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
@@ -31,7 +31,7 @@ def lab_with_one_master(folder: Path, ros: str = "debian") -> Path:
 
 def lost(lab: Path, procedure: str, *changes: str) -> dict[str, str]:
     """Run one repeat of a procedure in less time than the shipped one takes; return its row."""
-    own(lab, "procedures", procedure, *SHORTER, *changes)
+    copy_shipped(lab, "procedures", procedure, *SHORTER, *changes)
     run = fieldkit(lab, "trial", procedure, "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     (row,) = [row for row in rows(only_trial(lab)) if row["status"] == "valid"]

@@ -9,7 +9,7 @@ import pytest
 
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.ip import ICMP
-from tests.helpers.labs import BOX, own
+from tests.helpers.labs import BOX, copy_shipped
 from tests.helpers.runs import fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
@@ -52,7 +52,7 @@ def test_packets_go_another_way_within_babels_bound_and_the_row_says_so(tmp_path
         "duration: 25s",
         "duration: 2s",
     )
-    own(tmp_path, "procedures", "mesh_heal", *shorter, "count: 750", "count: 80")
+    copy_shipped(tmp_path, "procedures", "mesh_heal", *shorter, "count: 750", "count: 80")
     run = fieldkit(tmp_path, "trial", "mesh_heal", "220m", "--repeats", "1")
     assert run.code == 0, run.out + run.err
     trial = only_trial(tmp_path)

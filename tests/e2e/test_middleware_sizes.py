@@ -50,7 +50,7 @@ def test_what_passed_is_written_with_its_evidence(measured: Path) -> None:
     domain = ET.parse(out / "cyclonedds.xml").getroot().find("Domain")
     assert domain is not None
     values = {f"{outer.tag}/{inner.tag}": inner.text for outer in domain for inner in outer}
-    assert values == dict(tuning.tuned("dds", "tcp"))
+    assert values == dict(tuning.recommended_settings("dds", "tcp"))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.motion_cells import CELLS, Blow, chosen
+from tests.helpers.motion_cells import CELLS, InjectedFault, select_cells
 from tests.helpers.motion_outcomes import MotionOutcome
 from tests.helpers.motion_parties import Party
 from tests.helpers.paths import ROOT
@@ -88,7 +88,7 @@ def test_so_does_a_robot_of_the_rest_of_the_sample(name: str, outcomes_at_night:
 
 def test_the_sample_has_each_party_and_each_fault() -> None:
     assert set(IN_CI) <= set(SAMPLE)
-    cells = chosen(",".join(SAMPLE))
+    cells = select_cells(",".join(SAMPLE))
     assert {party for cell in cells for party in cell.parties} == set(Party)
-    assert {cell.blow for cell in cells} == set(Blow)
+    assert {cell.fault for cell in cells} == set(InjectedFault)
     assert {cell.craft for cell in cells} == {cell.craft for cell in CELLS}

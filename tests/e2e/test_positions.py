@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.model import Role, Whereabouts
+from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import bag, ping, track
-from fieldkit.measure.evidence.track import Apart
+from fieldkit.measure.evidence.track import Separation
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, only_trial, rows
 
@@ -77,10 +77,12 @@ def walked(lab: Path) -> Path:
     return only_trial(lab)
 
 
-def as_the_lab_knows(trial: Path) -> Apart:
+def as_the_lab_knows(trial: Path) -> Separation:
     folder = trial / "repeats" / "udp-01"
     times_ns = [at for one in ping.read(folder / "ping.txt").answers if (at := one.at_utc_ns)]
-    found = track.apart(track.read(folder / "track.csv"), Role.SENDER, Role.RECEIVER, min(times_ns), max(times_ns))
+    found = track.separation_between(
+        track.read(folder / "track.csv"), Role.SENDER, Role.RECEIVER, min(times_ns), max(times_ns)
+    )
     assert found is not None
     return found
 
@@ -92,14 +94,14 @@ def held_m(trial: Path) -> float:
     return max(math.dist(*pair) for pair in pairwise(places[:-1])) + 1e-3
 
 
-def as_columns_say(trial: Path) -> Apart:
+def as_columns_say(trial: Path) -> Separation:
     (row,) = rows(trial)
     assert row["status"] == "valid", row["reason"]
-    names = Apart.__dataclass_fields__
-    return Apart(*(float(row[f"rtt_{name}"] or "nan") for name in names))
+    names = Separation.__dataclass_fields__
+    return Separation(*(float(row[f"rtt_{name}"] or "nan") for name in names))
 
 
-def assert_alike(one: Apart, other: Apart, *, within_m: float) -> None:
+def assert_alike(one: Separation, other: Separation, *, within_m: float) -> None:
     """Both say the same distances, and the same speeds but for corners and noise."""
     assert astuple(one)[:4] == pytest.approx(astuple(other)[:4], abs=within_m)
     assert one.relative_speed_m_s == pytest.approx(other.relative_speed_m_s, abs=0.1 * SPEED_M_S)
@@ -145,7 +147,7 @@ def test_satellites_tell_it_too(lab: Path) -> None:
     )
 
 
-def gpx(path: Path, where: tuple[Whereabouts, ...], late_s: float) -> None:
+def gpx(path: Path, where: tuple[TrackPoint, ...], late_s: float) -> None:
     """Write the way of the receiver as the telephone of somebody would who walks with it, whose clock is late."""
     points = []
     for one, following in pairwise(one for one in where if one.role is Role.RECEIVER):

@@ -31,5 +31,5 @@ def test_the_example_passes(python: Path, example: Path) -> None:
     )
     assert Path(where.stdout.decode().strip()).is_relative_to(python.parents[1])
     done = suites.run(example, python=str(python), beside=())
-    assert (done.code, set(done.ended.values()), len(done.ended)) == (0, {"passed"}, 3), done.said
+    assert (done.code, set(done.results.values()), len(done.results)) == (0, {"passed"}, 3), done.output
     assert not (example / "fieldkit-results").exists()

@@ -12,7 +12,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.backends.registry import load_backend
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Protocol, RepeatId, Role, Topology
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.captures import pcap
 from fieldkit.remote import evidence, fetching, jobs
@@ -39,7 +39,7 @@ def lab() -> Iterator[tuple[Testbed, Scene]]:
         procedure=load_procedure("los"), distance=parse_distance("5m"), topology=Topology.MASTERLESS
     )
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
-    with backend.open(cast, seed=1, sink=lambda event: None, operator=Nobody()) as up:
+    with backend.open(cast, seed=1, sink=lambda event: None, operator=Unattended()) as up:
         up.place(plan.placement)
         yield up, plan.scene(RepeatId(Protocol.UDP, 1), FOLDER)
 

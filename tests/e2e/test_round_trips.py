@@ -11,7 +11,7 @@ from fieldkit.backends.registry import load_backend
 from fieldkit.config import schema
 from fieldkit.core.events import Event, RepeatEnded
 from fieldkit.core.model import Protocol, Status, Topology
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
@@ -59,7 +59,9 @@ def test_connecting_and_each_repeat_take_few_round_trips_in_sequence(tmp_path: P
                 assert event.status is Status.VALID, event.reason
                 passed.append(slow.trips)
 
-        robots = opened(backend, cast, session=plan.session, what=plan.trial, seed=1, sink=sink, operator=Nobody())
+        robots = opened(
+            backend, cast, session=plan.session, what=plan.trial, seed=1, sink=sink, operator=Unattended()
+        )
         with robots as testbed:
             assert slow.trips <= TO_OPEN
             run_trial(plan, testbed, tmp_path, sink)

@@ -8,7 +8,7 @@ import pytest
 from fieldkit.config import locations
 from fieldkit.core.deadline import Deadline
 from tests.helpers.host import Untouched
-from tests.helpers.labs import built_in_ros, own_procedure
+from tests.helpers.labs import built_in_ros, write_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
@@ -119,7 +119,7 @@ steps:
 
 
 def run_procedure(lab: Path, text: str) -> Run:
-    return fieldkit(lab, "trial", own_procedure(lab, text), "5m")
+    return fieldkit(lab, "trial", write_procedure(lab, text), "5m")
 
 
 def test_a_link_and_a_robot_come_back_and_the_rows_say_when(tmp_path: Path, untouched: Untouched) -> None:

@@ -9,7 +9,7 @@ from fieldkit.cli import main
 from fieldkit.core.errors import EvidenceError
 from fieldkit.trial import store
 from tests.helpers import stored_trials
-from tests.helpers.stored_trials import OUTPUTS, TRIALS, said
+from tests.helpers.stored_trials import OUTPUTS, TRIALS, command_output
 
 STORED = sorted(path.name for path in TRIALS.iterdir())
 
@@ -30,14 +30,14 @@ def differing(trials: list[Path]) -> list[str]:
 @pytest.mark.parametrize("name", STORED)
 def test_tables_made_again_are_the_same_bytes(trials: list[Path], name: str) -> None:
     trial = Path("trials", name)
-    assert "the same bytes as before" in said("rebuild", str(trial))
+    assert "the same bytes as before" in command_output("rebuild", str(trial))
     for table in ("trial.csv", "summary.csv"):
         assert (trial / table).read_bytes() == (TRIALS / name / table).read_bytes(), table
 
 
 @pytest.mark.parametrize("name", STORED)
 def test_every_file_is_the_one_that_was_written(trials: list[Path], name: str) -> None:
-    said("verify", f"trials/{name}")
+    command_output("verify", f"trials/{name}")
     kept = {path.relative_to(TRIALS / name) for path in (TRIALS / name).rglob("*") if path.is_file()}
     listed = {Path(line.split("  ", 1)[1]) for line in (TRIALS / name / "MANIFEST.sha256").read_text().splitlines()}
     assert listed - kept == set(), "a name that git ignores?"
@@ -48,7 +48,7 @@ def test_every_output_is_as_it_was(trials: list[Path]) -> None:
 
 
 def test_every_output_is_the_same_from_raw_evidence(trials: list[Path]) -> None:
-    said("export", "trials", "--rebuild", "--format", "csv", "-o", "again.csv")
+    command_output("export", "trials", "--rebuild", "--format", "csv", "-o", "again.csv")
     assert Path("again.csv").read_bytes() == (OUTPUTS / "export.csv").read_bytes()
 
 
@@ -61,5 +61,5 @@ def test_evidence_that_another_hand_changed_is_seen(trials: list[Path]) -> None:
     ping.write_text("".join(lines[:reply] + lines[reply + 1 :]), encoding="utf-8")
     assert main(["rebuild", str(lossy)]) == EvidenceError.exit_code, "it is not what was summed"
     (lossy / store.MANIFEST_FILE).unlink()
-    assert "changed: trial.csv" in said("rebuild", str(lossy))
+    assert "changed: trial.csv" in command_output("rebuild", str(lossy))
     assert {"export.csv", "mcap.json", "report.txt", "figures.json"} <= set(differing(trials))

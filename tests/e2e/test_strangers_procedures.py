@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-from tests.helpers.labs import BOX, own_procedure
+from tests.helpers.labs import BOX, write_procedure
 from tests.helpers.runs import fieldkit, rows
 
 pytestmark = pytest.mark.emulated
@@ -120,7 +120,7 @@ def worked(folder: Path, name: str) -> Stranger:
     (folder / "tools").mkdir()
     (folder / "tools" / "probe.sh").write_text(PROBE, encoding="utf-8")
     (folder / "tools" / "probe.sh").chmod(0o755)
-    own_procedure(folder, HEAD.replace("NAME", name) + PROCEDURES[name])
+    write_procedure(folder, HEAD.replace("NAME", name) + PROCEDURES[name])
 
     def says(command: str, *words: str) -> str:
         run = fieldkit(folder, command, *words)

@@ -6,7 +6,7 @@ from typing import Final
 
 import pytest
 
-from tests.helpers.labs import own
+from tests.helpers.labs import copy_shipped
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
@@ -52,8 +52,8 @@ def trial(lab: Path, pair: Pair, *words: str) -> Run:
     """Run a short trial in a lab of two robots whose only netcat is `nc`, whatever it is."""
     for name, recorder in (("one", pair.recorder), ("two", ROSBAG)):
         changes = ("name: turtlebot3_burger", f"name: {name}", "netcat: nc.traditional", "netcat: nc", *recorder)
-        own(lab, "robots", "turtlebot3_burger", *changes, called=name)
-    own(lab, "procedures", "los", *SHORTER)
+        copy_shipped(lab, "robots", "turtlebot3_burger", *changes, called=name)
+    copy_shipped(lab, "procedures", "los", *SHORTER)
     (lab / "fieldkit.yaml").write_text(
         SITE.format(one=pair.sender, two=pair.receiver, ros=pair.ros), encoding="utf-8"
     )

@@ -11,7 +11,7 @@ from rosbags.rosbag1 import Reader
 
 from fieldkit.trial.columns import trial_columns
 from tests.helpers.host import Untouched, descendants, wait_for_end
-from tests.helpers.labs import built_in_ros, own
+from tests.helpers.labs import built_in_ros, copy_shipped
 from tests.helpers.runs import Run, fieldkit, only_trial, rows, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -161,7 +161,7 @@ def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path, untou
 
 
 def test_a_silent_topic_makes_every_attempt_void_and_the_trial_invalid(tmp_path: Path) -> None:
-    own(
+    copy_shipped(
         tmp_path,
         "procedures",
         "los",
@@ -182,7 +182,7 @@ def test_a_silent_topic_makes_every_attempt_void_and_the_trial_invalid(tmp_path:
 
 def test_a_tool_that_a_robot_lacks_stops_the_trial_before_repeat_1(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
-    own(tmp_path, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
+    copy_shipped(tmp_path, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
     run = fieldkit(tmp_path, "trial", "los", "30ft")
     assert run.code == 3
     assert "nc.imaginary" in run.err

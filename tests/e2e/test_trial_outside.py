@@ -48,4 +48,4 @@ def until_it_records(outside: Outside) -> tuple[str, ...]:
 
 
 def left(outside: Outside, role: Role) -> tuple[str, ...]:
-    return jobs.left(outside.testbed.shells[role], Deadline.after(30))
+    return jobs.list_running(outside.testbed.shells[role], Deadline.after(30))

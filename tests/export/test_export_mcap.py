@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import NonSeekingReader, make_reader
 
 from fieldkit.cli import main
-from fieldkit.core.model import LinkSample, Role, StationSample, Whereabouts
+from fieldkit.core.model import LinkSample, Role, StationSample, TrackPoint
 from fieldkit.measure.evidence import link_samples, track
 from fieldkit.trial import journal
 from tests.helpers import recorded
@@ -271,9 +271,9 @@ def test_a_track_replaces_the_planned_places(trial: Path) -> None:
     folder = next(path for path in (trial / "repeats").iterdir() if path.name == "udp-01")
     began_ns = min(message.time_ns for message in before)
     went = [
-        Whereabouts(began_ns - SECOND_NS, Role.SENDER, (1.0, 2.0, 0.2)),
-        Whereabouts(began_ns + 10**6, Role.SENDER, (1.5, 2.0, 0.2), (2.0, 0.0, 0.0)),
-        Whereabouts(began_ns + 2 * 10**6, Role.SENDER, None),
+        TrackPoint(began_ns - SECOND_NS, Role.SENDER, (1.0, 2.0, 0.2)),
+        TrackPoint(began_ns + 10**6, Role.SENDER, (1.5, 2.0, 0.2), (2.0, 0.0, 0.0)),
+        TrackPoint(began_ns + 2 * 10**6, Role.SENDER, None),
     ]
     (folder / "track.csv").write_text(track.text(went), encoding="ascii")
     read_messages = messages(exported(trial, "tracked.mcap"))
@@ -291,7 +291,7 @@ def test_added_positions_replace_the_testbeds_track(trial: Path) -> None:
     began_ns = min(message.time_ns for message in of(messages(exported(trial)), "/tf"))
     folder = trial / "repeats" / "udp-01"
     (folder / "track.csv").write_text(
-        track.text([Whereabouts(began_ns, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER)])
+        track.text([TrackPoint(began_ns, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER)])
     )
     times_s = [began_ns / SECOND_NS + second for second in (-20, -10, 0.001, 3600)]
     lines = "".join(f"{at_s:.6f},48.1,{11 + number},\n" for number, at_s in enumerate(times_s))

@@ -28,7 +28,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.driving import DriveLease
 from fieldkit.steps.kinds import ask
-from fieldkit.steps.scene import Said
+from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
@@ -77,13 +77,13 @@ def _drove(data: bytes, place: Path) -> None:
     (place / drive_log.FILE).write_bytes(data)
     found = drive_log.measure(drive_log.read(place / drive_log.FILE))
     for column in drive_log.COLUMNS:
-        assert column.problem(cell(found.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell(found.values.get(column.name))) is None, column.name
 
 
 def _driver(data: bytes, _: Path) -> None:
     lease = DriveLease(cast("Shell", None), _JOB, "{}", 1.0)
-    lease.said = data
-    assert lease.why.isprintable()
+    lease.output = data
+    assert lease.end_state.isprintable()
 
 
 def _answer(data: bytes, place: Path) -> None:
@@ -110,8 +110,8 @@ def _needs(data: bytes, _: Path) -> None:
     report, text = Report("robot"), data.decode(errors="replace")
     for placed in _needy().walk():
         for need in placed.step.needs(scene):
-            for code in (0, 1, Said.MISSING):
-                report.add(need.name, *need.judge(Said(text, code)))
+            for code in (0, 1, CommandResult.MISSING):
+                report.add(need.name, *need.judge(CommandResult(text, code)))
     assert all(one.detail.isprintable() and one.remedy.isprintable() for one in report.findings)
 
 
@@ -150,7 +150,7 @@ def _bag(data: bytes, place: Path) -> None:
             found = recorded.read_topic(path, account)
             _sound(found)
             if found.yaws_rad is not None:
-                _sound(recorded.from_start(found, account))
+                _sound(recorded.to_placement_frame(found, account))
 
 
 def _file(ending: str, data: bytes, place: Path) -> None:
@@ -170,14 +170,14 @@ def _whole(of_trial: bool, data: bytes, place: Path) -> None:
     (folder / accounts.FILE).write_bytes(data)
     evidence = AttemptEvidence(attempt)
     times_ns = [BEGAN_NS + S, BEGAN_NS + 3 * S]
-    found = where.measure(evidence, ping.WAY_COLUMNS, _ENDS, times_ns)
+    found = where.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
     assert all(math.isfinite(float(value)) for value in found.values.values())  # what is too far, gates refuse
     where.distances_m(evidence, _ENDS)
-    where.told_of(evidence)
+    where.readable_samples(evidence)
     said = accounts.read(folder / accounts.FILE)
     (place / "again.json").write_text(accounts.text(said), encoding="utf-8")
     assert accounts.read(place / "again.json") == said
-    where.in_words(evidence)
+    where.sources_text(evidence)
     assert math.isfinite(where.clock_error_s(evidence) or 0.0)
 
 
@@ -206,7 +206,7 @@ def _received(data: bytes, place: Path) -> None:
     (place / "scan.bag").write_bytes(_heard())
     found = reception.measure(reception.read(place, "log", "scan.bag", ["/scan"], 5.0))
     for column in reception.COLUMNS:
-        assert column.problem(cell(found.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell(found.values.get(column.name))) is None, column.name
 
 
 def _lines(lines: Iterator[dict[str, Any]]) -> bytes:

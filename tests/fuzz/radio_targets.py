@@ -34,9 +34,9 @@ _PRINTED: Final = {"end": {"sum": {"bits_per_second": 5e6}}, "intervals": [{"sum
 def _measured(samples: list[LinkSample]) -> None:
     """Measure a link; a table can hold what came of it."""
     found = link.measure(Role.SENDER, samples)
-    link.line(samples)
+    link.link_history(samples)
     for column in link.COLUMNS:
-        assert column.problem(cell(found.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell(found.values.get(column.name))) is None, column.name
 
 
 def _testbeds(data: bytes, place: Path) -> None:
@@ -51,7 +51,7 @@ def _own(name: str, data: bytes, place: Path) -> None:
     if "link" not in name:
         (place / "sender-link.txt").write_text(_OWN, encoding="utf-8")
     (place / name).write_bytes(data)
-    _measured(list(link_samples.read_own(place, Role.SENDER)))
+    _measured(list(link_samples.read_robot(place, Role.SENDER)))
 
 
 def _iw(data: bytes, _: Path) -> None:
@@ -67,7 +67,7 @@ def _path(data: bytes, place: Path) -> None:
     """Look where a procedure's author says, a text of any length."""
     where = data.decode(errors="replace")
     (place / "run.txt").write_text(json.dumps(_PRINTED), encoding="ascii")
-    if printed.problem_of_path(where) is None:
+    if printed.path_error(where) is None:
         with suppress(EvidenceError):
             printed.at_path(place / "run.txt", where)
 
@@ -75,7 +75,7 @@ def _path(data: bytes, place: Path) -> None:
 def _expression(data: bytes, place: Path) -> None:
     expression = data.decode(errors="replace")
     (place / "run.txt").write_text("rtt = 12.5 ms\nloss: 3%\n" + "a" * 5000 + "b\n", encoding="ascii")
-    if printed.problem_of_expression(expression) is None:
+    if printed.expression_error(expression) is None:
         printed.by_expression(place / "run.txt", expression)
 
 

@@ -26,7 +26,7 @@ from fieldkit.measure import offsets
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.checks import topic_captures, topic_checks
-from fieldkit.measure.checks.topic_captures import Captured
+from fieldkit.measure.checks.topic_captures import CapturedTopic
 from fieldkit.measure.checks.topic_checks import TopicPlan
 from fieldkit.measure.evidence import (
     bag,
@@ -42,7 +42,7 @@ from fieldkit.measure.evidence import (
     tcpdump_log,
     track,
 )
-from fieldkit.measure.evidence.confined import ConfinedAnswerError
+from fieldkit.measure.evidence.confined import ReaderError
 from fieldkit.measure.motion import tlog
 from fieldkit.measure.positions import recorded
 from fieldkit.measure.positions.accounts import Account
@@ -50,7 +50,7 @@ from fieldkit.measure.transfers import topic_log, topics
 from fieldkit.measure.transfers.topics import TopicTraffic
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
-from fieldkit.steps.scene import Said
+from fieldkit.steps.scene import CommandResult
 from fieldkit.steps.view import View
 from fieldkit.trial import columns, journal, manifest, plan, rebuild, store
 from fieldkit.trial.check import probe, radio, software, system, tools
@@ -102,7 +102,7 @@ def _written(read: Callable[[Path], object], name: str, data: bytes, place: Path
 def _bag(path: Path) -> None:
     bag.read(path)
     bag.battery_share(path, TOPIC)
-    bag.heard(path)
+    bag.topic_stats(path)
 
 
 @cache
@@ -146,7 +146,7 @@ def _fault(data: bytes, place: Path) -> None:
 def _sections(data: bytes, _: Path) -> None:
     """Judge a robot by a mutated probe, and by sections that all say the same."""
     text = data.decode(errors="replace")
-    the_plan, said = los_plan(), Said(text.strip("\n"), 0)
+    the_plan, said = los_plan(), CommandResult(text.strip("\n"), 0)
     names = ("wifi-info", "wifi-link", "wifi-stations", "wifi-power-save", "interface", "offloads", "control", "disk")
     for sections in (probe.parse(text), dict.fromkeys((*names, "listeners", "batteries", "tools", "wireless"), said)):
         report = Report("robot")
@@ -186,7 +186,7 @@ def _tar(data: bytes, place: Path) -> None:
 def _tars() -> tuple[bytes, ...]:
     folder = LOS / "repeats" / "udp-01"
     small = (path for path in sorted(folder.iterdir()) if path.stat().st_size < 9000)
-    files = [(path.name.encode(), path.read_bytes()) for path in small if not laptop_files.reserved(path.name)]
+    files = [(path.name.encode(), path.read_bytes()) for path in small if not laptop_files.is_reserved(path.name)]
     members = [entry(b"scan/scan.db3", b"x"), *(entry(name, content) for name, content in files)]
     whole = b"".join(members) + bytes(1024)
     names = [one.name for one in archive.members(io.BytesIO(whole), "robot")]
@@ -197,7 +197,7 @@ def _tars() -> tuple[bytes, ...]:
 def _replies(data: bytes, place: Path) -> None:
     shells = [Sender(place, data, code=code, stderr=data) for code in (0, 1, 28, 75, 76, 255)]
     for shell in shells:
-        for ask in (locks.holder, partial(jobs.left, deadline=Deadline.after(1)), _called):
+        for ask in (locks.holder, partial(jobs.list_running, deadline=Deadline.after(1)), _called):
             with suppress(RobotError):
                 ask(shell)
     offsets.parse_date(data.decode("ascii", "replace"))
@@ -214,8 +214,8 @@ def _journal(data: bytes, place: Path) -> None:
         with suppress(EvidenceError):
             found = journal.history(place, _plan())
             journal.ended(found)
-            journal.cut_short(found)
-        journal.mend(place)
+            journal.interrupted(found)
+        journal.remove_torn_line(place)
 
 
 def _measured(name: str, data: bytes, place: Path) -> None:
@@ -234,7 +234,7 @@ def _measured(name: str, data: bytes, place: Path) -> None:
             placed.step.measure(view)
             list(placed.step.check(view))
         for error in found._failed.values():
-            if error.__cause__ is not None and not isinstance(error.__cause__, OSError | ConfinedAnswerError):
+            if error.__cause__ is not None and not isinstance(error.__cause__, OSError | ReaderError):
                 raise error.__cause__
 
 
@@ -282,9 +282,9 @@ def _host(path: Path) -> None:
     host.stations(path)
     state = host.state(path)
     for ending in (state.endings or {}).values():
-        endings.problem(ending, frozenset({endings.Cause.ITSELF}))
+        endings.termination_error(ending, frozenset({endings.Cause.ITSELF}))
     if state.clock is not None:
-        clock.problem(state.clock, state.clock)
+        clock.step_description(state.clock, state.clock)
 
 
 def _pinged(text: str) -> None:
@@ -295,7 +295,7 @@ def _pinged(text: str) -> None:
 
 def _tracked(path: Path) -> None:
     found = track.read(path)
-    track.apart(found, Role.SENDER, Role.RECEIVER, 0, 1 << 62)
+    track.separation_between(found, Role.SENDER, Role.RECEIVER, 0, 1 << 62)
 
 
 def _iperf3(path: Path) -> None:
@@ -328,8 +328,8 @@ def _topic_log(path: Path) -> None:
     found = topic_log.read(path)
     flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
     plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, on_ports=True)
-    list(topic_checks.of_logs(plan, found, found))
-    list(topic_captures.of_captures(plan, found, found, Captured(None, None, complete=False)))
+    list(topic_checks.check_logs(plan, found, found))
+    list(topic_captures.check_captures(plan, found, found, CapturedTopic(None, None, complete=False)))
     topics.measure(flow, found, found, None, None)
 
 
@@ -367,7 +367,7 @@ def _all_targets() -> Iterator[Target]:
     yield Target("iperf3", _all("iperf3/*/*.json"), partial(_measured_text, _iperf3))
     yield Target("tlog", (flight(3), flight(2, lost=lambda at: at % 3 == 1)), partial(_written, _tlog, "x.tlog"))
     told = b'{"frames": 203, "left_out": 0, "ended_us": 1795000010000000, "refused": {"32": 2}}\n'
-    yield Target("tlog-told", (told,), partial(_measured_text, tlog.told))
+    yield Target("tlog-told", (told,), partial(_measured_text, tlog.read_summary))
     yield Target("topic-log", _topic_logs(), partial(_measured_text, _topic_log))
     yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_all("iperf3/3.12/*.json")), _printed)
     yield Target("iw", (*_all("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe()), _sections, 2)

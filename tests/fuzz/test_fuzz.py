@@ -11,12 +11,12 @@ from fieldkit.core.errors import EvidenceError
 from tests.fuzz import harness, targets
 from tests.fuzz.harness import Defect, Target
 from tests.fuzz.mutate import MOST_BYTES, mutated
-from tests.helpers.nightly import others_at_night
+from tests.helpers.nightly import mark_nightly
 
 KEPT = Path(__file__).parent / "kept"
 
 
-@pytest.mark.parametrize("inputs", others_at_night([100, 3000]))
+@pytest.mark.parametrize("inputs", mark_nightly([100, 3000]))
 def test_a_short_hunt_finds_nothing(inputs: int, tmp_path: Path) -> None:
     *defects, tried = harness.hunted("", 10, inputs, tmp_path)
     assert defects == []

@@ -18,8 +18,8 @@ class Opened:
     """An open page, its console messages, and its requests other than for its own file."""
 
     page: Page
-    said: list[str] = field(default_factory=list)
-    asked_for: list[str] = field(default_factory=list)
+    console_messages: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
 
 
 @contextmanager
@@ -48,13 +48,13 @@ def opened(
         if route.request.url == path.as_uri():
             route.continue_()
         else:
-            opened_page.asked_for.append(route.request.url)
+            opened_page.requests.append(route.request.url)
             route.abort()
 
     context.route("**/*", filter_request)
-    opened_page.page.on("console", lambda message: opened_page.said.append(message.text))
-    opened_page.page.on("pageerror", lambda error: opened_page.said.append(str(error)))
-    opened_page.page.on("dialog", lambda dialog: opened_page.said.append(f"dialog: {dialog.message}"))
+    opened_page.page.on("console", lambda message: opened_page.console_messages.append(message.text))
+    opened_page.page.on("pageerror", lambda error: opened_page.console_messages.append(str(error)))
+    opened_page.page.on("dialog", lambda dialog: opened_page.console_messages.append(f"dialog: {dialog.message}"))
     opened_page.page.goto(path.as_uri())
     yield opened_page
     context.close()

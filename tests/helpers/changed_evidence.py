@@ -11,7 +11,7 @@ from fieldkit.core.columns import Value
 from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, store
-from fieldkit.trial.gates import Judged
+from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.plan import Plan
 from tests.helpers.paths import DATA
 
@@ -43,14 +43,14 @@ class Stored:
     plan: Plan
     repeat: RepeatId
     folder: Path
-    judged: Judged
+    judged: EvidenceVerdict
 
     def files(self) -> list[str]:
         """Sorted names of the files that robots wrote."""
         names = sorted(path.name for path in self.folder.iterdir())
         return [name for name in names if not any(fnmatch(name, pattern) for pattern in OF_THE_TESTBED)]
 
-    def changed(self, name: str, content: bytes | None, place: Path) -> Judged:
+    def changed(self, name: str, content: bytes | None, place: Path) -> EvidenceVerdict:
         """The judgement with different content for one file; None removes the file."""
         for path in self.folder.iterdir():
             (place / path.name).symlink_to(path)
@@ -59,7 +59,7 @@ class Stored:
             (place / name).write_bytes(content)
         return gates.judge(self.plan, self.repeat, AttemptEvidence(place))
 
-    def wrong(self, judged: Judged) -> dict[str, tuple[Value | None, Value]]:
+    def wrong(self, judged: EvidenceVerdict) -> dict[str, tuple[Value | None, Value]]:
         """Columns that changed although the attempt is still valid: the values before and after."""
         if judged.problems:
             return {}

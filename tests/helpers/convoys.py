@@ -13,7 +13,7 @@ from sim_backends.cosim.federates import Program
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.programs.follow import FollowAtHeadway
 from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.programs.several import Several
+from sim_backends.cosim.programs.several import CombinedProgram
 from sim_backends.cosim.programs.velocity_profile import SpeedOscillation
 from sim_backends.cosim.studies.intervals import Floats
 from sim_backends.network.disc import Disc
@@ -29,7 +29,7 @@ MEAN_M_S = 1.0
 SAMPLE_INTERVAL_NS = 10 * MS
 
 
-def places_m(
+def positions_m(
     policy: SyncPolicy,
     *,
     delay_s: float,
@@ -59,7 +59,7 @@ def places_m(
             else SpeedOscillation(MEAN_M_S, 0.2, math.tau / rate_rad_s)
         ]
         parts += [Periodic(name, follower, period_ns=period_ms * MS) for follower in names[number + 1 : number + 2]]
-        programs[name] = Several(parts)
+        programs[name] = CombinedProgram(parts)
     sampled = SampledBodies(bodies)
     network = Disc(1e6, round(delay_s * 1e9))
     Coordinator(Agents(sampled, programs), network, policy, [*pairwise(names)]).advance(round(seconds * 1e9))

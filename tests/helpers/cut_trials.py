@@ -22,7 +22,7 @@ from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.runner import resume_trial, run_trial
 from tests.helpers.disks import Disk, FileSystem
 from tests.helpers.idle_testbed import IdleTestbed
-from tests.helpers.power import Cut, Witness, demand_resumable
+from tests.helpers.power import Cut, Witness, assert_resumable
 from tests.trial.test_trial_crash import VOID_FIRST, plan, robots_with_evidence
 
 OUT: Final = "trials"
@@ -128,7 +128,7 @@ def cuts_at_every_sync(disk: Disk, place: Path, *, without: str = "") -> tuple[l
         def cut(location: str) -> bool:
             witness.look()
             image = disk.image(mounted, place / f"cut-{len(cuts)}.img")
-            cuts.append(Cut(image, dict(witness.told), witness.is_over, f"cut {len(cuts)}, before {location}"))
+            cuts.append(Cut(image, dict(witness.reported), witness.is_over, f"cut {len(cuts)}, before {location}"))
             locations.append(location)
             return location != without
 
@@ -190,7 +190,7 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
         (out := mounted / OUT).mkdir(exist_ok=True)
         witness = Witness(out)
         witness.look()
-        witness.told = dict.fromkeys(witness.versions, 0)  # these versions are on disk and must stay there
+        witness.reported = dict.fromkeys(witness.versions, 0)  # these versions are on disk and must stay there
         states: list[tuple[dict[str, int], bool]] = []
         cut_requested = threading.Event()
 
@@ -201,7 +201,7 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
 
         def cut() -> None:
             # The trial may hold any lock here, including one of the thread pool, so no thread is started.
-            states.append((dict(witness.told), witness.is_over))
+            states.append((dict(witness.reported), witness.is_over))
             cut_requested.set()
 
         def look(_location: str) -> bool:
@@ -239,12 +239,12 @@ def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, *, 
     for number in range(1, most + 1):
         cut, witness = cut_at_a_moment(disk, place, image, draw.randrange(calls))
         image.rename(disk.file)
-        with disk.mend().mounted(place / "disk") as mounted:
+        with disk.repair().mounted(place / "disk") as mounted:
             lost = cut.lost(mounted / OUT, witness)
             assert not lost, lost
             if cut.is_over or number == most:
                 run(mounted / OUT, witness)
-                demand_resumable(mounted / OUT)
+                assert_resumable(mounted / OUT)
                 break
     disk.file.unlink()
     return number

@@ -32,7 +32,7 @@ class FileSystem:
     kind: str
     make: tuple[str, ...]
     options: str
-    mend: tuple[str, ...] = ()
+    repair: tuple[str, ...] = ()
 
 
 FILE_SYSTEMS: Final = (
@@ -52,7 +52,7 @@ STRICTEST: Final = FILE_SYSTEMS[1]
 
 
 @contextmanager
-def workplace(folder: Path) -> Iterator[Path]:
+def mount_workspace(folder: Path) -> Iterator[Path]:
     """Yield `folder` with a file system in memory, for disks and images.
 
     Call it in a separate mount namespace (`host.namespaces_of_our_own`): the kernel removes all mounts in it, and
@@ -85,9 +85,9 @@ class Disk:
         _run(*file_system.make, str(file))
         return cls(file_system, file)
 
-    def mend(self) -> "Disk":
+    def repair(self) -> "Disk":
         """Repair the disk as at boot after a power cut, before it is mounted."""
-        if command := self._file_system.mend:
+        if command := self._file_system.repair:
             completed = subprocess.run((*command, str(self.file)), capture_output=True, text=True, check=False)
             assert completed.returncode in {0, 1}, completed.stdout  # e2fsck(8): 1 means that errors were corrected
         return self

@@ -231,7 +231,7 @@ def autopilot_at_usb(path: Path, firmware: Firmware = ARDUCOPTER) -> Iterator[tu
             usb.pull_out()
 
 
-def hostile(seed: int) -> Damage:
+def damage_randomly(seed: int) -> Damage:
     """A function that sends, with each frame, damaged frames and other bytes."""
     random_source = random.Random(seed)
 

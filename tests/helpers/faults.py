@@ -34,7 +34,7 @@ class _Clock:
 
 
 @contextmanager
-def lasting(up: EmulatedTestbed, fault: Fault) -> Iterator[None]:
+def inject_until_exit(up: EmulatedTestbed, fault: Fault) -> Iterator[None]:
     """Inject `fault` for the duration of the context, instead of its configured duration; it is active on entry."""
     clock = _Clock()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:

@@ -5,7 +5,7 @@ from contextlib import AbstractContextManager
 
 from fieldkit.backends.protocols import Oracle
 from fieldkit.core.model import Fault, Move, Placement, Role
-from fieldkit.core.prompts import DONE, NOBODY, Answer, Operator
+from fieldkit.core.prompts import DONE, UNATTENDED, Answer, Operator
 from fieldkit.remote.shell import Shell
 
 
@@ -17,7 +17,7 @@ class IdleTestbed:
     """
 
     oracle: Oracle | None = None
-    operator: Operator = NOBODY
+    operator: Operator = UNATTENDED
 
     def __init__(self, shells: Mapping[Role, Shell] | None = None) -> None:
         self.shells = shells or {}

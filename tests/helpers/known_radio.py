@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.labs import own_procedure
+from tests.helpers.labs import write_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 LOSSES_PERCENT = (0, 1, 10, 30)
@@ -49,7 +49,7 @@ def make_lab(lab: Path, radio: str, *, topic: str = "/scan", pings: int = 1, rep
     lab.mkdir()
     (lab / "fieldkit.yaml").write_text(SITE.replace("RADIO", radio), encoding="utf-8")
     text = PROCEDURE.replace("TOPIC", topic).replace("PINGS", str(pings)).replace("REPEATS", str(repeats))
-    own_procedure(lab, text)
+    write_procedure(lab, text)
     return lab
 
 

@@ -17,7 +17,7 @@ limits: {max_speed_m_s: 1}
 """The profile of a robot without ROS."""
 
 
-def changed(text: str, *changes: str) -> str:
+def replace_text(text: str, *changes: str) -> str:
     """The text with replacements, given as pairs of old and new strings; each old string must occur."""
     for old, new in zip(changes[::2], changes[1::2], strict=True):
         assert old in text, old
@@ -35,14 +35,14 @@ def built_in_ros(folder: Path, name: str = SITE_FILE) -> Path:
     return site
 
 
-def own(lab: Path, kind: Kind, name: str, *changes: str, called: str = "") -> None:
+def copy_shipped(lab: Path, kind: Kind, name: str, *changes: str, called: str = "") -> None:
     """Write a changed copy of a shipped file to a lab, under its name or the name `called`."""
     text = (ROOT / kind / f"{name}.yaml").read_text(encoding="utf-8")
     (lab / kind).mkdir(exist_ok=True)
-    (lab / kind / f"{called or name}.yaml").write_text(changed(text, *changes), encoding="utf-8")
+    (lab / kind / f"{called or name}.yaml").write_text(replace_text(text, *changes), encoding="utf-8")
 
 
-def own_procedure(lab: Path, text: str) -> str:
+def write_procedure(lab: Path, text: str) -> str:
     """Write a procedure to a lab; return its name."""
     name = text.partition("\n")[0].removeprefix("name: ")
     (lab / "procedures").mkdir(exist_ok=True)

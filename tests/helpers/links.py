@@ -59,7 +59,7 @@ class Link:
 
 
 @dataclass(frozen=True)
-class Fate:
+class PacketFates:
     """The fate of the sent packets, known to the generator.
 
     Attributes:
@@ -75,7 +75,7 @@ class Fate:
     bursts: int
 
     @classmethod
-    def of(cls, sent: int, arrived: Sequence[int]) -> "Fate":
+    def of(cls, sent: int, arrived: Sequence[int]) -> "PacketFates":
         arrived_once = set(arrived)
         latest, reordered = -1, 0
         for number in dict.fromkeys(arrived):

@@ -29,7 +29,7 @@ class Measures(dict[str, Any]):
 COLUMNS = frozenset(column.name for column in measures())
 
 
-def every(figures_by_column: Measures) -> dict[str, Any]:
+def all_columns(figures_by_column: Measures) -> dict[str, Any]:
     """All columns; None for a missing figure."""
     return {name: figures_by_column.get(name) for name in COLUMNS}
 
@@ -41,7 +41,7 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
     positions = evidence.read_or_none(track.read, track.FILE)
     reply_times_ns = [at for answer in pings.answers if (at := answer.at_utc_ns)] if pings else []
     measured = lateness.measure(evidence.read_or_none(lateness.read, lateness.FILE)) | ping.measure(pings)
-    measured |= track.measure(positions, ping.WAY_COLUMNS, (Role.SENDER, Role.RECEIVER), reply_times_ns)
+    measured |= track.measure(positions, ping.MOTION_COLUMNS, (Role.SENDER, Role.RECEIVER), reply_times_ns)
     if transfer is not None:
         measured |= figures.measure(evidence, transfer) | _captures(evidence)
         assert not {column.name for column in of_transfers.COLUMNS} - measured.values.keys() - measured.missing.keys()
@@ -61,5 +61,7 @@ def _captures(evidence: AttemptEvidence) -> Measured:
         log = evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_file(role))
         frame_count = capture.frames if capture else None
         dropped = log.dropped_by_kernel if log else None
-        measured |= Measured.of({f"{role}_captured": frame_count, f"{role}_capture_dropped": dropped}, "not at hand")
+        measured |= Measured.from_optional(
+            {f"{role}_captured": frame_count, f"{role}_capture_dropped": dropped}, "not at hand"
+        )
     return measured

@@ -69,4 +69,4 @@ class Meter(Step):
 
     @override
     def measure(self, view: View) -> Measured:
-        return Measured.nothing(self.output_columns(), "there is no meter")
+        return Measured.all_missing(self.output_columns(), "there is no meter")

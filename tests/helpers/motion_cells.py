@@ -27,7 +27,7 @@ class Craft(StrEnum):
         return self is not Craft.ROVER
 
 
-class Blow(StrEnum):
+class InjectedFault(StrEnum):
     """The fault that is applied to each party of a cell."""
 
     KILL = "kill"
@@ -152,13 +152,13 @@ class MotionCell:
 
     craft: Craft
     parties: tuple[Party, ...]
-    blow: Blow
+    fault: InjectedFault
     moment: Moment
 
     @property
     def name(self) -> str:
         """Name on the command line: robot/parties/fault/phase."""
-        return f"{self.craft}/{'+'.join(self.parties)}/{self.blow}/{self.moment}"
+        return f"{self.craft}/{'+'.join(self.parties)}/{self.fault}/{self.moment}"
 
     @property
     def routed(self) -> bool:
@@ -170,17 +170,19 @@ class MotionCell:
         """True if the programs must lose their link to the autopilot and the flight log can show it."""
         link_parties = {*self.parties} & {Party.ROUTER, Party.SERVER}
         is_logged = Party.SERVER in link_parties or Party.PILOT not in self.parties
-        return bool(link_parties) and is_logged and self.blow is not Blow.SLOW and self.moment not in AT_REST
+        return (
+            bool(link_parties) and is_logged and self.fault is not InjectedFault.SLOW and self.moment not in AT_REST
+        )
 
 
 _CONTROL: Final = {Party.LAPTOP, Party.FIELDKIT, Party.LINK}
 _BLOWS: Final = {
-    Party.LAPTOP: (Blow.KILL, Blow.PAUSE, Blow.SUSPEND),
-    Party.LINK: (Blow.KILL, Blow.PAUSE, Blow.SLOW),  # cut, cut for `PAUSE_S`, delayed
-    Party.OPERATOR: (Blow.CTRL_C, Blow.STOP),
+    Party.LAPTOP: (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SUSPEND),
+    Party.LINK: (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SLOW),  # cut, cut for `PAUSE_S`, delayed
+    Party.OPERATOR: (InjectedFault.CTRL_C, InjectedFault.STOP),
 }
-_ALL_BLOWS: Final = (Blow.KILL, Blow.PAUSE, Blow.SUSPEND, Blow.SLOW)
-_PAIR_BLOWS: Final = (Blow.KILL, Blow.PAUSE, Blow.SLOW)
+_ALL_BLOWS: Final = (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SUSPEND, InjectedFault.SLOW)
+_PAIR_BLOWS: Final = (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SLOW)
 
 
 def _parties(craft: Craft) -> tuple[Party, ...]:
@@ -213,7 +215,9 @@ def _all_cells() -> tuple[MotionCell, ...]:
             blows = _BLOWS.get(party, _ALL_BLOWS)
             cells += [MotionCell(craft, (party,), blow, moment) for blow, moment in product(blows, moments)]
         # `fieldkit stop` while the fieldkit process of the trial is suspended.
-        cells += [MotionCell(craft, (Party.FIELDKIT, Party.OPERATOR), Blow.STOP, moment) for moment in moments]
+        cells += [
+            MotionCell(craft, (Party.FIELDKIT, Party.OPERATOR), InjectedFault.STOP, moment) for moment in moments
+        ]
         pairs = list(filter(_is_valid_pair, combinations(parties, 2)))
         if craft is Craft.PX4:  # other faults affect only programs that are the same for both autopilots
             pairs = [(Party.PILOT, Party.GUARD)]
@@ -222,16 +226,17 @@ def _all_cells() -> tuple[MotionCell, ...]:
                 if all(blow in _BLOWS.get(party, _ALL_BLOWS) for party in pair):
                     cells.append(MotionCell(craft, pair, blow, moment))
         if craft.flies:  # only fieldkit can detect these
-            cells += [MotionCell(craft, flight_programs, Blow.SUSPEND, moment) for moment in moments]
+            cells += [MotionCell(craft, flight_programs, InjectedFault.SUSPEND, moment) for moment in moments]
             drone_programs = (*flight_programs, Party.SERVER)
             cells += [
                 MotionCell(craft, drone_programs, *blow_and_moment)
-                for blow_and_moment in product((Blow.KILL, Blow.SUSPEND), moments)
+                for blow_and_moment in product((InjectedFault.KILL, InjectedFault.SUSPEND), moments)
             ]
             # The router is killed, and then a person runs `fieldkit abort`.
             router_and_operator = (Party.ROUTER, Party.OPERATOR)
             cells += [
-                MotionCell(craft, router_and_operator, Blow.ABORT, moment) for moment in (Moment.FLYING, Moment.THERE)
+                MotionCell(craft, router_and_operator, InjectedFault.ABORT, moment)
+                for moment in (Moment.FLYING, Moment.THERE)
             ]
     return tuple(cells)
 
@@ -239,7 +244,7 @@ def _all_cells() -> tuple[MotionCell, ...]:
 CELLS: Final = _all_cells()
 
 
-def chosen(patterns: str) -> list[MotionCell]:
+def select_cells(patterns: str) -> list[MotionCell]:
     """The cells whose names match at least one of the comma-separated shell patterns.
 
     Raises:
@@ -267,30 +272,30 @@ def _drive_expectation(cell: MotionCell) -> Expectation:
     lease_s = DRIVE_LEASE_S + brakes_s
     if Party.OPERATOR in cell.parties:
         return Expectation("operator", "stops, stays", OPERATOR_S + brakes_s)
-    if cell.blow is Blow.SLOW and Party.LINK not in cell.parties:
+    if cell.fault is InjectedFault.SLOW and Party.LINK not in cell.parties:
         return Expectation("", "may continue, or stops", None)
-    if Party.AGENT in cell.parties and cell.blow is not Blow.SLOW:
+    if Party.AGENT in cell.parties and cell.fault is not InjectedFault.SLOW:
         return Expectation("base: no Twists", "stops, stays", BASE_S + brakes_s)
     return Expectation("agent: lease", "stops, stays", lease_s)
 
 
 def _flight_expectation(cell: MotionCell) -> Expectation:
     parties = {*cell.parties}
-    paused_s = PAUSE_S if cell.blow is Blow.PAUSE else 0.0
+    paused_s = PAUSE_S if cell.fault is InjectedFault.PAUSE else 0.0
     has_control_link = not parties & _CONTROL  # fieldkit runs and reaches the drone
     delay_s = (SERVER_S if Party.SERVER in parties else 0.0) + (paused_s if Party.ROUTER in parties else 0.0)
-    if cell.blow is Blow.ABORT:
+    if cell.fault is InjectedFault.ABORT:
         does, ends_s = "behaviour of the autopilot", UNHEARD_S + ENDS_S + LOAD_S
         expectation = Expectation("pilot, guard", does, None, alarm=True, judged=False, programs_s=ends_s)
     elif Party.OPERATOR in parties:
         expectation = _lands("operator", OPERATOR_S)
-    elif (cell.blow is Blow.SLOW and Party.LINK not in parties) or parties == {Party.SERVER}:
+    elif (cell.fault is InjectedFault.SLOW and Party.LINK not in parties) or parties == {Party.SERVER}:
         expectation = Expectation(
             "clients: a new server" if Party.SERVER in parties else "", "may continue, or lands", None
         )
     elif parties >= {Party.PILOT, Party.GUARD}:
         expectation = _lands("fieldkit", RESCUE_S + RESCUE_STARTS_S + delay_s, alarm_s=RESCUE_S + LOAD_S)
-    elif Party.ROUTER in parties and cell.blow is not Blow.PAUSE:
+    elif Party.ROUTER in parties and cell.fault is not InjectedFault.PAUSE:
         # No program on the drone reaches the autopilot any more.
         detected_by = "fieldkit: no log" if has_control_link else "autopilot"
         expectation = Expectation(

@@ -19,7 +19,7 @@ from fieldkit.core.model import Role, Topology, Vector
 from sim_backends.emulated.nodes import EmulatedRobot
 from tests.helpers import motion_router
 from tests.helpers.host import descendants
-from tests.helpers.labs import BOX, changed, own_procedure
+from tests.helpers.labs import BOX, replace_text, write_procedure
 from tests.helpers.motion_cells import (
     DRIVE_ACCELERATION_M_S2,
     DRIVE_LEASE_S,
@@ -111,10 +111,10 @@ def profiles(folder: Path) -> None:
     (folder / "robots/rover.yaml").write_text(rover, encoding="utf-8")
     for craft, autopilot in ((Craft.PX4, "px4"), (Craft.COPTER, "ardupilot")):
         for name, connection in ((craft, ""), (f"{craft}_routed", f", connection: tcp:127.0.0.1:{ROUTER_PORT}")):
-            text = changed(BOX, "name: box", f"name: {name}", "kind: ugv", "kind: uav")
+            text = replace_text(BOX, "name: box", f"name: {name}", "kind: ugv", "kind: uav")
             limits = f"limits: {{max_speed_m_s: 3, max_height_m: 30, fence_m: {FENCE_M[craft]:g}}}"
             mavlink = f"mavlink: {{port: {AUTOPILOT_PORT}, autopilot: {autopilot}{connection}}}"
-            text = changed(text, "limits: {max_speed_m_s: 1}", f"{limits}\n{mavlink}")
+            text = replace_text(text, "limits: {max_speed_m_s: 1}", f"{limits}\n{mavlink}")
             (folder / "robots" / f"{name}.yaml").write_text(text, encoding="utf-8")
 
 
@@ -168,10 +168,10 @@ class MotionLab:
         lines = [line for line in lines if not line.startswith("roles:")] + [roles]
         text = "\n".join(lines) + "\n"
         if cell.routed:
-            text = changed(text, f"{name}: {{profile: {craft},", f"{name}: {{profile: {craft}_routed,")
+            text = replace_text(text, f"{name}: {{profile: {craft},", f"{name}: {{profile: {craft}_routed,")
         (folder / SITE_FILE).write_text(text, encoding="utf-8")
         path_m, inner_s = (_PATHS | (_FLOWN_PATHS if craft.flies else _DRIVEN_PATHS))[cell.moment]
-        own_procedure(
+        write_procedure(
             folder,
             (_FLY if craft.flies else _DRIVE).format(
                 path_m=path_m,

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from tests.helpers.motion_cells import AT_REST, CELLS, Blow, Craft, MotionCell, expected
+from tests.helpers.motion_cells import AT_REST, CELLS, Craft, InjectedFault, MotionCell, expected
 from tests.helpers.motion_outcomes import MotionOutcome
 from tests.helpers.motion_parties import Party
 
@@ -18,13 +18,13 @@ _TITLES: Final = {
     Craft.COPTER: "Drone with ArduCopter",
 }
 _FAULTS: Final = {
-    Blow.KILL: "killed",
-    Blow.PAUSE: "6 s suspended",
-    Blow.SUSPEND: "suspended",
-    Blow.SLOW: "slow",
-    Blow.CTRL_C: "Ctrl-C",
-    Blow.STOP: "`fieldkit stop`",
-    Blow.ABORT: "`fieldkit abort`",
+    InjectedFault.KILL: "killed",
+    InjectedFault.PAUSE: "6 s suspended",
+    InjectedFault.SUSPEND: "suspended",
+    InjectedFault.SLOW: "slow",
+    InjectedFault.CTRL_C: "Ctrl-C",
+    InjectedFault.STOP: "`fieldkit stop`",
+    InjectedFault.ABORT: "`fieldkit abort`",
 }
 _CELLS: Final = {cell.name: cell for cell in CELLS}
 
@@ -54,12 +54,12 @@ def tables(outcomes: Sequence[MotionOutcome], made: str) -> str:
 
 
 def _rows(craft: Craft, outcomes: Sequence[MotionOutcome]) -> Iterator[str]:
-    groups: dict[tuple[tuple[Party, ...], Blow], list[tuple[MotionCell, MotionOutcome]]] = {}
+    groups: dict[tuple[tuple[Party, ...], InjectedFault], list[tuple[MotionCell, MotionOutcome]]] = {}
     for outcome in outcomes:
         cell = _CELLS[outcome.cell]
         if cell.craft is craft:
-            groups.setdefault((cell.parties, cell.blow), []).append((cell, outcome))
-    order = list(dict.fromkeys((cell.parties, cell.blow) for cell in CELLS if cell.craft is craft))
+            groups.setdefault((cell.parties, cell.fault), []).append((cell, outcome))
+    order = list(dict.fromkeys((cell.parties, cell.fault) for cell in CELLS if cell.craft is craft))
     for key in sorted(groups, key=order.index):
         (parties, blow), members = key, groups[key]
         expectation = expected(next((cell for cell, _ in members if cell.moment not in AT_REST), members[0][0]))
@@ -71,10 +71,10 @@ def _rows(craft: Craft, outcomes: Sequence[MotionOutcome]) -> Iterator[str]:
         yield "| " + " | ".join([*cells, str(len(members)), str(beyond)]) + " |"
 
 
-def _fault(parties: Sequence[Party], blow: Blow) -> str:
+def _fault(parties: Sequence[Party], blow: InjectedFault) -> str:
     if {*parties} == {Party.LINK}:
-        return {Blow.KILL: "cut", Blow.PAUSE: "6 s cut", Blow.SLOW: "3.5 s delay"}[blow]
-    if blow is Blow.ABORT:
+        return {InjectedFault.KILL: "cut", InjectedFault.PAUSE: "6 s cut", InjectedFault.SLOW: "3.5 s delay"}[blow]
+    if blow is InjectedFault.ABORT:
         return "killed, then `fieldkit abort`"
     if parties == (Party.FIELDKIT, Party.OPERATOR):
         return f"suspended, then {_FAULTS[blow]}"

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from tests.helpers.motion_cells import AT_REST, DELAY_S, PAUSE_S, Blow, Moment, MotionCell, expected
+from tests.helpers.motion_cells import AT_REST, DELAY_S, PAUSE_S, InjectedFault, Moment, MotionCell, expected
 from tests.helpers.motion_lab import LONG_S, MotionLab, start_trial
 from tests.helpers.motion_outcomes import MotionOutcome, problems
 from tests.helpers.motion_parties import ON_ROBOT, Party, SlowProcesses, agents_on, pids_of, send
@@ -172,29 +172,29 @@ class MotionTrial:
     def _inject(self) -> None:
         """Apply the fault to the parties; an operator acts last."""
         assert self._process is not None
-        blow, parties = self.cell.blow, {*self.cell.parties}
+        fault, parties = self.cell.fault, {*self.cell.parties}
         pids = {pid for party in parties & {*ON_ROBOT} for pid in self._pids_on_robot(party)}
         self._servers = self._pids_on_robot(Party.SERVER) if self.cell.cuts_link else set()
         if parties & {Party.FIELDKIT, Party.LAPTOP}:
             pids.add(self._process.pid)
         if parties & {Party.LINK, Party.LAPTOP}:
             self._disturb_link()
-        if blow is Blow.CTRL_C:
+        if fault is InjectedFault.CTRL_C:
             send(signal.SIGINT, {self._process.pid})
-        elif blow in {Blow.KILL, Blow.ABORT}:
+        elif fault in {InjectedFault.KILL, InjectedFault.ABORT}:
             send(signal.SIGKILL, pids)
-        elif blow is Blow.SLOW and pids:
+        elif fault is InjectedFault.SLOW and pids:
             self._restorers.append(SlowProcesses(pids).end)
-        elif blow is not Blow.SLOW:
+        elif fault is not InjectedFault.SLOW:
             send(signal.SIGSTOP, pids)
             self._restorers.append(lambda: send(signal.SIGCONT, pids))
-        if blow in {Blow.STOP, Blow.ABORT}:
-            self._run_command(blow)
+        if fault in {InjectedFault.STOP, InjectedFault.ABORT}:
+            self._run_command(fault)
 
     def _disturb_link(self) -> None:
         """Cut or delay the control link."""
         links, role = self.lab.outside.links, self.lab.role(self.cell.craft)
-        if self.cell.blow is Blow.SLOW:
+        if self.cell.fault is InjectedFault.SLOW:
             links.delay(role, DELAY_S)
             self._restorers.append(lambda: links.delay(role, 0.0))
         else:
@@ -207,18 +207,19 @@ class MotionTrial:
         assert pids, f"no process of the {party} runs on the robot"
         return pids
 
-    def _run_command(self, blow: Blow) -> None:
+    def _run_command(self, blow: InjectedFault) -> None:
         """Run `fieldkit stop` or `fieldkit abort`, as from another terminal."""
         name = self.lab.robot(self.cell.craft).name
-        completed = fieldkit(self.folder, *(("stop", name) if blow is Blow.STOP else ("abort", "--yes")))
+        completed = fieldkit(self.folder, *(("stop", name) if blow is InjectedFault.STOP else ("abort", "--yes")))
         (self.folder / "stop").write_text(completed.out + completed.err, encoding="utf-8")
 
     def _observe(self, sampler: MotionSampler, at_s: float) -> None:
         """Observe the robot until some time after it has stopped or landed; end a pause in time."""
-        paused_until_s = at_s + PAUSE_S if self.cell.blow is Blow.PAUSE else None
-        is_suspended = self.cell.blow in {Blow.SUSPEND, Blow.STOP} and {Party.FIELDKIT, Party.LAPTOP} & {
-            *self.cell.parties
-        }
+        paused_until_s = at_s + PAUSE_S if self.cell.fault is InjectedFault.PAUSE else None
+        is_suspended = self.cell.fault in {InjectedFault.SUSPEND, InjectedFault.STOP} and {
+            Party.FIELDKIT,
+            Party.LAPTOP,
+        } & {*self.cell.parties}
         rest_at_s: float | None = None
         while True:
             time.sleep(0.05)

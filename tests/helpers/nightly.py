@@ -9,7 +9,7 @@ from _pytest.mark import ParameterSet
 T = TypeVar("T")
 
 
-def others_at_night(values: Iterable[T], *, in_ci: Collection[T] = ()) -> list[T | ParameterSet]:
+def mark_nightly(values: Iterable[T], *, in_ci: Collection[T] = ()) -> list[T | ParameterSet]:
     """Values for `pytest.mark.parametrize`; those that CI skips are marked `nightly` and run with `make nightly`.
 
     Args:

@@ -10,7 +10,7 @@ from fieldkit.config.locations import SITE_FILE
 from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Placement, Role, Scenario, Topology
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.robot import ssh_server
@@ -53,7 +53,7 @@ def robots_outside(
     """
     backend = EmulatedBackend(*load_site(site or built_in_ros(folder, "robots.yaml")))
     cast = backend.cast(topology)
-    with backend.open(cast, seed=1, sink=lambda _: None, operator=Nobody()) as testbed:
+    with backend.open(cast, seed=1, sink=lambda _: None, operator=Unattended()) as testbed:
         assert isinstance(testbed, EmulatedTestbed)
         testbed.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
         with Forwarder({role: robot.connect for role, robot in testbed.robots.items()}) as links:

@@ -11,7 +11,7 @@ from sim_backends.cosim.observer import Window, WindowObserver
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.sliding_window import SlidingWindow
 from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.recording.manifest import About
+from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.network.disc import Disc
 from sim_backends.network.ip import Fragment
@@ -20,7 +20,7 @@ from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import WayPoints
 
 MS = 1_000_000
-ABOUT = About("robots: two\n", "sliding_window", {"window_s": 0.0033}, 1)
+ABOUT = RunSettings("robots: two\n", "sliding_window", {"window_s": 0.0033}, 1)
 
 
 def passing_robots(observer: WindowObserver | None = None, policy: SyncPolicy | None = None) -> Coordinator:

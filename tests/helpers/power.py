@@ -29,7 +29,7 @@ class Witness:
 
     folder: Path
     versions: dict[str, list[bytes]] = field(default_factory=dict)
-    told: dict[str, int] = field(default_factory=dict)
+    reported: dict[str, int] = field(default_factory=dict)
     is_over: bool = False
 
     def look(self) -> None:
@@ -43,7 +43,7 @@ class Witness:
         """Record the present versions if an event reports completed work to the user."""
         if isinstance(event, Note | RepeatEnded | TrialEnded):
             self.look()
-            self.told |= {name: len(versions) - 1 for name, versions in self.versions.items()}
+            self.reported |= {name: len(versions) - 1 for name, versions in self.versions.items()}
             self.is_over = isinstance(event, TrialEnded)
 
 
@@ -59,7 +59,7 @@ class Cut:
     """
 
     disk: Disk
-    told: dict[str, int]
+    reported: dict[str, int]
     is_over: bool
     at: str
 
@@ -73,7 +73,7 @@ class Cut:
         remaining = visible(folder)
         lost = [
             f"{self.at}: {name} is {'older than reported' if name in remaining else 'missing'}"
-            for name, number in self.told.items()
+            for name, number in self.reported.items()
             if not _is_current(
                 remaining.get(name), witness.versions[name][number:], grows=name.endswith(JOURNAL_FILE)
             )
@@ -86,7 +86,7 @@ class Cut:
         return lost + [f"{self.at}: {problem}" for problem in _lost_evidence(folder, witness)]
 
 
-def everything(folder: Path) -> dict[str, bytes | None]:
+def read_tree(folder: Path) -> dict[str, bytes | None]:
     """The content of each file below a folder, and None for each subfolder."""
     paths = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
     return {name: path.read_bytes() if path.is_file() else None for name, path in paths.items()}
@@ -94,7 +94,7 @@ def everything(folder: Path) -> dict[str, bytes | None]:
 
 def visible(folder: Path) -> dict[str, bytes]:
     """The content of each file below a folder that has its final name."""
-    entries = everything(folder).items()
+    entries = read_tree(folder).items()
     return {name: content for name, content in entries if "/." not in f"/{name}" and content is not None}
 
 
@@ -130,12 +130,12 @@ def _lost_evidence(folder: Path, witness: Witness) -> Iterator[str]:
                 yield f"{name} does not match the manifest"
 
 
-def demand_resumable(out: Path) -> None:
+def assert_resumable(out: Path) -> None:
     """Resume a trial after a cut; it must end complete, with all attempts that had ended or were measured."""
     folder = trial_of(out)
     entries = journal.read(folder) if (folder / JOURNAL_FILE).is_file() else []
     before, evidence = journal.ended(entries), visible(folder / "repeats")
-    measured = [attempt for attempt in journal.cut_short(entries) if attempt.status is Status.MEASURED]
+    measured = [attempt for attempt in journal.interrupted(entries) if attempt.status is Status.MEASURED]
     resume_trial(folder, IdleTestbed(), lambda _: None)
     demand_whole(out)
     after = journal.ended(journal.read(folder))

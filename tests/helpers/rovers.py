@@ -13,7 +13,7 @@ from fieldkit.core.model import Placement, Role, Scenario, Topology, Vector
 from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from sim_backends.emulated.ros.steered import Steered
-from tests.helpers.labs import BOX, changed
+from tests.helpers.labs import BOX, replace_text
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
@@ -52,7 +52,7 @@ _SETUP: Final = ("/opt/ros/noetic/setup.bash",)
 
 def rover_profile(*, fence_m: float, ros: str = "ros1", lease_s: float = 2.0, acceleration_m_s2: float = 2.0) -> str:
     """The profile `rover`: a TurtleBot3 with a higher speed, so that tests take less time."""
-    return changed(
+    return replace_text(
         (ROOT / "robots/turtlebot3_burger.yaml").read_text(encoding="utf-8"),
         *("name: turtlebot3_burger", "name: rover", "variant: ros1", f"variant: {ros}"),
         *("max_speed_m_s: 0.22", "max_speed_m_s: 1.0", "fence_m: 30", f"fence_m: {fence_m:g}"),
@@ -105,7 +105,7 @@ class RoverLab:
             if position.role is Role.SENDER and position.utc_ns >= since_ns and position.position_m is not None
         ]
 
-    def put(self, distance: str) -> None:
+    def place_at(self, distance: str) -> None:
         """Place the stationary rover at a distance from the box, as a person would carry it."""
         self.outside.testbed.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance(distance)))
 
@@ -113,7 +113,7 @@ class RoverLab:
         """Wait until the rover drives."""
         wait_until(lambda: self.drives, Deadline.after(LONG_S))
 
-    def push(self, distance_m: float) -> None:
+    def drive_forward(self, distance_m: float) -> None:
         """Drive the rover forward with its velocity topic, as a remote control would."""
         start_m = self.place_m
         topic = ("rostopic", "pub", "-r", "10", "/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 1.0}}")
@@ -140,6 +140,6 @@ def rover_lab(folder: Path, *, fence_m: float = 30.0, lease_s: float = 2.0) -> I
     (folder / "lab.yaml").write_text(_SITE, encoding="utf-8")
     with chdir(folder), robots_outside(folder, site=folder / "lab.yaml") as outside:
         site = (folder / SITE_FILE).read_text(encoding="utf-8")
-        swapped = changed(site, _ROLES, "roles: {masterless: {sender: box-1, receiver: rover-1}}")
+        swapped = replace_text(site, _ROLES, "roles: {masterless: {sender: box-1, receiver: rover-1}}")
         (folder / RECEIVER_SITE).write_text(swapped, encoding="utf-8")
         yield RoverLab(outside)

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Final
 
 from benchmarks.radio_vs_ns3 import Ns3
-from tests.helpers.labs import changed
+from tests.helpers.labs import replace_text
 from tests.helpers.paths import ROOT
 
 Shrink = Callable[[ModuleType, Path], None]
@@ -162,7 +162,7 @@ def _one_setting(module: ModuleType, folder: Path) -> None:
     site_lines = [
         line for line in text.splitlines() if not line.lstrip().startswith(("rover-2", "rover-3", "rover-4"))
     ]
-    small = changed("\n".join(site_lines) + "\n", ", rover2: rover-2, rover3: rover-3, rover4: rover-4", "")
+    small = replace_text("\n".join(site_lines) + "\n", ", rover2: rover-2, rover3: rover-3, rover4: rover-4", "")
     (lab / "fieldkit.yaml").write_text(small, encoding="utf-8")
     replace(module, "LAB", lab)
     replace(module, "SUBSCRIBER", ("base", "10.42.0.2"))
@@ -175,7 +175,9 @@ def _one_trial(module: ModuleType, folder: Path) -> None:
     shutil.copytree(module.LAB, lab)
     path = lab / "masterless-los.yaml"
     text = path.read_text(encoding="utf-8")
-    path.write_text(changed(text, "[10ft, 20ft, 30ft, 55ft]", "[10ft]", "record: 2s", "record: 1s"), encoding="utf-8")
+    path.write_text(
+        replace_text(text, "[10ft, 20ft, 30ft, 55ft]", "[10ft]", "record: 2s", "record: 1s"), encoding="utf-8"
+    )
     replace(module, "CAMPAIGNS", ("masterless-los",))
     replace(module, "LAB", lab)
 
@@ -215,7 +217,7 @@ def _one_stream(module: ModuleType, folder: Path) -> None:
     site_lines = [
         line for line in text.splitlines() if not line.lstrip().startswith(("rover-2", "rover-3", "rover-4"))
     ]
-    small = changed(
+    small = replace_text(
         "\n".join(site_lines) + "\n",
         ", rover2: rover-2, rover3: rover-3, rover4: rover-4",
         "",
@@ -224,7 +226,7 @@ def _one_stream(module: ModuleType, folder: Path) -> None:
     )
     (lab / "fieldkit.yaml").write_text(small, encoding="utf-8")
     campaign = (module.LAB / "dds.yaml").read_text(encoding="utf-8")
-    (lab / "dds.yaml").write_text(changed(campaign, "[20m, 40m, 60m, 80m]", "[20m]"), encoding="utf-8")
+    (lab / "dds.yaml").write_text(replace_text(campaign, "[20m, 40m, 60m, 80m]", "[20m]"), encoding="utf-8")
     (folder / "lab" / "procedures").mkdir(parents=True)
     (folder / "lab" / "procedures" / "middleware_dds.yaml").write_text(_STREAM, encoding="utf-8")
     replace(module, "LAB", lab)

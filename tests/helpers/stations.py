@@ -15,7 +15,7 @@ STRONG_MW = 1e-4
 HEADERS_BYTES = 28
 
 
-class ByHand(RadioChannel):
+class FixedPowers(RadioChannel):
     """A channel where all stations receive each other equally well, except the pairs in `deaf`."""
 
     def __init__(self, names: Sequence[str], mode: WifiMode, *, deaf: Sequence[tuple[str, str]] = ()) -> None:

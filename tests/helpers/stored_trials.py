@@ -48,11 +48,11 @@ def texts(trials: Sequence[Path]) -> Iterator[tuple[str, str]]:
     `trials` contains the lossless run, the lossy run, and others, in the order in which they are stored.
     """
     for form in ("csv", "json", "markdown", "latex"):
-        yield f"aggregate.{form}", said("aggregate", "trials", "--format", form)
+        yield f"aggregate.{form}", command_output("aggregate", "trials", "--format", form)
     lossless, lossy = (trial for trial in trials if "_los_" in trial.name)
     for form in ("csv", "json", "markdown"):
-        yield f"compare.{form}", said("compare", str(lossless), str(lossy), "--force", "--format", form)
-    said("export", "trials", "--format", "csv", "-o", "table.csv")
+        yield f"compare.{form}", command_output("compare", str(lossless), str(lossy), "--force", "--format", form)
+    command_output("export", "trials", "--format", "csv", "-o", "table.csv")
     yield "export.csv", Path("table.csv").read_text(encoding="utf-8")
     yield "mcap.json", _json({trial.name: _timeline(trial) for trial in trials})
     recorded: list[contents.Contents] = []
@@ -63,12 +63,12 @@ def texts(trials: Sequence[Path]) -> Iterator[tuple[str, str]]:
         return recorded[-1]
 
     with patch.object(contents, "put_together", record_contents):
-        said("report", "trials", "-o", "report.html")
+        command_output("report", "trials", "-o", "report.html")
     yield "report.txt", _page_text(Path("report.html").read_text(encoding="utf-8"))
     yield "figures.json", _json(list(_figures(recorded[0])))
 
 
-def said(*arguments: str) -> str:
+def command_output(*arguments: str) -> str:
     """The output of a command.
 
     Raises:
@@ -92,7 +92,7 @@ def _digest(value: object) -> str:
 def _timeline(trial: Path) -> dict[str, Any]:
     """Schema, times, and a digest of all messages for each topic of a trial's MCAP file."""
     path = Path(f"{trial.name}.mcap")
-    said("export", str(trial), "--format", "mcap", "-o", str(path))
+    command_output("export", str(trial), "--format", "mcap", "-o", str(path))
     topics: dict[str, list[Any]] = {}
     descriptions: dict[str, Any] = {}
     with path.open("rb") as file:

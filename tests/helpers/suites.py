@@ -34,8 +34,8 @@ class SuiteRun:
     """
 
     code: int
-    said: str
-    ended: dict[str, str]
+    output: str
+    results: dict[str, str]
     properties: dict[str, list[tuple[str, str]]]
 
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import pytest
 
-from tests.helpers.motion_cells import CELLS, Blow, Craft, Moment, MotionCell, chosen, expected
+from tests.helpers.motion_cells import CELLS, Craft, InjectedFault, Moment, MotionCell, expected, select_cells
 from tests.helpers.motion_outcomes import MotionOutcome, problems
 from tests.helpers.motion_parties import Party
 from tests.helpers.motion_table import tables
 from tests.helpers.motion_truth import MotionSample, descended_s, grounded_s, moved_again_m, stopped_s
 
-OUT = MotionCell(Craft.ROVER, (Party.FIELDKIT,), Blow.KILL, Moment.OUT)
-ROUTED = MotionCell(Craft.COPTER, (Party.ROUTER,), Blow.PAUSE, Moment.FLYING)
-FLYING = MotionCell(Craft.COPTER, (Party.PILOT,), Blow.KILL, Moment.FLYING)
+OUT = MotionCell(Craft.ROVER, (Party.FIELDKIT,), InjectedFault.KILL, Moment.OUT)
+ROUTED = MotionCell(Craft.COPTER, (Party.ROUTER,), InjectedFault.PAUSE, Moment.FLYING)
+FLYING = MotionCell(Craft.COPTER, (Party.PILOT,), InjectedFault.KILL, Moment.FLYING)
 
 
 def course(
@@ -103,11 +103,11 @@ def test_the_cells_cover_each_party_and_each_pair() -> None:
 
 
 def test_cells_are_selected_by_name() -> None:
-    assert [cell.name for cell in chosen("rover/agent/kill/*")] == [
+    assert [cell.name for cell in select_cells("rover/agent/kill/*")] == [
         f"rover/agent/kill/{moment}" for moment in ("waiting", "out", "there", "back")
     ]
     with pytest.raises(ValueError, match="no cell matches"):
-        chosen("rover/pilot/*")
+        select_cells("rover/pilot/*")
 
 
 def test_a_table_shows_the_median_and_the_phase_of_the_maximum() -> None:

@@ -11,7 +11,7 @@ from fieldkit.agent.records import Log
 from fieldkit.core.columns import Measured
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.checks import topic_captures, topic_checks
-from fieldkit.measure.checks.topic_captures import Captured
+from fieldkit.measure.checks.topic_captures import CapturedTopic
 from fieldkit.measure.checks.topic_checks import TopicPlan
 from fieldkit.measure.transfers import sample_heads, topic_log, topics
 from fieldkit.measure.transfers.topics import TopicTraffic
@@ -48,9 +48,9 @@ class TopicAttempt:
     """
 
     sent: tuple[Row, ...]
-    came: tuple[Row, ...]
-    near: tuple[Frame, ...]
-    far: tuple[Frame, ...]
+    received: tuple[Row, ...]
+    sender_frames: tuple[Frame, ...]
+    receiver_frames: tuple[Frame, ...]
     plan: TopicPlan = PLAN
 
 
@@ -123,7 +123,7 @@ def write(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> 
     end = START + topic_attempt.plan.samples * PERIOD + 2 * SECOND
     for role, rows, log_kind, end_ns in (
         ("sender", topic_attempt.sent, records.PUBLISHER, end),
-        ("receiver", topic_attempt.came, records.SUBSCRIBER, end + AHEAD),
+        ("receiver", topic_attempt.received, records.SUBSCRIBER, end + AHEAD),
     ):
         path = folder / f"{role}-topic.bin"
         log = Log(str(path))
@@ -136,12 +136,12 @@ def write(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> 
             content = path.read_bytes()[: -records.RECORD.size]
             samples = sum(row[0] == records.SAMPLE for row in rows)
             path.write_bytes(content + records.RECORD.pack(records.END, 0, 0, samples, 0, end_ns))
-    for role, frames in (("sender", topic_attempt.near), ("receiver", topic_attempt.far)):
+    for role, frames in (("sender", topic_attempt.sender_frames), ("receiver", topic_attempt.receiver_frames)):
         sorted_frames = sorted(frames, key=lambda frame: frame.time_ns)
         (folder / f"{role}.pcap").write_bytes(file_bytes(sorted_frames))
 
 
-def judged(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> tuple[list[str], Measured]:
+def judge_attempt(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> tuple[list[str], Measured]:
     """The contradictions in an attempt, and its measured values."""
     write(topic_attempt, folder, signed=signed)
     sent, came = (topic_log.read(folder / f"{role}-topic.bin") for role in ("sender", "receiver"))
@@ -162,10 +162,12 @@ def judged(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) ->
             )
         )
     sender_flow, receiver_flow = flows
-    captured = Captured(sender_flow, receiver_flow, complete=topic_captures.is_complete(sender_flow, receiver_flow))
+    captured = CapturedTopic(
+        sender_flow, receiver_flow, complete=topic_captures.is_complete(sender_flow, receiver_flow)
+    )
     reasons = [f"{end.foreign} foreign" for end in (sent, came) if end.foreign]  # as the step reports it
-    reasons += topic_checks.of_logs(topic_attempt.plan, sent, came)
-    reasons += [] if reasons else topic_captures.of_captures(topic_attempt.plan, sent, came, captured)
+    reasons += topic_checks.check_logs(topic_attempt.plan, sent, came)
+    reasons += [] if reasons else topic_captures.check_captures(topic_attempt.plan, sent, came, captured)
     measured = topics.measure(TRAFFIC, sent, came, *packets)
     arrived = topics.first_arrivals(came)
     withheld = topic_captures.withheld(

@@ -34,7 +34,7 @@ class TestHost:
 
 
 @contextmanager
-def cabled() -> Iterator[tuple[TestHost, TestHost]]:
+def two_connected_hosts() -> Iterator[tuple[TestHost, TestHost]]:
     """Yield two hosts on one cable."""
     with ExitStack() as stack:
         first, second = (stack.enter_context(_namespace()) for _ in ADDRESSES)

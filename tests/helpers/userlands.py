@@ -16,7 +16,7 @@ USERLANDS = ("debian", "busybox", "bash")
 """dash with coreutils and util-linux; BusyBox alone with its ash as sh; bash as sh."""
 
 
-def path_of(userland: str, folder: Path) -> str:
+def userland_path(userland: str, folder: Path) -> str:
     """The PATH of a robot with the userland, whose programs are linked in `folder`."""
     folder.mkdir(exist_ok=True)
     if userland == "bash":
@@ -50,7 +50,7 @@ class LocalSession:
             (program, *argv[1:]), cwd=shell.home, stdin=stdin, stdout=pipe, stderr=pipe, env=environment
         )
         assert self.process.stdout is not None
-        self.told = not until or self.process.stdout.readline() == until
+        self.is_ready = not until or self.process.stdout.readline() == until
 
     def end(self, *, deadline: Deadline, check: bool = True, stdin: bytes = b"") -> Completed:
         try:
@@ -69,7 +69,7 @@ class LocalShell:
         self.home = home
         self.path = path
         self.robot = robot
-        self.by_hand = robot
+        self.ssh_destination = robot
         self.sessions: list[LocalSession] = []
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:

@@ -7,7 +7,7 @@ import numpy as np
 
 from fieldkit.config import schema
 from fieldkit.core import columns
-from fieldkit.core.columns import Column, Figure, Kind, Value, named
+from fieldkit.core.columns import Column, Figure, Kind, Value, with_step_name
 from fieldkit.core.model import Protocol
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers.columns import COLUMNS
@@ -17,8 +17,8 @@ from fieldkit.trial.plan import Plan
 from tests.helpers.casts import los_plan
 
 NAMED = (
-    *(named(step, column) for step in ("up", "down") for column in COLUMNS),
-    *(named(step, column) for step in ("p502", "p8192") for column in ping.COLUMNS),
+    *(with_step_name(step, column) for step in ("up", "down") for column in COLUMNS),
+    *(with_step_name(step, column) for step in ("p502", "p8192") for column in ping.COLUMNS),
 )
 """Columns of two named transfers and two named pings."""
 VENDOR = columns.columns(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.model import Protocol, Role, Whereabouts
+from fieldkit.core.model import Protocol, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
 from fieldkit.measure.transfers import delay, figures, paper
@@ -25,7 +25,7 @@ from tests.helpers.captures import (
     timed,
     transfer,
 )
-from tests.helpers.measures import COLUMNS, Measures, every, measure
+from tests.helpers.measures import COLUMNS, Measures, all_columns, measure
 
 SNMP = "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: {}\nUdp: RcvbufErrors\nUdp: {}\n"
 LISTENING = "tcpdump: listening on wlan0, link-type RAW (Raw IP), snapshot length 128 bytes\n"
@@ -172,11 +172,11 @@ PIECES["ping.txt"] = {
 @pytest.mark.parametrize("missing", PIECES)
 def test_missing_evidence_empties_only_the_columns_that_depend_on_it(tmp_path: Path, missing: str) -> None:
     folder = _udp_folder(tmp_path)
-    track_text = track.text(Whereabouts(0, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER))
+    track_text = track.text(TrackPoint(0, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER))
     (folder / "track.csv").write_text(track_text, encoding="ascii")
-    complete = every(measure(folder, transfer(Protocol.UDP)))
+    complete = all_columns(measure(folder, transfer(Protocol.UDP)))
     (folder / missing).unlink()
-    remaining = every(measure(folder, transfer(Protocol.UDP)))
+    remaining = all_columns(measure(folder, transfer(Protocol.UDP)))
     assert {name for name in complete if complete[name] != remaining[name]} == PIECES[missing]
     assert all(remaining[name] is None for name in PIECES[missing])
 

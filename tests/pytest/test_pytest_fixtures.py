@@ -202,33 +202,35 @@ def part(said: str, title: str) -> str:
 
 def test_tests_pass_fail_and_have_errors_of_the_lab(ran: SuiteRun) -> None:
     assert ran.code == 1
-    failed = {name for name, how in ran.ended.items() if how == "failure"}
-    errors = {name.partition("[")[0] for name, how in ran.ended.items() if how == "error"}
-    assert failed == FAIL, ran.said
-    assert errors == {name.partition("[")[0] for name in ran.ended if "test_asks" in name or "test_gives" in name}
-    assert len(ran.ended) == len(FAIL) + len([how for how in ran.ended.values() if how == "error"]) + 10, ran.said
+    failed = {name for name, how in ran.results.items() if how == "failure"}
+    errors = {name.partition("[")[0] for name, how in ran.results.items() if how == "error"}
+    assert failed == FAIL, ran.output
+    assert errors == {name.partition("[")[0] for name in ran.results if "test_asks" in name or "test_gives" in name}
+    assert len(ran.results) == len(FAIL) + len([how for how in ran.results.values() if how == "error"]) + 10, (
+        ran.output
+    )
 
 
 def test_a_failure_is_reported_with_the_line_of_the_test(ran: SuiteRun) -> None:
-    said = part(ran.said, "test_fails_because_of_a_program")
+    said = part(ran.output, "test_fails_because_of_a_program")
     assert '>       robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])' in said
     assert "rover: `sh -c 'echo broken >&2; exit 3'` exited with code 3: broken" in said
     assert "/fieldkit/" not in said, "no internals of fieldkit are shown"
-    assert "rover: `sleep 60` did not end in time" in part(ran.said, "test_fails_because_of_a_timeout")
+    assert "rover: `sleep 60` did not end in time" in part(ran.output, "test_fails_because_of_a_timeout")
     assert "where inf = CellFigure(name='file_loss', unit='share', n=1" in part(
-        ran.said, "test_fails_because_of_a_figure"
+        ran.output, "test_fails_because_of_a_figure"
     )
-    assert "rtt_median_s < 1 us TCP" in part(ran.said, "test_fails_because_of_an_expectation")
+    assert "rtt_median_s < 1 us TCP" in part(ran.output, "test_fails_because_of_an_expectation")
 
 
 def test_an_error_of_the_lab_is_reported_with_its_remedy(ran: SuiteRun) -> None:
-    said = part(ran.said, "ERROR at setup of test_uses_an_unknown_robot")
+    said = part(ran.output, "ERROR at setup of test_uses_an_unknown_robot")
     assert "there is no robot 'sendr' in this lab\n  remedy: did you mean 'sender'?" in said
     assert "requested at test_robots.py:" in said
     assert "the site file gives no roles for topology master" in part(
-        ran.said, "ERROR at setup of test_uses_robots_missing_in_the_site"
+        ran.output, "ERROR at setup of test_uses_robots_missing_in_the_site"
     )
-    assert "remedy: write ['ping', '-c', '1', 'base']" in ran.said
+    assert "remedy: write ['ping', '-c', '1', 'base']" in ran.output
 
 
 def test_only_evidence_of_failures_is_kept(ran: SuiteRun, folder: Path) -> None:
@@ -249,7 +251,7 @@ def test_a_failed_test_names_its_evidence(ran: SuiteRun, folder: Path) -> None:
     (kept,) = (folder / "fieldkit-results").iterdir()
     own = kept / "test_robots.py" / "test_fails_because_of_a_program"
     assert f"fieldkit evidence -------------------------------\n{own}\n" in part(
-        ran.said, "test_fails_because_of_a_program"
+        ran.output, "test_fails_because_of_a_program"
     )
     assert ("fieldkit_evidence", str(own)) in ran.properties["test_fails_because_of_a_program"]
     assert not ran.properties["test_files_are_copied_in_both_directions"]
@@ -259,7 +261,7 @@ def test_each_worker_has_a_lab_and_all_share_one_folder(tmp_path: Path) -> None:
     files = {f"test_{name}": PASSES.format(name=name) for name in ("a", "b")}
     suites.write(tmp_path, **files)
     done = suites.run(tmp_path, "-n", "2", "--dist", "loadfile", "--fieldkit-keep", "all")
-    assert (done.code, set(done.ended.values())) == (0, {"passed"}), done.said
+    assert (done.code, set(done.results.values())) == (0, {"passed"}), done.output
     (kept,) = (tmp_path / "fieldkit-results").iterdir()
     logs = sorted(str(path.relative_to(kept)) for path in kept.rglob("lab.log"))
     assert logs == [f"test_{one}.py/{test}/lab.log" for one in "ab" for test in ("set-up", f"test_{one}", "test_one")]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.prompts import NOBODY
+from fieldkit.core.prompts import UNATTENDED
 from fieldkit.pytest.evidence import LOG, EvidenceKeeper
 from fieldkit.pytest.lab import OpenedLab
 from fieldkit.pytest.options import Keep, LabOptions
@@ -96,7 +96,7 @@ def test_tests_without_its_fixtures_import_no_other_module(tmp_path: Path) -> No
     """Other fixtures with the same names are not affected."""
     suites.write(tmp_path, site="robots: [", test_others=OTHERS, conftest=OWN)
     done = suites.run(tmp_path)
-    assert (done.code, set(done.ended.values())) == (0, {"passed"}), done.said
+    assert (done.code, set(done.results.values())) == (0, {"passed"}), done.output
     assert not (tmp_path / "fieldkit-results").exists()
 
 
@@ -160,10 +160,10 @@ def test_a_test_module_chooses_its_lab(pytester: pytest.Pytester) -> None:
 def test_an_unreachable_robot_is_an_error_with_a_remedy(tmp_path: Path) -> None:
     suites.write(tmp_path, site=field(tmp_path), test_asks=ASKS)
     done = suites.run(tmp_path)
-    assert (done.code, done.ended) == (1, {"test_asks": "error"}), done.said
-    assert "near: connection: 127.0.0.1 cannot be reached for SSH" in done.said
-    assert "far: connection: 127.0.0.2 cannot be reached for SSH" in done.said
-    assert "start its SSH server" in done.said
+    assert (done.code, done.results) == (1, {"test_asks": "error"}), done.output
+    assert "near: connection: 127.0.0.1 cannot be reached for SSH" in done.output
+    assert "far: connection: 127.0.0.2 cannot be reached for SSH" in done.output
+    assert "start its SSH server" in done.output
     (_, folder) = done.properties["test_asks"][0]
     assert "open field, masterless" in Path(folder, LOG).read_text(encoding="utf-8")
 
@@ -177,7 +177,7 @@ def test_workers_do_not_share_real_robots(tmp_path: Path) -> None:
     site = tmp_path / "fieldkit.yaml"
     site.write_text(field(tmp_path), encoding="utf-8")
     keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
-    lab = OpenedLab(LabOptions(site=site), keeper, NOBODY, workers=2)
+    lab = OpenedLab(LabOptions(site=site), keeper, UNATTENDED, workers=2)
     with pytest.raises(ConfigurationError, match="2 workers of pytest-xdist cannot share the robots") as caught:
         lab.open()
     assert caught.value.remedy.endswith("pytest -n 0")

@@ -15,9 +15,9 @@ from fieldkit.core.model import Role
 from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
-from fieldkit.trial.running.locks import Holder, taken
+from fieldkit.trial.running.locks import Holder, locked
 from tests.helpers.sshd import wait_until
-from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -40,7 +40,7 @@ class SmallShell(LocalShell):
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SmallShell]:
     home = tmp_path / "home"
     home.mkdir()
-    small_shell = SmallShell(home, path_of(request.param, tmp_path / "bin"))
+    small_shell = SmallShell(home, userland_path(request.param, tmp_path / "bin"))
     script = 'mount -t tmpfs -o size=2m tmpfs "$1" && echo mounted && exec cat'
     argv = ("unshare", "--mount", "--propagation", "private", "sh", "-c", script, "sh", str(home))
     with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
@@ -100,20 +100,20 @@ def test_evidence_that_does_not_fit_is_reported(shell: SmallShell, tmp_path: Pat
 
 def test_lock_that_does_not_fit_is_reported(shell: SmallShell) -> None:
     fill(shell)
-    with pytest.raises(RobotError, match=NO_SPACE), taken({Role.SENDER: shell}, Holder("a", "b", "c"), sink=print):
+    with pytest.raises(RobotError, match=NO_SPACE), locked({Role.SENDER: shell}, Holder("a", "b", "c"), sink=print):
         raise AssertionError("taken")
 
 
 def test_lock_that_cannot_be_renewed_is_reported_and_kept(shell: SmallShell) -> None:
     anna, bert = Holder("a", "anna@one", "a"), Holder("b", "bert@two", "b")
-    with taken({Role.SENDER: shell}, anna, sink=print):
+    with locked({Role.SENDER: shell}, anna, sink=print):
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
         shell.run(("sh", "-c", HALF_OVER), deadline=Deadline.after(30))
         fill(shell)
         with pytest.raises(RobotError, match=NO_SPACE):
             evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
         shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
-        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: shell}, bert, sink=print):
+        with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: shell}, bert, sink=print):
             raise AssertionError("taken twice")
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
 
@@ -131,7 +131,7 @@ def is_full(shell: SmallShell) -> bool:
 
 def test_job_that_fills_the_disk_is_stopped_by_abort_of_any_version(shell: SmallShell) -> None:
     anna = Holder("a", "anna@one", "a")
-    with taken({Role.SENDER: shell}, anna, sink=print):
+    with locked({Role.SENDER: shell}, anna, sink=print):
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
         jobs.start(shell, job("sh", "-c", "cat /dev/zero >hole; exec sleep 100"))
         wait_until(lambda: is_full(shell), Deadline.after(30))
@@ -152,7 +152,7 @@ def test_job_that_fills_the_disk_is_stopped_by_abort_of_any_version(shell: Small
 
 def test_lock_that_cannot_be_released_is_reported_and_not_awaited(shell: SmallShell) -> None:
     events: list[Event] = []
-    with taken({Role.SENDER: shell}, Holder("a", "anna@one", "a"), sink=events.append):
+    with locked({Role.SENDER: shell}, Holder("a", "anna@one", "a"), sink=events.append):
         fill(shell)
     (note,) = events
     assert isinstance(note, Note)

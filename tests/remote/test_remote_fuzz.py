@@ -21,7 +21,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LockLostError, RobotError
 from fieldkit.core.events import Event, Note, RepeatEnded
 from fieldkit.core.model import Status
-from fieldkit.core.text import unguarded
+from fieldkit.core.text import unescape_formula
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable, quote
 from fieldkit.remote.drain import drain
@@ -211,7 +211,7 @@ def test_any_answer_of_the_script_raises_an_error_of_fieldkit(said: bytes, code:
             said_then = error
         assert said_then is None if code == 0 else said_then is not None and harmless(said_then)
         if code == 0:
-            assert all(line.isprintable() for line in jobs.left(shell, Deadline.after(1)))
+            assert all(line.isprintable() for line in jobs.list_running(shell, Deadline.after(1)))
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_reason_is_one_cell_and_one_line(reason: str) -> None:
     assert len(table.splitlines()) == 2
     head, cells = csv.reader(io.StringIO(table, newline=""))
     expected = "".join(char if is_visible(char) else "?" for char in " ".join(reason.splitlines()))
-    assert unguarded(cells[head.index("reason")]) == expected
+    assert unescape_formula(cells[head.index("reason")]) == expected
     del cells[head.index("reason")]
     assert not any(cells)
 

@@ -28,7 +28,7 @@ from fieldkit.remote.shell import Completed
 from tests.helpers.host import ENDED
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import free_port, wait_until
-from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -39,12 +39,12 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
     home = tmp_path / "home"
     home.mkdir()
-    local_shell = LocalShell(home, path_of(request.param, tmp_path / "bin"))
+    local_shell = LocalShell(home, userland_path(request.param, tmp_path / "bin"))
     jobs.install(local_shell, Deadline.after(30))
     evidence.begin(local_shell, FOLDER, "sender", "lo")
     yield local_shell
     evidence.end_jobs(local_shell, FOLDER)
-    assert jobs.left(local_shell, Deadline.after(30)) == ()
+    assert jobs.list_running(local_shell, Deadline.after(30)) == ()
 
 
 def stop(shell: LocalShell, job_spec: Job, *, signal: str = "INT", settle: str | None = None) -> int:
@@ -106,7 +106,9 @@ def test_start_has_no_output(shell: LocalShell) -> None:
 def test_start_returns_when_the_port_is_bound(shell: LocalShell, protocol: Protocol) -> None:
     port = free_port()
     udp = ("-u",) if protocol is Protocol.UDP else ()
-    job_spec = replace(job("nc.traditional", *udp, "-l", "-p", str(port)), ready=jobs.bound(protocol, port))
+    job_spec = replace(
+        job("nc.traditional", *udp, "-l", "-p", str(port)), ready=jobs.ready_when_bound(protocol, port)
+    )
     jobs.start(shell, job_spec)
     table = Path(f"/proc/net/{protocol}").read_text(encoding="ascii")
     assert f":{port:04X} " in table
@@ -260,7 +262,7 @@ def test_serve_reports_readiness_and_exit_code(shell: LocalShell) -> None:
 def test_ended_listener_counts_as_ready_after_a_lost_link(shell: LocalShell) -> None:
     port = free_port()
     listen = 'nc.traditional -l -p "$0" & until [ -e go ]; do sleep 0.02; done; kill $!; exit 6'
-    job_spec = replace(job("sh", "-c", listen, str(port)), ready=jobs.bound(Protocol.TCP, port))
+    job_spec = replace(job("sh", "-c", listen, str(port)), ready=jobs.ready_when_bound(Protocol.TCP, port))
     first = jobs.serve(shell, job_spec)
     (shell.home / FOLDER / "go").touch()
     assert first.end(30) == 6
@@ -294,7 +296,7 @@ def test_job_after_its_parting_text_may_run_until_the_evidence_is_fetched(
     else:
         fetching.fetch(shell, FOLDER, "sender", "lo", into)
         assert (into / "job.log").read_text(encoding="ascii").endswith("counted\ngone\n")
-    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 def test_job_that_does_not_end_after_its_parting_text_is_killed(shell: LocalShell, tmp_path: Path) -> None:
@@ -304,7 +306,7 @@ def test_job_that_does_not_end_after_its_parting_text_is_killed(shell: LocalShel
     assert jobs.stop(shell, job_spec, grace_s=30, parting="counted") == 0
     with pytest.raises(RobotError, match=f"job job ended with exit code {jobs.KILLED}"):
         fetching.fetch(shell, FOLDER, "sender", "lo", tmp_path)
-    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 def test_job_that_ends_without_its_parting_text_returns_its_exit_code(shell: LocalShell) -> None:
@@ -327,7 +329,7 @@ def test_job_that_a_reboot_interrupted_is_reported(shell: LocalShell) -> None:
     for call in calls:
         with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
             call()
-    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 def test_no_job_starts_in_a_folder_whose_jobs_were_stopped(shell: LocalShell) -> None:
@@ -357,7 +359,7 @@ def test_job_that_starts_during_an_abort_does_not_run(
         with pytest.raises(RobotError, match=f"comes too late: the jobs of {FOLDER} were ended by bert@two"):
             starting.result(30)
     # `start` returns as soon as the leader has an identity; the leader may then still be about to exit.
-    wait_until(lambda: jobs.left(shell, Deadline.after(30)) == (), Deadline.after(30))
+    wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(30))
     assert not (shell.home / FOLDER / "started").exists()
 
 
@@ -378,7 +380,7 @@ def test_process_whose_folder_was_deleted_is_listed_and_stopped(shell: LocalShel
     wait_until((shell.home / FOLDER / "up").exists, Deadline.after(30))
     pid = leader(shell)
     shutil.rmtree(shell.home / FOLDER)
-    assert any(line.startswith(f"{FOLDER} {pid} ") for line in jobs.left(shell, Deadline.after(30)))
+    assert any(line.startswith(f"{FOLDER} {pid} ") for line in jobs.list_running(shell, Deadline.after(30)))
     ended = jobs.abort(shell, "anna@one", Deadline.after(30)).jobs
     assert any(line.startswith(FOLDER) and line.endswith("sleep 60") for line in ended)
     assert pending.session.process.wait(30) == -signal.SIGKILL
@@ -437,7 +439,7 @@ def test_begin_rejects_a_disk_with_less_space_than_needed(shell: LocalShell) -> 
 
 def test_missing_program_is_reported_at_the_installation(tmp_path: Path) -> None:
     folder = tmp_path / "bin"
-    path = path_of("busybox", folder)
+    path = userland_path("busybox", folder)
     (folder / "setsid").unlink()
     shell = LocalShell(tmp_path, str(folder))
     with pytest.raises(RobotError, match="it lacks setsid") as caught:
@@ -453,10 +455,10 @@ def test_unknown_job_is_an_error(shell: LocalShell) -> None:
 
 def test_remaining_jobs_are_listed_and_stopped(shell: LocalShell) -> None:
     jobs.start(shell, job("sleep", "60"))
-    (line,) = jobs.left(shell, Deadline.after(30))
+    (line,) = jobs.list_running(shell, Deadline.after(30))
     assert line.endswith("sleep 60")
     evidence.end_jobs(shell, FOLDER)
-    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 def test_stop_waits_until_a_file_has_stopped_growing(shell: LocalShell) -> None:
@@ -530,11 +532,11 @@ def test_end_of_each_job_is_recorded_with_boot_id_and_clock(shell: LocalShell, t
     lasted_s = after.endings["job"].lasted_s
     assert lasted_s is not None
     assert lasted_s >= 0.28
-    assert before.boot == after.boot == evidence.boot(shell) == evidence.begin(shell, FOLDER, "sender", "lo")
+    assert before.boot == after.boot == evidence.boot_id(shell) == evidence.begin(shell, FOLDER, "sender", "lo")
     assert before.clock is not None
     assert after.clock is not None
-    assert clock.problem(before.clock, after.clock) is None
-    assert clock.moved(before.clock, after.clock).error_s < 1, "busybox has fractions of a second, too"
+    assert clock.step_description(before.clock, after.clock) is None
+    assert clock.clock_step(before.clock, after.clock).error_s < 1, "busybox has fractions of a second, too"
 
 
 def test_state_of_the_radio_is_recorded_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
@@ -578,7 +580,7 @@ def test_regular_files_in_one_level_of_folders_are_fetched(shell: LocalShell, tm
 
 def test_userland_without_fractions_of_seconds(tmp_path: Path) -> None:
     """As old and small versions of busybox: no fractions in sleep, and another timeout."""
-    shell = LocalShell(tmp_path, path_of("busybox", tmp_path / "bin"))
+    shell = LocalShell(tmp_path, userland_path("busybox", tmp_path / "bin"))
     refusals = {"sleep": "case $1 in *.*) exit 1 ;; esac", "timeout": "case $1 in -t) shift ;; *) exit 127 ;; esac"}
     for name, refusal in refusals.items():
         replace_program(shell, name, f'{refusal}\nexec {{program}} "$@"')
@@ -590,7 +592,7 @@ def test_userland_without_fractions_of_seconds(tmp_path: Path) -> None:
     assert stop(shell, job_spec, signal="TERM") == 128 + signal.SIGTERM
     script = "trap 'exit 9' INT; echo up; while :; do sleep 1; done"
     assert jobs.run(shell, replace(job("sh", "-c", script, name="x", limit_s=0.3), ready="log:up")) == 9
-    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 def test_job_of_another_version_of_the_script_is_listed_and_stopped(shell: LocalShell) -> None:
@@ -602,7 +604,7 @@ def test_job_of_another_version_of_the_script_is_listed_and_stopped(shell: Local
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         (meta / "pid").write_text(f"{process.pid} {ticks} {boot}\n", encoding="ascii")
         line = f".fieldkit/older/tcp-01-1/capture {process.pid} tcpdump -i wlan0"
-        assert jobs.left(shell, Deadline.after(30)) == (line,)
+        assert jobs.list_running(shell, Deadline.after(30)) == (line,)
         assert jobs.abort(shell, "anna@one", Deadline.after(30)).jobs == (line,)
         assert process.wait(30) == -signal.SIGINT
 

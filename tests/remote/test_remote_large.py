@@ -14,7 +14,7 @@ from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.fetching import PIECE_BYTES, FetchProgress, NoFolderError
 from fieldkit.remote.shell import Completed
-from tests.helpers.userlands import USERLANDS, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -44,7 +44,7 @@ class Flaky(LocalShell):
 def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Flaky]:
     home = tmp_path / "home"
     home.mkdir()
-    flaky_shell = Flaky(home, path_of(request.param, tmp_path / "bin"))
+    flaky_shell = Flaky(home, userland_path(request.param, tmp_path / "bin"))
     jobs.install(flaky_shell, Deadline.after(30))
     evidence.begin(flaky_shell, FOLDER, "sender", "lo", need_kib=0)
     (home / FOLDER / "scan").mkdir()

@@ -65,14 +65,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 class HaltingServer(paramiko.ServerInterface):
     """An SSH server that stops at one request and reports it, or refuses logins."""
 
-    def __init__(self, at: str, told: Callable[[], None]) -> None:
+    def __init__(self, at: str, on_request: Callable[[], None]) -> None:
         self.at = at
-        self.told = told
+        self.on_request = on_request
         self.go = threading.Event()
 
     def halt(self, at: str) -> None:
         if self.at == at:
-            self.told()
+            self.on_request()
             self.go.wait(SOON)
 
     def get_allowed_auths(self, username: str) -> str:
@@ -89,7 +89,7 @@ class HaltingServer(paramiko.ServerInterface):
     def check_channel_exec_request(self, channel: paramiko.Channel, command: bytes) -> bool:
         self.halt("exec")
         if self.at == "command":
-            self.told()
+            self.on_request()
         return True  # but no command runs
 
 
@@ -486,7 +486,7 @@ def test_link_that_breaks_before_the_expected_output_is_not_an_end(
     waiting.wait_for_starts(2)
     waiting.go.touch()
     session = begun.result(SOON)
-    assert session.told
+    assert session.is_ready
     assert session.end(deadline=soon()).exit_code == 0
 
 

@@ -10,9 +10,9 @@ from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs, motion
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.motion import MotionState
-from fieldkit.trial.running.locks import Holder, taken
+from fieldkit.trial.running.locks import Holder, locked
 from tests.helpers.sshd import wait_until
-from tests.helpers.userlands import USERLANDS, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -33,7 +33,7 @@ HANGS = "trap '' INT; echo up; while :; do sleep 0.05; done"
 def robot(tmp_path: Path, request: pytest.FixtureRequest) -> LocalShell:
     home = tmp_path / "home"
     home.mkdir()
-    made = LocalShell(home, path_of(request.param, tmp_path / "bin"), "turtlebot-1")
+    made = LocalShell(home, userland_path(request.param, tmp_path / "bin"), "turtlebot-1")
     jobs.install(made, Deadline.after(30))
     return made
 
@@ -45,7 +45,7 @@ def start(robot: LocalShell, name: str, verb: str, script: str) -> None:
 
 
 def runs(robot: LocalShell) -> list[str]:
-    return [line.split()[0].rpartition("/")[2] for line in jobs.left(robot, Deadline.after(30))]
+    return [line.split()[0].rpartition("/")[2] for line in jobs.list_running(robot, Deadline.after(30))]
 
 
 def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShell) -> None:
@@ -62,7 +62,9 @@ def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShel
     assert halted.state is MotionState.LAND, "the worst"
     names = [name for name, _ in halted.programs]
     (robot.home / FOLDER / "ground").touch()
-    wait_until(lambda: motion.look(robot, names, Deadline.after(30)).state is MotionState.LANDED, Deadline.after(60))
+    wait_until(
+        lambda: motion.poll_states(robot, names, Deadline.after(30)).state is MotionState.LANDED, Deadline.after(60)
+    )
     assert "record" in runs(robot), "it does not move the robot"
     again = motion.halt(robot, "bert@two", Deadline.after(60))
     assert (again.programs, again.state) == ((), MotionState.NOTHING)
@@ -90,11 +92,11 @@ def test_liveness_file_and_time_since_boot(robot: LocalShell) -> None:
     content = bytes(range(64))
     (robot.home / FOLDER).mkdir(parents=True)
     (robot.home / FOLDER / "liveness").write_bytes(content)
-    answer = motion.life_signs(robot, f"{FOLDER}/liveness", Deadline.after(60))
+    answer = motion.read_liveness(robot, f"{FOLDER}/liveness", Deadline.after(60))
     assert answer[:64] == content
     assert 0 < float(answer[64:].split()[0]) <= float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
     with pytest.raises(RobotError):
-        motion.life_signs(robot, f"{FOLDER}/missing", Deadline.after(60))
+        motion.read_liveness(robot, f"{FOLDER}/missing", Deadline.after(60))
 
 
 def test_program_that_confirms_nothing_is_killed_and_reported(robot: LocalShell) -> None:
@@ -106,7 +108,7 @@ def test_program_that_confirms_nothing_is_killed_and_reported(robot: LocalShell)
 
 
 def test_trial_with_the_lock_is_informed_and_starts_nothing(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=lambda _: None):
+    with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):
         evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
         start(robot, "drive", "drive", STANDS)
         own = motion.halt_attempt(robot, FOLDER, "the-operator", Deadline.after(60))
@@ -116,7 +118,7 @@ def test_trial_with_the_lock_is_informed_and_starts_nothing(robot: LocalShell) -
         motion.halt(robot, "bert@two", Deadline.after(60))
         with pytest.raises(LockLostError, match=r"bert@two stopped the robots at \d\d:\d\d:\d\d UTC"):
             evidence.begin(robot, jobs.work_folder("trial-a", "tcp-01-3"), "sender", "lo", token=ANNA.token)
-    with taken({Role.SENDER: robot}, ANNA, sink=lambda _: None):  # resumed
+    with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):  # resumed
         evidence.begin(robot, jobs.work_folder("trial-a", "tcp-01-4"), "sender", "lo", token=ANNA.token)
 
 

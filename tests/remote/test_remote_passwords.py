@@ -17,7 +17,7 @@ from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Topology
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from fieldkit.remote import passwords
 from tests.helpers.sshd import Server, sshd
 
@@ -111,7 +111,9 @@ def test_field_backend_asks_once_per_robot_and_run(password_server: Server, tmp_
     path.write_text(site(access), encoding="utf-8")
     field = FieldBackend(*load_site(path), answer)
     for _ in range(2):
-        with field.open(field.cast(Topology.MASTERLESS), seed=1, sink=lambda event: None, operator=Nobody()) as lab:
+        with field.open(
+            field.cast(Topology.MASTERLESS), seed=1, sink=lambda event: None, operator=Unattended()
+        ) as lab:
             assert len(lab.shells) == 2
     assert asked == [("root", "localhost", "turtlebot-1"), ("root", "127.0.0.1", "duckiedrone-1")]
 

@@ -8,10 +8,10 @@ import pytest
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
-from fieldkit.trial.running.locks import Holder, taken
-from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, workplace
+from fieldkit.trial.running.locks import Holder, locked
+from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, mount_workspace
 from tests.helpers.host import Untouched
-from tests.helpers.userlands import LocalShell, path_of
+from tests.helpers.userlands import LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -23,7 +23,7 @@ FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 @pytest.fixture
 def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
     """A folder in memory, in separate mounts of the test."""
-    with workplace(tmp_path) as folder:
+    with mount_workspace(tmp_path) as folder:
         yield folder
 
 
@@ -33,21 +33,21 @@ def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
     ids=lambda value: value.name if isinstance(value, FileSystem) else value,
 )
 def test_robot_is_locked_after_a_power_failure(place: Path, file_system: FileSystem, userland: str) -> None:
-    path = path_of(userland, place / "bin")
+    path = userland_path(userland, place / "bin")
     disk = Disk.make(file_system, place / "disk.img")
     with disk.mounted(place / "disk") as mounted:
         robot = LocalShell(mounted, path, "turtlebot-1")
-        with taken({Role.SENDER: robot}, ANNA, sink=lambda _: None):
+        with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):
             images = [disk.image(mounted, place / "locked.img")]
             evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
             images.append(disk.image(mounted, place / "begun.img"))
     for image in images:
-        with image.mend().mounted(place / "disk") as mounted:
+        with image.repair().mounted(place / "disk") as mounted:
             robot = LocalShell(mounted, path, "turtlebot-1")
             with (
                 pytest.raises(RobotError, match="anna@one holds it"),
-                taken({Role.SENDER: robot}, BERT, sink=lambda _: None),
+                locked({Role.SENDER: robot}, BERT, sink=lambda _: None),
             ):
                 pass
-            with taken({Role.SENDER: robot}, ANNA, sink=lambda _: None):
+            with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):
                 evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)

@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.core.errors import RobotError
 from fieldkit.remote import programs
-from tests.helpers.userlands import USERLANDS, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
 
 CONTENT = bytes(range(256)) * 1000
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -15,10 +15,10 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 @pytest.mark.parametrize("userland", USERLANDS)
 def test_copy_is_complete_private_and_idempotent(tmp_path: Path, userland: str) -> None:
-    shell = LocalShell(tmp_path, path_of(userland, tmp_path / "bin"))
+    shell = LocalShell(tmp_path, userland_path(userland, tmp_path / "bin"))
     at = programs.path("a.run", "the probe's $1")
     for executable, mode in ((True, 0o700), (False, 0o600)):
-        programs.place(shell, "folder", at, CONTENT, SHA256, executable=executable)
+        programs.copy(shell, "folder", at, CONTENT, SHA256, executable=executable)
         copy = tmp_path / "folder" / at
         assert copy.read_bytes() == CONTENT
         assert copy.stat().st_mode & 0o777 == mode
@@ -30,11 +30,11 @@ def test_copy_is_complete_private_and_idempotent(tmp_path: Path, userland: str) 
 def test_incomplete_copy_is_rejected(tmp_path: Path) -> None:
     at = programs.path("run", "probe")
     with pytest.raises(RobotError, match="the copy is not whole"):
-        programs.place(LocalShell(tmp_path), "folder", at, CONTENT[:-1], SHA256, executable=True)
+        programs.copy(LocalShell(tmp_path), "folder", at, CONTENT[:-1], SHA256, executable=True)
     assert not (tmp_path / "folder" / at).exists()
 
 
 def test_read_only_robot_is_reported(tmp_path: Path) -> None:
     (tmp_path / "folder").write_bytes(b"")
     with pytest.raises(RobotError, match="ended with exit code"):
-        programs.place(LocalShell(tmp_path), "folder", programs.path("run", "a"), CONTENT, SHA256, executable=True)
+        programs.copy(LocalShell(tmp_path), "folder", programs.path("run", "a"), CONTENT, SHA256, executable=True)

@@ -82,9 +82,9 @@ def test_files_of_another_robot_are_rejected(role: Role, name: str, tmp_path: Pa
 @given(st.sampled_from(OF_THE_LAPTOP), st.lists(st.booleans(), min_size=30, max_size=30))
 def test_name_is_reserved_in_any_case(name: str, upper: list[bool]) -> None:
     mixed = "".join(letter.upper() if up else letter for letter, up in zip(name, upper, strict=False))
-    assert laptop_files.reserved(mixed)
+    assert laptop_files.is_reserved(mixed)
 
 
 @pytest.mark.parametrize("name", ["sender-link.txt", "ping.txt", "my-track.csv.gz", "answers.txt", "x.trial.csv.bak"])
 def test_other_names_are_not_reserved(name: str) -> None:
-    assert not laptop_files.reserved(name)
+    assert not laptop_files.is_reserved(name)

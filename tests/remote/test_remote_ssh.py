@@ -44,7 +44,7 @@ def test_begin_returns_after_the_expected_output(shell: SshShell, tmp_path: Path
     go = tmp_path / "go"
     words = 'cat; sleep 0.2; echo up; until [ -e "$0" ]; do sleep 0.02; done; echo over; exit 4'
     session = shell.begin(("sh", "-c", words, str(go)), deadline=soon(), until=b"up\n")
-    assert session.told
+    assert session.is_ready
     go.touch()
     done = session.end(deadline=soon(), check=False)
     assert (done.exit_code, done.stdout) == (4, b"over\n")
@@ -52,7 +52,7 @@ def test_begin_returns_after_the_expected_output(shell: SshShell, tmp_path: Path
 
 def test_begin_returns_when_the_command_ended_without_the_output(shell: SshShell) -> None:
     session = shell.begin(("sh", "-c", "echo u; echo why >&2; exit 4"), deadline=soon(), until=b"up\n")
-    assert not session.told
+    assert not session.is_ready
     assert session.end(deadline=soon(), check=False).stderr == b"why\n"
 
 

@@ -27,7 +27,7 @@ from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshSession, SshShell
 from fieldkit.remote.standing import PersistentShell, RunningCommand
 from tests.helpers.sshd import Server, sshd, wait_until
-from tests.helpers.userlands import USERLANDS, path_of
+from tests.helpers.userlands import USERLANDS, userland_path
 
 SOON: Final = 60.0
 
@@ -76,7 +76,7 @@ class Robot:
 def robot(folder: Path, userland: str = "debian", *, script: bytes = OBEYS, **options: str) -> Iterator[Robot]:
     """Run an SSH server whose sessions have this userland and a home in `folder`."""
     home = folder / "home"
-    path = path_of(userland, folder / "bin")
+    path = userland_path(userland, folder / "bin")
     (home / SCRIPT_PATH).parent.mkdir(parents=True)
     (home / SCRIPT_PATH).write_bytes(script)
     before = options.pop("before", ":")
@@ -141,7 +141,7 @@ def test_long_command_does_not_block_others(debian_robot: Robot) -> None:
     pid = debian_robot.shell_pid()
     code = "echo up; until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo $$; exit 5"
     session = debian_robot.shell.begin((*CALL, "left", code), deadline=soon(), until=b"up\n")
-    assert session.told
+    assert session.is_ready
     assert debian_robot.pid() != pid
     (debian_robot.home / "go").touch()
     done = session.end(deadline=soon(), check=False)
@@ -179,7 +179,7 @@ def test_wait_for_output_ends_with_the_command(debian_robot: Robot) -> None:
     session = debian_robot.shell.begin(
         (*CALL, "left", "echo u; echo why >&2; exit 4"), deadline=soon(), until=b"up\n"
     )
-    assert not session.told
+    assert not session.is_ready
     assert session.end(deadline=soon(), check=False).stderr == b"why\n"
 
 

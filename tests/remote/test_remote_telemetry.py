@@ -20,7 +20,7 @@ from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote import evidence, fetching, jobs, script
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import wait_until
-from tests.helpers.userlands import USERLANDS, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -31,10 +31,10 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
     home = tmp_path / "home"
     home.mkdir()
-    local_shell = LocalShell(home, path_of(request.param, tmp_path / "bin"))
+    local_shell = LocalShell(home, userland_path(request.param, tmp_path / "bin"))
     jobs.install(local_shell, Deadline.after(30))
     yield local_shell
-    wait_until(lambda: jobs.left(local_shell, Deadline.after(30)) == (), Deadline.after(60))
+    wait_until(lambda: jobs.list_running(local_shell, Deadline.after(30)) == (), Deadline.after(60))
 
 
 def give_iw(tmp_path: Path, link_file: str = "link-station") -> None:
@@ -64,15 +64,15 @@ def begin(shell: LocalShell, least: int = 3) -> Path:
 def test_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_path: Path) -> None:
     give_iw(tmp_path)
     written = begin(shell)
-    (line,) = jobs.left(shell, Deadline.after(30))
+    (line,) = jobs.list_running(shell, Deadline.after(30))
     assert line.startswith(".fieldkit/trial/udp-01-1/link "), "identified as any job"
     assert line.endswith("sample the link of wlan0")
     evidence.begin(shell, FOLDER, "sender", "wlan0")
-    assert len(jobs.left(shell, Deadline.after(30))) == 1, "a repeated begin joins it"
+    assert len(jobs.list_running(shell, Deadline.after(30))) == 1, "a repeated begin joins it"
     into = tmp_path / "local"
     into.mkdir()
     fetching.fetch(shell, FOLDER, "sender", "wlan0", into)
-    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert jobs.list_running(shell, Deadline.after(30)) == ()
     assert not written.exists()
     assert (into / "sender-link.txt.gz").stat().st_size < 4000, "it is fetched compressed"
     samples = AttemptEvidence(into).links(Role.SENDER)
@@ -94,7 +94,7 @@ def test_all_stations_of_an_access_point_are_sampled(shell: LocalShell, tmp_path
     assert "station dump" in asked
     assert "station get" not in asked
     evidence.end_jobs(shell, FOLDER)
-    assert jobs.left(shell, Deadline.after(30)) == ()
+    assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 @pytest.mark.parametrize("means", ["abort", "end", "remove", "lock"])
@@ -112,7 +112,7 @@ def test_sampler_stops_with_the_attempt(shell: LocalShell, tmp_path: Path, means
         evidence.end_all(shell, "trial")
     elif means == "remove":
         evidence.discard_attempt(shell, FOLDER)
-    wait_until(lambda: jobs.left(shell, Deadline.after(30)) == (), Deadline.after(60))
+    wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
 
 
 def test_sampler_exits_without_wifi_and_does_not_start_without_iw(shell: LocalShell, tmp_path: Path) -> None:

@@ -58,8 +58,8 @@ def test_all_figures_are_visible_on_phone_and_laptop(
     browser: Browser, lawn: Path, width: int, scheme: Literal["light", "dark"]
 ) -> None:
     with opened(browser, lawn, width=width, scheme=scheme) as opened_page:
-        assert opened_page.said == []
-        assert opened_page.asked_for == []
+        assert opened_page.console_messages == []
+        assert opened_page.requests == []
         figures = opened_page.page.locator("figure")
         names = [figure.get_attribute("id") for figure in figures.all()]
         assert {"datagram-loss", "tcp-byte-loss", "rtt-median", "transfer", "rtt-distribution"} <= set(names)
@@ -118,7 +118,7 @@ def test_report_of_an_emulated_trial_links_to_its_evidence(browser: Browser, tmp
     run = fieldkit(tmp_path, "report", "trials", "--rebuild")
     assert run.code == 0, run.err
     with opened(browser, tmp_path / "report.html") as opened_page:
-        assert opened_page.said == opened_page.asked_for == []
+        assert opened_page.console_messages == opened_page.requests == []
         names = [figure.get_attribute("id") for figure in opened_page.page.locator("figure").all()]
         assert "timeline" in names
         assert opened_page.page.locator("svg.raster").count() == 1

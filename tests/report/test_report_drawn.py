@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats, read
-from fieldkit.core.columns import of_fault
+from fieldkit.core.columns import fault_column_name
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, recovery
 from fieldkit.report import distance, distribution, dots, figures
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
-from fieldkit.report.evidence import at_hand
+from fieldkit.report.evidence import load_evidence
 from fieldkit.report.points import needs_log
 from fieldkit.report.theme import Style
 from fieldkit.trial.columns import trial_columns
@@ -36,13 +36,13 @@ def at(metres: float, repeats: int = 8, **changes: object) -> list[RepeatRow]:
 
 
 def curves(repeats: Repeats, *names: str) -> list[Chart]:
-    evidence = at_hand(repeats)
+    evidence = load_evidence(repeats)
     cells = aggregate(repeats)
     return list(distance.charts(cells, Identities(cells), evidence, names))
 
 
 def dot_charts(repeats: Repeats) -> list[Chart]:
-    evidence = at_hand(repeats)
+    evidence = load_evidence(repeats)
     cells = aggregate(repeats)
     return list(dots.charts(cells, Identities(cells), evidence))
 
@@ -158,7 +158,7 @@ def test_axis_of_a_distribution_is_logarithmic_for_a_wide_range(longest_s: float
     rows[-1] = replace(rows[-1], rtt_median_s=longest_s)
     repeats = parsed(rows)
     cells = aggregate(repeats)
-    chart = next(iter(distribution.charts(cells, Identities(cells), at_hand(repeats))))
+    chart = next(iter(distribution.charts(cells, Identities(cells), load_evidence(repeats))))
     assert chart.panels[0].x_log is is_log
     assert ("logarithmic" in chart.caption) is is_log
     assert chart.panels[0].left == (pytest.approx(10 / 1.1) if is_log else 0)
@@ -166,7 +166,7 @@ def test_axis_of_a_distribution_is_logarithmic_for_a_wide_range(longest_s: float
 
 def test_flag_is_drawn_as_a_share_of_repeats(tmp_path: Path) -> None:
     columns = trial_columns(recovery.declared(FaultKind.REBOOT))
-    name = of_fault(FaultKind.REBOOT, "recovered")
+    name = fault_column_name(FaultKind.REBOOT, "recovered")
     rows = [{**row, name: n > 1} for metres in (10, 20) for n, row in enumerate(at(metres, 4))]
     path = tmp_path / "trial.csv"
     path.write_text(to_csv(rows, columns), encoding="utf-8")

@@ -9,12 +9,12 @@ import pytest
 from fieldkit.analysis.cells import aggregate
 from fieldkit.cli import main
 from fieldkit.config import schema
-from fieldkit.core.model import Role, Whereabouts
+from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import track
 from fieldkit.report import bursts, distribution, timeline
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together, repeat_to_draw
-from fieldkit.report.evidence import at_hand
+from fieldkit.report.evidence import load_evidence
 from fieldkit.trial import sources, store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded
@@ -43,7 +43,7 @@ def test_links_lead_to_existing_folders(trial: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_lost_packets_are_marked_at_their_positions(trial: Path) -> None:
-    evidence = at_hand(sources.find([trial], print).read())
+    evidence = load_evidence(sources.find([trial], print).read())
     ((raster,),) = (group.rasters for group in bursts.groups(aggregate(evidence.repeats), evidence))
     assert raster.lines == 1
     assert raster.columns == recorded.PACKETS
@@ -52,7 +52,7 @@ def test_lost_packets_are_marked_at_their_positions(trial: Path) -> None:
 
 
 def test_each_reply_is_in_the_distribution(trial: Path) -> None:
-    evidence = at_hand(sources.find([trial], print).read())
+    evidence = load_evidence(sources.find([trial], print).read())
     cells = aggregate(evidence.repeats)
     chart, *_ = distribution.charts(cells, Identities(cells), evidence)
     assert chart.title == "Round-trip time: distribution, 8192 bytes"
@@ -61,7 +61,7 @@ def test_each_reply_is_in_the_distribution(trial: Path) -> None:
 
 
 def test_time_line_has_all_packets_and_replies(trial: Path) -> None:
-    evidence = at_hand(sources.find([trial], print).read())
+    evidence = load_evidence(sources.find([trial], print).read())
     row = repeat_to_draw(aggregate(evidence.repeats), evidence, "")
     assert row is not None
     assert evidence.repeats.texts["status"][row] == "valid"
@@ -83,15 +83,15 @@ def test_time_line_has_all_packets_and_replies(trial: Path) -> None:
 def test_time_line_shows_the_distance_between_moving_robots(trial: Path) -> None:
     began_ns = recorded.START_NS + 10 * recorded.SECOND_NS
     places_m = {Role.SENDER: 1.0, Role.RECEIVER: 4.0}
-    initial = [Whereabouts(0, role, (place_m, 0.0, 0.2)) for role, place_m in places_m.items()]
+    initial = [TrackPoint(0, role, (place_m, 0.0, 0.2)) for role, place_m in places_m.items()]
     moved = [
-        Whereabouts(began_ns + 10**9, Role.SENDER, None),
-        Whereabouts(began_ns + 2 * 10**9, Role.SENDER, START_M),
+        TrackPoint(began_ns + 10**9, Role.SENDER, None),
+        TrackPoint(began_ns + 2 * 10**9, Role.SENDER, START_M),
     ]
     file = trial / "repeats" / "udp-01" / "track.csv"
     for moves, panels in (([], 2), (moved, 3)):
         file.write_text(track.text([*initial, *moves]), encoding="ascii")
-        evidence = at_hand(sources.find([trial], print).read())
+        evidence = load_evidence(sources.find([trial], print).read())
         row = repeat_to_draw(aggregate(evidence.repeats), evidence, "")
         assert row is not None
         chart, _ = timeline.charts(row, evidence)

@@ -8,7 +8,7 @@ import pytest
 from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
 from fieldkit.report.coverage import everything_lost
-from fieldkit.report.evidence import Evidence, at_hand
+from fieldkit.report.evidence import Evidence, load_evidence
 from fieldkit.report.headlines import Headline, headlines
 from fieldkit.trial import sources, store
 from fieldkit.trial.plan import PLAN_FILE
@@ -21,7 +21,7 @@ LOST = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_loss": 1.0, "rtt_med
 
 def lines(rows: Sequence[RepeatRow], unmeasured: Sequence[str] = ()) -> dict[str, list[str]]:
     """Return the lines of each headline by its subject."""
-    evidence = at_hand(parsed(rows))
+    evidence = load_evidence(parsed(rows))
     shown = headlines(aggregate(evidence.repeats), evidence, unmeasured)
     return {headline.subject: texts(headline) for headline in shown}
 
@@ -112,7 +112,7 @@ def evidence_with(folder: Path, *expected: str) -> Evidence:
     plan = store.read_plan(trial)
     changed = plan.procedure.model_copy(update={"expect": expected})
     (trial / PLAN_FILE).write_text(schema.dump(plan.model_copy(update={"procedure": changed})), encoding="utf-8")
-    return at_hand(sources.find([trial], print).read())
+    return load_evidence(sources.find([trial], print).read())
 
 
 def test_expected_quantities_are_first(tmp_path: Path) -> None:

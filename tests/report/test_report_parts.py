@@ -13,7 +13,7 @@ from scipy import stats
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats, read
-from fieldkit.core.columns import named
+from fieldkit.core.columns import with_step_name
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
@@ -24,7 +24,7 @@ from fieldkit.report import bursts, distance, distribution, figures, headlines, 
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
-from fieldkit.report.evidence import at_hand
+from fieldkit.report.evidence import load_evidence
 from fieldkit.report.theme import Style
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
@@ -97,7 +97,7 @@ def test_marked_tcp_frames_equal_the_count_of_retransmissions(tmp_path: Path) ->
     packet_fates = fates.read(AttemptEvidence(tmp_path), transfer)
     assert packet_fates is not None
     sender, receiver = (pcap.read(tmp_path / name).packets for name in ("sender.pcap", "receiver.pcap"))
-    assert packet_fates.marked.sum() == tcp.count(tcp.cross(sender, receiver, transfer)).retransmitted_frames
+    assert packet_fates.marked.sum() == tcp.count(tcp.match_transfer(sender, receiver, transfer)).retransmitted_frames
     assert packet_fates.sent_bytes[0] == packet_fates.sent_bytes.min()
 
 
@@ -148,7 +148,7 @@ def test_strip_of_many_repeats_keeps_all_void_ones(tmp_path: Path) -> None:
         lawns.row(number, status="void", reason="no capture") if number % 50 == 0 else lawns.row(number)
         for number in range(1, 2401)
     ]
-    evidence = at_hand(table(tmp_path, rows))
+    evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
     ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), evidence))
     assert len(strip.marks) == strips.MOST_MARKS
@@ -159,7 +159,7 @@ def test_strip_of_many_repeats_keeps_all_void_ones(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("loss", "expected"), [(0.0, "none"), (0.125, "full height 12.5 %")])
 def test_strip_states_its_scale(tmp_path: Path, loss: float, expected: str) -> None:
-    evidence = at_hand(
+    evidence = load_evidence(
         table(tmp_path, [lawns.row(1, datagram_loss=loss, datagrams_sent=8, datagrams_received=8 - round(8 * loss))])
     )
     cells = aggregate(evidence.repeats)
@@ -171,7 +171,7 @@ def test_strip_shows_a_loss_that_its_repeats_have(tmp_path: Path) -> None:
     """Otherwise, a repeat with named steps would appear to have no loss."""
     without = dict.fromkeys(("datagram_loss", "datagrams_sent", "datagrams_received"))
     lost = {"ip_loss": 0.5, "ip_packets_sent": 8, "ip_packets_received": 4}
-    evidence = at_hand(table(tmp_path, [lawns.row(1), lawns.row(2, topology="masterless", **without, **lost)]))
+    evidence = load_evidence(table(tmp_path, [lawns.row(1), lawns.row(2, topology="masterless", **without, **lost)]))
     cells = aggregate(evidence.repeats)
     scales = {group.title: group.scale for group in strips.groups(cells, Identities(cells), evidence)}
     assert scales["UDP, masterless"] == "IP packet loss, full height 50.0 %"
@@ -201,7 +201,7 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
         lawns.row(3, code_sha256="b", status="void", reason="tcpdump dropped 3 packets"),
         lawns.row(4, code_sha256="b", distance="20ft", distance_m=6.096, status="failed", reason="no answer"),
     ]
-    evidence = at_hand(table(tmp_path, rows))
+    evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
     shown = [(warning.text, list(map(plain, warning.reasons))) for warning in summary.warnings(cells, evidence)]
     assert shown[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
@@ -215,7 +215,7 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
 
 
 def test_summary_paragraph_has_counts_and_conditions(tmp_path: Path) -> None:
-    evidence = at_hand(table(tmp_path, lawns.lawn(4)))
+    evidence = load_evidence(table(tmp_path, lawns.lawn(4)))
     paragraph = summary.paragraph(aggregate(evidence.repeats), evidence).replace("\N{NO-BREAK SPACE}", " ")
     assert paragraph == (
         "24 trials of los and nlos on 2026-11-21 12:00 UTC: 10ft to 55ft; "
@@ -227,7 +227,7 @@ def test_summary_paragraph_has_counts_and_conditions(tmp_path: Path) -> None:
 def test_headline_has_the_extremes_with_their_intervals(tmp_path: Path) -> None:
     rows = [lawns.row(number) for number in (1, 2)]
     rows += [lawns.row(number, distance="20ft", distance_m=6.096, rtt_median_s=0.02) for number in (1, 2)]
-    evidence = at_hand(table(tmp_path, rows))
+    evidence = load_evidence(table(tmp_path, rows))
     _, loss, rtt = headlines.headlines(aggregate(evidence.repeats), evidence)
     assert (loss.subject, ends(loss)) == ("UDP datagram loss", ["in all conditions 5.56 %"])
     assert rtt.subject == "RTT with UDP"
@@ -239,11 +239,13 @@ def test_headline_has_the_extremes_with_their_intervals(tmp_path: Path) -> None:
 
 def test_headline_of_several_steps_names_the_step_of_each_extreme(tmp_path: Path) -> None:
     pings = {f"{step}.rtt_median_s": at_s for step, at_s in (("small", 0.002), ("middle", 0.004), ("big", 0.016))}
-    columns = trial_columns(named(step, column) for step in ("small", "middle", "big") for column in ping.COLUMNS)
+    columns = trial_columns(
+        with_step_name(step, column) for step in ("small", "middle", "big") for column in ping.COLUMNS
+    )
     rows = [{**lawns.row(number), **pings, "rtt_median_s": None} for number in (1, 2)]
     path = tmp_path / "trial.csv"
     path.write_text(to_csv(rows, columns), encoding="utf-8")
-    evidence = at_hand(read([path], columns))
+    evidence = load_evidence(read([path], columns))
     _, _, rtt = headlines.headlines(aggregate(evidence.repeats), evidence)
     assert rtt.subject == "RTT with UDP"
     assert ends(rtt) == [
@@ -259,7 +261,7 @@ def test_report_of_topics_has_their_headlines_and_charts(tmp_path: Path) -> None
     far = {"distance": "20ft", "distance_m": 6.096}
     rows = [{**lawns.row(number), **topic, **place} for place in ({}, far) for number in (1, 2)]
     path.write_text(to_csv(rows, columns), encoding="utf-8")
-    evidence = at_hand(read([path], columns))
+    evidence = load_evidence(read([path], columns))
     cells = aggregate(evidence.repeats)
     by_subject = {headline.subject: ends(headline) for headline in headlines.headlines(cells, evidence)}
     assert by_subject == {
@@ -300,7 +302,7 @@ def test_pings_of_different_sizes_have_separate_charts(tmp_path: Path) -> None:
     tcp = {"protocol": "tcp", "rtt_payload_bytes": 502, "rtt_median_s": 0.004}
     far = {"distance": "20ft", "distance_m": 6.096}
     rows = [lawns.row(number, **values, **place) for values in (udp, tcp) for place in ({}, far) for number in (1, 2)]
-    evidence = at_hand(table(tmp_path, rows))
+    evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
     of_rtt = list(distance.charts(cells, Identities(cells), evidence, ["rtt_median_s"]))
     assert [(chart.name, [panel.title for panel in chart.panels]) for chart in of_rtt] == [
@@ -318,7 +320,7 @@ def test_points_are_joined_from_four_distances_with_repeats_in_the_background(tm
             for metres in range(1, 1 + count)
             for number in (1, 2)
         ]
-        evidence = at_hand(table(tmp_path / join, rows))
+        evidence = load_evidence(table(tmp_path / join, rows))
         cells = aggregate(evidence.repeats)
         (chart,) = distance.charts(cells, Identities(cells), evidence, ["rtt_median_s"])
         (series,) = chart.panels[0].series
@@ -363,5 +365,5 @@ def test_los_and_nlos_keep_their_style_among_other_procedures(tmp_path: Path, pr
 
 
 def test_edited_table_cannot_refer_to_other_folders(tmp_path: Path) -> None:
-    evidence = at_hand(table(tmp_path, [lawns.row(1, protocol="../../../etc")]))
+    evidence = load_evidence(table(tmp_path, [lawns.row(1, protocol="../../../etc")]))
     assert evidence.attempt(0) is None

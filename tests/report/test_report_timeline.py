@@ -9,13 +9,13 @@ import pytest
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
-from fieldkit.core.model import Role, Whereabouts
+from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import host, track
 from fieldkit.measure.transfers import topic_log
 from fieldkit.report import timeline
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import repeat_to_draw
-from fieldkit.report.evidence import at_hand
+from fieldkit.report.evidence import load_evidence
 from fieldkit.trial import procedure, sources, store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded
@@ -45,7 +45,7 @@ def jobs(trial: Path, **spans: tuple[float, float]) -> Path:
 
 
 def panels(trial: Path) -> list[Panel]:
-    evidence = at_hand(sources.find([trial], print).read())
+    evidence = load_evidence(sources.find([trial], print).read())
     row = repeat_to_draw(aggregate(evidence.repeats), evidence, "")
     assert row is not None
     chart, *_ = timeline.charts(row, evidence)
@@ -91,10 +91,9 @@ def test_fault_has_a_bar_for_its_cause_and_one_for_the_time_without_replies(tria
 def test_move_has_a_bar_from_its_first_to_its_last_position(trial: Path) -> None:
     folder = jobs(trial, capture=(1.0, 9.0))
     moved = [
-        Whereabouts(BEGAN_NS + 2 * 10**9 + round(n * 1e8), Role.RECEIVER, (10.0 + n / 10, 0.0, 0.2))
-        for n in range(21)
+        TrackPoint(BEGAN_NS + 2 * 10**9 + round(n * 1e8), Role.RECEIVER, (10.0 + n / 10, 0.0, 0.2)) for n in range(21)
     ]
-    initial = [Whereabouts(1, Role.RECEIVER, (10.0, 0.0, 0.2)), Whereabouts(1, Role.SENDER, (0.0, 0.0, 0.2))]
+    initial = [TrackPoint(1, Role.RECEIVER, (10.0, 0.0, 0.2)), TrackPoint(1, Role.SENDER, (0.0, 0.0, 0.2))]
     (folder / track.FILE).write_text(track.text([*initial, *moved]), encoding="ascii")
     start, stop = bars(panels(trial)[0])["move receiver"]
     assert stop - start == pytest.approx(2.0, abs=0.02)

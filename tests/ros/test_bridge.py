@@ -23,7 +23,7 @@ from fieldkit.ros.bridge import Side
 from fieldkit.ros.crossings import Crossing, parse_qos
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
-from tests.helpers.two_hosts import TestHost, cabled
+from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
 TYPE = "sensor_msgs/msg/LaserScan"
 SCAN = "/scan:sensor_msgs/LaserScan"
@@ -104,7 +104,7 @@ class Site:
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    with cabled() as hosts:
+    with two_connected_hosts() as hosts:
         samples = Site(hosts, tmp_path_factory.mktemp("bridge"))
         with samples.started(hosts[0], "rosmaster", "--core", "-p", "11311"):
             # A node that starts before its master prints a warning among the received messages.
@@ -297,7 +297,7 @@ def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
         source.deliver(of_ros1, time.time_ns())
         target.takes = True
     source.deliver(of_ros1, time.time_ns())  # after the carrier was stopped
-    report = carrier.told()
+    report = carrier.counts()
     assert target.written == [sample]
     assert (report.messages, report.unreadable, report.refused) == (1, 4, 1)
     assert report.bytes == len(of_ros1)

@@ -36,10 +36,12 @@ def run(*argv: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(argv, env=environment, capture_output=True, text=True, timeout=120, check=False)
 
 
-@pytest.mark.parametrize("settings", [{}, tuning.tuned("dds", "tcp"), {"Discovery/Tag@x": "1", "No/Such": "1"}])
+@pytest.mark.parametrize(
+    "settings", [{}, tuning.recommended_settings("dds", "tcp"), {"Discovery/Tag@x": "1", "No/Such": "1"}]
+)
 def test_cyclonedds_reads_its_file(tmp_path: Path, settings: dict[str, str]) -> None:
     path = tmp_path / "cyclonedds.xml"
-    path.write_text(configurations.written("dds", "tcp", settings, COMMENT), encoding="utf-8")
+    path.write_text(configurations.configuration_text("dds", "tcp", settings, COMMENT), encoding="utf-8")
     program = "from cyclonedds.domain import DomainParticipant; DomainParticipant(71)"
     completed = run(sys.executable, "-c", program, CYCLONEDDS_URI=f"file://{path}")
     is_known = "No/Such" not in settings
@@ -52,8 +54,8 @@ def test_cyclonedds_reads_its_file(tmp_path: Path, settings: dict[str, str]) -> 
 def test_zenoh_reads_its_file(tmp_path: Path, transport: str) -> None:
     zenoh = pytest.importorskip("zenoh")
     path = tmp_path / "zenoh.json5"
-    settings = tuning.tuned("zenoh", transport)
-    path.write_text(configurations.written("zenoh", transport, settings, COMMENT), encoding="utf-8")
+    settings = tuning.recommended_settings("zenoh", transport)
+    path.write_text(configurations.configuration_text("zenoh", transport, settings, COMMENT), encoding="utf-8")
     config = zenoh.Config.from_file(str(path))
     for where, text in settings.items():
         read, wanted = json.loads(config.get_json(where)), json.loads(text)
@@ -69,7 +71,7 @@ def test_zenoh_reads_its_file(tmp_path: Path, transport: str) -> None:
 def test_fast_dds_reads_its_file(tmp_path: Path, transports: str, *, loads: bool) -> None:
     path = tmp_path / "fastdds.xml"
     settings = {"FASTDDS_BUILTIN_TRANSPORTS": transports}
-    path.write_text(configurations.written("ros2", "tcp", settings, COMMENT), encoding="utf-8")
+    path.write_text(configurations.configuration_text("ros2", "tcp", settings, COMMENT), encoding="utf-8")
     python = str(ROOT / ".ros2" / "bin" / "python")
     wanted = str(int(transports == "LARGE_DATA"))
     completed = run(
@@ -90,8 +92,8 @@ def test_fast_dds_reads_its_file(tmp_path: Path, transports: str, *, loads: bool
 
 def test_setting_that_a_file_cannot_contain_is_rejected() -> None:
     with pytest.raises(ConfigurationError, match="cannot hold FASTDDS_X"):
-        configurations.written("ros2", "tcp", {"FASTDDS_X": "1"}, [])
+        configurations.configuration_text("ros2", "tcp", {"FASTDDS_X": "1"}, [])
     with pytest.raises(ConfigurationError, match="cannot hold rmw_cyclonedds_cpp"):
-        configurations.written("ros2", "tcp", {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, [])
+        configurations.configuration_text("ros2", "tcp", {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, [])
     with pytest.raises(ConfigurationError, match="ros1 has no configuration file"):
-        configurations.written("ros1", "tcp", {}, [])
+        configurations.configuration_text("ros1", "tcp", {}, [])

@@ -55,7 +55,7 @@ def keeper(link: Link, silent_lease_s: float | None = None) -> LeaseKeeper:
 def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
     link = Link()
     with keeper(link) as lease:
-        assert lease.said == b"said"
+        assert lease.output == b"said"
         link.broken = 2
         assert link.many.wait(60)
         lease.give_order("go")

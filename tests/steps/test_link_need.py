@@ -6,7 +6,7 @@ import pytest
 
 from fieldkit.core.model import Role, Verdict
 from fieldkit.steps.link_need import link_need
-from fieldkit.steps.scene import Said
+from fieldkit.steps.scene import CommandResult
 from tests.helpers.casts import CAST
 
 GOOD = json.dumps({"error": "", "system": 7, "candidates": []})
@@ -26,7 +26,7 @@ SILENT = json.dumps({"error": "", "system": 0, "candidates": []})
 def test_detail_names_connection_and_programs(connection: str, kind: str) -> None:
     need = link_need(CAST[Role.RECEIVER], Role.RECEIVER, connection, ("pilot", "guard"))
     assert connection in need.argv[-1]
-    assert need.judge(Said(GOOD, 0)) == (
+    assert need.judge(CommandResult(GOOD, 0)) == (
         Verdict.OK,
         f"{connection} ({kind}) reaches system 7; pilot and guard use it through the link server",
         "",
@@ -45,7 +45,7 @@ def test_detail_names_connection_and_programs(connection: str, kind: str) -> Non
 )
 def test_failure_names_available_connections(text: str, detail: str, remedy: str) -> None:
     need = link_need(CAST[Role.RECEIVER], Role.RECEIVER, "tcp:127.0.0.1:5760", ("recorder",))
-    verdict, what, how = need.judge(Said(text, 0))
+    verdict, what, how = need.judge(CommandResult(text, 0))
     assert verdict is Verdict.FAIL
     assert detail in what
     assert remedy in how

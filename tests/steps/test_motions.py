@@ -35,11 +35,11 @@ def mover(shell: ScriptedShell, name: str = "rover") -> Mover:
 
 def test_without_motion_no_order_is_given() -> None:
     motions = Motions()
-    assert not motions.order(pytest.fail)
+    assert not motions.order_stop(pytest.fail)
     with motions.moving(mover(ScriptedShell(""))):
         pass
-    assert not motions.order(pytest.fail)
-    assert not motions.called
+    assert not motions.order_stop(pytest.fail)
+    assert not motions.is_ordered
 
 
 def test_each_robot_is_stopped_once_and_leaving_waits_for_landing() -> None:
@@ -47,10 +47,10 @@ def test_each_robot_is_stopped_once_and_leaving_waits_for_landing() -> None:
     drives = ScriptedShell("t/a/.jobs/drive stationary\n")
     flies = ScriptedShell(f"{name} land\n", f"{name} land\n", f"{name} landed\n")
     motions = Motions()
-    motions.ahead = ("rover stops", "drone lands")
+    motions.stop_notes = ("rover stops", "drone lands")
     with motions.moving(mover(drives)), motions.moving(mover(flies, "drone")), motions.moving(mover(flies, "drone")):
-        assert motions.order(reports.append)
-        assert motions.order(reports.append)
+        assert motions.order_stop(reports.append)
+        assert motions.order_stop(reports.append)
     assert drives.asked == [("halt_motion", "the-operator", ".fieldkit/t/a")]
     assert flies.asked == [drives.asked[0], *[("motion_states", name)] * 2]
     assert {"stopping: rover stops", "stopping: drone lands"} < set(reports)
@@ -63,8 +63,8 @@ def test_each_robot_is_stopped_once_and_leaving_waits_for_landing() -> None:
 
 def test_no_robot_starts_to_move_after_the_order() -> None:
     motions, shell, reports = Motions(), ScriptedShell(""), list[str]()
-    motions.ahead = ("rover stops",)
-    assert motions.order(reports.append)
+    motions.stop_notes = ("rover stops",)
+    assert motions.order_stop(reports.append)
     with pytest.raises(KeyboardInterrupt), motions.moving(mover(shell)):
         pytest.fail("it moves")
     assert not shell.asked
@@ -75,7 +75,7 @@ def test_no_robot_starts_to_move_after_the_order() -> None:
 def test_unreachable_robot_is_reported_with_its_fallback() -> None:
     motions, reports = Motions(), list[str]()
     with motions.moving(mover(ScriptedShell(LinkError("the connection broke", where="rover", remedy="")))):
-        motions.order(reports.append)
+        motions.order_stop(reports.append)
     assert reports == ["no answer from rover: it stops automatically within 2 s (the connection broke)"]
 
 
@@ -83,6 +83,6 @@ def test_abandoned_wait_does_not_wait_for_landing() -> None:
     motions, shell = Motions(), ScriptedShell("t/a/.jobs/fly return\n")
     coming = threading.Event()
     with motions.moving(mover(shell)):
-        motions.order(lambda line: coming.set() if "coming down (return)" in line else None)
+        motions.order_stop(lambda line: coming.set() if "coming down (return)" in line else None)
         assert coming.wait(60)
         motions.abandon()

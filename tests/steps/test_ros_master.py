@@ -15,7 +15,7 @@ from fieldkit.core.model import Protocol, RepeatId, Role, Topology, Verdict
 from fieldkit.core.units import parse_distance
 from fieldkit.steps import ros_master
 from fieldkit.steps.kinds.record import RecordStep
-from fieldkit.steps.scene import Said, Scene
+from fieldkit.steps.scene import CommandResult, Scene
 from fieldkit.trial.check import topics
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import load_procedure
@@ -100,7 +100,7 @@ def test_preflight_checks_only_shared_masters() -> None:
     )
     assert own.keys() == {"ROS"}
     assert shared.keys() == {"ROS", "ROS master"}
-    assert shared["ROS master"].explains == "rosbag", "no recording is tried without a master"
+    assert shared["ROS master"].missing_program == "rosbag", "no recording is tried without a master"
     assert shared["ROS"].argv[-3:] == ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
 
 
@@ -108,15 +108,17 @@ def test_preflight_checks_only_shared_masters() -> None:
     ("answer", "detail"),
     [
         (
-            Said("bash: connect: No route to host\nbash: line 1: /dev/tcp/10.42.0.3/11311: No route to host", 1),
+            CommandResult(
+                "bash: connect: No route to host\nbash: line 1: /dev/tcp/10.42.0.3/11311: No route to host", 1
+            ),
             "route",
         ),
-        (Said("", 124), "no output"),
-        (Said("HTTP/1.0 404 Not Found", 0), "404"),
-        (Said("SSH-2.0-OpenSSH_9.2p1", 0), "SSH"),
+        (CommandResult("", 124), "no output"),
+        (CommandResult("HTTP/1.0 404 Not Found", 0), "404"),
+        (CommandResult("SSH-2.0-OpenSSH_9.2p1", 0), "SSH"),
     ],
 )
-def test_invalid_answer_of_master_fails_with_remedy(answer: Said, detail: str) -> None:
+def test_invalid_answer_of_master_fails_with_remedy(answer: CommandResult, detail: str) -> None:
     verdict, detail_text, remedy = ros_master.judge(SHARED[Role.RELAY], answer)
     assert verdict is Verdict.FAIL
     assert detail_text.startswith("no master answers at duckiedrone-1, 10.42.0.3:11311: ")

@@ -10,7 +10,7 @@ import pytest
 from fieldkit.core.model import Protocol, Role, Verdict
 from fieldkit.steps import routing
 from fieldkit.steps.kinds.ping import PingStep
-from fieldkit.steps.scene import Said, Scene
+from fieldkit.steps.scene import CommandResult, Scene
 from tests.helpers.casts import CAST
 
 SCENE = Scene(Protocol.UDP, CAST, "f")
@@ -45,13 +45,13 @@ def test_daemon_is_found_by_exact_name_in_each_shell(tmp_path: Path, shell: str,
 @pytest.mark.parametrize(
     ("result", "verdict", "detail"),
     [
-        (Said("babeld\n", 0), Verdict.OK, "babeld"),
-        (Said("babeld\nbabeld\nbatman-adv\n", 0), Verdict.OK, "babeld, batman-adv"),
-        (Said("", 0), Verdict.FAIL, "no routing protocol runs on it"),
-        (Said("sh: not found", 127), Verdict.FAIL, "no routing protocol runs on it"),
+        (CommandResult("babeld\n", 0), Verdict.OK, "babeld"),
+        (CommandResult("babeld\nbabeld\nbatman-adv\n", 0), Verdict.OK, "babeld, batman-adv"),
+        (CommandResult("", 0), Verdict.FAIL, "no routing protocol runs on it"),
+        (CommandResult("sh: not found", 127), Verdict.FAIL, "no routing protocol runs on it"),
     ],
 )
-def test_verdict_and_detail(result: Said, verdict: Verdict, detail: str) -> None:
+def test_verdict_and_detail(result: CommandResult, verdict: Verdict, detail: str) -> None:
     actual, detail_text, remedy = routing.judge(result)
     assert actual is verdict
     assert detail_text.startswith(detail)

@@ -19,11 +19,11 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import Limits, Mavlink, RobotProfile
 from fieldkit.config.site import load_site
 from fieldkit.core import runtime
-from fieldkit.core.columns import prefixed
+from fieldkit.core.columns import step_prefixed
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.events import Event, PhaseStarted
 from fieldkit.core.model import Role, Topology, Verdict
-from fieldkit.core.prompts import NOBODY
+from fieldkit.core.prompts import UNATTENDED
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.remote import jobs
@@ -186,13 +186,15 @@ class Bench:
     def run(self, plan: Plan, sink: Callable[[Event], None] = lambda event: None) -> tuple[str, str, Path]:
         """Run a trial of one attempt; return its status, the reason, and the folder of its evidence."""
         self.testbed.place(plan.placement)
-        with locks.held(self.testbed.shells, Holder(plan.session, runtime.me(), plan.trial), sink=sink):
+        with locks.held(self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=sink):
             runner.begin(plan, self.testbed, self.out, sink, Stop())
         return self.ended(plan)
 
     def resume(self, plan: Plan) -> tuple[str, str, Path]:
-        with locks.held(self.testbed.shells, Holder(plan.session, runtime.me(), plan.trial), sink=lambda event: None):
-            runner.go_on(self.out / plan.trial, self.testbed, lambda event: None, Stop())
+        with locks.held(
+            self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=lambda event: None
+        ):
+            runner.continue_trial(self.out / plan.trial, self.testbed, lambda event: None, Stop())
         return self.ended(plan)
 
     def ended(self, plan: Plan) -> tuple[str, str, Path]:
@@ -202,7 +204,9 @@ class Bench:
 
     def left(self) -> list[str]:
         """Return the jobs that still run on the robots."""
-        return [line for shell in self.testbed.shells.values() for line in jobs.left(shell, Deadline.after(30))]
+        return [
+            line for shell in self.testbed.shells.values() for line in jobs.list_running(shell, Deadline.after(30))
+        ]
 
 
 FLYING = {
@@ -231,7 +235,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     profile = profile.replace("max_speed_m_s: 0.22", "max_speed_m_s: 1.0\n  max_height_m: 2.0")
     (out / "robots" / "turtlebot3_burger.yaml").write_text(f"{profile}\nmavlink: {{port: 14550}}\n", encoding="utf-8")
     backend = EmulatedBackend(*load_site(out / "fieldkit.yaml"))
-    with backend.open(cast_of(backend), seed=1, sink=lambda _: None, operator=NOBODY) as testbed:
+    with backend.open(cast_of(backend), seed=1, sink=lambda _: None, operator=UNATTENDED) as testbed:
         assert isinstance(testbed, EmulatedTestbed)
         yield Bench(testbed, backend, out)
 
@@ -275,7 +279,7 @@ def test_dry_run_prints_every_job(
 def test_attempt_without_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
     plan, evidence = valid.plan, valid.evidence
     step = of_kind(valid.kind, plan).step
-    spare = {prefixed(step.prefix, name) for name in EXAMPLES[valid.kind].spare}
+    spare = {step_prefixed(step.prefix, name) for name in EXAMPLES[valid.kind].spare}
     repeat = next(plan.order())
     for name in step.files():
         if name.endswith(".log") or name in spare or not (evidence / name).exists():
@@ -290,10 +294,10 @@ def test_every_column_has_a_value_or_a_reason(valid: Valid) -> None:
     step = of_kind(valid.kind, valid.plan).step
     measured = gates.judge(valid.plan, next(valid.plan.order()), AttemptEvidence(valid.evidence)).measured
     for column in step.output_columns():
-        name = prefixed(step.prefix, column.name)
+        name = step_prefixed(step.prefix, column.name)
         assert name in measured.values or measured.missing[name]
     assert not step.output_columns() or measured.values.keys() & {
-        prefixed(step.prefix, column.name) for column in step.output_columns()
+        step_prefixed(step.prefix, column.name) for column in step.output_columns()
     }
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.config import schema
-from fieldkit.core.columns import of_fault
+from fieldkit.core.columns import fault_column_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
 from fieldkit.core.units import parse_distance
@@ -150,7 +150,7 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
     assert {name for name in (*values, *missing) if name.startswith(("file_loss", "link_down"))} == set()
     assert "bare: bare.recv.bag is missing" in judged.problems
     assert "cut.link_down_outage_s" in missing
-    text = rows.in_words(plan, values)
+    text = rows.describe(plan, values)
     assert text.startswith("up: file loss 0.0 %, up: ping loss 90.0 %, ping loss 90.0 %, up: RTT 16.0 ms, RTT 4.0 ms")
 
 
@@ -191,7 +191,7 @@ def test_refusal_of_unknown_file_lists_recorded_files() -> None:
 def test_summary_starts_with_gap_of_ping() -> None:
     ping = "{ping: {from: sender, to: receiver, gap: true}}"
     plan = plan_of(f"  - fault: {{name: cut, robot: sender, kind: link-down, for: 7s, during: [{ping}]}}\n")
-    outage_s, recovered = (of_fault(FaultKind.LINK_DOWN, what) for what in ("outage_s", "recovered"))
+    outage_s, recovered = (fault_column_name(FaultKind.LINK_DOWN, what) for what in ("outage_s", "recovered"))
     fault_values = {f"cut.{outage_s}": 7.2, f"cut.{recovered}": True}
-    text = rows.in_words(plan, {**fault_values, "rtt_gap_s": 3.2, "rtt_gap_lost": 29, "rtt_median_s": 0.0032})
+    text = rows.describe(plan, {**fault_values, "rtt_gap_s": 3.2, "rtt_gap_lost": 29, "rtt_median_s": 0.0032})
     assert text == "longest gap 3.2 s with 29 lost, RTT 3.2 ms, cut: link-down: gone for 7.2 s"

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.config import schema
-from fieldkit.core.columns import Value, prefixed
+from fieldkit.core.columns import Value, step_prefixed
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, Protocol, RepeatId
 from fieldkit.core.units import parse_distance
@@ -242,7 +242,7 @@ def _compare(
     missing: Mapping[str, str],
 ) -> None:
     declared = [
-        prefixed(placed.step.prefix, column.name)
+        step_prefixed(placed.step.prefix, column.name)
         for placed in procedure.walk()
         for column in placed.step.output_columns()
     ]
@@ -250,11 +250,14 @@ def _compare(
     assert set(declared) <= values.keys() | missing.keys()
     assert all(missing.get(name, "for a reason") for name in declared)
     for name, (asked, answered) in truth.pings.items():
-        assert (values[prefixed(name, "rtt_sent")], values[prefixed(name, "rtt_received")]) == (asked, answered)
+        assert (values[step_prefixed(name, "rtt_sent")], values[step_prefixed(name, "rtt_received")]) == (
+            asked,
+            answered,
+        )
     for name, (sent, came) in truth.loads.items():
         for end, packets in (("sent", sent), ("received", came)):
-            assert values[prefixed(name, f"iperf3_{end}_bytes")] == 1400 * packets
-        loss, cookie_bytes = prefixed(name, "iperf3_captured_loss"), truth.cookies_bytes[name]
+            assert values[step_prefixed(name, f"iperf3_{end}_bytes")] == 1400 * packets
+        loss, cookie_bytes = step_prefixed(name, "iperf3_captured_loss"), truth.cookies_bytes[name]
         sent_bytes, came_bytes = (1400 * packets + cookie_bytes for packets in (sent, came))
         assert loss in missing or values[loss] == 1 - came_bytes / sent_bytes
         SEEN["valid, iperf3 captured"] += loss in values
@@ -265,7 +268,7 @@ def _compare(
         if isinstance(placed.step, TransferStep):
             sent_file = truth.transfers[placed.step.prefix]
             _compare_transfer(placed, protocol, sent_file, values, missing)
-            refused = prefixed(placed.step.prefix, "receiver_udp_buffer_errors")
+            refused = step_prefixed(placed.step.prefix, "receiver_udp_buffer_errors")
             others = truth.udp_to.count(sent_file.target) - (protocol is Protocol.UDP)
             assert "only one counter for all of it" in missing[refused] if others else values[refused] == REFUSED
             SEEN["valid, UDP of several to one"] += bool(others)
@@ -278,16 +281,16 @@ def _compare_transfer(
     assert isinstance(step, TransferStep)
 
     def value(column: str) -> Value:
-        return values[prefixed(step.prefix, column)]
+        return values[step_prefixed(step.prefix, column)]
 
     assert (value("sent_bytes"), value("received_bytes")) == (sent.sent_bytes, sent.received_bytes)
     assert value("file_loss") == 1 - sent.received_bytes / sent.sent_bytes
-    if (packets := prefixed(step.prefix, "paper_packets")) in values and protocol is Protocol.UDP:
+    if (packets := step_prefixed(step.prefix, "paper_packets")) in values and protocol is Protocol.UDP:
         assert values[packets] == -(-sent.sent_bytes // 8192)
     captured = {role for nest in placed.within for role in nest.captures()}
     if not {step.sender, step.receiver} <= captured:
         SEEN["valid, transfer not captured at both ends"] += 1
-        assert prefixed(step.prefix, "byte_loss") in missing
+        assert step_prefixed(step.prefix, "byte_loss") in missing
     elif protocol is Protocol.UDP:
         SEEN["valid, UDP captured"] += 1
         assert value("ip_packets_sent") == sent.packets_sent

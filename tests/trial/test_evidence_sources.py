@@ -51,8 +51,8 @@ def test_no_row_names_an_unknown_column() -> None:
     columns |= {column.name for step in base.step_types().values() for column in step.columns}
     columns |= {column.name for column in (*drive_log.COLUMNS, *fly_log.COLUMNS)}  # of self-moving robots
     # Only a procedure with such a flow, or with a flow across such a fault, declares these.
-    columns |= {column.name for flow in recoveries.FLOWS for column in stalls.declared(flow, flow, 120)}
-    across = (recoveries.declared(flow, fault) for flow in recoveries.FLOWS for fault in FaultKind)
+    columns |= {column.name for flow in recoveries.FLOWS for column in stalls.declare_columns(flow, flow, 120)}
+    across = (recoveries.declare_columns(flow, fault) for flow in recoveries.FLOWS for fault in FaultKind)
     columns |= {column.name for declared in across for column in declared}
     for kind, check in evidence_sources.rows():
         for pattern in check.columns if kind else ():

@@ -229,7 +229,7 @@ def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Pat
         repeat = RepeatId(Protocol.UDP, 1)
         begun = ledger.begin(repeat)
         why = "cannot read \udcff\ud800.bag"
-        ledger.keep(store.open_attempt(folder, repeat), replace(begun, status=VOID, reason=why), Measured())
+        ledger.commit(store.open_attempt(folder, repeat), replace(begun, status=VOID, reason=why), Measured())
         ledger.summarize()
         (attempt,) = journal.ended(journal.history(folder, plan))
         assert attempt.reason == "cannot read ??.bag"
@@ -244,5 +244,5 @@ def test_a_journal_that_an_older_fieldkit_wrote_with_half_a_pair_is_read(tmp_pat
     (entry,) = journal.read(tmp_path)
     assert entry.reason == "?"
     before = (tmp_path / journal.JOURNAL_FILE).read_bytes()
-    journal.mend(tmp_path)
+    journal.remove_torn_line(tmp_path)
     assert (tmp_path / journal.JOURNAL_FILE).read_bytes() == before

@@ -69,7 +69,7 @@ def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_p
     first = kept(tmp_path)
     first.record(Role.RECEIVER, ORIGIN)
     with first.moving(Role.RECEIVER) as motion:
-        motion.ended(ORIGIN)
+        motion.mark_ended(ORIGIN)
     with pytest.raises(ValueError, match="torn"), first.moving(Role.RECEIVER):
         raise ValueError("torn")
     for role in ROBOTS:
@@ -104,8 +104,8 @@ def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:
 def test_two_robots_move_at_the_same_time(tmp_path: Path) -> None:
     origins = kept(tmp_path)
     with origins.moving(Role.SENDER) as outer, origins.moving(Role.RECEIVER) as inner:
-        inner.ended()
-        outer.ended()
+        inner.mark_ended()
+        outer.mark_ended()
     origins.demand()
 
 
@@ -157,16 +157,16 @@ def test_no_sequence_of_attempts_leaves_the_fence_of_the_trial(attempts: list[tu
             order = OUT
             for number in range(4000):
                 now_s += 3.0 if number == ticks and end == "suspended" else TICK_S
-                driver.odometry(now_s, base.pose)
+                driver.on_odometry(now_s, base.pose)
                 if number == ticks and end == "back":
                     order = BACK
                 if driver.ready and origins.get(Role.RECEIVER) is None:
                     origins.record(Role.RECEIVER, MotionOrigin("odometry", "boot", *base.pose))
                 if not (number >= ticks and end == "lease"):
-                    driver.renewed(now_s, order)
+                    driver.on_order(now_s, order)
                 base.drive(driver.tick(now_s))
                 farthest_m = max(farthest_m, math.hypot(*base.pose[:2]))
-                if driver.over and not base.forward_m_s:
+                if driver.is_finished and not base.forward_m_s:
                     break
-            assert driver.over
+            assert driver.is_finished
     assert farthest_m <= TASK.fence_m + MARGIN_M

@@ -103,6 +103,6 @@ def test_columns_that_depend_on_positions(column: str, dependent: bool) -> None:
 
 
 def test_every_column_of_positions_depends_on_them() -> None:
-    from fieldkit.measure.evidence.track import Apart  # noqa: PLC0415
+    from fieldkit.measure.evidence.track import Separation  # noqa: PLC0415
 
-    assert all(placements.is_dependent(f"rtt_{name}") for name in Apart.__dataclass_fields__)
+    assert all(placements.is_dependent(f"rtt_{name}") for name in Separation.__dataclass_fields__)

@@ -22,11 +22,11 @@ from tests.helpers.cut_trials import (
     cuts_in_a_row,
     robots_with_much_evidence,
 )
-from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, workplace
+from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, mount_workspace
 from tests.helpers.host import Untouched
-from tests.helpers.nightly import others_at_night
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
-from tests.helpers.power import Cut, Witness, demand_resumable, everything
+from tests.helpers.power import Cut, Witness, assert_resumable, read_tree
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated  # mounts need root
@@ -37,14 +37,14 @@ the file, which POSIX does not promise; see fsync(2)."""
 
 every_file_system = pytest.mark.parametrize("file_system", FILE_SYSTEMS, ids=lambda file_system: file_system.name)
 strictest_in_ci = pytest.mark.parametrize(
-    "file_system", others_at_night(FILE_SYSTEMS, in_ci=[STRICTEST]), ids=lambda file_system: file_system.name
+    "file_system", mark_nightly(FILE_SYSTEMS, in_ci=[STRICTEST]), ids=lambda file_system: file_system.name
 )
 
 
 @pytest.fixture
 def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
     """A folder in memory, in separate mounts of the test."""
-    with workplace(tmp_path) as folder, robots_with_much_evidence():
+    with mount_workspace(tmp_path) as folder, robots_with_much_evidence():
         yield folder
 
 
@@ -68,7 +68,7 @@ def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -
             "renamed",
             "written",
         ]
-    with image.mend().mounted(place / "elsewhere") as mounted:
+    with image.repair().mounted(place / "elsewhere") as mounted:
         assert sorted(path.name for path in mounted.iterdir() if path.name != "lost+found") == ["changed", "synced"]
         assert (mounted / "changed").read_bytes() != b"after"
         assert (mounted / "synced").read_bytes() == b"synced" * 10_000
@@ -78,17 +78,17 @@ def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -
 def test_a_power_cut_at_any_write_loses_nothing_that_was_reported(place: Path, file_system: FileSystem) -> None:
     cuts, witness, _ = cuts_at_every_sync(Disk.make(file_system, place / "disk.img"), place)
     assert len(cuts) > 30, "too few writes were interrupted"
-    assert any(cut.told for cut in cuts)
+    assert any(cut.reported for cut in cuts)
     resumed = []
     for cut in cuts:
-        with cut.disk.mend().mounted(place / "elsewhere") as mounted:
+        with cut.disk.repair().mounted(place / "elsewhere") as mounted:
             assert cut.lost(mounted / OUT, witness) == []
-            left = everything(mounted / OUT)
+            left = read_tree(mounted / OUT)
             if not any((mounted / OUT).glob("*/trial.yaml")):
-                assert not cut.told
+                assert not cut.reported
             elif left not in resumed:
                 resumed.append(left)
-                demand_resumable(mounted / OUT)
+                assert_resumable(mounted / OUT)
 
 
 def test_removing_any_sync_is_detected(place: Path) -> None:
@@ -110,7 +110,7 @@ def test_cuts_at_random_moments_one_after_the_other_lose_nothing(place: Path, fi
 
 
 def _lost(place: Path, cut: Cut, witness: Witness) -> list[str]:
-    with cut.disk.mend().mounted(place / "elsewhere") as mounted:
+    with cut.disk.repair().mounted(place / "elsewhere") as mounted:
         return cut.lost(mounted / OUT, witness)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fieldkit.analysis import repeats
 from fieldkit.config import schema
 from fieldkit.core import plugins
-from fieldkit.core.columns import Column, Figure, Kind, Value, named
+from fieldkit.core.columns import Column, Figure, Kind, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps.base import step_types
 from fieldkit.trial import frozen, rows, store, tables
@@ -69,7 +69,7 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     tmp_path_factory: pytest.TempPathFactory, found: tuple[list[Column], dict[str, Value]]
 ) -> None:
     columns, row = found
-    assert [column.flaw() for column in columns] == [None] * len(columns)
+    assert [column.declaration_error() for column in columns] == [None] * len(columns)
     plan = los_plan().model_copy(update={"columns": freeze(columns) or None})
     folder = tmp_path_factory.mktemp("trial")
     (folder / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
@@ -96,7 +96,7 @@ def test_the_paper_s_procedure_freezes_nothing() -> None:
 
 def test_a_named_column_has_named_figures_and_counts() -> None:
     (loss,) = (column for column in trial_columns() if column.name == "ip_loss")
-    up = named("up", loss)
+    up = with_step_name("up", loss)
     assert up.name == "up.ip_loss"
     assert up.figure is not None
     assert (up.figure.label, up.figure.arrived, up.figure.sent) == (
@@ -105,7 +105,7 @@ def test_a_named_column_has_named_figures_and_counts() -> None:
         "up.ip_packets_sent",
     )
     assert (up.unit, up.meaning, up.possible) == (loss.unit, loss.meaning, loss.possible)
-    assert named("", loss) is loss
+    assert with_step_name("", loss) is loss
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_a_named_column_has_named_figures_and_counts() -> None:
     ],
 )
 def test_a_column_that_cannot_be_read_or_shown_is_rejected(column: Column, flaw: str) -> None:
-    problem = column.flaw()
+    problem = column.declaration_error()
     assert problem is not None
     assert flaw in problem
 

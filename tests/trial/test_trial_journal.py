@@ -81,7 +81,7 @@ def test_entries_after_a_repair_are_read_back(
     whole = path.read_bytes()
     path.write_bytes(whole[: max(0, len(whole) - cut)])
     before = journal.read(folder)
-    journal.mend(folder)
+    journal.remove_torn_line(folder)
     journal.append(folder, next_entry)
     assert journal.read(folder) == [*before, next_entry]
 
@@ -96,7 +96,7 @@ def test_an_attempt_without_an_end_was_interrupted(tmp_path: Path) -> None:
         JournalEntry(40, Protocol.UDP, 3, 1, Status.RUNNING),
         JournalEntry(45, Protocol.UDP, 3, 1, Status.MEASURED),
     )
-    assert journal.cut_short(journal.read(tmp_path)) == [
+    assert journal.interrupted(journal.read(tmp_path)) == [
         Attempt(RepeatId(Protocol.UDP, 2), 1, 30, Status.RUNNING),
         Attempt(RepeatId(Protocol.UDP, 3), 1, 40, Status.MEASURED),
     ]

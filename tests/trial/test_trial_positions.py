@@ -149,9 +149,9 @@ def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.Ca
     ],
 )
 def test_a_place_is_distinguished_from_a_file(text: str, found: object) -> None:
-    assert positions.told(text) == (Role.SENDER, found)
+    assert positions.parse_source(text) == (Role.SENDER, found)
 
 
 def test_an_invalid_pair_is_rejected() -> None:
     with pytest.raises(ConfigurationError, match="not ROLE=FILE"):
-        positions.told("=walk.gpx")
+        positions.parse_source("=walk.gpx")

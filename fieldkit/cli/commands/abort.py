@@ -10,7 +10,7 @@ from fieldkit.cli.terminal import confirmed
 from fieldkit.core import runtime
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.events import Note
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 
 
@@ -39,29 +39,29 @@ _ENDS: Final = (
 def run(arguments: argparse.Namespace) -> int:
     """Abort, and print the terminated jobs robot by robot."""
     from fieldkit.cli import options
-    from fieldkit.remote.motion import IN_WORDS, MotionState
+    from fieldkit.remote.motion import STATE_TEXTS, MotionState
     from fieldkit.trial.running import locks
 
     with watching(as_json=False) as sink:
         _, backend = options.backend(arguments, sink)
-        with backend.standing(sink=sink) as robots:
+        with backend.persistent_shells(sink=sink) as robots:
             if not robots:
                 sink(Note(_NONE))
                 return 0
             question = f"terminate every job of fieldkit on {', '.join(robots)}"
             if not arguments.yes and not confirmed(question, unasked="fieldkit abort --yes"):
-                say("nothing was terminated")
+                print_text("nothing was terminated")
                 return FieldkitError.exit_code
-            results = locks.abort(robots, runtime.me())
+            results = locks.abort(robots, runtime.user_at_host())
     for robot, result in results.items():
         count = f"{format_count(len(result.jobs), 'job')} terminated"
         if result.error is None:
-            say(f"{robot}: {'lock broken' if result.locked else 'not locked'}, {count}")
+            print_text(f"{robot}: {'lock broken' if result.locked else 'not locked'}, {count}")
         elif result.jobs:
-            say(f"{robot}: {count}")
-        say("".join(f"  {job}\n" for job in result.jobs), end="")
+            print_text(f"{robot}: {count}")
+        print_text("".join(f"  {job}\n" for job in result.jobs), end="")
         for program, state in result.landing:
-            say(f"  {program.rpartition('/')[2]} still runs: {IN_WORDS[MotionState(state)]}. {_ENDS}")
+            print_text(f"  {program.rpartition('/')[2]} still runs: {STATE_TEXTS[MotionState(state)]}. {_ENDS}")
         if result.error is not None:
             show_error(str(result.error))
     return RobotError.exit_code if any(result.error for result in results.values()) else 0

@@ -12,8 +12,8 @@ from fieldkit.bags.formats import LAST_RESORT, BagFormat
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.cli.parser import Parser
-from fieldkit.core.errors import EvidenceError, FieldkitError, typed
-from fieldkit.core.printing import say
+from fieldkit.core.errors import EvidenceError, FieldkitError, shell_command
+from fieldkit.core.printing import print_text
 from fieldkit.core.text import json_text
 from fieldkit.core.units import format_bytes, format_count, format_duration
 
@@ -57,7 +57,7 @@ def info(arguments: argparse.Namespace) -> int:
     """Print the contents of a bag from its index, and its problems."""
     bag_contents = contents.inspect(arguments.bag)
     if arguments.json:
-        say(json_text(asdict(bag_contents) | {"messages": bag_contents.messages}))
+        print_text(json_text(asdict(bag_contents) | {"messages": bag_contents.messages}))
     else:
         _show(arguments.bag, bag_contents)
     return EvidenceError.exit_code if bag_contents.problems else 0
@@ -65,13 +65,13 @@ def info(arguments: argparse.Namespace) -> int:
 
 def _show(path: Path, bag_contents: BagContents) -> None:
     if bag_contents.problems:
-        say(f"{path}: {bag_contents.format}, {format_bytes(bag_contents.size_bytes)}, damaged")
+        print_text(f"{path}: {bag_contents.format}, {format_bytes(bag_contents.size_bytes)}, damaged")
     else:
         count = format_count(bag_contents.messages, "message")
-        say(f"{path}: {bag_contents.format}, {format_bytes(bag_contents.size_bytes)}, {count}")
+        print_text(f"{path}: {bag_contents.format}, {format_bytes(bag_contents.size_bytes)}, {count}")
     if bag_contents.messages:
         started = datetime.fromtimestamp(bag_contents.started_utc_ns / 1e9, UTC)
-        say(f"{started:%Y-%m-%d %H:%M:%S} UTC, {format_duration(bag_contents.duration_s)}")
+        print_text(f"{started:%Y-%m-%d %H:%M:%S} UTC, {format_duration(bag_contents.duration_s)}")
     rows = [
         (topic.name, topic.type, str(topic.messages), _rate(topic.messages, bag_contents.duration_s))
         for topic in bag_contents.topics
@@ -88,9 +88,9 @@ def _rate(messages: int, duration_s: float) -> str:
 def _show_problems(path: Path, bag_contents: BagContents) -> None:
     for problem in bag_contents.problems:
         show_error(f"{path}: {problem}")
-    if bag_contents.savable:
-        repair = typed("fieldkit", "bag", "repair", path, "NEW")
-        show_note(f"{format_count(bag_contents.savable, 'message')} can be saved: {repair}")
+    if bag_contents.recoverable_messages:
+        repair = shell_command("fieldkit", "bag", "repair", path, "NEW")
+        show_note(f"{format_count(bag_contents.recoverable_messages, 'message')} can be saved: {repair}")
     elif bag_contents.problems:
         show_note("; ".join(filter(None, ("no message can be saved", LAST_RESORT.get(bag_contents.format)))))
 
@@ -110,14 +110,14 @@ def _check_bag(path: Path) -> int:
     if bag_contents.problems:
         _show_problems(path, bag_contents)
         return EvidenceError.exit_code
-    say(f"{path}: intact, {format_count(bag_contents.messages, 'message')}")
+    print_text(f"{path}: intact, {format_count(bag_contents.messages, 'message')}")
     return 0
 
 
 def repair(arguments: argparse.Namespace) -> int:
     """Write the readable messages of a bag into a new one."""
     result = contents.repair(arguments.bag, arguments.to)
-    say(f"{arguments.to}: {format_count(result.messages or 0, 'message')} saved")
+    print_text(f"{arguments.to}: {format_count(result.messages or 0, 'message')} saved")
     for note in result.notes:
         show_note(f"{arguments.bag}: {note}")
     return 0

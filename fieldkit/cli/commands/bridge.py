@@ -21,13 +21,13 @@ from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.text import json_text
 from fieldkit.core.units import format_bytes
 from fieldkit.ros import bridge
 from fieldkit.ros.bridge import Carrier, Side
-from fieldkit.ros.crossings import Crossed, Crossing
-from fieldkit.ros.ports import MOST_DOMAIN
+from fieldkit.ros.crossings import Crossing, CrossingCounts
+from fieldkit.ros.ports import MAX_DOMAIN
 from fieldkit.ros.types import Distribution, MessageTypes
 
 MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
@@ -119,9 +119,9 @@ def run(arguments: argparse.Namespace) -> int:
     with _until_signal() as stopped, bridge.bridged(near, far, crossings, types) as carriers:
         show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C stops it")
         _watch(carriers, stopped)
-        counts = [carrier.told() for carrier in carriers]
+        counts = [carrier.counts() for carrier in carriers]
     if arguments.json:
-        say(json_text([asdict(crossed) for crossed in counts]))
+        print_text(json_text([asdict(crossed) for crossed in counts]))
     else:
         _show(counts)
     return 0
@@ -189,10 +189,10 @@ def _host(text: str, usual_port: int) -> tuple[str, int]:
 def _domain(given: int | None) -> int:
     text = os.environ.get("ROS_DOMAIN_ID") or "0"
     number = given if given is not None else int(text) if text.isascii() and text.isdigit() else -1
-    if 0 <= number <= MOST_DOMAIN:
+    if 0 <= number <= MAX_DOMAIN:
         return number
     raise ConfigurationError(
-        f"{text if given is None else given} is not a domain of ROS 2", remedy=f"use 0 to {MOST_DOMAIN}"
+        f"{text if given is None else given} is not a domain of ROS 2", remedy=f"use 0 to {MAX_DOMAIN}"
     )
 
 
@@ -221,7 +221,7 @@ def _watch(carriers: Sequence[Carrier], stopped: threading.Event) -> None:
                 )
 
 
-def _show(counts: Sequence[Crossed]) -> None:
+def _show(counts: Sequence[CrossingCounts]) -> None:
     head = ("topic", "direction", "messages", "a second", "bytes", "refused", "unreadable", "median", "99 %")
     rows = [
         (

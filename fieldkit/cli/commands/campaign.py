@@ -8,7 +8,7 @@ from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, watching
 from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import interruptible
-from fieldkit.core.errors import EvidenceError, FieldkitError, typed
+from fieldkit.core.errors import EvidenceError, FieldkitError, shell_command
 from fieldkit.core.units import format_count
 
 if TYPE_CHECKING:
@@ -59,16 +59,17 @@ def run(arguments: argparse.Namespace) -> int:
 def _exit_code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
     if outcome.failed:
         failed = format_count(outcome.failed, "repeat")
-        remedy = (
-            f"correct what the reasons name, then add --failed: {typed('fieldkit', 'campaign', file, '--failed')}"
-        )
+        command = shell_command("fieldkit", "campaign", file, "--failed")
+        remedy = f"correct what the reasons name, then add --failed: {command}"
         show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}\n  remedy: {remedy}")
     if outcome.left:
         names = ", ".join(map(str, outcome.left))
         show_error(f"skipped: {names}\n  remedy: run the same command again for the skipped trials")
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
-        show_error(f"{unmet} not shown to hold\n  remedy: {typed('fieldkit', 'aggregate', folder)} lists them")
+        show_error(
+            f"{unmet} not shown to hold\n  remedy: {shell_command('fieldkit', 'aggregate', folder)} lists them"
+        )
     if outcome.failed:
         return EvidenceError.exit_code
     return FieldkitError.exit_code if outcome.left or outcome.unmet else 0

@@ -10,7 +10,7 @@ from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import RobotError
 from fieldkit.core.events import PhaseStarted
 from fieldkit.core.model import Distance, Verdict
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 
 
 def add(parser: Parser) -> None:
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
         name, backend = options.backend(arguments, sink)
         cast = backend.cast(request.chosen_topology)
         plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC), lab_bytes=backend.lab_bytes)
-        with backend.open(plan.cast, seed=plan.seed, sink=sink, operator=Nobody()) as lab:
+        with backend.open(plan.cast, seed=plan.seed, sink=sink, operator=Unattended()) as lab:
             lab.place(plan.placement)
             sink(PhaseStarted("check"))
             findings = preflight.check(plan, lab.shells, Path("trials"), whole=True).findings

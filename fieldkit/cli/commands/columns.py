@@ -8,7 +8,7 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.cli.display import table
 from fieldkit.cli.parser import Parser
 from fieldkit.core.columns import DifferenceRow, EstimateRow, declared, plain_name
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 
 def add(parser: Parser) -> None:
@@ -76,7 +76,7 @@ def _columns(name: str | None) -> int:
     ]
     if not rows:
         raise ConfigurationError(
-            f"there is no column {name!r}", remedy=nearest(name or "", known, "fieldkit columns lists them")
+            f"there is no column {name!r}", remedy=did_you_mean(name or "", known, "fieldkit columns lists them")
         )
     table(("file", "column", "unit", "meaning"), rows)
     return 0

@@ -119,7 +119,7 @@ def _tables(prefix: str) -> Iterator[str]:
 
 
 def _backends(_prefix: str) -> Iterable[str]:
-    return (point.name for point in plugins.points(plugins.BACKENDS))
+    return (point.name for point in plugins.entry_points(plugins.BACKENDS))
 
 
 def _quantities(_prefix: str) -> Iterable[str]:

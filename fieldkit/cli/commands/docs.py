@@ -6,7 +6,7 @@ import webbrowser
 from fieldkit.cli.display import table
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 
 
 def add(parser: Parser) -> None:
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     page = documentation.find(arguments.topic)
     if arguments.path:
-        say(str(page.path))
+        print_text(str(page.path))
     elif not webbrowser.open(page.uri):
         raise ConfigurationError("this machine has no browser", remedy=f"open it elsewhere: {page.path}")
     return 0

@@ -8,8 +8,8 @@ from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import confirmed
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, nearest, typed
-from fieldkit.core.printing import say
+from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, did_you_mean, shell_command
+from fieldkit.core.printing import print_text
 from fieldkit.remote.identity import Address, HostKey
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
         kind=pinned.kind if pinned else "ssh-ed25519",
     )
     if offered == pinned:
-        say(f"{name}: this key is already pinned: {offered.fingerprint}")
+        print_text(f"{name}: this key is already pinned: {offered.fingerprint}")
         return 0
     if pinned is not None and not arguments.replace:
         raise HostKeyError(
@@ -62,10 +62,10 @@ def run(arguments: argparse.Namespace) -> int:
         )
     _show(address, offered, pinned)
     if not arguments.yes and not confirmed("pin it", unasked="compare the fingerprints, then add --yes"):
-        say("not pinned")
+        print_text("not pinned")
         return FieldkitError.exit_code
     site_file.pin(path, name, offered.text)
-    say(f"pinned in {path}")
+    print_text(f"pinned in {path}")
     return 0
 
 
@@ -75,14 +75,14 @@ def _robot(name: str, path: Path) -> "tuple[SiteRobot, str]":
 
     if not path.exists():
         raise ConfigurationError(
-            "there is no site file", where=str(path), remedy=typed("fieldkit", "init", "--out", path)
+            "there is no site file", where=str(path), remedy=shell_command("fieldkit", "init", "--out", path)
         )
     site, document = load_site(path)
     if name not in site.robots:
         raise ConfigurationError(
             f"there is no robot {name!r}",
             where=str(path),
-            remedy=nearest(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
+            remedy=did_you_mean(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
         )
     where = document.where(("robots", name))
     if site.robots[name].host is None:
@@ -103,6 +103,8 @@ def _pinned(name: str, robot: "SiteRobot", *, or_none: bool) -> HostKey | None:
 
 def _show(address: Address, offered: HostKey, pinned: HostKey | None) -> None:
     if pinned is not None:
-        say(f"pinned before: {pinned.kind} {pinned.fingerprint}")
-    say(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
-    say(f"compare it with the output of this command on the robot's own console:\n  {offered.by_hand}")
+        print_text(f"pinned before: {pinned.kind} {pinned.fingerprint}")
+    print_text(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
+    print_text(
+        f"compare it with the output of this command on the robot's own console:\n  {offered.fingerprint_command}"
+    )

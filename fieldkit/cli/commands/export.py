@@ -10,8 +10,8 @@ from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, typed
-from fieldkit.core.printing import say
+from fieldkit.core.errors import ConfigurationError, shell_command
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_bytes
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             "this file exists and is not overwritten",
             where=str(out),
-            remedy=typed("mv", out, f"{out}.old") if out.is_file() else "choose another -o",
+            remedy=shell_command("mv", out, f"{out}.old") if out.is_file() else "choose another -o",
         )
     try:
         with files.replacing(out) as file:
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"cannot be written: {error.strerror}", where=str(out), remedy="choose another -o"
         ) from error
-    say(f"wrote {out} ({format_bytes(size_bytes)})")
+    print_text(f"wrote {out} ({format_bytes(size_bytes)})")
     return 0
 
 
@@ -83,7 +83,7 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
         raise ConfigurationError(
             f"an MCAP file holds one trial, {len(arguments.paths)} are given",
             remedy="one at a time: "
-            + typed("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
+            + shell_command("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )
     plan = store.read_plan(folder)
     sources.note_differences(folder, show_note)

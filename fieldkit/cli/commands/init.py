@@ -5,8 +5,8 @@ from pathlib import Path
 
 from fieldkit.cli.parser import Parser
 from fieldkit.config.locations import SITE_FILE
-from fieldkit.core.errors import typed
-from fieldkit.core.printing import say
+from fieldkit.core.errors import shell_command
+from fieldkit.core.printing import print_text
 
 
 def add(parser: Parser) -> None:
@@ -28,13 +28,16 @@ def run(arguments: argparse.Namespace) -> int:
     site, _ = load_site(path)
     option = () if path == Path(SITE_FILE) else ("--site", path)
     steps = [
-        (f"${{EDITOR:-nano}} {typed(path)}", "hosts, users and keys of your robots"),
-        *((typed("fieldkit", "enroll", name, *option), f"pin the host key of {name}") for name in site.robots),
-        (typed("fieldkit", "check", *option), "what the robots lack"),
-        (typed("fieldkit", "trial", "los", "30ft", "--repeats", 1, *option), "a first trial"),
+        (f"${{EDITOR:-nano}} {shell_command(path)}", "hosts, users and keys of your robots"),
+        *(
+            (shell_command("fieldkit", "enroll", name, *option), f"pin the host key of {name}")
+            for name in site.robots
+        ),
+        (shell_command("fieldkit", "check", *option), "what the robots lack"),
+        (shell_command("fieldkit", "trial", "los", "30ft", "--repeats", 1, *option), "a first trial"),
     ]
     width = max(len(command) for command, _ in steps)
-    say(f"wrote {path}; next:")
+    print_text(f"wrote {path}; next:")
     for command, purpose in steps:
-        say(f"  {command:{width}}  # {purpose}")
+        print_text(f"  {command:{width}}  # {purpose}")
     return 0

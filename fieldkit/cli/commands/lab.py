@@ -16,7 +16,7 @@ from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Vector
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.text import json_text
 from fieldkit.core.units import format_count, format_duration, parse_offset_m
 from fieldkit.lab import background, folder
@@ -121,15 +121,15 @@ def up(arguments: argparse.Namespace) -> int:
     here, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
     def announce(robots: "Lab") -> None:
-        say(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
+        print_text(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
         server.run(here, backend, seed=arguments.seed, sink=_show_note, ready=announce)
         return 0
 
-    def serve(leave: background.Leave) -> int:
+    def serve(leave: background.OnReady) -> int:
         def ready(robots: "Lab") -> None:
-            say(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
+            print_text(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
             leave(here.log)
 
         try:
@@ -139,7 +139,7 @@ def up(arguments: argparse.Namespace) -> int:
             return error.exit_code
         return 0
 
-    return background.detached(serve)
+    return background.run_detached(serve)
 
 
 def list_robots(arguments: argparse.Namespace) -> int:
@@ -148,7 +148,7 @@ def list_robots(arguments: argparse.Namespace) -> int:
 
     state = client.state(_here())
     if arguments.json:
-        say(json_text(asdict(state)))
+        print_text(json_text(asdict(state)))
         return 0
     rows = [
         (
@@ -162,7 +162,7 @@ def list_robots(arguments: argparse.Namespace) -> int:
         for robot in state.robots
     ]
     table(("robot", "profile", "roles", "address", "east, north, up (m)", "runs"), rows)
-    say(f"up for {format_duration(state.up_s)}, pid {state.pid}")
+    print_text(f"up for {format_duration(state.up_s)}, pid {state.pid}")
     return 0
 
 
@@ -178,7 +178,7 @@ def move(arguments: argparse.Namespace) -> int:
     east_m, north_m, *up_m = map(parse_offset_m, words)
     to = Destination(east_m, north_m, up_m[0] if up_m else None, relative)
     place_m = client.move(_here(), arguments.robot, to)
-    say(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
+    print_text(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
     return 0
 
 
@@ -204,7 +204,7 @@ def print_ssh_config(_: argparse.Namespace) -> int:
 
     here = _here()
     client.state(here)
-    say(here.ssh_config.read_text(encoding="utf-8"), end="")
+    print_text(here.ssh_config.read_text(encoding="utf-8"), end="")
     return 0
 
 
@@ -213,7 +213,7 @@ def down(_: argparse.Namespace) -> int:
     from fieldkit.lab import client
 
     client.end(_here())
-    say("the robots are down")
+    print_text("the robots are down")
     return 0
 
 
@@ -225,7 +225,7 @@ def plot(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     form = theme.format_of(out, "--out")
     files.write(out, figures.overview(_overview(arguments), form))
-    say(out)
+    print_text(out)
     return 0
 
 
@@ -266,7 +266,7 @@ def _backend(arguments: argparse.Namespace) -> "LabBackend":
         site = (
             Site(robots=robots, roles={}) if site is None else site.model_copy(update={"robots": robots, "roles": {}})
         )
-    return protocol.of(name, load_backend(name, site, document))
+    return protocol.as_lab_backend(name, load_backend(name, site, document))
 
 
 def _show_note(event: Event) -> None:

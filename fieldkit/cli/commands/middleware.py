@@ -10,8 +10,8 @@ from fieldkit.cli.display import show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import say
-from fieldkit.core.text import harmless
+from fieldkit.core.printing import print_text
+from fieldkit.core.text import sanitized
 from fieldkit.core.units import BYTES_PER_UNIT, parse_quantity
 from fieldkit.ros import configurations
 
@@ -62,7 +62,7 @@ NOTHING: int = 1
 
 def recommend(arguments: argparse.Namespace) -> int:
     """Write a file for each middleware with settings that passed."""
-    from fieldkit.analysis.expectations import MOST_SHARE
+    from fieldkit.analysis.expectations import MAX_SHARE
     from fieldkit.trial import recommendation, sources
     from fieldkit.trial.link_cells import LinkCriterion
     from fieldkit.trial.recommendation import Assessment
@@ -74,26 +74,28 @@ def recommend(arguments: argparse.Namespace) -> int:
         max_delay_s=None if arguments.max_delay is None else parse_amount(arguments.max_delay, "s", "--max-delay"),
         size_bytes=None if arguments.size is None else parse_quantity(arguments.size, BYTES_PER_UNIT, "size"),
         repeats=arguments.repeats,
-        share=None if arguments.share is None else _parse_share(arguments.share, "--share", most=MOST_SHARE),
+        share=None if arguments.share is None else _parse_share(arguments.share, "--share", most=MAX_SHARE),
     )
     data = sources.find(arguments.trials, show_note)
     assessments = recommendation.assess(data.read(undeclared=True), criterion)
     if not assessments:
-        say("no trial has a step topics with samples of this size; to run one, see: fieldkit docs topics")
+        print_text("no trial has a step topics with samples of this size; to run one, see: fieldkit docs topics")
         return NOTHING
     best: dict[str, Assessment] = {}
     for assessment in assessments:
         word = "passed" if assessment.passed else "failed" if assessment.failed else "undecided"
-        say(harmless(f"{word}: {assessment.candidate}"))
+        print_text(sanitized(f"{word}: {assessment.candidate}"))
         for reason in (*assessment.failed, *assessment.lacking):
-            say(harmless(f"  {reason}"))
+            print_text(sanitized(f"  {reason}"))
         current = best.get(assessment.candidate.over)
         if assessment.passed and (current is None or assessment.rank < current.rank):
             best[assessment.candidate.over] = assessment
     wrote = [_write(arguments, assessment, criterion) for assessment in best.values()]
     if any(wrote):
         return 0
-    say("nothing was written: no settings passed. Measure the undecided ones with more repeats, or other settings")
+    print_text(
+        "nothing was written: no settings passed. Measure the undecided ones with more repeats, or other settings"
+    )
     return NOTHING
 
 
@@ -121,7 +123,7 @@ def _write(arguments: argparse.Namespace, assessment: "Assessment", criterion: "
     middleware = assessment.candidate.over
     comment = list(recommendation.evidence(assessment, criterion))
     try:
-        text = configurations.written(
+        text = configurations.configuration_text(
             middleware, assessment.candidate.transport, assessment.candidate.by_path, comment
         )
     except ConfigurationError as error:
@@ -130,5 +132,5 @@ def _write(arguments: argparse.Namespace, assessment: "Assessment", criterion: "
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / configurations.FILES[middleware]
     files.write(path, text.encode())
-    say(f"wrote {path}; name it in {configurations.VARIABLES[middleware]}")
+    print_text(f"wrote {path}; name it in {configurations.VARIABLES[middleware]}")
     return True

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import parse_duration_s
 
 if TYPE_CHECKING:
-    from fieldkit.trial.positions import Spotted
+    from fieldkit.trial.positions import AttemptPositions
 
 
 def add(parser: Parser) -> None:
@@ -43,23 +43,23 @@ def run(arguments: argparse.Namespace) -> int:
     """Store the given files, and print the distances in each repeat with their source."""
     from fieldkit.trial import positions
 
-    files = dict(map(positions.told, arguments.files))
+    files = dict(map(positions.parse_source, arguments.files))
     if files or arguments.clear:
         if files and arguments.clear:
             raise ConfigurationError(
                 "--clear removes stored files and takes no new ones", remedy="omit it to replace the stored files"
             )
-        rebuilt = positions.give(
+        rebuilt = positions.set_positions(
             arguments.trial,
             files,
             offset_s=_offset_s(arguments.offset),
             gap_s=parse_duration_s(arguments.gap),
             heights=arguments.heights,
         )
-        say(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
-    for spotted in positions.spotted(arguments.trial):
-        for line in _lines(spotted):
-            say(line)
+        print_text(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
+    for attempt_positions in positions.attempt_positions(arguments.trial):
+        for line in _lines(attempt_positions):
+            print_text(line)
     return 0
 
 
@@ -69,9 +69,9 @@ def _offset_s(text: str) -> float:
     return -offset_s if text.startswith("-") else offset_s
 
 
-def _lines(spotted: "Spotted") -> list[str]:
+def _lines(spotted: "AttemptPositions") -> list[str]:
     """Return the lines about an attempt, one per distance."""
-    source = spotted.told_by or "positions from the backend"
+    source = spotted.source or "positions from the backend"
     lines = [
         f"{spotted.attempt}  {pair}: {least:.1f} to {most:.1f} m, {source}"
         for pair, (least, most) in spotted.distances_m.items()

@@ -5,7 +5,7 @@ import argparse
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import prose, show_note
 from fieldkit.cli.parser import Parser
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 
 
 def add(parser: Parser) -> None:
@@ -26,5 +26,5 @@ def run(arguments: argparse.Namespace) -> int:
         show_note(f"{arguments.trial}: there is no manifest to verify its evidence with")
     if left_out := summary.show(rebuilt.cells, every=arguments.all, expected=rebuilt.expected):
         prose(f"{summary.more(left_out)}: add --all")
-    say(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
+    print_text(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
     return 0

@@ -10,8 +10,8 @@ from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, typed
-from fieldkit.core.printing import say
+from fieldkit.core.errors import ConfigurationError, shell_command
+from fieldkit.core.printing import print_text
 
 
 def add(parser: Parser) -> None:
@@ -79,12 +79,12 @@ def run(arguments: argparse.Namespace) -> int:
     )
     with _explain_os_errors(out, "-o"):
         files.write(out, page.render(report_contents, out).encode())
-    say(out)
+    print_text(out)
     if folder is not None:
         with _explain_os_errors(folder, "--figures"):
             folder.mkdir(parents=True, exist_ok=True)
             for path in figures.save(report_contents.charts, folder):
-                say(path)
+                print_text(path)
     return 0
 
 
@@ -92,10 +92,12 @@ def _require_writable(out: Path) -> None:
     """Raise an error before the work if no page can be written there. Only a report may be overwritten."""
     if not out.parent.is_dir():
         raise ConfigurationError(
-            "there is no such folder", where=str(out.parent), remedy=typed("mkdir", "-p", out.parent)
+            "there is no such folder", where=str(out.parent), remedy=shell_command("mkdir", "-p", out.parent)
         )
     if out.is_dir():
-        raise ConfigurationError("this is a folder", where=str(out), remedy=f"name a file: {typed('-o', out / _OUT)}")
+        raise ConfigurationError(
+            "this is a folder", where=str(out), remedy=f"name a file: {shell_command('-o', out / _OUT)}"
+        )
     if out.exists() and not _is_page(out):
         raise ConfigurationError(
             "this file is not a report, and is not overwritten",

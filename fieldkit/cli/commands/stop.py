@@ -18,9 +18,9 @@ from fieldkit.cli.parser import Parser
 from fieldkit.config import documents, robot_access
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.config.robot_access import RobotAccess
-from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError, nearest
-from fieldkit.core.printing import say
-from fieldkit.core.runtime import me
+from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError, did_you_mean
+from fieldkit.core.printing import print_text
+from fieldkit.core.runtime import user_at_host
 from fieldkit.lab import folder
 from fieldkit.remote import motion
 from fieldkit.remote.motion import Halted, MotionState
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     def report(name: str, result: Halted) -> None:
         with printing:
-            say(f"{name}: {_in_words(result)}", flush=True)
+            print_text(f"{name}: {_in_words(result)}", flush=True)
 
     with _robots(arguments) as robots:
         if not robots:
@@ -68,10 +68,10 @@ def run(arguments: argparse.Namespace) -> int:
         for name in arguments.robots:
             if name not in robots:
                 raise ConfigurationError(
-                    f"there is no robot {name!r}", remedy=nearest(name, robots, ", ".join(robots))
+                    f"there is no robot {name!r}", remedy=did_you_mean(name, robots, ", ".join(robots))
                 )
         chosen = {name: shell for name, shell in robots.items() if arguments.all or name in arguments.robots}
-        halted = motion.halt_all(chosen, me(), _WITHIN_S, report)
+        halted = motion.halt_all(chosen, user_at_host(), _WITHIN_S, report)
     return RobotError.exit_code if any(map(_failed, halted.values())) else 0
 
 
@@ -115,7 +115,7 @@ def _other_robots(backend: str | None, path: Path | None) -> Iterator[Robots]:
     from fieldkit.config.site import load_site
 
     site, document = (None, None) if path is None else load_site(path)
-    with load_backend(backend or DEFAULT_BACKEND, site, document).standing(sink=lambda _: None) as robots:
+    with load_backend(backend or DEFAULT_BACKEND, site, document).persistent_shells(sink=lambda _: None) as robots:
         yield robots
 
 
@@ -126,8 +126,8 @@ def _failed(result: Halted) -> bool:
 def _in_words(result: Halted) -> str:
     """Return the state of a robot after the order to stop, in one line."""
     if result.error is None:
-        return motion.IN_WORDS[result.state]
+        return motion.STATE_TEXTS[result.state]
     if isinstance(result.error, LinkError):
         return f"NOT REACHED: stop it by hand ({result.error.what})"
-    done = motion.IN_WORDS[result.state] if result.programs else "NOT CONFIRMED: stop it by hand"
+    done = motion.STATE_TEXTS[result.state] if result.programs else "NOT CONFIRMED: stop it by hand"
     return f"{done}; {result.error.what}"

@@ -6,7 +6,7 @@ from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 
 
@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> int:
     problems = verify(arguments.trial)
     for problem in problems:
         show_error(problem)
-    say(
+    print_text(
         f"{format_count(len(problems), 'file')} different from the manifest"
         if problems
         else "every file matches the manifest"

@@ -82,7 +82,7 @@ def address(text: str) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=1024)
-def written(upper: int, lower: int) -> str:
+def address_text(upper: int, lower: int) -> str:
     """Return the usual text of an address whose two halves are given."""
     ipv6 = IPv6Address(upper << 64 | lower)
     return str(ipv6.ipv4_mapped or ipv6)

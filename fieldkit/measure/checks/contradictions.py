@@ -59,7 +59,7 @@ def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, cut: 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
     sent = evidence.read_or_none(reading.size, transfer.sent_file)
     received = evidence.read_or_none(reading.size, transfer.received_file)
-    common = evidence.read_or_none(reading.alike_bytes, "", transfer.sent_file, transfer.received_file)
+    common = evidence.read_or_none(reading.common_prefix_bytes, "", transfer.sent_file, transfer.received_file)
     return None if sent is None or received is None or common is None else _Files(sent, received, common)
 
 

@@ -70,7 +70,7 @@ CROSS_CHECKS: Final = (
 
 
 @dataclass(frozen=True)
-class IperfOrder:
+class IperfSettings:
     """Settings of an iperf3 test in a procedure.
 
     Attributes:
@@ -88,7 +88,7 @@ class IperfOrder:
     lasts_s: float | None
 
 
-def within(test: IperfTest, *, sends: bool) -> Iterator[str]:
+def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
     """Yield the contradictions within the JSON of one end."""
     intervals = test.intervals
     yield from _gaps(intervals)
@@ -156,7 +156,7 @@ def _datagram_bytes(test: IperfTest, payload_bytes: int) -> Iterator[str]:
         yield f"it received {received_bytes} bytes, but counts {counted}"
 
 
-def between(client: IperfTest, server: IperfTest, order: IperfOrder) -> Iterator[str]:
+def compare_ends(client: IperfTest, server: IperfTest, order: IperfSettings) -> Iterator[str]:
     """Yield the contradictions between the JSON of both ends, and differences from the procedure's settings."""
     if client.start.cookie != server.start.cookie:
         yield "client and server have different cookies, so they are different tests"
@@ -172,7 +172,7 @@ def between(client: IperfTest, server: IperfTest, order: IperfOrder) -> Iterator
     yield from _totals(client, sender, receiver, order)
 
 
-def _differences(test: IperfTest, order: IperfOrder) -> Iterator[str]:
+def _differences(test: IperfTest, order: IperfSettings) -> Iterator[str]:
     start = test.start
     settings = {
         "protocol": (start.protocol or None, str(order.protocol)),
@@ -186,7 +186,7 @@ def _differences(test: IperfTest, order: IperfOrder) -> Iterator[str]:
             yield f"had another {setting} than the procedure requires"
 
 
-def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, order: IperfOrder) -> Iterator[str]:
+def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, order: IperfSettings) -> Iterator[str]:
     """Yield differences between the client's summary, which has the server's results, and the counts of both ends."""
     totals = client.totals
     sent_bytes, received_bytes = _sum(sender.intervals, "payload_bytes"), _sum(receiver.intervals, "payload_bytes")
@@ -215,7 +215,7 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, order: Ip
         yield f"the receiver expected {expected} datagrams, but {sent_datagrams} were sent"
 
 
-def misdated(test: IperfTest, window: tuple[int, int] | None) -> str | None:
+def date_problem(test: IperfTest, window: tuple[int, int] | None) -> str | None:
     """Return the reason why a test was not made during the attempt, by the robot's clock, or None."""
     if window is None or test.start.began_utc_s is None:
         return None

@@ -45,7 +45,7 @@ _TAIL_DATAGRAMS: Final = 10
 
 
 @dataclass(frozen=True)
-class LoadWitness:
+class LoadEvidence:
     """Captures of a test, and the kernels' counters for the attempt.
 
     Attributes:
@@ -82,7 +82,7 @@ class _Progress:
         return int(self.lower[index]) if index >= 0 else 0
 
 
-def find(flow: LoadFlow, sent: IperfTest, received: IperfTest, witness: LoadWitness) -> Iterator[str]:
+def find(flow: LoadFlow, sent: IperfTest, received: IperfTest, witness: LoadEvidence) -> Iterator[str]:
     """Yield the contradictions between both ends' JSON and both captures; none if a capture has no times."""
     if (witness.receiver.time_ns == NO_TIME).any() or (witness.sender.time_ns == NO_TIME).any():
         return
@@ -103,7 +103,7 @@ def find(flow: LoadFlow, sent: IperfTest, received: IperfTest, witness: LoadWitn
         yield from _arrivals(flow, received, progress, witness)
 
 
-def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, witness: LoadWitness) -> Iterator[str]:
+def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, witness: LoadEvidence) -> Iterator[str]:
     """Yield a contradiction for the first interval at whose end iperf3 had received too many or too few bytes."""
     total_bytes = sum(interval.payload_bytes for interval in received.intervals)
     if not len(progress.times_ns):
@@ -130,7 +130,7 @@ def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, witness:
             return
 
 
-def _last_request_ns(flow: LoadFlow, witness: LoadWitness, first_ns: int) -> int:
+def _last_request_ns(flow: LoadFlow, witness: LoadEvidence, first_ns: int) -> int:
     """Return the time of the client's last control message before the data; `first_ns` if there is none."""
     client, server = flow.source_address, flow.destination_address
     if witness.reverse:
@@ -157,7 +157,7 @@ def _udp_progress(flow: LoadFlow, streams: list[Packets]) -> _Progress:
     return _Progress(times_ns, np.zeros_like(upper) if fragmented else upper, upper)
 
 
-def _tcp_progress(flow: LoadFlow, streams: list[Packets], witness: LoadWitness) -> _Progress | None:
+def _tcp_progress(flow: LoadFlow, streams: list[Packets], witness: LoadEvidence) -> _Progress | None:
     """Return the progress of all streams; None if a stream is too long for unambiguous sequence numbers."""
     cookie_bytes = 0 if witness.reverse else COOKIE_BYTES
     times: list[Ints] = []
@@ -206,7 +206,7 @@ def _answers(flow: LoadFlow, packets: Packets, sport: int, dport: int) -> Packet
     )
 
 
-def _sent_bytes(sent: IperfTest, streams: list[Packets], witness: LoadWitness) -> Iterator[str]:
+def _sent_bytes(sent: IperfTest, streams: list[Packets], witness: LoadEvidence) -> Iterator[str]:
     """Yield a contradiction if iperf3 wrote fewer TCP bytes than were captured, or more than a socket can buffer."""
     written = sum(interval.payload_bytes for interval in sent.intervals)
     cookie_bytes = 0 if witness.reverse else COOKIE_BYTES
@@ -243,7 +243,7 @@ def _datagrams(
     received: IperfTest,
     sent_streams: list[Packets],
     received_streams: list[Packets],
-    witness: LoadWitness,
+    witness: LoadEvidence,
 ) -> Iterator[str]:
     counts = [
         [getattr(interval, name) for interval in test.intervals]

@@ -63,7 +63,7 @@ CROSS_CHECKS: Final = (
 )
 
 
-def within(output: Ping, count: int, payload_bytes: int, window: tuple[int, int] | None) -> Iterator[str]:
+def check_output(output: Ping, count: int, payload_bytes: int, window: tuple[int, int] | None) -> Iterator[str]:
     """Yield the contradictions within the output and its differences from the procedure.
 
     Args:
@@ -103,7 +103,9 @@ def _summary(output: Ping) -> Iterator[str]:
             yield f"ping's summary has {1e3 * summed_s:g} ms as the {name} time, {in_lines}"
 
 
-def beside(output: Ping, captured: CapturedPing, interval_s: float, role: str, *, asks: bool) -> Iterator[str]:
+def compare_with_capture(
+    output: Ping, captured: CapturedPing, interval_s: float, role: str, *, asks: bool
+) -> Iterator[str]:
     """Yield the contradictions between the output and one ping in a capture.
 
     Args:

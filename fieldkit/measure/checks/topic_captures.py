@@ -67,7 +67,7 @@ _OVERHEAD_ONCE_BYTES: Final = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class Captured:
+class CapturedTopic:
     """A topic in both captures.
 
     Attributes:
@@ -89,7 +89,7 @@ def is_complete(publisher: SampleFlow, subscriber: SampleFlow) -> bool:
     return len(sent_packets) > 0 and bool(match(sent_packets, received_packets).arrived.all())
 
 
-def of_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured: Captured) -> Iterator[str]:
+def check_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured: CapturedTopic) -> Iterator[str]:
     """Yield each contradiction between the logs and the captures as a sentence.
 
     Args:
@@ -125,7 +125,7 @@ def _of_arrivals(plan: TopicPlan, received: TopicLog, subscriber: SampleFlow, *,
 def withheld(
     values: Mapping[str, Value],
     arrived: TopicSamples,
-    captured: Captured,
+    captured: CapturedTopic,
     *,
     reliable: bool,
     deadline_s: float | None,
@@ -183,7 +183,7 @@ class _Arrivals:
 
     @classmethod
     def of(cls, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool, reliable: bool) -> "_Arrivals":
-        """Return the arrivals of samples, each of which occurs once; arguments as in `Captured` and `TopicPlan`."""
+        """Return the arrivals of samples that occur once; arguments as in `CapturedTopic` and `TopicPlan`."""
         heads = subscriber.heads.first()
         _, logged, captured = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
         at_ns, head_ns = samples.at_ns[logged], heads.at_ns[captured]

@@ -52,7 +52,7 @@ class TopicPlan:
     on_ports: bool
 
 
-def of_logs(plan: TopicPlan, sent: TopicLog, received: TopicLog) -> Iterator[str]:
+def check_logs(plan: TopicPlan, sent: TopicLog, received: TopicLog) -> Iterator[str]:
     """Yield each contradiction in the two logs of one stream as a sentence.
 
     Args:
@@ -76,7 +76,7 @@ def of_logs(plan: TopicPlan, sent: TopicLog, received: TopicLog) -> Iterator[str
         yield "the subscriber's log is a copy of the publisher's"
 
 
-def of_window(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int, int] | None]) -> Iterator[str]:
+def check_times(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int, int] | None]) -> Iterator[str]:
     """Yield the logs with records from before or after the attempt, by the clock of the robot.
 
     Args:

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError, Json
+from fieldkit.measure.evidence.confined import Json, ReaderError, SandboxedReader
 
 METADATA: Final = "metadata.yaml"
 """File that a ROS 2 recorder writes next to its data file when it closes the bag."""
@@ -18,7 +18,7 @@ ROS2: Final = {".db3", ".mcap"}
 # The ratio of a full three-cell battery's voltage to its nominal voltage is 12.6 V / 11.1 V, below this bound.
 _MAX_FRACTION: Final = 1.5
 
-_READER: Final = Confined("fieldkit.measure.evidence.bag_reader")
+_READER: Final = SandboxedReader("fieldkit.measure.evidence.bag_reader")
 
 _BLOCK_BYTES: Final = 512  # unit of st_blocks on every file system
 _MIN_ALLOCATED_BYTES: Final = 64 << 20
@@ -66,7 +66,7 @@ def read(path: Path) -> Bag:
         )
     try:
         contents = _query(path)
-    except ConfinedAnswerError as error:
+    except ReaderError as error:
         raise EvidenceError(
             f"the bag cannot be read, it is unindexed, truncated or not a bag: {error}",
             where=where,
@@ -105,7 +105,7 @@ class TopicStats:
     gap_ns: int
 
 
-def heard(path: Path) -> Mapping[str, TopicStats]:
+def topic_stats(path: Path) -> Mapping[str, TopicStats]:
     """Return number and times of the messages by topic; topics without a message are omitted.
 
     Raises:
@@ -115,7 +115,7 @@ def heard(path: Path) -> Mapping[str, TopicStats]:
         raise EvidenceError("there is no bag", where=str(path), remedy="read the recorder's log: did it start?")
     try:
         topics = _query(path, heard="true")["topics"]
-    except ConfinedAnswerError as error:
+    except ReaderError as error:
         raise EvidenceError(f"the bag cannot be read: {error}", where=str(path)) from error
     return {topic: TopicStats(**fields) for topic, fields in topics.items()}
 
@@ -131,7 +131,7 @@ def battery_share(path: Path, topic: str) -> float | None:
     """
     try:
         share: float | None = _query(path, topic=topic)["share"]
-    except ConfinedAnswerError as error:
+    except ReaderError as error:
         raise EvidenceError(f"a message of {topic} cannot be read: {error}", where=str(path)) from error
     if share is None or share < 0:
         return None
@@ -146,16 +146,16 @@ def positions(path: Path, topic: str, child: str) -> Json:
     """
     try:
         return _query(path, positions=topic, child=child)
-    except ConfinedAnswerError as error:
+    except ReaderError as error:
         raise EvidenceError(f"the positions of {topic} cannot be read: {error}", where=str(path)) from error
 
 
 def _query(path: Path, **parameters: str) -> Json:
     # The path must be absolute, because the reader keeps the working directory in which it was started.
-    return _READER.ask({"path": str(path.absolute()), **parameters}, given_bytes(path))
+    return _READER.query({"path": str(path.absolute()), **parameters}, allocated_bytes(path))
 
 
-def given_bytes(path: Path) -> int:
+def allocated_bytes(path: Path) -> int:
     """Return the size of a file for the reader's limits, without the holes of a sparse file."""
     status = path.stat()
     return min(status.st_size, max(_BLOCK_BYTES * status.st_blocks, _MIN_ALLOCATED_BYTES))

@@ -68,17 +68,17 @@ def _bounds(match: re.Match[str]) -> tuple[int, int, int, int]:
     return first_ns, last_ns, first_ns - after_ns - _TICK_NS, last_ns - before_ns
 
 
-def moved(before: Clock, after: Clock) -> ClockStep:
+def clock_step(before: Clock, after: Clock) -> ClockStep:
     """Return the step of a clock between two times of one boot."""
     least_ns, most_ns = after.lowest_ns - before.highest_ns, after.highest_ns - before.lowest_ns
     return ClockStep((least_ns + most_ns) / 2e9, (most_ns - least_ns) / 2e9)
 
 
-def problem(before: Clock, after: Clock) -> str | None:
+def step_description(before: Clock, after: Clock) -> str | None:
     """Return a description of a clock step between two times of one boot; None if no step can be detected."""
     if any(reading.lowest_ns > reading.highest_ns for reading in (before, after)):
         return "its clock was set while it was read"
-    step = moved(before, after)
+    step = clock_step(before, after)
     if abs(step.step_s) <= step.error_s:
         return None
     direction = "back" if step.step_s < 0 else "ahead"

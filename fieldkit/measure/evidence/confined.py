@@ -53,11 +53,11 @@ Json = dict[str, Any]
 """A query or an answer; the keys depend on the module that answers."""
 
 
-class ConfinedAnswerError(Exception):
+class ReaderError(Exception):
     """The reader gave no answer; the message is the reason."""
 
 
-class Confined:
+class SandboxedReader:
     """A sandboxed process that answers queries about files.
 
     Args:
@@ -70,7 +70,7 @@ class Confined:
         self._owner_pid = 0
         self._query_lock = Lock()
 
-    def ask(self, question: Json, size_bytes: int) -> Json:
+    def query(self, question: Json, size_bytes: int) -> Json:
         """Return the answer to a query about a file.
 
         Args:
@@ -87,12 +87,12 @@ class Confined:
                 if answer or code not in _EXTERNAL_EXIT_CODES:
                     break
         if not answer:
-            raise ConfinedAnswerError(_exit_reason(code, size_bytes))
+            raise ReaderError(_exit_reason(code, size_bytes))
         if _ERROR_KEY in answer:
-            raise ConfinedAnswerError(answer[_ERROR_KEY])
+            raise ReaderError(answer[_ERROR_KEY])
         return answer
 
-    def end(self) -> None:
+    def stop(self) -> None:
         """Stop the process, which otherwise exits after an idle time."""
         with self._query_lock:
             if self._process is not None and self._owner_pid == os.getpid():

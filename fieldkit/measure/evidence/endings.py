@@ -76,7 +76,7 @@ def _ending(match: re.Match[str]) -> Ending:
     return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), lasted_s, ended_s)
 
 
-def problem(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) -> str | None:
+def termination_error(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) -> str | None:
     """Return why the termination of a job is not acceptable, without its name; None if it is.
 
     Args:

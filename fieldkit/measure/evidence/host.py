@@ -122,7 +122,7 @@ def state(path: Path) -> HostState:
     return HostState(boot, clock.parse(lines.get(CLOCK, ())), jobs, frozenset(sections))
 
 
-def lacking(before: HostState, after: HostState) -> Iterator[str]:
+def incomplete_sections(before: HostState, after: HostState) -> Iterator[str]:
     """Yield the names of sections that are in only one of the two states of an attempt.
 
     A section that the host does not support is in neither. Files of versions without the boot ID have no jobs.
@@ -243,7 +243,7 @@ def _parse_snmp(snmp: str) -> dict[tuple[str, str], int]:
     return counters
 
 
-def shared(measured: Measured) -> Measured:
+def without_shared_counters(measured: Measured) -> Measured:
     """Return the columns of `measure` for a repeat in which other steps send UDP to the receiver too.
 
     A counter above 0 becomes missing, because it is unknown whose datagrams it counts; 0 holds for all steps.
@@ -258,16 +258,16 @@ def measure_system(congestion: str | None) -> Measured:
     Args:
         congestion: The sender's congestion control; None if unknown.
     """
-    return Measured.of({"tcp_congestion_control": congestion}, "the sender's state does not report it")
+    return Measured.from_optional({"tcp_congestion_control": congestion}, "the sender's state does not report it")
 
 
 def measure(before: Counters | None, after: Counters | None) -> Measured:
     """Return the columns; `before` and `after` are None if the state is not available."""
     if before is None or after is None:
-        return Measured.nothing(COLUMNS, "the receiver's state is not available")
+        return Measured.all_missing(COLUMNS, "the receiver's state is not available")
     increments = difference(before, after)
     values = {
         "receiver_udp_buffer_errors": increments.udp_buffer_errors,
         "receiver_reassembly_failures": increments.reassembly_failures,
     }
-    return Measured.of(values, "the receiver restarted, or does not count them")
+    return Measured.from_optional(values, "the receiver restarted, or does not count them")

@@ -17,7 +17,7 @@ from typing import Any, Final
 from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.core.text import brief
+from fieldkit.core.text import shorten
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.evidence.iperf3_summary import IperfStart, IperfTotals, parse_start, parse_totals
 from fieldkit.measure.evidence.json_fields import count, items, mapping, number
@@ -186,7 +186,7 @@ def parse(text: str) -> IperfTest:
     jitters_ms = [number(mapping(end, name), "jitter_ms") for name in ("sum_received", "sum")]
     jitter_ms = next((value for value in jitters_ms if value is not None), None)
     return IperfTest(
-        error=brief(str(document.get("error", ""))),
+        error=shorten(str(document.get("error", ""))),
         ports=tuple(_ports(start)),
         intervals=tuple(_intervals(document)),
         jitter_s=None if jitter_ms is None else jitter_ms / 1e3,
@@ -249,7 +249,9 @@ def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | 
     inapplicable = _TCP_COLUMNS if protocol is Protocol.UDP else _UDP_COLUMNS
     applicable = {name: value for name, value in values.items() if name not in inapplicable}
     others = [column for column in COLUMNS if column.name in inapplicable]
-    return Measured.of(applicable, "iperf3 does not report it") | Measured.nothing(others, f"not for {protocol}")
+    return Measured.from_optional(applicable, "iperf3 does not report it") | Measured.all_missing(
+        others, f"not for {protocol}"
+    )
 
 
 def _sum(counts: list[int | None]) -> int | None:

@@ -85,14 +85,14 @@ def too_late(lateness: Lateness) -> int:
 def measure(lateness: Lateness | None) -> Measured:
     """Return the columns; `lateness` is None for real radios, or if the testbed cannot measure it."""
     if lateness is None:
-        return Measured.nothing(COLUMNS, "the radios are real")
+        return Measured.all_missing(COLUMNS, "the radios are real")
     late_ns = {share: quantile_ns(lateness, share) for share in (0.99, 1.0)}
     values = {
         "emulator_late_p99_s": None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
         "emulator_late_max_s": None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
         "emulator_too_late": too_late(lateness),
     }
-    return Measured.of(values, "no packet was delivered")
+    return Measured.from_optional(values, "no packet was delivered")
 
 
 def problem(lateness: Lateness) -> str | None:

@@ -94,8 +94,8 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
         samples: Samples of its radio, in the order of time.
     """
     if not samples:
-        return Measured.nothing(_COLUMNS[role], _NOT_SAMPLED)
-    link = line(samples)
+        return Measured.all_missing(_COLUMNS[role], _NOT_SAMPLED)
+    link = link_history(samples)
     signals = _present(station.signal_dbm for _, station in link)
     counts, lost = _counts(link)
     values: dict[str, Value | None] = {
@@ -110,15 +110,19 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
         "roams": _roams(samples),
         "link_samples": len(samples),
     }
-    measured = Measured.of({f"{role}_{name}": value for name, value in values.items()}, _NOT_REPORTED)
+    measured = Measured.from_optional({f"{role}_{name}": value for name, value in values.items()}, _NOT_REPORTED)
     if lost:
         measured = measured.without({f"{role}_{name}": _RESET for name, count in counts.items() if count is not None})
     # Impossible values of a driver are removed, because a table that contains them cannot be read again.
-    impossible = (column.name for column in _COLUMNS[role] if column.problem(cell(measured.values.get(column.name))))
+    impossible = (
+        column.name
+        for column in _COLUMNS[role]
+        if column.invalid_value_reason(cell(measured.values.get(column.name)))
+    )
     return measured.without(dict.fromkeys(impossible, _NOT_REPORTED))
 
 
-def line(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample]]:
+def link_history(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample]]:
     """Return the statistics of a radio's link with their times in ns, in the order of time.
 
     A station is associated with one access point at a time, although its samples can contain others.

@@ -94,7 +94,7 @@ def _parse_dbm(text: str | None) -> float | None:
     return None if text is None else float(text)
 
 
-def read_own(folder: Path, role: Role) -> Sequence[LinkSample]:
+def read_robot(folder: Path, role: Role) -> Sequence[LinkSample]:
     """Return the samples of a robot's sampler and of the host states before and after, in the order of time.
 
     Raises:

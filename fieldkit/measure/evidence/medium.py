@@ -67,7 +67,7 @@ def text(before: DelayParts, after: DelayParts) -> str:
 def measure(parts: DelayParts | None) -> Measured:
     """Return the columns, means over the packets; `parts` is None if the testbed cannot measure the delay."""
     if parts is None:
-        return Measured.nothing(COLUMNS, "the testbed cannot measure the delay on the air")
+        return Measured.all_missing(COLUMNS, "the testbed cannot measure the delay on the air")
     scale = 1e9 * parts.packets
     values = {
         "delay_s": total_ns(parts) / scale if scale else None,
@@ -77,4 +77,4 @@ def measure(parts: DelayParts | None) -> Measured:
         "delay_queuing_s": parts.queuing_ns / scale if scale else None,
         "delay_packets": parts.packets,
     }
-    return Measured.of(values, "no packet was delivered")
+    return Measured.from_optional(values, "no packet was delivered")

@@ -91,7 +91,7 @@ _MAX_LATE_NUMBERS: Final = 1 << 10
 
 UNREMARKABLE_S: Final = 1.0
 """A gap at the start or end of a ping is ignored if it is shorter than this and than the longest gap in between."""
-WAY_COLUMNS: Final = columns(
+MOTION_COLUMNS: Final = columns(
     40,
     (
         "rtt_distance_start_m",
@@ -315,7 +315,7 @@ def measure_gap(output: Ping | None, interval_s: float) -> Measured:
     """
     gap = None if output is None else longest_gap(output, interval_s)
     if gap is None:
-        return Measured.nothing((*GAP_COLUMNS, *OPEN_GAP_COLUMNS), "no two answers have a time stamp")
+        return Measured.all_missing((*GAP_COLUMNS, *OPEN_GAP_COLUMNS), "no two answers have a time stamp")
     closed, bounds = (tuple(column.name for column in columns) for columns in (GAP_COLUMNS, OPEN_GAP_COLUMNS))
     filled, empty = (bounds, closed) if gap.is_open else (closed, bounds)
     reason = "ping started or ended in the gap" if gap.is_open else "ping neither started nor ended in the gap"
@@ -343,7 +343,7 @@ def measure(pings: Ping | None) -> Measured:
     """Return the columns of a run of ping; `pings` is None if its output is not available."""
     # Without the header line ping did not run, so the absence of answers is not a measured loss.
     if pings is None or pings.payload_bytes is None:
-        return Measured.nothing((*COLUMNS, *SENT_COLUMNS), "ping did not run")
+        return Measured.all_missing((*COLUMNS, *SENT_COLUMNS), "ping did not run")
     rtt_s = pings.rtt_s
     counts = {
         "rtt_sent": pings.transmitted,
@@ -361,7 +361,7 @@ def measure(pings: Ping | None) -> Measured:
     }
     of_sent = {"rtt_median_sent_s": quantile_of_sent(rtt_s, pings.transmitted or 0, 0.5)}
     return (
-        Measured.of(counts, "ping was killed before its summary")
-        | Measured.of(times, "too few replies have a time")
-        | Measured.of(of_sent, "half of the requests or more were unanswered")
+        Measured.from_optional(counts, "ping was killed before its summary")
+        | Measured.from_optional(times, "too few replies have a time")
+        | Measured.from_optional(of_sent, "half of the requests or more were unanswered")
     )

@@ -12,16 +12,16 @@ from typing import Any, Final
 
 from fieldkit.core.columns import MISSING, Column, Value
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.text import brief
+from fieldkit.core.text import shorten
 from fieldkit.measure.evidence import reading
 
-MOST_BYTES: Final = 1 << 20
+MAX_OUTPUT_BYTES: Final = 1 << 20
 """Maximum size of a program's output; the rest is discarded on the robot."""
 
 _TOO_DEEP: Final = "it is nested too deeply"
 
 
-def problem_of_path(text: str) -> str | None:
+def path_error(text: str) -> str | None:
     """Return why a text is not a path into JSON, or None if it is."""
     try:
         _compile_path(text)
@@ -30,7 +30,7 @@ def problem_of_path(text: str) -> str | None:
     return None
 
 
-def problem_of_expression(text: str) -> str | None:
+def expression_error(text: str) -> str | None:
     """Return why a text is not a regular expression with one group, or None if it is."""
     try:
         groups = _compile_expression(text).groups
@@ -70,8 +70,8 @@ def text(path: Path) -> str:
     Raises:
         EvidenceError: The file is missing, cannot be read, or has the maximum size, so that output was discarded.
     """
-    if reading.size(path) >= MOST_BYTES:
-        raise EvidenceError(f"the program printed more than {MOST_BYTES >> 20} MiB", where=str(path))
+    if reading.size(path) >= MAX_OUTPUT_BYTES:
+        raise EvidenceError(f"the program printed more than {MAX_OUTPUT_BYTES >> 20} MiB", where=str(path))
     return reading.text(path)
 
 
@@ -125,14 +125,14 @@ def value(column: Column, extracted: object) -> Value:
     if isinstance(extracted, list | dict):
         raise EvidenceError("it is not one value, but several")
     text = json.dumps(extracted) if isinstance(extracted, bool | int | float) else str(extracted).strip()
-    shown = brief(text)
+    shown = shorten(text)
     if text in MISSING:
         raise EvidenceError("the value is missing")
     if column.type is str:
         return shown
     if isinstance(extracted, bool) != (column.type is bool) and not isinstance(extracted, str):
         raise EvidenceError(f"it is {shown}, which has another type than the column")
-    if reason := column.problem(text):
+    if reason := column.invalid_value_reason(text):
         raise EvidenceError(f"it is {shown!r}, {reason}")
     if column.type is bool:
         return text.lower() in {"true", "1"}

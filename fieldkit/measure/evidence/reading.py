@@ -32,10 +32,10 @@ def size(path: Path) -> int:
         return file.seek(0, 2)
 
 
-def same(folder: Path, first: str, second: str) -> bool:
+def have_equal_bytes(folder: Path, first: str, second: str) -> bool:
     """Return True if two evidence files have the same bytes; raises `EvidenceError` as `size`."""
     size_bytes = size(folder / first)
-    return size_bytes == size(folder / second) and alike_bytes(folder, first, second) == size_bytes
+    return size_bytes == size(folder / second) and common_prefix_bytes(folder, first, second) == size_bytes
 
 
 def mapped(path: Path) -> bytes | mmap:
@@ -51,7 +51,7 @@ def mapped(path: Path) -> bytes | mmap:
         return file.read(_MAX_READ_BYTES)
 
 
-def alike_bytes(folder: Path, first: str, second: str) -> int:
+def common_prefix_bytes(folder: Path, first: str, second: str) -> int:
     """Return the length of the common prefix of two files in a folder, in bytes; raises as `size`."""
     with _open_regular(folder / first) as left, _open_regular(folder / second) as right:
         common_bytes = 0

@@ -91,7 +91,7 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
     start_ns = subscribed_ns(reading.text(folder / log), topics)
     all_subscribed = start_ns.keys() >= set(topics)
     try:
-        by_topic = bag.heard(folder / file)
+        by_topic = bag.topic_stats(folder / file)
     except EvidenceError:
         # A recorder that cannot reach its master never subscribes and writes no bag.
         return RecordingReception(None if all_subscribed else False, None, None, None)
@@ -121,9 +121,9 @@ def _stamp_ns(match: re.Match[str]) -> int:
 def measure(reception: RecordingReception | None) -> Measured:
     """Return the columns; `reception` is None without the recorder's log."""
     if reception is None:
-        return Measured.nothing(COLUMNS, "the recorder's log is missing")
+        return Measured.all_missing(COLUMNS, "the recorder's log is missing")
     counts = {"bag_discovered": reception.discovered, "bag_messages": reception.messages}
     times = {"bag_discovery_s": reception.discovery_s, "bag_gap_s": reception.gap_s}
-    return Measured.of(counts, "there is no complete bag") | Measured.of(
+    return Measured.from_optional(counts, "there is no complete bag") | Measured.from_optional(
         times, "no message of a topic was received, or the log contains no time"
     )

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, of_fault, prefixed
+from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, fault_column_name, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
@@ -40,14 +40,14 @@ def declared(kind: FaultKind) -> tuple[Column, ...]:
     recovery_meaning = f"Part of the outage after the cause of {kind} had ended; empty if that time is unknown."
     recovered_meaning = f"Whether the robot recovered within the limit after {kind}."
     bound_meaning = f"Lower bound of the recovery time if the robot did not recover from {kind}; otherwise empty."
-    index, bound = list(FaultKind).index(kind), of_fault(kind, "recovery_at_least_s")
+    index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")
     recovered = Figure(f"{_observer(kind)} back after {kind}", Kind.FLAG, rank=70 + index)
     recovery = Figure(f"{_observer(kind)} recovery after {kind}", Kind.MEDIAN, rank=80 + index, at_least=bound)
     times = columns(
         90,
-        (of_fault(kind, "outage_s"), "s", outage_meaning),
-        (of_fault(kind, "recovery_s"), "s", recovery_meaning, recovery),
-        (of_fault(kind, "recovered"), "bool", recovered_meaning, recovered),
+        (fault_column_name(kind, "outage_s"), "s", outage_meaning),
+        (fault_column_name(kind, "recovery_s"), "s", recovery_meaning, recovery),
+        (fault_column_name(kind, "recovered"), "bool", recovered_meaning, recovered),
     )
     return (*times, *columns(110, (bound, "s", bound_meaning)))
 
@@ -120,8 +120,8 @@ def read(folder: Path, kind: FaultKind, name: str = "") -> Recovery:
     Raises:
         EvidenceError: A file is missing or incomplete, or shows no effect of the fault.
     """
-    note = _note(folder / prefixed(name, note_file(kind)))
-    path = folder / prefixed(name, observed_file(kind))
+    note = _note(folder / step_prefixed(name, note_file(kind)))
+    path = folder / step_prefixed(name, observed_file(kind))
     answers = _process_answers(path) if kind is FaultKind.KILL else _ping_answers(path, note)
     if not answers.at_s:
         raise EvidenceError("the robot or process did not answer before the fault", where=path.name)
@@ -182,12 +182,15 @@ def _process_answers(path: Path) -> _Answers:
 def measure(kind: FaultKind, effect: Recovery | None) -> Measured:
     """Return the columns of a kind of fault; `effect` is None if the evidence is not available."""
     if effect is None:
-        return Measured.nothing(declared(kind), "the observation is not available")
-    outage = {of_fault(kind, "outage_s"): effect.outage_s, of_fault(kind, "recovered"): effect.recovered}
-    recovery = {of_fault(kind, "recovery_s"): effect.recovery_s}
-    bound = {of_fault(kind, "recovery_at_least_s"): effect.recovery_at_least_s}
+        return Measured.all_missing(declared(kind), "the observation is not available")
+    outage = {
+        fault_column_name(kind, "outage_s"): effect.outage_s,
+        fault_column_name(kind, "recovered"): effect.recovered,
+    }
+    recovery = {fault_column_name(kind, "recovery_s"): effect.recovery_s}
+    bound = {fault_column_name(kind, "recovery_at_least_s"): effect.recovery_at_least_s}
     return (
-        Measured.of(outage, "the robot did not recover")
-        | Measured.of(recovery, "the duration of the cause is unknown, or the robot did not recover")
-        | Measured.of(bound, "the robot recovered, or the duration of the cause is unknown")
+        Measured.from_optional(outage, "the robot did not recover")
+        | Measured.from_optional(recovery, "the duration of the cause is unknown, or the robot did not recover")
+        | Measured.from_optional(bound, "the robot recovered, or the duration of the cause is unknown")
     )

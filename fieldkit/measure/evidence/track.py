@@ -15,7 +15,7 @@ from typing import Final
 from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Role, Vector, Whereabouts
+from fieldkit.core.model import Role, TrackPoint, Vector
 from fieldkit.measure.evidence import counted_csv
 
 FILE: Final = laptop_files.TRACK
@@ -27,7 +27,7 @@ _LINE: Final = re.compile(rf"([0-9]{{1,19}}),({Role.PATTERN}),{_POSITION},{_NUMB
 
 
 @dataclass(frozen=True)
-class Apart:
+class Separation:
     """Distance and speeds of two robots during a time; the names of columns end with the names of the attributes.
 
     Attributes:
@@ -47,12 +47,12 @@ class Apart:
     sender_speed_m_s: float
 
 
-def text(track: Iterable[Whereabouts]) -> str:
+def text(track: Iterable[TrackPoint]) -> str:
     """Return the file text of a track, with a resolution of 0.1 mm."""
     return counted_csv.text(_HEADER, map(_format_line, track))
 
 
-def _format_line(entry: Whereabouts) -> str:
+def _format_line(entry: TrackPoint) -> str:
     position = ",," if entry.position_m is None else _format_vector(entry.position_m)
     return f"{entry.utc_ns},{entry.role},{position},{_format_vector(entry.velocity_m_s)}"
 
@@ -62,7 +62,7 @@ def _format_vector(vector: Vector) -> str:
     return ",".join(f"{round(value, 4) + 0.0:.4f}" for value in vector)
 
 
-def read(path: Path) -> tuple[Whereabouts, ...]:
+def read(path: Path) -> tuple[TrackPoint, ...]:
     """Return the track in a file, in the order of time.
 
     Raises:
@@ -75,10 +75,10 @@ def read(path: Path) -> tuple[Whereabouts, ...]:
     return track
 
 
-def _parse_line(match: re.Match[str]) -> Whereabouts:
+def _parse_line(match: re.Match[str]) -> TrackPoint:
     utc_ns, role, *numbers = match.groups()
     values = [None if number is None else float(number) for number in numbers]
-    return Whereabouts(int(utc_ns), Role(role), _vector(values[:3]), _vector(values[3:]) or (0.0, 0.0, 0.0))
+    return TrackPoint(int(utc_ns), Role(role), _vector(values[:3]), _vector(values[3:]) or (0.0, 0.0, 0.0))
 
 
 def _vector(values: Sequence[float | None]) -> Vector | None:
@@ -86,13 +86,15 @@ def _vector(values: Sequence[float | None]) -> Vector | None:
     return (present[0], present[1], present[2]) if len(present) == 3 else None
 
 
-def distances_m(track: Sequence[Whereabouts], source: Role, destination: Role) -> Iterator[tuple[int, float | None]]:
+def distances_m(track: Sequence[TrackPoint], source: Role, destination: Role) -> Iterator[tuple[int, float | None]]:
     """Yield start in ns and value of the distance between two robots, for each entry of one of them."""
     for utc_ns, sender, receiver in _joint_states(track, source, destination):
         yield utc_ns, _distance_m(sender, receiver)
 
 
-def apart(track: Sequence[Whereabouts], source: Role, destination: Role, start_ns: int, end_ns: int) -> Apart | None:
+def separation_between(
+    track: Sequence[TrackPoint], source: Role, destination: Role, start_ns: int, end_ns: int
+) -> Separation | None:
     """Return distance and speeds of two robots between two times.
 
     Times in which a robot has no position are ignored; the result is None if there are no other times.
@@ -120,7 +122,7 @@ def apart(track: Sequence[Whereabouts], source: Role, destination: Role, start_n
         return None
     total_ns = sum(ns for ns, *_ in pieces)
     distances = [distance_m for _, distance_m, *_ in pieces]
-    return Apart(
+    return Separation(
         distance_start_m=_distance_m(*within[0][1:]),
         distance_min_m=min(distances),
         distance_mean_m=sum(ns * distance_m for ns, distance_m, *_ in pieces) / total_ns,
@@ -131,24 +133,24 @@ def apart(track: Sequence[Whereabouts], source: Role, destination: Role, start_n
 
 
 def _joint_states(
-    track: Sequence[Whereabouts], source: Role, destination: Role
-) -> Iterator[tuple[int, Whereabouts, Whereabouts]]:
+    track: Sequence[TrackPoint], source: Role, destination: Role
+) -> Iterator[tuple[int, TrackPoint, TrackPoint]]:
     """Yield the start in ns and the entries of both robots, for each entry of one of them after both have one."""
-    latest: dict[Role, Whereabouts] = {}
+    latest: dict[Role, TrackPoint] = {}
     for entry in track:
         latest[entry.role] = entry
         if entry.role in {source, destination} and source in latest and destination in latest:
             yield entry.utc_ns, latest[source], latest[destination]
 
 
-def _distance_m(first: Whereabouts, second: Whereabouts) -> float | None:
+def _distance_m(first: TrackPoint, second: TrackPoint) -> float | None:
     if first.position_m is None or second.position_m is None:
         return None
     return math.dist(first.position_m, second.position_m)
 
 
 def measure(
-    track: Sequence[Whereabouts] | None,
+    track: Sequence[TrackPoint] | None,
     declared: Sequence[Column],
     ends: tuple[Role, Role],
     times_ns: Collection[int],
@@ -164,11 +166,11 @@ def measure(
         times_ns: The times, nanoseconds since 1970 UTC.
     """
     if track is None:
-        return Measured.nothing(declared, "the positions of the robots are unknown")
+        return Measured.all_missing(declared, "the positions of the robots are unknown")
     if not len(times_ns):
-        return Measured.nothing(declared, "no packet has a time")
-    separation = apart(track, *ends, min(times_ns), max(times_ns))
+        return Measured.all_missing(declared, "no packet has a time")
+    separation = separation_between(track, *ends, min(times_ns), max(times_ns))
     if separation is None:
-        return Measured.nothing(declared, "a robot had no position")
+        return Measured.all_missing(declared, "a robot had no position")
     values = {column.name: getattr(separation, column.name.partition("_")[2]) for column in declared}
-    return Measured.of(values, "a robot had no position at the start")
+    return Measured.from_optional(values, "a robot had no position at the start")

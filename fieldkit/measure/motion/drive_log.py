@@ -17,7 +17,7 @@ import numpy as np
 
 from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.text import brief
+from fieldkit.core.text import shorten
 from fieldkit.measure.motion import motion_log
 from fieldkit.measure.motion.motion_log import LAST_NS, LONGEST_M, LONGEST_S
 
@@ -131,13 +131,13 @@ def _parse_moment(fields: Mapping[str, Any]) -> DriveMoment:
     if not is_possible:
         raise ValueError(fields)
     yaw_rad = max(-math.pi, min(yaw_rad, math.pi))
-    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, brief(ended), utc_ns)
+    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, shorten(ended), utc_ns)
 
 
 def measure(log: Sequence[DriveMoment] | None) -> Measured:
     """Return the columns; all are missing if there is no log."""
     if not log:
-        return Measured.nothing(COLUMNS, "the robot wrote no log of its drive")
+        return Measured.all_missing(COLUMNS, "the robot wrote no log of its drive")
     out = [record for record in log if record.phase in _OUT]
     home = log[-1] if log[-1].ended == HOME else None
     out_m_s = speeds_m_s([record for record in out if record.phase == "out"])
@@ -151,7 +151,7 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
         "drive_back_turned_rad": None if home is None else home.yaw_rad,
         "drive_ended": log[-1].ended or None,
     }
-    return Measured.of(values, "the log ends before that")
+    return Measured.from_optional(values, "the log ends before that")
 
 
 def speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:

@@ -57,7 +57,7 @@ def contradictions(log: Sequence[FlightMoment], plan: FlyPlan) -> Iterator[str]:
         yield f"the drone flew at {speed_m_s:.1f} m/s, but its limit is {plan.fastest_m_s:g} m/s"
 
 
-def of_telemetry(log: Sequence[FlightMoment], places_m: Floats) -> str | None:
+def telemetry_contradiction(log: Sequence[FlightMoment], places_m: Floats) -> str | None:
     """Return why telemetry cannot be of the same flight as the log; None if it can.
 
     Args:

@@ -116,7 +116,7 @@ def _parse_moment(fields: Mapping[str, Any]) -> FlightMoment | None:
 def measure(log: Sequence[FlightMoment] | None) -> Measured:
     """Return the columns; all are missing if there is no log."""
     if not log:
-        return Measured.nothing(COLUMNS, "the drone wrote no log of its flight")
+        return Measured.all_missing(COLUMNS, "the drone wrote no log of its flight")
     heights_m = [moment.up_m for moment in log if moment.phase in _STEP_PHASES]
     speeds_m_s = [moment.speed_m_s for moment in log if moment.phase == _ON_WAY]
     values: dict[str, Value | None] = {
@@ -127,4 +127,4 @@ def measure(log: Sequence[FlightMoment] | None) -> Measured:
         "fly_speed_max_m_s": max(moment.speed_m_s for moment in log),
         "fly_back_off_m": log[-1].off_m if log[-1].phase == _LAST_PHASE else None,
     }
-    return Measured.of(values, "the log ends before that")
+    return Measured.from_optional(values, "the log ends before that")

@@ -11,7 +11,7 @@ from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError
+from fieldkit.measure.evidence.confined import ReaderError, SandboxedReader
 
 SUFFIX: Final = ".tlog"
 GLOBAL: Final = "GLOBAL_POSITION_INT"
@@ -107,7 +107,7 @@ COLUMNS: Final = columns(
     ("mavlink_pitch_max_deg", "deg", "Largest pitch angle.", _ANGLE),
 )
 
-_READER: Final = Confined("fieldkit.measure.motion.tlog_reader")
+_READER: Final = SandboxedReader("fieldkit.measure.motion.tlog_reader")
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class RecorderSummary:
     slow_s: float | None = None
 
 
-def told(path: Path) -> RecorderSummary:
+def read_summary(path: Path) -> RecorderSummary:
     """Return the summary of a recorder.
 
     Raises:
@@ -244,7 +244,7 @@ def contradictions(
         yield "has frames from before the attempt or after it, by the recorder's clock"
 
 
-def sum_of(path: Path) -> int:
+def crc32_of(path: Path) -> int:
     """Return the CRC-32 of a log; raises `EvidenceError` as `reading.mapped`."""
     return zlib.crc32(reading.mapped(path))
 
@@ -257,10 +257,10 @@ def measure(log: Tlog | None, slow_s: float | None = None) -> Measured:
         slow_s: `RecorderSummary.slow_s`.
     """
     if log is None:
-        return Measured.nothing(COLUMNS, "the telemetry log is incomplete")
+        return Measured.all_missing(COLUMNS, "the telemetry log is incomplete")
     values = {**log.values, "mavlink_slow_s": slow_s}
     possible = {column.name: _possible_value(column, values.get(column.name)) for column in COLUMNS}
-    return Measured.of(possible, "the autopilot does not report it")
+    return Measured.from_optional(possible, "the autopilot does not report it")
 
 
 def _possible_value(column: Column, value: Value | None) -> Value | None:
@@ -284,8 +284,8 @@ def positions(path: Path, system: int, kind: str) -> list[list[Any]]:
 def _query(path: Path, system: int, **parameters: object) -> Any:  # noqa: ANN401 (JSON)
     try:
         size_bytes = reading.size(path)
-        return _READER.ask({"path": str(path.absolute()), "system": system, **parameters}, size_bytes)
-    except ConfinedAnswerError as error:
+        return _READER.query({"path": str(path.absolute()), "system": system, **parameters}, size_bytes)
+    except ReaderError as error:
         raise EvidenceError(
             f"cannot be read as a telemetry log: {error}", where=str(path), remedy="read the recorder's log"
         ) from error

@@ -89,7 +89,7 @@ class Accounts:
     heights: bool = False
 
 
-def merged(base: Accounts, override: Accounts) -> Accounts:
+def merge(base: Accounts, override: Accounts) -> Accounts:
     """Combine two sets of sources. `override` takes precedence, except if it only has the planned placement."""
     robots = {**base.robots}
     for role, account in override.robots.items():

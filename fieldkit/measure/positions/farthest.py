@@ -57,7 +57,7 @@ def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: f
     a smaller one is not.
     """
     try:
-        account = where.given(evidence).robots.get(role)
+        account = where.position_accounts(evidence).robots.get(role)
         if account is None or account.place is not None:
             return None
         samples = where.samples_of(evidence, role)

@@ -9,7 +9,7 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import bag, reading
-from fieldkit.measure.evidence.confined import Confined, ConfinedAnswerError
+from fieldkit.measure.evidence.confined import ReaderError, SandboxedReader
 from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.positions.samples import (
     MOST_SAMPLES,
@@ -24,7 +24,7 @@ MOST_STALE_S: Final = 10.0
 """If stamps and reception times differ by more than this, the stamps are from another clock."""
 
 _TLOG: Final = ".tlog"
-_GPX_READER: Final = Confined("fieldkit.measure.positions.gpx_reader")
+_GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
 
 
 def read_file(path: Path) -> Samples:
@@ -43,8 +43,8 @@ def read_file(path: Path) -> Samples:
 
 def _read_gpx(path: Path) -> Samples:
     try:
-        points = _GPX_READER.ask({"path": str(path.absolute())}, reading.size(path))["points"]
-    except ConfinedAnswerError as error:
+        points = _GPX_READER.query({"path": str(path.absolute())}, reading.size(path))["points"]
+    except ReaderError as error:
         raise EvidenceError(f"cannot be read as GPX: {error}", where=str(path)) from error
     if len(points) > MOST_SAMPLES:
         raise EvidenceError(f"has more than {MOST_SAMPLES} points", where=str(path), remedy="cut it to the trial")
@@ -141,7 +141,7 @@ def read_bag(path: Path, account: Account) -> Samples:
     return Samples(times_ns, values[first, :3], frames.get(kind, f"frame {frame}"), yaws_rad)
 
 
-def from_start(samples: Samples, account: Account) -> Samples:
+def to_placement_frame(samples: Samples, account: Account) -> Samples:
     """Transform odometry to the frame of the placement, with the robot's place and heading at the start of the step.
 
     Args:

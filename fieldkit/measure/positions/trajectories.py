@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import Floats, Ints
-from fieldkit.measure.evidence.track import Apart
+from fieldkit.measure.evidence.track import Separation
 
 SPEED_SPAN_NS: Final = 200_000_000
 """Shortest time over which a speed is computed: over shorter times, noise in the positions would appear as speed."""
@@ -59,7 +59,7 @@ def stationary(place_m: Floats) -> Trajectory:
     return Trajectory(_ALWAYS, np.array([place_m, place_m]), gap_ns=2**62)
 
 
-def apart(source: Trajectory, destination: Trajectory, start_ns: int, end_ns: int) -> Apart:
+def separation_between(source: Trajectory, destination: Trajectory, start_ns: int, end_ns: int) -> Separation:
     """Return the distances and speeds of two robots during a time span that both trajectories cover.
 
     Args:
@@ -77,7 +77,7 @@ def apart(source: Trajectory, destination: Trajectory, start_ns: int, end_ns: in
     pieces = list(pairwise(between_m))
     means_m = [_mean_m(*piece) for piece in pieces]
     has_length = len(pieces) > 0
-    return Apart(
+    return Separation(
         distance_start_m=float(distances_m[0]),
         distance_min_m=float(min((_nearest_m(*piece) for piece in pieces), default=distances_m[0])),
         distance_mean_m=float(np.average(means_m, weights=lengths_ns)) if has_length else float(distances_m[0]),

@@ -13,7 +13,7 @@ import numpy as np
 
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Role, in_order
+from fieldkit.core.model import Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.evidence import track
@@ -41,22 +41,24 @@ def measure(
         times_ns: The times, nanoseconds since 1970 UTC.
     """
     try:
-        sources = given(evidence)
+        sources = position_accounts(evidence)
         if not sources.robots.keys() & set(ends):
             return track.measure(evidence.read_or_none(track.read, track.FILE), declared, ends, times_ns)
-        source, destination = of_two(evidence, ends)
+        source, destination = trajectories_of_pair(evidence, ends)
     except EvidenceError as error:
-        return Measured.nothing(declared, error.what)
+        return Measured.all_missing(declared, error.what)
     if not len(times_ns):
-        return Measured.nothing(declared, "no packet has a time")
+        return Measured.all_missing(declared, "no packet has a time")
     ahead_ns = _ahead_ns(sources, ends[0])
     start_ns, end_ns = int(min(times_ns)) - ahead_ns, int(max(times_ns)) - ahead_ns
     for role, trajectory in zip(ends, (source, destination), strict=True):
         if problem := trajectory.coverage_problem(start_ns, end_ns):
             reason = f"the positions of the {role} from {sources.robots[role].description} {problem}"
-            return Measured.nothing(declared, reason)
-    separation = trajectories.apart(source, destination, start_ns, end_ns)
-    return Measured.of({column.name: getattr(separation, column.name.partition("_")[2]) for column in declared}, "")
+            return Measured.all_missing(declared, reason)
+    separation = trajectories.separation_between(source, destination, start_ns, end_ns)
+    return Measured.from_optional(
+        {column.name: getattr(separation, column.name.partition("_")[2]) for column in declared}, ""
+    )
 
 
 def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
@@ -66,10 +68,10 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     the positions. The list is empty if no distance is known.
     """
     try:
-        sources = given(evidence)
+        sources = position_accounts(evidence)
         if not sources.robots.keys() & set(ends):
             return list(track.distances_m(evidence.read_or_none(track.read, track.FILE) or (), *ends))
-        source, destination = of_two(evidence, ends)
+        source, destination = trajectories_of_pair(evidence, ends)
     except EvidenceError:
         return ()
     ahead_ns, distances = _ahead_ns(sources, ends[0]), list[tuple[int, float | None]]()
@@ -81,7 +83,7 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     return distances
 
 
-def given(evidence: AttemptEvidence) -> Accounts:
+def position_accounts(evidence: AttemptEvidence) -> Accounts:
     """Return the sources of positions besides the testbed; most attempts have none.
 
     Raises:
@@ -105,13 +107,13 @@ def _trial_folder(evidence: AttemptEvidence) -> Path | None:
     return parent.parent if parent.name == _ATTEMPTS else None
 
 
-def in_words(evidence: AttemptEvidence) -> str | None:
+def sources_text(evidence: AttemptEvidence) -> str | None:
     """Return the sources as text, `sender as placed, receiver /odom`, or None if there are none."""
-    robots = given(evidence).robots
-    return ", ".join(f"{role} {robots[role].description}" for role in in_order(robots)) or None
+    robots = position_accounts(evidence).robots
+    return ", ".join(f"{role} {robots[role].description}" for role in sort_roles(robots)) or None
 
 
-def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
+def trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
     """Return the trajectories of two robots by the laptop's clock, in one frame.
 
     Raises:
@@ -121,7 +123,7 @@ def of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajecto
 
 
 def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
-    sources = given(evidence)
+    sources = position_accounts(evidence)
     source, destination = (samples_of(evidence, role) for role in ends)
     if source.frame != destination.frame:
         frames = f"the {ends[0]} {source.frame}, the {ends[1]} {destination.frame}"
@@ -147,7 +149,7 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
     Raises:
         EvidenceError: The robot has no source, or the source cannot be read.
     """
-    sources = given(evidence)
+    sources = position_accounts(evidence)
     if (account := sources.robots.get(role)) is None:
         raise EvidenceError(f"no source has the position of the {role}")
     if account.place is not None:
@@ -156,17 +158,17 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
     if account.topic:
         recorded_samples = evidence.read(recorded.read_topic, account.file, account)
         samples = _shifted(recorded_samples, -_ahead_ns(sources, Role(account.clock) if account.clock else role))
-        return samples if samples.yaws_rad is None else recorded.from_start(samples, account)
+        return samples if samples.yaws_rad is None else recorded.to_placement_frame(samples, account)
     folder = _trial_folder(evidence)
     assert folder is not None  # only the sources of a trial have neither a place nor a topic
     return _shifted(_samples_in_trial(folder / account.file), round(account.offset_s * 1e9))
 
 
-def told_of(evidence: AttemptEvidence) -> Mapping[Role, Samples]:
+def readable_samples(evidence: AttemptEvidence) -> Mapping[Role, Samples]:
     """Return the samples of each robot with a readable source besides the testbed."""
     samples_by_role: dict[Role, Samples] = {}
     with suppress(EvidenceError):
-        for role in given(evidence).robots:
+        for role in position_accounts(evidence).robots:
             with suppress(EvidenceError):
                 samples_by_role[role] = samples_of(evidence, role)
     return samples_by_role
@@ -196,13 +198,13 @@ def _ahead_ns(sources: Accounts, role: Role) -> int:
 
 
 def ahead_ns(evidence: AttemptEvidence, role: Role) -> int:
-    """Return how far a robot's clock was ahead of the laptop's; 0 if that was not measured. Raises as `given`."""
-    return _ahead_ns(given(evidence), role)
+    """Return the offset of a robot's clock from the laptop's, or 0 if unknown. Errors as for `position_accounts`."""
+    return _ahead_ns(position_accounts(evidence), role)
 
 
 def clock_error_s(evidence: AttemptEvidence) -> float | None:
     """Return the maximum error between the times of two robots, or None if no clock offset was measured."""
-    errors = sorted(offset.error_s for offset in given(evidence).clocks.values())
+    errors = sorted(offset.error_s for offset in position_accounts(evidence).clocks.values())
     return sum(errors[-2:]) if errors else None
 
 

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from fieldkit.core.columns import OVERCOUNTED, Column, Figure, Kind, columns
+from fieldkit.core.columns import NEGATIVE_LOSS_BOUNDS, Column, Figure, Kind, columns
 from fieldkit.measure.evidence import host, medium
 from fieldkit.measure.transfers import delay, rates, stalls
 
@@ -15,7 +15,7 @@ FILES: Final = columns(
         "share",
         "1 - received_bytes/sent_bytes, the bytes that the application missed.",
         Figure("file loss", Kind.MEAN, rank=14),
-        OVERCOUNTED,
+        NEGATIVE_LOSS_BOUNDS,
     ),
     ("hash_match", "bool", "True if the received file equals the bag byte for byte."),
     ("bag_messages", "count", "Messages in the bag."),
@@ -193,10 +193,10 @@ PAPER: Final = columns(
         "share",
         "1 - paper_received/paper_packets; counts first fragments only.",
         Figure("paper's loss (eq. 1)", Kind.COUNTED, "paper_received", "paper_packets", rank=15),
-        OVERCOUNTED,
+        NEGATIVE_LOSS_BOUNDS,
     ),
 )
-STALLS: Final = stalls.declared("transfer", "the transfer", 36)
+STALLS: Final = stalls.declare_columns("transfer", "the transfer", 36)
 
 COLUMNS: Final[tuple[Column, ...]] = (
     *FILES,

@@ -121,25 +121,25 @@ def _empty(rows: int, kind: type[np.generic]) -> MaskedArray:
 
 
 def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
-    crossing = udp.cross(sender, receiver, transfer)
+    crossing = udp.match_transfer(sender, receiver, transfer)
     # Each received packet that may be a copy may hide the loss of another packet.
     hidden = np.append(crossing.chosen, False)[crossing.match.sent_index] & crossing.match.possible_copy
     return _MatchedPackets(
         sent=crossing.sent,
         received=crossing.received,
         chosen=crossing.chosen,
-        lost=np.ma.array(~crossing.match.arrived, mask=crossing.match.doubtful | hidden.any()),
+        lost=np.ma.array(~crossing.match.arrived, mask=crossing.match.ambiguous | hidden.any()),
         sent_again=_empty(len(crossing.sent), np.bool_),
         copies=delay.udp_copies(crossing),
     )
 
 
 def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
-    crossing = tcp.cross(sender, receiver, transfer)
+    crossing = tcp.match_transfer(sender, receiver, transfer)
     pieces, match = crossing.payload.sent, crossing.payload.match
     lost, ambiguous = np.zeros((2, len(crossing.sent)), dtype=np.bool_)
     lost[pieces.frame[~match.arrived]] = True
-    ambiguous[pieces.frame[match.doubtful]] = True
+    ambiguous[pieces.frame[match.ambiguous]] = True
     return _MatchedPackets(
         sent=crossing.sent,
         received=crossing.received,

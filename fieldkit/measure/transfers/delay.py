@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import EITHER_WAY_S, Figure, Kind, Measured, columns
+from fieldkit.core.columns import CLOCK_DIFFERENCE_BOUNDS_S, Figure, Kind, Measured, columns
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
 from fieldkit.measure.captures.ip import UDP
@@ -53,7 +53,7 @@ COLUMNS: Final = columns(
         "clock_offset_s",
         "s",
         "Receiver's clock minus sender's in the middle of the captures; empty without packets in both directions.",
-        EITHER_WAY_S,
+        CLOCK_DIFFERENCE_BOUNDS_S,
     ),
     ("clock_offset_error_s", "s", "Maximum error of clock_offset_s."),
     (
@@ -108,7 +108,7 @@ def tcp_copies(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
     A frame arrives with its last byte. If offload joined several frames, the joined frame matches the last of them.
     """
     sent_pieces, received_pieces, matched = frames.payload.sent, frames.payload.received, frames.payload.match
-    certain = matched.arrived & ~matched.doubtful & _is_last_piece(sent_pieces)
+    certain = matched.arrived & ~matched.ambiguous & _is_last_piece(sent_pieces)
     certain[certain] = _is_last_piece(received_pieces)[matched.received_index[certain]]
     return sent_pieces.frame[certain], received_pieces.frame[matched.received_index[certain]]
 
@@ -153,7 +153,7 @@ def measure(
         return _withheld("a capture lacks times")
     pairs = pairs.where(np.argsort(pairs.receiver_ns, kind="stable"))
     transit_ns = pairs.receiver_ns - pairs.sender_ns
-    jitter = Measured.of({"jitter_s": jitter_s(transit_ns)}, "a single packet has none")
+    jitter = Measured.from_optional({"jitter_s": jitter_s(transit_ns)}, "a single packet has none")
     if not len(reverse):
         variation = _variation((transit_ns - transit_ns.min()) / 1e9)
         return jitter | variation | _withheld("no packet from receiver to sender is in both captures")
@@ -213,7 +213,7 @@ def _delays_s(pairs: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
 
 def _withheld(reason: str) -> Measured:
     """Return empty columns with the reason."""
-    return Measured({"one_way_withheld": reason}) | Measured.nothing((*COLUMNS, *SENT_COLUMNS), reason)
+    return Measured({"one_way_withheld": reason}) | Measured.all_missing((*COLUMNS, *SENT_COLUMNS), reason)
 
 
 def jitter_s(transit_ns: Ints) -> float | None:
@@ -258,7 +258,7 @@ def _clock(clocks: Clocks) -> Measured:
         "clock_skew_ppm": 1e6 * clocks.skew if clocks.skew_error <= QUARTZ_SKEW else None,
         "clock_skew_error_ppm": 1e6 * clocks.skew_error,
     }
-    return Measured.of(values, "it can be wrong by more than 100 ppm")
+    return Measured.from_optional(values, "it can be wrong by more than 100 ppm")
 
 
 def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
@@ -274,9 +274,11 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
     of_sent = None if shown["one_way_median_s"] is None else quantile_of_sent(delay_s, sent, 0.5)
     return (
         Measured({"one_way_error_s": error_s})
-        | Measured.of({"one_way_median_sent_s": of_sent}, "the median is withheld, or half of the packets were lost")
-        | Measured.of(shown, "its error is above a tenth of it")
-        | Measured.of({"one_way_withheld": reason}, "nothing is withheld")
+        | Measured.from_optional(
+            {"one_way_median_sent_s": of_sent}, "the median is withheld, or half of the packets were lost"
+        )
+        | Measured.from_optional(shown, "its error is above a tenth of it")
+        | Measured.from_optional({"one_way_withheld": reason}, "nothing is withheld")
     )
 
 
@@ -321,6 +323,6 @@ def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
 
 def _copies(matched: Match, chosen: Mask | None = None) -> tuple[Ints, Ints]:
     """Return the indices of matched packets among those sent and those received, without ambiguous ones."""
-    certain = matched.arrived & ~matched.doubtful
+    certain = matched.arrived & ~matched.ambiguous
     index = np.flatnonzero(certain if chosen is None else certain & chosen)
     return index, matched.received_index[index]

@@ -26,7 +26,7 @@ class CapturedPing:
     replied_ns: Mapping[int, int]
 
 
-def of_each_ping(packets: Packets, source: str, destination: str, payload_bytes: int) -> Iterator[CapturedPing]:
+def captured_pings(packets: Packets, source: str, destination: str, payload_bytes: int) -> Iterator[CapturedPing]:
     """Yield the echoes of each identifier that has a request.
 
     Args:

@@ -73,9 +73,9 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
 
 
 def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
-    packets = udp.cross(sender, receiver, transfer)
+    packets = udp.match_transfer(sender, receiver, transfer)
     chosen, sent_index = packets.chosen, packets.match.sent_index
-    if (chosen & packets.match.doubtful).any():
+    if (chosen & packets.match.ambiguous).any():
         return None
     offset_bytes = np.cumsum(packets.sent.ip_payload_bytes * chosen) - packets.sent.ip_payload_bytes
     received = np.append(chosen, False)[sent_index]  # the last entry is that of match.NONE

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fieldkit.core.columns import Measured, Value, prefixed
+from fieldkit.core.columns import Measured, Value, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
@@ -30,7 +30,7 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
     captures = [evidence.whole_capture(file) for file in transfer.captures]
     sender, receiver = captures if transfer.captured else (None, None)
     contradiction = incomparable(evidence, transfer)
-    pings = evidence.read_or_none(ping.read, prefixed(transfer.name, ping.FILE))
+    pings = evidence.read_or_none(ping.read, step_prefixed(transfer.name, ping.FILE))
     states = (host.before(transfer.destination), host.after(transfer.destination))
     files = _files(evidence, transfer)
     return (
@@ -42,7 +42,7 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
             contradiction,
             transfer_stalls.flow_schedule(evidence, transfer, listener),
         )
-        | medium.measure(evidence.read_or_none(medium.read, prefixed(transfer.name, medium.FILE)))
+        | medium.measure(evidence.read_or_none(medium.read, step_prefixed(transfer.name, medium.FILE)))
         | where.measure(evidence, DISTANCE, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
         | _paper(sender, None if contradiction else receiver, pings, transfer)
         | host.measure(*(evidence.read_or_none(host.read, name) for name in states))
@@ -53,7 +53,7 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
 def _system(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
     """Return the columns of the operating systems of both ends."""
     if transfer.protocol is Protocol.UDP:
-        return Measured.nothing(host.SYSTEM, "UDP has no congestion control")
+        return Measured.all_missing(host.SYSTEM, "UDP has no congestion control")
     return host.measure_system(evidence.read_or_none(host.congestion_control, host.before(transfer.source)))
 
 
@@ -92,13 +92,15 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
         "sent_bytes": sent,
         "received_bytes": received,
         "file_loss": loss(received, sent),
-        "hash_match": evidence.read_or_none(reading.same, "", transfer.sent_file, transfer.received_file),
+        "hash_match": evidence.read_or_none(reading.have_equal_bytes, "", transfer.sent_file, transfer.received_file),
     }
     messages: dict[str, Value | None] = {
         "bag_messages": contents.messages if contents else None,
         "bag_duration_s": contents.duration_s if contents else None,
     }
-    return Measured.of(files, "the file is missing or empty") | Measured.of(messages, "the sent file is not a bag")
+    return Measured.from_optional(files, "the file is missing or empty") | Measured.from_optional(
+        messages, "the sent file is not a bag"
+    )
 
 
 def _layers(
@@ -112,18 +114,18 @@ def _layers(
     declared = (*LAYERS, *delay.COLUMNS, *delay.SENT_COLUMNS, *rates.COLUMNS, *STALLS)
     sender, receiver = ends
     if contradiction:
-        return Measured({"one_way_withheld": contradiction}) | Measured.nothing(declared, contradiction)
+        return Measured({"one_way_withheld": contradiction}) | Measured.all_missing(declared, contradiction)
     if sender is None or receiver is None:
-        return Measured.nothing(declared, "there are no complete captures of both ends")
+        return Measured.all_missing(declared, "there are no complete captures of both ends")
     try:
         if transfer.protocol is Protocol.UDP:
-            udp_packets = udp.cross(sender.packets, receiver.packets, transfer)
+            udp_packets = udp.match_transfer(sender.packets, receiver.packets, transfer)
             udp_counts = udp.count(udp_packets)
             pairs, counts, sent = delay.udp_packets(udp_packets), _udp(udp_counts), udp_counts.packets_sent
             transfer_rates = rates.of_udp(udp_packets)
             stall_columns = stalls.measure("transfer", lambda: transfer_stalls.of_udp(udp_packets, schedule))
         else:
-            frames = tcp.cross(sender.packets, receiver.packets, transfer)
+            frames = tcp.match_transfer(sender.packets, receiver.packets, transfer)
             tcp_counts = tcp.count(frames)
             pairs, counts, sent = delay.tcp_frames(frames), _tcp(tcp_counts), delay.tcp_sent(frames)
             transfer_rates = rates.of_tcp(frames, receiver.packets, transfer, tcp_counts)
@@ -132,11 +134,11 @@ def _layers(
         ambiguous = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
         delays = delay.measure(pairs, sender.packets, receiver.packets, transfer, sent=sent or 0, ambiguous=ambiguous)
     except EvidenceError as error:  # handled like a damaged capture
-        return Measured.nothing(declared, error.what)
+        return Measured.all_missing(declared, error.what)
     rate_values = transfer_rates.values(files.values.get("received_bytes"))
     if delays.values.get("one_way_withheld") == delay.UNSTEADY:
-        delays |= Measured.nothing((*TIMES, *rates.COLUMNS), delay.UNSTEADY)
-        stall_columns = Measured.nothing(STALLS, delay.UNSTEADY)
+        delays |= Measured.all_missing((*TIMES, *rates.COLUMNS), delay.UNSTEADY)
+        stall_columns = Measured.all_missing(STALLS, delay.UNSTEADY)
         counts, rate_values = (
             {name: value for name, value in values.items() if name not in delays.missing}
             for values in (counts, rate_values)
@@ -144,9 +146,11 @@ def _layers(
     other_names = OF_TCP if transfer.protocol is Protocol.UDP else OF_UDP
     other_columns = [column for column in LAYERS if column.name in other_names]
     reason = "no such packet was sent, none arrived, or it is ambiguous which arrived"
-    count_columns = Measured.of(counts, reason)
-    rate_columns = Measured.of(rate_values, "the captures do not have two packets, or not the end, of the transfer")
-    no_such_count = Measured.nothing(other_columns, f"not applicable to {transfer.protocol}")
+    count_columns = Measured.from_optional(counts, reason)
+    rate_columns = Measured.from_optional(
+        rate_values, "the captures do not have two packets, or not the end, of the transfer"
+    )
+    no_such_count = Measured.all_missing(other_columns, f"not applicable to {transfer.protocol}")
     return delays | count_columns | rate_columns | stall_columns | no_such_count
 
 
@@ -219,6 +223,6 @@ def _paper(sender: Capture | None, receiver: Capture | None, pings: ping.Ping | 
         "paper_delay_s": delay_s,
         "paper_transfer_s": None if sent is None or delay_s is None else paper.transfer_s(sent, delay_s),
     }
-    return Measured.of(frames, "there are no complete captures of both ends, or nothing was sent") | Measured.of(
-        times, f"no reply to a ping of {window_bytes} bytes has a time"
-    )
+    return Measured.from_optional(
+        frames, "there are no complete captures of both ends, or nothing was sent"
+    ) | Measured.from_optional(times, f"no reply to a ping of {window_bytes} bytes has a time")

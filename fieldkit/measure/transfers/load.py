@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import OVERCOUNTED, Figure, Kind, Measured, columns
+from fieldkit.core.columns import NEGATIVE_LOSS_BOUNDS, Figure, Kind, Measured, columns
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Ints
 from fieldkit.measure.captures.ip import TCP, UDP
@@ -31,7 +31,7 @@ COLUMNS: Final = columns(
             "TCP payload bytes, retransmissions included. Empty if datagrams were fragmented."
         ),
         Figure("iperf3 loss, captured", Kind.MEAN, rank=66),
-        OVERCOUNTED,
+        NEGATIVE_LOSS_BOUNDS,
     ),
 )
 
@@ -77,10 +77,10 @@ class LoadFlow:
 def measure(flow: LoadFlow, sender: Packets | None, receiver: Packets | None) -> Measured:
     """Return the columns of a test; a capture that is missing or damaged is None."""
     if sender is None or receiver is None:
-        return Measured.nothing(COLUMNS, "there are no complete captures of both ends")
+        return Measured.all_missing(COLUMNS, "there are no complete captures of both ends")
     sent, received = flow.streams(sender), flow.streams(receiver)
     values = {"iperf3_captured_bit_s": _rate(flow, received), "iperf3_captured_loss": _loss(flow, sent, received)}
-    return Measured.of(values, "no packet of the test is in a capture, or its datagrams were fragmented")
+    return Measured.from_optional(values, "no packet of the test is in a capture, or its datagrams were fragmented")
 
 
 def _loss(flow: LoadFlow, sent: list[Packets], received: list[Packets]) -> float | None:

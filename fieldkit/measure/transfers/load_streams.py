@@ -170,13 +170,13 @@ def read(load: LoadStreams, sender: Packets | None, receiver: Packets | None) ->
 def measure_jitter(load: LoadStreams, sender: Packets | None, receiver: Packets | None) -> Measured:
     """Return the columns of the jitter of a UDP load; arguments as for `measure`."""
     if load.protocol is not Protocol.UDP:
-        return Measured.nothing(JITTER, f"not applicable to {load.protocol}")
+        return Measured.all_missing(JITTER, f"not applicable to {load.protocol}")
     if sender is None or receiver is None:
-        return Measured.nothing(JITTER, "there are no complete captures of both ends")
+        return Measured.all_missing(JITTER, "there are no complete captures of both ends")
     try:
         streams = list(_transits_ns(load, sender, receiver))
     except EvidenceError as error:
-        return Measured.nothing(JITTER, error.what)
+        return Measured.all_missing(JITTER, error.what)
     values: dict[str, Value | None] = dict.fromkeys(column.name for column in JITTER)
     means_s = {
         index: mean_s
@@ -191,7 +191,7 @@ def measure_jitter(load: LoadStreams, sender: Packets | None, receiver: Packets 
             "iperf3_captured_variation_median_s": float(np.median(variation_s)),
             "iperf3_captured_variation_p95_s": float(np.percentile(variation_s, 95)),
         }
-    return Measured.of(values, "too few datagrams of the test are in both captures")
+    return Measured.from_optional(values, "too few datagrams of the test are in both captures")
 
 
 def _udp_packets(load: LoadStreams, sender: Packets, receiver: Packets) -> UdpPackets:
@@ -223,7 +223,7 @@ def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Itera
         raise EvidenceError("a capture lacks times")
     first, arrived_ns = matched.sent.where(matched.first), deliveries.arrivals_ns(matched)
     for mask in load.datagram_masks(first):
-        if (np.append(mask, False)[matched.datagram] & matched.match.doubtful).any():
+        if (np.append(mask, False)[matched.datagram] & matched.match.ambiguous).any():
             raise EvidenceError("its packets cannot be distinguished, so it is unknown which of them arrived when")
         complete = mask & (arrived_ns != NO_TIME)
         if complete.any():

@@ -50,7 +50,7 @@ class Match:
     received_index: Ints
     sent_index: Ints
     duplicates: Mask
-    doubtful: Mask
+    ambiguous: Mask
     possible_copy: Mask
 
     @property
@@ -101,7 +101,7 @@ def match(sent: Packets, received: Packets) -> Match:
     ):
         frame, first = np.unique(near.frame, return_index=True)
         index[frame] = np.append(far.frame, NONE)[piece_index[first]]
-    frames.doubtful[payload.sent.frame[payload.match.doubtful]] = True
+    frames.ambiguous[payload.sent.frame[payload.match.ambiguous]] = True
     frames.duplicates[payload.received.frame] = True
     frames.duplicates[payload.received.frame[~payload.match.duplicates]] = False
     return frames
@@ -234,8 +234,8 @@ def _match_pieces(sent: Packets, received: Packets, frames: Match) -> Payload:
         received.time_ns[received_pieces.frame],
         contents=(sent_frame, received_frame),
     )
-    ambiguous = pieces.doubtful | frames.doubtful[sent_pieces.frame] & (sent_frame > 0)
-    return Payload(sent_pieces, received_pieces, replace(pieces, doubtful=ambiguous))
+    ambiguous = pieces.ambiguous | frames.ambiguous[sent_pieces.frame] & (sent_frame > 0)
+    return Payload(sent_pieces, received_pieces, replace(pieces, ambiguous=ambiguous))
 
 
 def _equal_frames(sent: Packets, received: Packets, frames: Match) -> tuple[Ints, Ints]:

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, of_fault
+from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, fault_column_name
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Role
@@ -56,9 +56,9 @@ class FaultRecovery:
     recovery_open: bool
 
 
-def declared(flow: str, kind: FaultKind) -> tuple[Column, ...]:
+def declare_columns(flow: str, kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns for a kind of flow and a kind of fault."""
-    recovery, outage = (f"{flow}_{of_fault(kind, part)}" for part in ("recovery", "outage"))
+    recovery, outage = (f"{flow}_{fault_column_name(kind, part)}" for part in ("recovery", "outage"))
     place = list(FaultKind).index(kind)
     return columns(
         stalls.RANK,
@@ -126,15 +126,15 @@ def measure(
         times: Times of the fault; None if they were not recorded.
         role: Role of the receiving robot.
     """
-    declared_columns = declared(flow, kind)
+    declared_columns = declare_columns(flow, kind)
     try:
         began_ns, ended_ns = _fault_times_at(times, role)
         streams = [find(delivery, began_ns, ended_ns) for delivery in deliveries()]
     except EvidenceError as error:
-        return Measured.nothing(declared_columns, error.what)
+        return Measured.all_missing(declared_columns, error.what)
     if not streams:
-        return Measured.nothing(declared_columns, "no packet of it is in a capture")
-    recovery, outage = (f"{flow}_{of_fault(kind, part)}" for part in ("recovery", "outage"))
+        return Measured.all_missing(declared_columns, "no packet of it is in a capture")
+    recovery, outage = (f"{flow}_{fault_column_name(kind, part)}" for part in ("recovery", "outage"))
     values = {
         _column_name(outage, any(stream.outage_open for stream in streams)): max(
             stream.outage_s for stream in streams

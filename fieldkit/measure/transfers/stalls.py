@@ -37,7 +37,7 @@ class Stalls:
     is_open: bool
 
 
-def declared(flow: str, label: str, rank: int) -> tuple[Column, ...]:
+def declare_columns(flow: str, label: str, rank: int) -> tuple[Column, ...]:
     """Return the columns for a kind of flow.
 
     Args:
@@ -123,16 +123,16 @@ def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured
     """Return the columns for a flow.
 
     Args:
-        flow: As for `declared`.
+        flow: As for `declare_columns`.
         deliveries: Returns the deliveries of each stream; raises `EvidenceError` if they are unknown.
     """
-    declared_columns = declared(flow, flow, 0)
+    declared_columns = declare_columns(flow, flow, 0)
     try:
         streams = [find(delivery) for delivery in deliveries()]
     except EvidenceError as error:
-        return Measured.nothing(declared_columns, error.what)
+        return Measured.all_missing(declared_columns, error.what)
     if not streams:
-        return Measured.nothing(declared_columns, "no packet of it is in a capture")
+        return Measured.all_missing(declared_columns, "no packet of it is in a capture")
     longest_s, count = max(stream.longest_s for stream in streams), sum(stream.count for stream in streams)
     if any(stream.is_open for stream in streams):
         values = {f"{flow}_stall_at_least_s": longest_s, f"{flow}_stalls": count}

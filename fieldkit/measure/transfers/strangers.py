@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import Keys, Mask, row_hashes
-from fieldkit.measure.captures.ip import TCP, written
+from fieldkit.measure.captures.ip import TCP, address_text
 from fieldkit.measure.captures.packets import NO_PORT, SYN, Packets
 from fieldkit.measure.transfers.match import connection_keys, usable_stamps
 from fieldkit.measure.transfers.transfer import Transfer
@@ -148,4 +148,4 @@ def _most_common_ends(packets: Packets) -> str:
     _, first, count = np.unique(connection_keys(packets), return_index=True, return_counts=True)
     packet = packets.where(first[[count.argmax()]])
     ends = ((packet.src, packet.sport), (packet.dst, packet.dport))
-    return "as " + " > ".join(f"{written(*halves[0].tolist())}:{port[0]}" for halves, port in ends)
+    return "as " + " > ".join(f"{address_text(*halves[0].tolist())}:{port[0]}" for halves, port in ends)

@@ -74,7 +74,7 @@ class TcpCounts:
     transfer_s: float | None
 
 
-def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpFrames:
+def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpFrames:
     """Match the frames of a TCP transfer in both captures.
 
     A connection is included if its SYN is in the sender's capture. This excludes what the kernel still retransmits of
@@ -94,7 +94,7 @@ def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpFrames:
 
 
 def match_frames(sent: Packets, received: Packets) -> TcpFrames:
-    """Match TCP frames of one direction in both captures; raises as `cross`."""
+    """Match TCP frames of one direction in both captures; raises as `match_transfer`."""
     return TcpFrames(sent, received, match_payload(sent, received), 0)
 
 
@@ -106,7 +106,7 @@ def count(frames: TcpFrames) -> TcpCounts:
     times_sent, times_received = (
         np.bincount(pieces.range_id, minlength=range_count) for pieces in (sent_pieces, received_pieces)
     )
-    ambiguous = len(np.unique(sent_pieces.frame[payload.match.doubtful]))
+    ambiguous = len(np.unique(sent_pieces.frame[payload.match.ambiguous]))
     size_bytes = np.zeros(range_count, dtype=np.int64)
     size_bytes[sent_pieces.range_id], size_bytes[received_pieces.range_id] = (
         sent_pieces.size_bytes,

@@ -19,7 +19,7 @@ from fieldkit.measure.transfers.topics import TopicTraffic
 
 COLUMNS = tuple(
     replace(column, meaning=column.meaning.replace("complete captures", "complete logs"))
-    for column in stalls.declared("topic", "the topic", 83)
+    for column in stalls.declare_columns("topic", "the topic", 83)
 )
 
 

@@ -193,7 +193,7 @@ def measure(
     traffic = _packet_loss(flow, sender, receiver) | _traffic(flow, sender)
     if sent is None or received is None:
         of_logs = (*_COUNTS, *_TIMES, *_OF_SENT)
-        return traffic | Measured.nothing(of_logs, "there are no complete logs of both ends")
+        return traffic | Measured.all_missing(of_logs, "there are no complete logs of both ends")
     arrived = first_arrivals(received)
     clocks = None
     if sender is not None and receiver is not None:
@@ -202,7 +202,7 @@ def measure(
     return traffic | counts | _times(arrived, clocks, flow.deadline_s, len(sent.samples))
 
 
-def without_captures(measured: Measured, reason: str) -> dict[str, str]:
+def withheld_reasons(measured: Measured, reason: str) -> dict[str, str]:
     """Return the reason for each column of a topic that is missing because packets were dropped before tcpdump.
 
     Args:
@@ -222,7 +222,7 @@ def withheld_mark(reason: str) -> Measured:
     Args:
         reason: Why the captures are not used; empty if they are.
     """
-    return Measured.of({"topic_capture_withheld": reason or None}, "nothing is withheld")
+    return Measured.from_optional({"topic_capture_withheld": reason or None}, "nothing is withheld")
 
 
 def first_arrivals(log: TopicLog) -> TopicSamples:
@@ -247,7 +247,7 @@ def _counts(sent: TopicLog, arrived: TopicSamples, arrivals: int) -> Measured:
         "topic_discovered": sent.matched_ns is not None,
         "topic_discovery_s": discovery_s,
     }
-    return Measured.of(values, "the publisher discovered no subscription, so nothing was sent")
+    return Measured.from_optional(values, "the publisher discovered no subscription, so nothing was sent")
 
 
 def _times(arrived: TopicSamples, clocks: Clocks | None, deadline_s: float | None, sent: int) -> Measured:
@@ -262,7 +262,7 @@ def _times(arrived: TopicSamples, clocks: Clocks | None, deadline_s: float | Non
     if len(arrived) and clocks is not None:
         values |= _by_clocks(arrived, clocks, sent)
     reason = "too few samples arrived, there is no deadline, or the captures do not give the clock offset well enough"
-    return Measured.of(values, reason) | Measured.nothing((*_TIMES, *_OF_SENT), reason)
+    return Measured.from_optional(values, reason) | Measured.all_missing((*_TIMES, *_OF_SENT), reason)
 
 
 def _by_clocks(arrived: TopicSamples, clocks: Clocks, sent: int) -> dict[str, float]:
@@ -316,7 +316,7 @@ def deadline_misses(at_ns: Ints, deadline_s: float) -> int:
 def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
     """Return the counts of the topic's data and discovery packets in a capture."""
     if sender is None:
-        return Measured.nothing(_TRAFFIC, "there is no complete capture of the publisher")
+        return Measured.all_missing(_TRAFFIC, "there is no complete capture of the publisher")
     data, discovery = list(flow.data_ports), list(flow.discovery_ports)
     packets = with_ports(sender)
     to_data, to_discovery = np.isin(packets.dport, data), np.isin(packets.dport, discovery)
@@ -329,13 +329,13 @@ def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
     for name, mask in kinds.items():
         values[f"topic_{name}_packets"] = int(mask.sum())
         values[f"topic_{name}_bytes"] = int(sender.wire_bytes[mask].sum())
-    return Measured.of(values, "")
+    return Measured.from_optional(values, "")
 
 
 def _packet_loss(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> Measured:
     """Return the share of UDP data packets from publisher to subscriber that did not arrive."""
     if sender is None or receiver is None:
-        return Measured.of({"topic_packet_loss": None}, "there are no complete captures of both ends")
+        return Measured.from_optional({"topic_packet_loss": None}, "there are no complete captures of both ends")
 
     def forward(packets: Packets) -> Packets:
         ends = packets.are_from(flow.sender_address) & packets.are_to(flow.receiver_address)
@@ -346,4 +346,4 @@ def _packet_loss(flow: TopicTraffic, sender: Packets | None, receiver: Packets |
     of_data = np.isin(with_ports(sent).dport, list(flow.data_ports))
     arrived = match(sent, forward(receiver)).arrived[of_data]
     lost = 1 - float(arrived.mean()) if len(arrived) else None
-    return Measured.of({"topic_packet_loss": lost}, "none of its data was sent over UDP")
+    return Measured.from_optional({"topic_packet_loss": lost}, "none of its data was sent over UDP")

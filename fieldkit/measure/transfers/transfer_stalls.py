@@ -40,8 +40,8 @@ def read(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> list[D
         raise EvidenceError("there are no complete captures of both ends")
     schedule = flow_schedule(evidence, transfer, listener)
     if transfer.protocol is Protocol.UDP:
-        return of_udp(udp.cross(sender.packets, receiver.packets, transfer), schedule)
-    frames = tcp.cross(sender.packets, receiver.packets, transfer)
+        return of_udp(udp.match_transfer(sender.packets, receiver.packets, transfer), schedule)
+    frames = tcp.match_transfer(sender.packets, receiver.packets, transfer)
     return of_tcp(frames, transfer.backward(sender.packets), schedule)
 
 

@@ -80,7 +80,7 @@ class UdpCounts:
     transfer_s: float | None
 
 
-def cross(sender: Packets, receiver: Packets, transfer: Transfer) -> UdpPackets:
+def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> UdpPackets:
     """Match the UDP packets of both captures."""
     sent, received = transfer.forward(sender), transfer.forward(receiver)
     return UdpPackets(sent, received, match(sent, received), *datagrams(sent), transfer.port)
@@ -95,7 +95,7 @@ def count(packets: UdpPackets) -> UdpCounts:
     received_chosen = np.append(chosen, False)[matched.sent_index]  # the last entry is that of match.NONE
     bursts = _bursts(~arrived[chosen])
     time_ns = received.time_ns[received_chosen]
-    ambiguous = int((chosen & matched.doubtful).sum())
+    ambiguous = int((chosen & matched.ambiguous).sum())
     bursts_known = not ambiguous or bool(arrived[chosen].all())
     return UdpCounts(
         packets_sent=int(chosen.sum()),

@@ -32,7 +32,7 @@ _OWN: Final = MappingProxyType(
 """Class of each built-in kind, in the module of that name in this package; in the order of messages."""
 
 
-def own() -> frozenset[str]:
+def builtin() -> frozenset[str]:
     """Return the names of the built-in kinds."""
     return frozenset(_OWN)
 
@@ -45,11 +45,11 @@ def load() -> Iterator[tuple[EntryPoint, Any]]:
     """
     used_names = set()
     builtin = [EntryPoint(kind, f"fieldkit.steps.kinds.{kind}:{name}", plugins.STEPS) for kind, name in _OWN.items()]
-    for point in (*builtin, *plugins.points(plugins.STEPS)):
+    for point in (*builtin, *plugins.entry_points(plugins.STEPS)):
         if point.name in used_names:
             raise ConfigurationError(
                 f"there is already a kind of step {point.name!r}",
-                where=plugins.where(point),
+                where=plugins.location(point),
                 remedy="uninstall it, or rename it",
             )
         used_names.add(point.name)

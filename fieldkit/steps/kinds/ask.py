@@ -31,7 +31,9 @@ def _can_be_chosen(word: str) -> str:
     """Return a word that can be a choice: neither a number, a position in the list, nor an answer for *unknown*."""
     fits = 0 < len(word) <= _MAX_LETTERS and word.isprintable() and word == word.strip()
     if not fits or word.isdigit() or word in {UNKNOWN, *MISSING}:
-        raise schema.complaint(f"{word[:40]!r} cannot be a choice: write words of at most {_MAX_LETTERS} characters")
+        raise schema.validation_error(
+            f"{word[:40]!r} cannot be a choice: write words of at most {_MAX_LETTERS} characters"
+        )
     return word
 
 
@@ -57,9 +59,10 @@ class AskStep(Step):
     """
 
     column: StepName
-    question: Annotated[str, schema.shaped(r"^\S[^\n]{0,200}$", "a question: one line")]
+    question: Annotated[str, schema.pattern_field(r"^\S[^\n]{0,200}$", "a question: one line")]
     unit: (
-        Annotated[str, schema.shaped(r"^[^\s0-9][^\s]{0,15}$", "a unit: up to 16 characters, no digit first")] | None
+        Annotated[str, schema.pattern_field(r"^[^\s0-9][^\s]{0,15}$", "a unit: up to 16 characters, no digit first")]
+        | None
     ) = None
     choices: Annotated[tuple[_Word, ...], Field(min_length=2, max_length=20)] | None = None
     least: Number | None = None
@@ -70,14 +73,14 @@ class AskStep(Step):
     @schema.model_validator(mode="after")
     def _can_be_answered(self) -> "AskStep":
         if self.choices and (self.unit or self.least is not None or self.most is not None):
-            raise schema.complaint("choices are words: they have no unit, least or most", "choices")
+            raise schema.validation_error("choices are words: they have no unit, least or most", "choices")
         if self.least is not None and self.most is not None and self.least > self.most:
-            raise schema.complaint("least is greater than most", "least")
+            raise schema.validation_error("least is greater than most", "least")
         if self.choices and len(set(self.choices)) < len(self.choices):
-            raise schema.complaint("a choice is listed twice", "choices")
+            raise schema.validation_error("a choice is listed twice", "choices")
         if self.usual and self._full_question.read(self.usual) is None:
-            permitted = replace(self._full_question, usual="").how
-            raise schema.complaint(f"usual is {self.usual!r}; permitted answers: {permitted}", "usual")
+            permitted = replace(self._full_question, usual="").answer_hint
+            raise schema.validation_error(f"usual is {self.usual!r}; permitted answers: {permitted}", "usual")
         return self
 
     @property
@@ -91,7 +94,7 @@ class AskStep(Step):
 
     @override
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
-        yield f"the operator is asked: {self.question}? {self._full_question.how}"
+        yield f"the operator is asked: {self.question}? {self._full_question.answer_hint}"
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """Ask the operator, or use the answer of an earlier attempt of the trial; see `Step.run`.
@@ -103,12 +106,12 @@ class AskStep(Step):
         if answer is None:
             announce("ask", None)
             answer = testbed.operator.enter(self._full_question)
-        if scene.here is not None:
-            (scene.here / self._file).write_text(f"{answer}\n", encoding="utf-8")
+        if scene.laptop_folder is not None:
+            (scene.laptop_folder / self._file).write_text(f"{answer}\n", encoding="utf-8")
 
     def _earlier_answer(self, scene: Scene) -> str | None:
         """Return the answer in an earlier attempt of the trial; None in the first attempt."""
-        for path in sorted(scene.here.parent.glob(f"*/{self._file}")) if scene.here else ():
+        for path in sorted(scene.laptop_folder.parent.glob(f"*/{self._file}")) if scene.laptop_folder else ():
             with suppress(EvidenceError):
                 return _read(path, self._full_question)
         return None
@@ -131,7 +134,7 @@ class AskStep(Step):
 
     @property
     def _file(self) -> str:
-        return self.own_name(laptop_files.answer(self.column))
+        return self.prefixed_name(laptop_files.answer_file(self.column))
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
@@ -154,7 +157,7 @@ class AskStep(Step):
         answer = view.evidence.read_or_none(_read, self._file, self._full_question)
         text = answer if answer != UNKNOWN else None
         value: Value | None = text if text is None or self.choices else float(text)
-        return Measured.of({self.column: value}, "the operator did not know")
+        return Measured.from_optional({self.column: value}, "the operator did not know")
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
@@ -164,7 +167,7 @@ class AskStep(Step):
             yield f"{self.column} {shown}"
 
     @override
-    def asks(self) -> bool:
+    def may_prompt(self) -> bool:
         return True
 
     @override

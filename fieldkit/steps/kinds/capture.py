@@ -15,8 +15,8 @@ from fieldkit.config.schema import Field, Int
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import EvidenceError, FieldkitError
-from fieldkit.core.model import Protocol, Role, Verdict, in_order
-from fieldkit.core.threads import together
+from fieldkit.core.model import Protocol, Role, Verdict, sort_roles
+from fieldkit.core.threads import run_parallel
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
@@ -27,7 +27,7 @@ from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import StepEntry
 from fieldkit.steps.nest import Nest
-from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Said, Scene
+from fieldkit.steps.scene import BY_FIELDKIT, Announce, CommandResult, Flow, Need, Planned, Scene
 from fieldkit.steps.variants import Tool
 from fieldkit.steps.view import View
 
@@ -94,7 +94,7 @@ class CaptureStep(Nest):
     @schema.model_validator(mode="after")
     def _captures_once(self) -> "CaptureStep":
         if len(set(self.robots)) < len(self.robots):
-            raise schema.complaint("a robot is named twice", "robots")
+            raise schema.validation_error("a robot is named twice", "robots")
         return self
 
     @override
@@ -109,7 +109,7 @@ class CaptureStep(Nest):
         options = ("-n", "-U", *immediate, "-s", str(self._snap_bytes), "-B", str(self._buffer_kib))
         job = Job(
             folder=scene.folder,
-            name=self.own_name("capture"),
+            name=self.prefixed_name("capture"),
             argv=(
                 *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", self._file(role)),
                 self._filter(scene),
@@ -120,7 +120,7 @@ class CaptureStep(Nest):
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
         )
-        return Planned(role, job, program=profile.tools.capture, tool=Tool.CAPTURE, ends=BY_FIELDKIT)
+        return Planned(role, job, program=profile.tools.capture, tool=Tool.CAPTURE, permitted_causes=BY_FIELDKIT)
 
     @property
     def _snap_bytes(self) -> int:
@@ -139,7 +139,7 @@ class CaptureStep(Nest):
         """Return the capture filter (pcap-filter(7))."""
         flows = list(self.flows_inside(scene)) or [Flow(Role.SENDER, Role.RECEIVER)]
         pairs = dict.fromkeys(frozenset({flow.source, flow.destination}) for flow in flows)
-        hosts = [" and ".join(f"host {scene.robot(role).address}" for role in in_order(pair)) for pair in pairs]
+        hosts = [" and ".join(f"host {scene.robot(role).address}" for role in sort_roles(pair)) for pair in pairs]
         groups = {(flow.group, role) for flow in flows if flow.group for role in (flow.source, flow.destination)}
         hosts += [f"src host {scene.robot(role).address} and dst host {group}" for group, role in sorted(groups)]
         ports = dict.fromkeys(port for port in (*(flow.port for flow in flows), self.port) if port is not None)
@@ -157,7 +157,7 @@ class CaptureStep(Nest):
             prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if names.capture_right == "sudo" else ()
             # The list of link types needs the same permission as a capture, because it opens the interface.
             argv = (*prefix, names.capture, "-L", "-i", profile.radio.interface)
-            yield Need(role, "right to capture", argv, partial(_judge, profile), of=names.capture)
+            yield Need(role, "right to capture", argv, partial(_judge, profile), required_program=names.capture)
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
@@ -170,10 +170,10 @@ class CaptureStep(Nest):
         return {role: self._file(role) for role in self.robots}
 
     def _file(self, role: Role) -> str:
-        return self.own_name(capture_file(role))
+        return self.prefixed_name(capture_file(role))
 
     def _log(self, role: Role) -> str:
-        return self.own_name(log_file(role))
+        return self.prefixed_name(log_file(role))
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -192,7 +192,7 @@ class CaptureStep(Nest):
         announce("start captures", None)
         try:
             for calls in rounds:
-                together(lambda call: call(), calls)
+                run_parallel(lambda call: call(), calls)
             for carry_out in prepared:
                 carry_out(announce)
             for step in others:
@@ -214,7 +214,7 @@ class CaptureStep(Nest):
             shell, file = testbed.shells[capture.role], self._file(capture.role)
             return jobs.stop(shell, capture.job, settle=file, parting=COUNTED)
 
-        return together(stop, captures)
+        return run_parallel(stop, captures)
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
@@ -241,7 +241,7 @@ class CaptureStep(Nest):
         for role in (Role.SENDER, Role.RECEIVER):
             if role not in self.robots:
                 role_columns = [column for column in self.columns if column.name.startswith(f"{role}_")]
-                measured |= Measured.nothing(role_columns, f"the {role} does not capture")
+                measured |= Measured.all_missing(role_columns, f"the {role} does not capture")
                 continue
             capture = view.evidence.whole_capture(self._file(role))
             log = view.evidence.read_or_none(tcpdump_log.read, self._log(role))
@@ -249,7 +249,7 @@ class CaptureStep(Nest):
                 f"{role}_captured": capture.frames if capture else None,
                 f"{role}_capture_dropped": log.dropped_by_kernel if log else None,
             }
-            measured |= Measured.of(values, "its capture is incomplete")
+            measured |= Measured.from_optional(values, "its capture is incomplete")
         return measured
 
     @override
@@ -299,14 +299,14 @@ def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
         yield f"has a packet from {late_s:.3f} s after the end of the attempt, by the robot's clock"
 
 
-def _judge(profile: RobotProfile, answer: Said) -> tuple[Verdict, str, str]:
+def _judge(profile: RobotProfile, answer: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy on the permission of a robot's user to capture."""
     names = profile.tools
     if answer.ok:
         return Verdict.OK, "by sudo -n" if names.capture_right == "sudo" else "permission of the user", ""
     if names.capture_right == "direct":
         remedy = f"sudo setcap cap_net_raw,cap_net_admin+eip $(command -v {quote((names.capture,))})"
-    elif answer.code == Said.MISSING:
+    elif answer.code == CommandResult.MISSING:
         return Verdict.FAIL, "there is no sudo", f"write capture_right: direct in profile {profile.name}"
     else:
         remedy = 'echo "$USER ALL=(ALL) NOPASSWD: $(command -v sh)" | sudo tee /etc/sudoers.d/fieldkit'

@@ -13,12 +13,12 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field
 from fieldkit.core import model
-from fieldkit.core.columns import Column, Measured, Value, of_fault
+from fieldkit.core.columns import Column, Measured, Value, fault_column_name
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, Role
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import recovery
 from fieldkit.measure.offsets import Offset, offset
@@ -88,7 +88,9 @@ class FaultStep(Nest):
     kind: FaultKind
     lasts: Annotated[Duration, Field(gt=0)] | None = Field(default=None, alias="for")
     process: (
-        Annotated[str, schema.shaped(r"^[A-Za-z0-9._-]{1,15}$", "the name of a process, as ps -e -o comm shows it")]
+        Annotated[
+            str, schema.pattern_field(r"^[A-Za-z0-9._-]{1,15}$", "the name of a process, as ps -e -o comm shows it")
+        ]
         | None
     ) = None
     after: Duration = 1.0
@@ -102,7 +104,7 @@ class FaultStep(Nest):
             ("process", self.process is not None, self.kind is FaultKind.KILL),
         ):
             if given != wanted:
-                raise schema.complaint(f"a {self.kind} {'needs' if wanted else 'does not allow'} {key}:")
+                raise schema.validation_error(f"a {self.kind} {'needs' if wanted else 'does not allow'} {key}:")
         return self
 
     @property
@@ -138,8 +140,8 @@ class FaultStep(Nest):
         shell = testbed.shells[observer.role]
         announce(f"watch {scene.robot(self.robot).name}", None)
         jobs.start(shell, watch.job)
-        ahead = {} if scene.here is None else self._clocks(testbed)
-        inner = replace(scene, halt=scene.halt.inside())
+        ahead = {} if scene.laptop_folder is None else self._clocks(testbed)
+        inner = replace(scene, halt=scene.halt.child())
         pool = ThreadPoolExecutor(max_workers=1)
         steps = pool.submit(self._run_inside, inner, testbed, announce)
         try:
@@ -154,13 +156,13 @@ class FaultStep(Nest):
             jobs.stop(shell, watch.job)
             self._wait_for_steps(steps, scene, testbed)
         except Exception:
-            inner.halt.call()
+            inner.halt.set()
             with suppress(FieldkitError):
                 self.end_inside(scene, testbed)
             wait([steps])
             raise
         finally:
-            inner.halt.call()
+            inner.halt.set()
             pool.shutdown(wait=False)  # after Ctrl-C its handler stops the jobs for which the steps wait
 
     def _clocks(self, testbed: Testbed) -> dict[Role, Offset]:
@@ -176,26 +178,28 @@ class FaultStep(Nest):
             return None
 
         roles = list(testbed.shells)
-        return {role: ahead for role, ahead in zip(roles, together(query, roles), strict=True) if ahead is not None}
+        return {
+            role: ahead for role, ahead in zip(roles, run_parallel(query, roles), strict=True) if ahead is not None
+        }
 
     def _note_times(self, scene: Scene, asked_ns: int, lasted_s: float | None, ahead: Mapping[Role, Offset]) -> None:
         """Record the times of the fault by the laptop's clock, when its cause is over."""
-        if scene.here is None:
+        if scene.laptop_folder is None:
             return
         now_ns = time.time_ns()
         # A lasting fault started `lasted_s` ago; a reboot or a kill lasts from the request until now.
         began_ns = now_ns - round(1e9 * lasted_s) if lasted_s else asked_ns
         times = FaultTimes(began_ns, None if lasted_s is None else now_ns, ahead)
-        path = scene.here / self.own_name(fault_times.file(self.kind))
+        path = scene.laptop_folder / self.prefixed_name(fault_times.file(self.kind))
         path.write_text(fault_times.text(times), encoding="ascii")
 
     def times(self, evidence: AttemptEvidence) -> FaultTimes | None:
         """Return the recorded times of the fault; see `CausesFault.times`."""
-        return evidence.read_or_none(fault_times.read, self.own_name(fault_times.file(self.kind)))
+        return evidence.read_or_none(fault_times.read, self.prefixed_name(fault_times.file(self.kind)))
 
     def _run_inside(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         for entry in self.during:
-            if not scene.halt.called:
+            if not scene.halt.is_set:
                 entry.step.run(scene, testbed, announce)
 
     def _lead_in(self, steps: "Future[None]") -> None:
@@ -221,7 +225,7 @@ class FaultStep(Nest):
         return frozenset({self.robot, observed_from(self.cause)}) | self.roles_inside()
 
     @override
-    def asks(self) -> bool:
+    def may_prompt(self) -> bool:
         return True
 
     @override
@@ -235,7 +239,7 @@ class FaultStep(Nest):
     @override
     def files(self) -> tuple[str, ...]:
         names = (recovery.note_file, recovery.observed_file, recovery.log_file, fault_times.file)
-        return tuple(self.own_name(name(self.kind)) for name in names)
+        return tuple(self.prefixed_name(name(self.kind)) for name in names)
 
     @override
     def check(self, view: View) -> Iterator[str]:
@@ -257,7 +261,7 @@ class FaultStep(Nest):
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
-        outage_s, recovered = (values.get(of_fault(self.kind, what)) for what in ("outage_s", "recovered"))
+        outage_s, recovered = (values.get(fault_column_name(self.kind, what)) for what in ("outage_s", "recovered"))
         if recovered is not None:
             gone = f"gone for {outage_s:.1f} s" if isinstance(outage_s, float) else "did not come back"
             yield f"{self.kind}: {gone}"

@@ -62,9 +62,11 @@ class FlyLeg(PathLeg):
     def _one_direction(self) -> "FlyLeg":
         for key, opposite in (("away", "towards"), ("left", "right"), ("up", "down")):
             if getattr(self, key) is not None and getattr(self, opposite) is not None:
-                raise schema.complaint(f"a segment has {key} or {opposite}, not both; make two segments", opposite)
+                raise schema.validation_error(
+                    f"a segment has {key} or {opposite}, not both; make two segments", opposite
+                )
         if not any((self.away, self.towards, self.left, self.right, self.up, self.down)):
-            raise schema.complaint("a segment needs a distance: away, towards, left, right, up or down")
+            raise schema.validation_error("a segment needs a distance: away, towards, left, right, up or down")
         return self
 
     @property
@@ -113,7 +115,7 @@ class FlyStep(Nest):
     @schema.model_validator(mode="after")
     def _stays_in_the_air(self) -> "FlyStep":
         if min(up_m for _, _, up_m in self._corners_m()) <= 0:
-            raise schema.complaint("the path leads to the ground, or below it", "path")
+            raise schema.validation_error("the path leads to the ground, or below it", "path")
         return self
 
     def _corners_m(self) -> list[tuple[float, float, float]]:
@@ -147,7 +149,7 @@ class FlyStep(Nest):
         origin = scene.origins.get(self.robot)
         return FlightPlan(
             connection=piloting.connection(scene.robot(self.robot)),
-            orders=orders_file(self.own_name("fly")),
+            orders=orders_file(self.prefixed_name("fly")),
             abort=piloting.abort_of(scene, self.robot).value,
             lease_s=self.lease,
             end=self.then.value,
@@ -160,16 +162,16 @@ class FlyStep(Nest):
             least_charge=mavlink.least_charge if mavlink else 0.0,
             origin=None if origin is None else asdict(origin),
             log=self._log,
-            liveness=piloting.liveness_file(self.own_name("guard")),
+            liveness=piloting.liveness_file(self.prefixed_name("guard")),
         )
 
     @property
     def _log(self) -> str:
-        return self.own_name(fly_log.FILE)
+        return self.prefixed_name(fly_log.FILE)
 
     def _pilot(self, scene: Scene) -> Planned:
         limit_s = _LIMIT_S + self.expected_s(scene.protocol)
-        return piloting.planned(scene, self.robot, self.own_name("fly"), self._plan(scene), limit_s)
+        return piloting.planned(scene, self.robot, self.prefixed_name("fly"), self._plan(scene), limit_s)
 
     @property
     def _lease_s(self) -> float:
@@ -177,7 +179,7 @@ class FlyStep(Nest):
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:
-        return piloting.guard(scene, self.robot, self.own_name("guard"), lease_s=self._lease_s, has_pilot=True)
+        return piloting.guard(scene, self.robot, self.prefixed_name("guard"), lease_s=self._lease_s, has_pilot=True)
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
@@ -271,8 +273,8 @@ class FlyStep(Nest):
             flight.lost = "neither its pilot nor its guard runs"
             announce(text, None)
 
-        guard_name = self.own_name("guard")
-        job = piloting.rescue(scene, self.robot, self.own_name("rescue"), guard_name)
+        guard_name = self.prefixed_name("guard")
+        job = piloting.rescue(scene, self.robot, self.prefixed_name("rescue"), guard_name)
         sends = scene.robot(self.robot).control is not Control.RADIO
         return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, sends=sends)
 
@@ -290,7 +292,7 @@ class FlyStep(Nest):
             announce(f"land {name}", self._descent_s)
             flight.give_order(HOME)
             flight.wait_for("landed", self._descent_s + _SLACK_S)
-            motion.ended()
+            motion.mark_ended()
 
     def _wait_for_start(self, scene: Scene, flight: piloting.FlightLease) -> None:
         """Wait until the drone is ready at its origin; record the origin before the first start."""
@@ -313,9 +315,9 @@ class FlyStep(Nest):
 
     @override
     def files(self) -> tuple[str, ...]:
-        name = self.own_name("fly")
-        guard = self.own_name("guard")
-        rescue = self.own_name("rescue")
+        name = self.prefixed_name("fly")
+        guard = self.prefixed_name("guard")
+        rescue = self.prefixed_name("rescue")
         return (f"{name}.log", orders_file(name), self._log, f"{guard}.log", orders_file(guard), f"{rescue}.log")
 
     @override
@@ -342,7 +344,7 @@ class FlyStep(Nest):
         reasons = [damage] if damage else list(fly_checks.contradictions(log, plan))
         for step in (*view.within, *follow.steps_inside(self)):
             if isinstance(step, MavlinkStep) and step.robot == self.robot and not reasons:
-                reasons += filter(None, (fly_checks.of_telemetry(log, step.places_m(view)),))
+                reasons += filter(None, (fly_checks.telemetry_contradiction(log, step.places_m(view)),))
         yield from (f"{self._log}: {why}" for why in reasons)
 
     @override

@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Role
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.measure.offsets import Exchange, Offset, offset
 from fieldkit.measure.positions import accounts, where
 from fieldkit.measure.positions.accounts import Account, Accounts
@@ -76,26 +76,26 @@ def follow(
         jobs.begin_wait(testbed.shells[recording.role], recording.job, seconds).end(seconds + jobs.REPLY_S)
 
     try:
-        together(lambda planned: jobs.start(testbed.shells[planned.role], planned.job), recordings)
-        together(query_clock, list(exchanges))
+        run_parallel(lambda planned: jobs.start(testbed.shells[planned.role], planned.job), recordings)
+        run_parallel(query_clock, list(exchanges))
         began_utc_ns = time.time_ns()
         for entry in nest.during:
             entry.step.run(scene, testbed, announce)
-        together(query_clock, list(exchanges))
-        together(wait, recordings)
+        run_parallel(query_clock, list(exchanges))
+        run_parallel(wait, recordings)
     except FieldkitError:
         # The recordings are kept with the failed attempt; its reason is the first error.
         with suppress(FieldkitError):
             _stop(testbed, recordings)
         raise
     codes = _stop(testbed, recordings)
-    if scene.here is not None and make_accounts is not None:
+    if scene.laptop_folder is not None and make_accounts is not None:
         offsets = {role: offset(results) for role, results in exchanges.items() if results}
-        path = scene.here / accounts.FILE
+        path = scene.laptop_folder / accounts.FILE
         # Steps inside may have written the sources for other robots.
         earlier = accounts.read(path) if path.exists() else Accounts()
-        merged = accounts.merged(earlier, make_accounts(began_utc_ns, offsets))
-        path.write_text(accounts.text(merged), encoding="utf-8")
+        merge = accounts.merge(earlier, make_accounts(began_utc_ns, offsets))
+        path.write_text(accounts.text(merge), encoding="utf-8")
     return list(zip(recordings, codes, strict=True))
 
 
@@ -103,7 +103,7 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
     def stop(recording: Planned) -> int:
         return jobs.stop(testbed.shells[recording.role], recording.job, grace_s=CLOSE_S)
 
-    return together(stop, recordings)
+    return run_parallel(stop, recordings)
 
 
 def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, Account]:
@@ -133,7 +133,7 @@ def placement_error(what: str, within: Sequence[Nest]) -> str | None:
 def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
     """Yield the reasons why the recorded positions of robots cannot be used."""
     try:
-        sources = where.given(view.evidence)
+        sources = where.position_accounts(view.evidence)
         for role in roles:
             where.samples_of(view.evidence, role)
     except EvidenceError as error:
@@ -159,7 +159,7 @@ def _place_problems(view: View, sources: Accounts) -> Iterator[str]:
 def measure(view: View) -> Measured:
     """Return the values of `COLUMNS`: source of the positions, and error of the clocks."""
     values = {
-        "positions_from": where.in_words(view.evidence),
+        "positions_from": where.sources_text(view.evidence),
         "positions_clock_error_s": where.clock_error_s(view.evidence),
     }
-    return Measured.of(values, f"{accounts.FILE} does not contain it")
+    return Measured.from_optional(values, f"{accounts.FILE} does not contain it")

@@ -18,8 +18,8 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure import job_times
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.checks import iperf3_checks, load_checks
-from fieldkit.measure.checks.iperf3_checks import IperfOrder
-from fieldkit.measure.checks.load_checks import LoadWitness
+from fieldkit.measure.checks.iperf3_checks import IperfSettings
+from fieldkit.measure.checks.load_checks import LoadEvidence
 from fieldkit.measure.evidence import iperf3
 from fieldkit.measure.evidence.iperf3 import IperfTest
 from fieldkit.measure.transfers import load, load_streams, stalls
@@ -42,7 +42,7 @@ _DEFAULT_S: Final = 10.0
 _INTERVAL_BYTES: Final = 600
 """Size of iperf3's report on one second of one stream."""
 
-_STALLS: Final = stalls.declared("iperf3", "iperf3", 67)
+_STALLS: Final = stalls.declare_columns("iperf3", "iperf3", 67)
 
 
 class Iperf3Step(LoadOptions, AlongStep):
@@ -74,13 +74,15 @@ class Iperf3Step(LoadOptions, AlongStep):
     @schema.model_validator(mode="after")
     def _has_one_end(self) -> "Iperf3Step":
         if self.size is not None and self.duration is not None:
-            raise schema.complaint("a test has a duration or a size, not both; leave one out", "size")
+            raise schema.validation_error("a test has a duration or a size, not both; leave one out", "size")
         if self.size is not None and self.along:
-            raise schema.complaint("a test has along: true or a size, not both; leave one out", "size")
+            raise schema.validation_error("a test has along: true or a size, not both; leave one out", "size")
         if self._duration_s % 1:
-            raise schema.complaint(f"iperf3 needs whole seconds, not {self._duration_s:g} s", "duration")
+            raise schema.validation_error(f"iperf3 needs whole seconds, not {self._duration_s:g} s", "duration")
         if self.size is None and self._duration_s >= self.limit:
-            raise schema.complaint(f"the test lasts {self._duration_s:g} s, so its limit must be longer", "limit")
+            raise schema.validation_error(
+                f"the test lasts {self._duration_s:g} s, so its limit must be longer", "limit"
+            )
         return self
 
     @property
@@ -114,12 +116,12 @@ class Iperf3Step(LoadOptions, AlongStep):
         serves = role == self.receiver
         job = Job(
             folder=scene.folder,
-            name=self.own_name(f"iperf3-{name}"),
+            name=self.prefixed_name(f"iperf3-{name}"),
             argv=argv,
             limit_s=self.limit + _SERVER_EXIT_S * serves,
             log=self._log(role),
             stdout=self._json(role),
-            ready=jobs.bound(Protocol.TCP, self.port) if serves else None,
+            ready=jobs.ready_when_bound(Protocol.TCP, self.port) if serves else None,
         )
         least_s = 0.0 if serves or self.size is not None else self._duration_s
         return Planned(role, job, program=PROGRAM, least_s=least_s)
@@ -166,10 +168,10 @@ class Iperf3Step(LoadOptions, AlongStep):
         return tuple(name for role in (self.sender, self.receiver) for name in (self._json(role), self._log(role)))
 
     def _json(self, role: Role) -> str:
-        return self.own_name(iperf3.json_file(role))
+        return self.prefixed_name(iperf3.json_file(role))
 
     def _log(self, role: Role) -> str:
-        return self.own_name(f"{role}-iperf3.log")
+        return self.prefixed_name(f"{role}-iperf3.log")
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:
@@ -208,9 +210,9 @@ class Iperf3Step(LoadOptions, AlongStep):
                 yield f"{file}: iperf3 measured nothing"
             else:
                 tests[role] = test
-                reasons = iperf3_checks.within(test, sends=role == self.source)
+                reasons = iperf3_checks.check_one_end(test, sends=role == self.source)
                 yield from (f"{file}: {why}" for why in reasons)
-                if why := iperf3_checks.misdated(test, view.attempt_window(role)):
+                if why := iperf3_checks.date_problem(test, view.attempt_window(role)):
                     yield f"{file}: {why}"
         if len(tests) > 1:
             yield from self._contradictions(view, tests)
@@ -219,12 +221,12 @@ class Iperf3Step(LoadOptions, AlongStep):
         """Yield the contradictions between both JSON reports, the procedure, captures and interface counters."""
         protocol = self.carried_by(view.scene.protocol)
         duration_s = self._duration_s if self.size is None else None
-        order = IperfOrder(protocol, self.streams, self.payload_bytes, self.reverse, duration_s)
-        yield from iperf3_checks.between(tests[self.sender], tests[self.receiver], order)
+        order = IperfSettings(protocol, self.streams, self.payload_bytes, self.reverse, duration_s)
+        yield from iperf3_checks.compare_ends(tests[self.sender], tests[self.receiver], order)
         sent, received = tests[self.source], tests[self.destination]
         source_capture, destination_capture = (view.capture(role) for role in (self.source, self.destination))
         if source_capture is not None and destination_capture is not None:
-            witness = LoadWitness(
+            witness = LoadEvidence(
                 sender=source_capture.packets,
                 receiver=destination_capture.packets,
                 server_port=self.port,
@@ -277,7 +279,7 @@ class Iperf3Step(LoadOptions, AlongStep):
         sent, received = (self._report(view, role) for role in (self.source, self.destination))
         swapped = tuple((remote, local) for local, remote in received.ports) if received else ()
         ports = sent.ports if sent else swapped
-        job = self.own_name(f"iperf3-{'client' if self.reverse else 'server'}")
+        job = self.prefixed_name(f"iperf3-{'client' if self.reverse else 'server'}")
         return self.data_streams(
             view.scene,
             reverse=self.reverse,

@@ -64,7 +64,7 @@ _EXTRA_S: Final = 2
 
 def _is_message(name: str) -> str:
     if name not in MESSAGES:
-        raise schema.complaint(f"no rate can be requested for {name!r}; possible: {', '.join(MESSAGES)}")
+        raise schema.validation_error(f"no rate can be requested for {name!r}; possible: {', '.join(MESSAGES)}")
     return name
 
 
@@ -110,7 +110,9 @@ class MavlinkStep(Nest):
     @schema.model_validator(mode="after")
     def _has_direction(self) -> "MavlinkStep":
         if (self.positions == "local") is (self.facing is None):
-            raise schema.complaint("facing is required with positions: local, and not allowed otherwise", "facing")
+            raise schema.validation_error(
+                "facing is required with positions: local, and not allowed otherwise", "facing"
+            )
         return self
 
     @property
@@ -130,7 +132,7 @@ class MavlinkStep(Nest):
         arguments = {"connection": self._connection(scene), "intervals_us": intervals_us, "system": self.system}
         job = Job(
             folder=scene.folder,
-            name=self.own_name("mavlink"),
+            name=self.prefixed_name("mavlink"),
             argv=streams.agent_command(robot, "mavlink", streams.compact(arguments), self._file),
             limit_s=follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log,
@@ -139,7 +141,7 @@ class MavlinkStep(Nest):
             ready_s=_READY_S,
         )
         setup, program = streams.setup(robot), robot.profile.tools.python
-        return Planned(self.recorder, job, program=program, setup=setup, ends=BY_FIELDKIT)
+        return Planned(self.recorder, job, program=program, setup=setup, permitted_causes=BY_FIELDKIT)
 
     def _connection(self, scene: Scene) -> str:
         """Return the connection from the recorder to the autopilot.
@@ -155,7 +157,7 @@ class MavlinkStep(Nest):
             )
         if self.recorder != self.robot:
             return f"udpout:{robot.address}:{mavlink.port}"
-        return mavlink.own
+        return mavlink.onboard_connection
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
@@ -212,15 +214,15 @@ class MavlinkStep(Nest):
 
     @property
     def _file(self) -> str:
-        return self.own_name(f"mavlink{tlog.SUFFIX}")
+        return self.prefixed_name(f"mavlink{tlog.SUFFIX}")
 
     @property
     def _counters_file(self) -> str:
-        return self.own_name("mavlink.json")
+        return self.prefixed_name("mavlink.json")
 
     @property
     def _log(self) -> str:
-        return self.own_name(f"{self.recorder}-mavlink.log")
+        return self.prefixed_name(f"{self.recorder}-mavlink.log")
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
@@ -246,9 +248,9 @@ class MavlinkStep(Nest):
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the log is incomplete, lacks requested messages, or contradicts its recorder."""
         try:
-            counters = view.evidence.read(tlog.told, self._counters_file)
+            counters = view.evidence.read(tlog.read_summary, self._counters_file)
             log = self._read(view)
-            total = view.evidence.read(tlog.sum_of, self._file)
+            total = view.evidence.read(tlog.crc32_of, self._file)
         except EvidenceError as error:
             yield f"{self._file}: {error.what}"
             return
@@ -277,7 +279,7 @@ class MavlinkStep(Nest):
         Raises:
             EvidenceError: The log or the counters of its recorder cannot be read.
         """
-        counters = view.evidence.read(tlog.told, self._counters_file)
+        counters = view.evidence.read(tlog.read_summary, self._counters_file)
         intervals_us = tuple((name, round(1e6 / rate)) for name, rate in self.rates.items())
         return view.evidence.read(tlog.read, self._file, self.system, counters.ended_us, intervals_us)
 
@@ -288,7 +290,9 @@ class MavlinkStep(Nest):
     @override
     def measure(self, view: View) -> Measured:
         try:
-            measured = tlog.measure(self._read(view), view.evidence.read(tlog.told, self._counters_file).slow_s)
+            measured = tlog.measure(
+                self._read(view), view.evidence.read(tlog.read_summary, self._counters_file).slow_s
+            )
         except EvidenceError:
             measured = tlog.measure(None)
         return measured | follow.measure(view) if self.positions else measured

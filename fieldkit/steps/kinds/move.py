@@ -52,9 +52,11 @@ class PathLeg(Strict):
     def _one_direction(self) -> "PathLeg":
         for key, opposite in (("away", "towards"), ("left", "right")):
             if getattr(self, key) is not None and getattr(self, opposite) is not None:
-                raise schema.complaint(f"a segment has {key} or {opposite}, not both; make two segments", opposite)
+                raise schema.validation_error(
+                    f"a segment has {key} or {opposite}, not both; make two segments", opposite
+                )
         if not any((self.away, self.towards, self.left, self.right)):
-            raise schema.complaint("a segment needs a distance: away, towards, left or right")
+            raise schema.validation_error("a segment needs a distance: away, towards, left or right")
         return self
 
     @classmethod
@@ -119,7 +121,7 @@ class MoveStep(Nest):
             speed_m_s = min(speed_m_s, fastest_m_s)
             if fence_m is not None and geometry.farthest_m(legs) > fence_m:
                 margin_m = min(_FENCE_MARGIN_M, fence_m / 2)
-                path = tuple(filter(None, map(PathLeg.of, geometry.within(legs, fence_m - margin_m)))) or path
+                path = tuple(filter(None, map(PathLeg.of, geometry.clip_path(legs, fence_m - margin_m)))) or path
         update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or robot.drives}
         step = self.model_copy(update=update)
         return super(MoveStep, step).resolved(cast, step.path_s(robot))
@@ -130,10 +132,8 @@ class MoveStep(Nest):
             requested = self.model_copy(update={"within_limits": False}).resolved(cast).motion
             permitted = self.resolved(cast).motion
             if permitted != requested:
-                yield (
-                    f"{cast[self.robot].name} moves {geometry.in_words(permitted)}; {geometry.in_words(requested)} "
-                    "is beyond its limits"
-                )
+                permitted_text, requested_text = geometry.describe_move(permitted), geometry.describe_move(requested)
+                yield f"{cast[self.robot].name} moves {permitted_text}; {requested_text} is beyond its limits"
         yield from super().adjustments(cast)
 
     @property
@@ -172,11 +172,11 @@ class MoveStep(Nest):
     @property
     def _name_pattern(self) -> str:
         """Pattern of the names of jobs and files, see `driving.planned`."""
-        return self.own_name("{}")
+        return self.prefixed_name("{}")
 
     @property
     def _log(self) -> str:
-        return self.own_name(drive_log.FILE)
+        return self.prefixed_name(drive_log.FILE)
 
     @override
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
@@ -189,7 +189,7 @@ class MoveStep(Nest):
                 f"the laptop is silent for {drive.lease:g} s, and {robot.profile.limits.fence_m:g} m from its place"
             )
         duration = f"for up to {round(self.path_s(robot), 1):g} s"
-        yield f"{robot.name} moves {geometry.in_words(self.motion)}, {duration}{driving_note}"
+        yield f"{robot.name} moves {geometry.describe_move(self.motion)}, {duration}{driving_note}"
         yield from super().dry_run_notes(scene)
 
     @override
@@ -300,7 +300,7 @@ class MoveStep(Nest):
         return None
 
     @override
-    def asks(self) -> bool:
+    def may_prompt(self) -> bool:
         return True
 
     @override

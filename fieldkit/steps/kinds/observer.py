@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.core.columns import prefixed
+from fieldkit.core.columns import step_prefixed
 from fieldkit.core.model import Fault, FaultKind, Role
 from fieldkit.measure.evidence import recovery
 from fieldkit.remote.jobs import Job
@@ -69,16 +69,16 @@ class Observer:
             )
         job = Job(
             folder=self.scene.folder,
-            name=prefixed(self.name, f"fault-{self.fault.kind}"),
+            name=step_prefixed(self.name, f"fault-{self.fault.kind}"),
             argv=argv,
             limit_s=limit_s,
             log=self._file,
             ready="log:watching" if self._is_kill else "log:bytes from",
         )
         if self._is_kill:
-            return Planned(self.role, job, program="sh", ends=BY_FIELDKIT)
+            return Planned(self.role, job, program="sh", permitted_causes=BY_FIELDKIT)
         program = self.scene.robot(self.role).profile.tools.ping
-        return Planned(self.role, job, program=program, tool=Tool.PING, ends=BY_FIELDKIT)
+        return Planned(self.role, job, program=program, tool=Tool.PING, permitted_causes=BY_FIELDKIT)
 
     def heals(self, lasted_s: str, limit_s: float) -> Planned:
         """Return the job that records the duration of the cause and ends when the robot has recovered.
@@ -91,13 +91,13 @@ class Observer:
         arguments = (lasted_s, f"{self._interval_s:g}", self._file, answer, str(round(HEALED_S / self._interval_s)))
         job = Job(
             folder=self.scene.folder,
-            name=prefixed(self.name, f"fault-{self.fault.kind}-heals"),
+            name=step_prefixed(self.name, f"fault-{self.fault.kind}-heals"),
             argv=("sh", "-c", _HEALS, "sh", *arguments),
             limit_s=limit_s,
-            log=prefixed(self.name, recovery.log_file(self.fault.kind)),
-            stdout=prefixed(self.name, recovery.note_file(self.fault.kind)),
+            log=step_prefixed(self.name, recovery.log_file(self.fault.kind)),
+            stdout=step_prefixed(self.name, recovery.note_file(self.fault.kind)),
         )
-        return Planned(self.role, job, program="grep", ends=BY_ITSELF_OR_LIMIT)
+        return Planned(self.role, job, program="grep", permitted_causes=BY_ITSELF_OR_LIMIT)
 
     @property
     def _is_kill(self) -> bool:
@@ -105,7 +105,7 @@ class Observer:
 
     @property
     def _file(self) -> str:
-        return prefixed(self.name, recovery.observed_file(self.fault.kind))
+        return step_prefixed(self.name, recovery.observed_file(self.fault.kind))
 
     @property
     def _interval_s(self) -> float:

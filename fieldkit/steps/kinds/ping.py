@@ -79,7 +79,7 @@ class PingStep(AlongStep):
         forwarded: Whether robots forward for each other; preflight then looks for a routing daemon on all of them.
     """
 
-    columns = (*ping.COLUMNS, *ping.SENT_COLUMNS, *ping.WAY_COLUMNS)
+    columns = (*ping.COLUMNS, *ping.SENT_COLUMNS, *ping.MOTION_COLUMNS)
     cross_checks = ping_checks.CROSS_CHECKS
     needs_complete_capture = False
     duration_key = "count"
@@ -95,7 +95,7 @@ class PingStep(AlongStep):
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "PingStep":
         if self.sender == self.receiver:
-            raise schema.complaint(f"{self.sender} cannot ping itself; name another robot", "to")
+            raise schema.validation_error(f"{self.sender} cannot ping itself; name another robot", "to")
         return self
 
     @override
@@ -111,7 +111,7 @@ class PingStep(AlongStep):
             self.sender,
             Job(
                 folder=scene.folder,
-                name=self.own_name("ping"),
+                name=self.prefixed_name("ping"),
                 argv=command_line(scene, self.sender, options, scene.robot(self.receiver).address),
                 limit_s=self.count * self.interval + LAST_REPLY_S + 10.0,
                 log=self._log,
@@ -155,11 +155,11 @@ class PingStep(AlongStep):
 
     @property
     def _file(self) -> str:
-        return self.own_name(ping.FILE)
+        return self.prefixed_name(ping.FILE)
 
     @property
     def _log(self) -> str:
-        return self.own_name(f"{self.sender}-ping.log")
+        return self.prefixed_name(f"{self.sender}-ping.log")
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
@@ -183,7 +183,9 @@ class PingStep(AlongStep):
         elif result.transmitted < self.count:
             yield f"{self._file}: ping sent {result.transmitted} of {self.count} requests"
         payload_bytes, window = self._payload_bytes(view.scene.protocol), view.attempt_window(self.sender)
-        yield from (f"{self._file}: {why}" for why in ping_checks.within(result, self.count, payload_bytes, window))
+        yield from (
+            f"{self._file}: {why}" for why in ping_checks.check_output(result, self.count, payload_bytes, window)
+        )
         if result.received is not None and result.received != len(result.answers):
             yield f"{self._file}: ping counted {result.received} answers and printed {len(result.answers)}"
         # iputils reports 0 for a negative time, and "time of day goes back" in its log.
@@ -207,10 +209,10 @@ class PingStep(AlongStep):
             capture = view.capture(role)
             if capture is None or result.payload_bytes is None or (capture.packets.time_ns == NO_TIME).any():
                 continue
-            candidates = echoes.of_each_ping(capture.packets, source, destination, result.payload_bytes)
+            candidates = echoes.captured_pings(capture.packets, source, destination, result.payload_bytes)
             on_sender = role == self.sender
             reasons = [
-                list(ping_checks.beside(result, candidate, self.interval, role, asks=on_sender))
+                list(ping_checks.compare_with_capture(result, candidate, self.interval, role, asks=on_sender))
                 for candidate in candidates
             ]
             yield from (f"{self._file}: {why}" for why in min(reasons, key=len, default=[]))
@@ -267,7 +269,7 @@ class PingStep(AlongStep):
         replied_ns = [at_ns for reply in result.answers if (at_ns := reply.at_utc_ns)] if result else []
         ends = self.sender, self.receiver
         gap = ping.measure_gap(result, self.interval) if self.gap else Measured()
-        return ping.measure(result) | gap | where.measure(view.evidence, ping.WAY_COLUMNS, ends, replied_ns)
+        return ping.measure(result) | gap | where.measure(view.evidence, ping.MOTION_COLUMNS, ends, replied_ns)
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

@@ -20,7 +20,17 @@ from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import ros_master, variants
 from fieldkit.steps.base import Step, StepName
-from fieldkit.steps.scene import BY_ITSELF, BY_LIMIT, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
+from fieldkit.steps.scene import (
+    BY_ITSELF,
+    BY_LIMIT,
+    Announce,
+    CommandResult,
+    Need,
+    Planned,
+    RecordedFile,
+    Refusal,
+    Scene,
+)
 from fieldkit.steps.variants import Recorder, Tool
 from fieldkit.steps.view import View
 
@@ -116,7 +126,7 @@ class RecordStep(Step):
             self.robot,
             Job(
                 folder=scene.folder,
-                name=self.own_name("record"),
+                name=self.prefixed_name("record"),
                 argv=with_environment(argv, setup=ros.command.setup, environment=robot.ros_environment),
                 # A recorder without an option for the duration is stopped by SIGINT at the limit of the job.
                 limit_s=self.duration + START_AND_CLOSE_S if has_duration else self.duration,
@@ -126,7 +136,7 @@ class RecordStep(Step):
             program=ros.command.record[0],
             setup=ros.command.setup,
             tool=Tool.RECORDER,
-            ends=BY_ITSELF if has_duration else BY_LIMIT,
+            permitted_causes=BY_ITSELF if has_duration else BY_LIMIT,
             least_s=self.duration,
         )
 
@@ -170,7 +180,9 @@ class RecordStep(Step):
         ros = _ros(robot)
         command = ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
         argv = with_environment(command, setup=ros.command.setup, environment=robot.ros_environment)
-        yield Need(self.robot, "ROS", argv, lambda answer: _judge(robot, answer), explains=ros.command.record[0])
+        yield Need(
+            self.robot, "ROS", argv, lambda answer: _judge(robot, answer), missing_program=ros.command.record[0]
+        )
         yield from ros_master.needs(scene, self.robot, explains=ros.command.record[0])
 
     @override
@@ -183,13 +195,13 @@ class RecordStep(Step):
 
     @property
     def _log(self) -> str:
-        return self.own_name(f"{self.robot}-record.log")
+        return self.prefixed_name(f"{self.robot}-record.log")
 
     @override
     def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
         robot = cast[self.robot]
         size_bytes = _BAG_BYTES + self.duration * sum(_bytes_per_s(robot, topic) for topic in self.topics)
-        yield RecordedFile(self.robot, self.bag(robot), size_bytes, called=self.name)
+        yield RecordedFile(self.robot, self.bag(robot), size_bytes, alias=self.name)
 
     @override
     def records_on(self) -> frozenset[Role]:
@@ -260,7 +272,7 @@ def _ros(robot: Robot) -> Ros:
         raise ConfigurationError(
             f"{robot.name} cannot record: its profile {robot.profile.name} has no ros",
             remedy="let another robot record, or describe its ROS under ros: in the profile: "
-            + locations.own_copy(robot.profile.name),
+            + locations.copy_profile_command(robot.profile.name),
         )
     return robot.profile.ros
 
@@ -275,7 +287,7 @@ def _bytes_per_s(robot: Robot, name: str) -> float:
     return _UNKNOWN_BYTES_PER_S
 
 
-def _judge(robot: Robot, answer: Said) -> tuple[Verdict, str, str]:
+def _judge(robot: Robot, answer: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy on the ROS environment after the setup files."""
     ros, profile = _ros(robot), robot.profile.name
     command = ros.command

@@ -30,14 +30,14 @@ _Word = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 
 
 def _is_path(text: str) -> str:
-    if why := printed.problem_of_path(text):
-        raise schema.complaint(f"{text!r} is not a valid JMESPath: {why}")
+    if why := printed.path_error(text):
+        raise schema.validation_error(f"{text!r} is not a valid JMESPath: {why}")
     return text
 
 
 def _is_expression(text: str) -> str:
-    if why := printed.problem_of_expression(text):
-        raise schema.complaint(f"{text!r} is not a regular expression (RE2) with one group: {why}")
+    if why := printed.expression_error(text):
+        raise schema.validation_error(f"{text!r} is not a regular expression (RE2) with one group: {why}")
     return text
 
 
@@ -58,13 +58,15 @@ class PrintedColumn(Strict):
 
     name: Annotated[
         str,
-        schema.shaped(
+        schema.pattern_field(
             r"^[a-z][a-z0-9_]{0,40}$", "a name: small letters, digits and _, a small letter first, 41 in all"
         ),
     ]
     unit: Annotated[
         str,
-        schema.shaped(r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit: 1 to 16 characters, none of them , ; or quotes"),
+        schema.pattern_field(
+            r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit: 1 to 16 characters, none of them , ; or quotes"
+        ),
     ]
     meaning: Annotated[str, Field(max_length=300)] = ""
     path: Annotated[str, AfterValidator(_is_path)] | None = Field(default=None, alias="json")
@@ -75,7 +77,7 @@ class PrintedColumn(Strict):
     @schema.model_validator(mode="after")
     def _has_one_source(self) -> "PrintedColumn":
         if (self.path is None) == (self.expression is None):
-            raise schema.complaint(f"the column {self.name} needs either json: or regex:")
+            raise schema.validation_error(f"the column {self.name} needs either json: or regex:")
         return self
 
     @property
@@ -173,18 +175,20 @@ class RunStep(Step):
     @schema.model_validator(mode="after")
     def _can_be_run(self) -> "RunStep":
         if bool(self.command.strip()) == bool(self.argv):
-            raise schema.complaint("the step needs either command: or argv:")
+            raise schema.validation_error("the step needs either command: or argv:")
         try:
             words = self.words
         except ValueError as error:
-            raise schema.complaint(f"{self.command!r} cannot be split into words: {error}", "command") from None
+            raise schema.validation_error(
+                f"{self.command!r} cannot be split into words: {error}", "command"
+            ) from None
         self._check_roles()
         if operator := next((word for word in shlex.split(self.command) if word in _SHELL_OPERATORS), None):
-            raise schema.complaint(
+            raise schema.validation_error(
                 f"{operator} is a shell operator, but no shell runs this command; write sh -c '...'", "command"
             )
         if not words[0]:
-            raise schema.complaint(
+            raise schema.validation_error(
                 "the program, which is the first word, is empty", "argv" if self.argv else "command"
             )
         self._check_variables()
@@ -193,35 +197,37 @@ class RunStep(Step):
     def _check_variables(self) -> None:
         for index, word in enumerate(self.words):
             if why := arguments.problem(word, has_program=self.put is not None):
-                raise schema.complaint(why, *(("argv", index) if self.argv else ("command",)))
+                raise schema.validation_error(why, *(("argv", index) if self.argv else ("command",)))
         program = self.words[0]
         if arguments.depends_on_repeat(program):
             why = f"the name of the program must not depend on a variable, but {program} does; use an argument"
-            raise schema.complaint(why, "argv" if self.argv else "command")
+            raise schema.validation_error(why, "argv" if self.argv else "command")
         if self.put is None:
             return
         if not any(arguments.PUT in arguments.names(word) for word in self.words):
             why = f"the command does not run {self.put.name}: write {{put}} in the command for its path"
-            raise schema.complaint(why, "put")
+            raise schema.validation_error(why, "put")
         if program == f"{{{arguments.PUT}}}" and not self.put.executable:
             why = f"{self.put.file} is not executable: chmod +x it, or name its interpreter: python3 {{put}}"
-            raise schema.complaint(why, "put")
+            raise schema.validation_error(why, "put")
 
     def _check_roles(self) -> None:
         try:
             self.roles()
         except ValueError as error:
-            raise schema.complaint(f"an address needs a valid role, as in {{address.receiver}}: {error}") from None
+            raise schema.validation_error(
+                f"an address needs a valid role, as in {{address.receiver}}: {error}"
+            ) from None
 
     @schema.model_validator(mode="after")
     def _has_valid_columns(self) -> "RunStep":
         names = [column.name for column in self.figures]
         for index, name in enumerate(names):
             if name in names[:index]:
-                raise schema.complaint(f"there is already a column {name}", "columns", index, "name")
+                raise schema.validation_error(f"there is already a column {name}", "columns", index, "name")
         for name in self.expect.values:
             if name not in names:
-                raise schema.complaint(f"there is no column {name}", "expect", "values", name)
+                raise schema.validation_error(f"there is no column {name}", "expect", "values", name)
         return self
 
     @property
@@ -245,12 +251,12 @@ class RunStep(Step):
         argv = [arguments.fill_in(word, values, address) for word in self.words]
         job = Job(
             folder=scene.folder,
-            name=self.own_name("run"),
+            name=self.prefixed_name("run"),
             argv=tuple(argv),
             limit_s=self.limit,
             log=self._log,
             stdout=self._output,
-            output_limit_bytes=printed.MOST_BYTES,
+            output_limit_bytes=printed.MAX_OUTPUT_BYTES,
         )
         remedy = f"install {argv[0]}, or correct the command of this run in the procedure"
         # Preflight searches for the program; a copied program does not exist on the robot yet.
@@ -261,7 +267,7 @@ class RunStep(Step):
     def _copied_program(self) -> PutProgram | None:
         if self.put is None:
             return None
-        return PutProgram(self.robot, self.put, programs.path(self.own_name("run"), self.put.name))
+        return PutProgram(self.robot, self.put, programs.path(self.prefixed_name("run"), self.put.name))
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -312,11 +318,11 @@ class RunStep(Step):
 
     @property
     def _log(self) -> str:
-        return self.own_name(f"{self.robot}-run.log")
+        return self.prefixed_name(f"{self.robot}-run.log")
 
     @property
     def _output(self) -> str:
-        return self.own_name(self.output)
+        return self.prefixed_name(self.output)
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
@@ -327,7 +333,7 @@ class RunStep(Step):
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason for a wrong exit code, unreadable output, and each missing value or value out of bounds."""
         after = view.evidence.read_or_none(host.state, host.after(self.robot))
-        ending = (after.endings or {}).get(self.own_name("run")) if after else None
+        ending = (after.endings or {}).get(self.prefixed_name("run")) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.expect.code:
             yield f"{view.scene.robot(self.robot).name}: {self._program_name} ended with exit code {ending.code}"
         try:

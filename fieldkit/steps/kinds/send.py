@@ -17,7 +17,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import FileName, Step
 from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.nest import Nest
-from fieldkit.steps.scene import GOOD_BIT_S, Announce, Need, Planned, RecordedFile, Refusal, Said, Scene
+from fieldkit.steps.scene import GOOD_BIT_S, Announce, CommandResult, Need, Planned, RecordedFile, Refusal, Scene
 from fieldkit.steps.view import View
 
 FILE: Final = "send.bin"
@@ -68,7 +68,7 @@ class SendStep(TransferStep):
         return None
 
     def _sent(self, scene: Scene) -> RecordedFile:  # noqa: ARG002 (no step records it)
-        return RecordedFile(self.sender, self.own_name(FILE), self.size)
+        return RecordedFile(self.sender, self.prefixed_name(FILE), self.size)
 
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (there is no recorder)
         return iter(())
@@ -87,7 +87,7 @@ class SendStep(TransferStep):
             argv = ("sh", "-c", _COPY, "sh", self._path, sent_file)
         job = Job(
             folder=scene.folder,
-            name=self.own_name("make"),
+            name=self.prefixed_name("make"),
             argv=argv,
             limit_s=30.0 + self.size / _MADE_BYTES_PER_S,
             log=self._log,
@@ -101,7 +101,7 @@ class SendStep(TransferStep):
 
     @property
     def _log(self) -> str:
-        return self.own_name(f"{self.sender}-make.log")
+        return self.prefixed_name(f"{self.sender}-make.log")
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
@@ -109,7 +109,7 @@ class SendStep(TransferStep):
         if self.file is not None:
             yield Need(self.sender, f"file {self.file}", ("sh", "-c", _COUNT, "sh", self._path, "-"), self._judge)
 
-    def _judge(self, answer: Said) -> tuple[Verdict, str, str]:
+    def _judge(self, answer: CommandResult) -> tuple[Verdict, str, str]:
         """Return verdict, detail and remedy on the existence and the size of the file."""
         if not answer.ok or not _SIZE.fullmatch(answer.text.strip()):
             remedy = f"scp {quote((self.file or '',))} to it, or correct file: in the procedure"
@@ -137,7 +137,7 @@ class SendStep(TransferStep):
 
     @override
     def files(self) -> tuple[str, ...]:
-        return (*super().files(), self.own_name(FILE), self._log)
+        return (*super().files(), self.prefixed_name(FILE), self._log)
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:

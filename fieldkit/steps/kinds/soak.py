@@ -28,7 +28,7 @@ LIMIT_S: Final = 900.0
 _FOREVER_S: Final = 86_400
 """Maximum duration that iperf3 accepts."""
 
-_STALLS: Final = stalls.declared("soak", "the load", 69)
+_STALLS: Final = stalls.declare_columns("soak", "the load", 69)
 
 # Prints "flows" when 10 kB have been sent by interface $1, and executes the command after it. iperf3 itself reports
 # its packets only after a second, and old versions do not report at all while their output is a file.
@@ -67,16 +67,18 @@ class SoakStep(LoadOptions, Nest):
         interface = scene.robot(self.sender).profile.radio.interface
         client = self.client(scene, "-t", str(_FOREVER_S))
         ends = {
-            self.receiver: (self.server(), jobs.bound(Protocol.TCP, self.port)),
+            self.receiver: (self.server(), jobs.ready_when_bound(Protocol.TCP, self.port)),
             self.sender: (("sh", "-c", _FLOWS, "sh", interface, *client), "log:flows"),
         }
         server, sender = (
             Planned(
                 role,
-                Job(scene.folder, self.own_name("soak"), argv, limit_s=limit_s, log=self._log(role), ready=ready),
+                Job(
+                    scene.folder, self.prefixed_name("soak"), argv, limit_s=limit_s, log=self._log(role), ready=ready
+                ),
                 program=PROGRAM,
                 # The server exits after its client.
-                ends=BY_FIELDKIT | (BY_ITSELF if role == self.receiver else frozenset()),
+                permitted_causes=BY_FIELDKIT | (BY_ITSELF if role == self.receiver else frozenset()),
             )
             for role, (argv, ready) in ends.items()
         )
@@ -109,7 +111,7 @@ class SoakStep(LoadOptions, Nest):
         return (self._log(self.sender), self._log(self.receiver))
 
     def _log(self, role: Role) -> str:
-        return self.own_name(f"{role}-soak.log")
+        return self.prefixed_name(f"{role}-soak.log")
 
     @override
     def output_columns(self) -> tuple[Column, ...]:

@@ -13,7 +13,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Field
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Planned, Scene
@@ -44,9 +44,11 @@ class TogetherStep(Nest):
     def _can_run_in_parallel(self) -> "TogetherStep":
         if (count := _max_parallel(self)) > MAX_PARALLEL:
             why = f"{count} steps at the same time are more than {MAX_PARALLEL}: leave some out"
-            raise schema.complaint(why, "during")
+            raise schema.validation_error(why, "during")
         for kind, location in _operator_steps(self):
-            raise schema.complaint(f"{kind} may prompt the operator, so no step may run at the same time", *location)
+            raise schema.validation_error(
+                f"{kind} may prompt the operator, so no step may run at the same time", *location
+            )
         return self
 
     @override
@@ -61,7 +63,7 @@ class TogetherStep(Nest):
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        inner = replace(scene, halt=scene.halt.inside())
+        inner = replace(scene, halt=scene.halt.child())
         prepared = self._each([partial(entry.step.prepare, inner, testbed) for entry in self.during], inner, testbed)
 
         def carry_out(announce: Announce) -> None:
@@ -77,17 +79,17 @@ class TogetherStep(Nest):
         """Make all calls at the same time; if one fails, stop the jobs for which the others wait."""
 
         def end() -> None:
-            scene.halt.call()
+            scene.halt.set()
             with suppress(FieldkitError):  # the first error is reported
                 self.end_inside(scene, testbed)
 
         try:
-            return together(lambda call: call(), calls, end_others=end)
+            return run_parallel(lambda call: call(), calls, end_others=end)
         except Exception:
             end()  # also stops jobs of steps that did not fail
             raise
         except BaseException:
-            scene.halt.call()  # the handler of Ctrl-C stops the jobs
+            scene.halt.set()  # the handler of Ctrl-C stops the jobs
             raise
 
     @override
@@ -103,7 +105,7 @@ def _operator_steps(nest: Nest) -> Iterator[tuple[str, schema.Location]]:
     """Yield kind and location of each step inside, at any depth, that may prompt the operator."""
     for index, entry in enumerate(nest.during):
         location = ("during", index, entry.kind)
-        if entry.step.asks():
+        if entry.step.may_prompt():
             yield entry.kind, location
         if isinstance(entry.step, Nest):
             yield from ((kind, (*location, *inside)) for kind, inside in _operator_steps(entry.step))

@@ -9,8 +9,8 @@ from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
-from fieldkit.core.model import Protocol, Role, in_order
-from fieldkit.core.threads import together
+from fieldkit.core.model import Protocol, Role, sort_roles
+from fieldkit.core.threads import run_parallel
 from fieldkit.measure.checks import topic_sources
 from fieldkit.measure.transfers import stalls
 from fieldkit.remote import agent, jobs
@@ -18,7 +18,7 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
 from fieldkit.steps.along import AlongStep
-from fieldkit.steps.middlewares import Discovery, Over
+from fieldkit.steps.middlewares import Discovery, Middleware
 from fieldkit.steps.scene import (
     BY_FIELDKIT,
     BY_ITSELF,
@@ -92,7 +92,7 @@ class TopicsStep(StreamOptions, AlongStep):
         duration_s = self.patience + self.duration + _OVERHEAD_S
         job = Job(
             folder=scene.folder,
-            name=self.own_name(verb),
+            name=self.prefixed_name(verb),
             argv=streams.agent_command(
                 robot, verb, self.agent_arguments(scene, role), self._file(role), environment=self.environment(robot)
             ),
@@ -102,7 +102,9 @@ class TopicsStep(StreamOptions, AlongStep):
             ready=None if publishes else "log:up,",
         )
         setup, program = streams.setup(robot), robot.profile.tools.python
-        return Planned(role, job, program=program, setup=setup, ends=BY_ITSELF if publishes else BY_FIELDKIT)
+        return Planned(
+            role, job, program=program, setup=setup, permitted_causes=BY_ITSELF if publishes else BY_FIELDKIT
+        )
 
     def _server(self, scene: Scene, role: Role) -> Planned:
         """Return the job of the router or of the ROS master."""
@@ -119,19 +121,19 @@ class TopicsStep(StreamOptions, AlongStep):
             argv, program = with_environment(command, setup=setup, environment=addresses), MASTER
         job = Job(
             folder=scene.folder,
-            name=self.own_name("serve"),
+            name=self.prefixed_name("serve"),
             argv=argv,
             limit_s=3 * (self.patience + self.duration + _OVERHEAD_S),
-            log=self.own_name(f"{role}-serve.log"),
-            ready="log:up," if is_router else jobs.bound(Protocol.TCP, self.listening_port),
+            log=self.prefixed_name(f"{role}-serve.log"),
+            ready="log:up," if is_router else jobs.ready_when_bound(Protocol.TCP, self.listening_port),
         )
-        return Planned(role, job, program=program, setup=setup, ends=BY_FIELDKIT)
+        return Planned(role, job, program=program, setup=setup, permitted_causes=BY_FIELDKIT)
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         """Install the agent and start all jobs except the publisher; return the function that publishes."""
-        roles = in_order(self.participants)
-        together(lambda role: agent.install(testbed.shells[role]), roles)
+        roles = sort_roles(self.participants)
+        run_parallel(lambda role: agent.install(testbed.shells[role]), roles)
         *before, publish = self.jobs(scene)
         for planned in before:
             jobs.start(testbed.shells[planned.role], planned.job)
@@ -173,7 +175,7 @@ class TopicsStep(StreamOptions, AlongStep):
         listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}
         if self.server_role:
             # Clients of a router do not listen.
-            listeners = listeners if self.over is Over.ROS1 else set()
+            listeners = listeners if self.over is Middleware.ROS1 else set()
             listeners |= {(self.server_role, self.sender if self.server_role != self.sender else self.receiver)}
         ports = (ListeningPort(role, self.listening_port, peer, by="domain") for role, peer in listeners)
         return tuple(sorted(ports, key=lambda port: (port.role, port.peer)))
@@ -182,7 +184,7 @@ class TopicsStep(StreamOptions, AlongStep):
     def needs(self, scene: Scene) -> Iterator[Need]:
         """Yield the check of the middleware's Python package for each robot that needs it; a ROS master does not."""
         masters = {self.server_role} if self.discovery_method is Discovery.MASTER else set()
-        for role in in_order(self.participants - masters):
+        for role in sort_roles(self.participants - masters):
             yield self.need(role, scene.robot(role))
 
     @override
@@ -192,13 +194,13 @@ class TopicsStep(StreamOptions, AlongStep):
     @override
     def files(self) -> tuple[str, ...]:
         ends = [name for role in (self.receiver, self.sender) for name in (self._file(role), self._log(role))]
-        return (*ends, *([self.own_name(f"{self.server_role}-serve.log")] if self.server_role else []))
+        return (*ends, *([self.prefixed_name(f"{self.server_role}-serve.log")] if self.server_role else []))
 
     def _file(self, role: Role) -> str:
-        return self.own_name(f"{role}-topic.bin")
+        return self.prefixed_name(f"{role}-topic.bin")
 
     def _log(self, role: Role) -> str:
-        return self.own_name(f"{role}-topic.log")
+        return self.prefixed_name(f"{role}-topic.log")
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
@@ -249,7 +251,7 @@ class TopicsStep(StreamOptions, AlongStep):
         flow, packets = self._traffic(view), self._packets(view)
         stall_values = topic_stalls.measure(flow, ends, packets, self._schedule)
         measured = topics.measure(flow, *ends, *packets) | stall_values
-        measured = measured.without(topics.without_captures(measured, topic_evidence.dropped(self, view)))
+        measured = measured.without(topics.withheld_reasons(measured, topic_evidence.dropped(self, view)))
         measured = topic_evidence.checked(self, view, logs, measured)
         return measured | topics.withheld_mark(topic_evidence.dropped(self, view))
 

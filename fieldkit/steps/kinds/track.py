@@ -64,9 +64,9 @@ class Spot(Strict):
     def _is_one_place(self) -> "Spot":
         on_earth, in_frame = (self.lat, self.lon), (self.frame, self.x, self.y)
         if None in (in_frame if self.frame is not None else on_earth) or {*on_earth, *in_frame} - {None} == set():
-            raise schema.complaint("a position needs lat and lon, or frame, x and y")
+            raise schema.validation_error("a position needs lat and lon, or frame, x and y")
         if self.frame is not None and (*on_earth, self.alt) != (None, None, None):
-            raise schema.complaint("a position has lat and lon, or frame, x and y, not both")
+            raise schema.validation_error("a position has lat and lon, or frame, x and y, not both")
         return self
 
     @property
@@ -103,7 +103,7 @@ class TrackedRobot(Strict):
     @schema.model_validator(mode="after")
     def _has_one_source(self) -> "TrackedRobot":
         if (self.topic is None) is (self.at is None):
-            raise schema.complaint("a robot needs either topic or at")
+            raise schema.validation_error("a robot needs either topic or at")
         return self
 
 
@@ -144,12 +144,12 @@ class TrackStep(Nest):
         arguments = (recorder.bag(scene.robot(planned.role)), str(self._period_s(scene, planned.role)))
         job = replace(
             planned.job,
-            name=self.own_name("track"),
+            name=self.prefixed_name("track"),
             argv=("sh", "-c", _RECORDS, "sh", *arguments, *planned.job.argv),
             limit_s=recorder.duration,
             ready="log:recording",
         )
-        return replace(planned, job=job, ends=BY_FIELDKIT, least_s=0.0)
+        return replace(planned, job=job, permitted_causes=BY_FIELDKIT, least_s=0.0)
 
     def _recorders(self, duration_s: float) -> Mapping[Role, RecordStep]:
         """Return the equivalent `record` step of each robot with a topic, for a duration."""

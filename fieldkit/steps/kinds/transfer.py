@@ -45,7 +45,7 @@ from fieldkit.steps.view import View, capture_around
 
 BagName = Annotated[
     str,
-    schema.shaped(
+    schema.pattern_field(
         r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$",
         "the name of a recording, scan, or of its file, scan.bag or scan/scan_0.db3",
     ),
@@ -92,7 +92,7 @@ class TransferStep(Step):
     @schema.model_validator(mode="after")
     def _has_two_ends(self) -> "TransferStep":
         if self.sender == self.receiver:
-            raise schema.complaint(f"{self.sender} cannot send to itself; name another robot", "to")
+            raise schema.validation_error(f"{self.sender} cannot send to itself; name another robot", "to")
         return self
 
     @override
@@ -111,7 +111,7 @@ class TransferStep(Step):
     def _sent(self, scene: Scene) -> RecordedFile:
         """Return the recording to send; the first one if none has the name, which `refusals` reports."""
         recordings = scene.recorded[self.sender]
-        return next((file for file in recordings if self.file in {file.name, file.called}), recordings[0])
+        return next((file for file in recordings if self.file in {file.name, file.alias}), recordings[0])
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
@@ -126,22 +126,22 @@ class TransferStep(Step):
             self.receiver,
             Job(
                 folder=scene.folder,
-                name=self.own_name(_LISTEN),
+                name=self.prefixed_name(_LISTEN),
                 argv=netcat.listen(listener_variant, listener, scene.protocol, self.port, math.ceil(self.idle)),
                 limit_s=self.limit,
                 log=self._logs[0],
                 stdout=self._into,
-                ready=jobs.bound(scene.protocol, self.port),
+                ready=jobs.ready_when_bound(scene.protocol, self.port),
             ),
             program=listener,
             tool=Tool.NETCAT,
-            ends=BY_ITSELF_OR_LIMIT,
+            permitted_causes=BY_ITSELF_OR_LIMIT,
         )
         yield Planned(
             self.sender,
             Job(
                 folder=scene.folder,
-                name=self.own_name(_SEND),
+                name=self.prefixed_name(_SEND),
                 argv=netcat.send(sender_variant, sender, scene.protocol, address, self.port),
                 limit_s=self.limit,
                 log=self._logs[1],
@@ -149,7 +149,7 @@ class TransferStep(Step):
             ),
             program=sender,
             tool=Tool.NETCAT,
-            ends=BY_ITSELF_OR_LIMIT,
+            permitted_causes=BY_ITSELF_OR_LIMIT,
         )
 
     @override
@@ -172,7 +172,7 @@ class TransferStep(Step):
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:
         """Yield a reason if no recording has the name of the file to send."""
         recordings = [file.name for file in scene.recorded[self.sender]]
-        if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).called}:
+        if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).alias}:
             what = f"it cannot send {self.file}: its recorder writes {', '.join(recordings)}"
             leave_out = "leave out file: in the transfer, or " if len(recordings) == 1 else ""
             yield Refusal(self.sender, what, f"{leave_out}write file: {recordings[0]}")
@@ -214,9 +214,11 @@ class TransferStep(Step):
             raise self._late_start(waited_s, f"the listener was stopped after {self.limit:g} s", scene)
         # A sender runs longer than its listener only if the transfer was interrupted; then its limit has passed, too.
         sending.end(jobs.REPLY_S)
-        if oracle is not None and before is not None and scene.here is not None:
+        if oracle is not None and before is not None and scene.laptop_folder is not None:
             after = oracle.delays(*flow)
-            (scene.here / self.own_name(medium.FILE)).write_text(medium.text(before, after), encoding="ascii")
+            (scene.laptop_folder / self.prefixed_name(medium.FILE)).write_text(
+                medium.text(before, after), encoding="ascii"
+            )
 
     def _late_start(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
         """Return the error of a sender that started so late that its loss is not caused by the radio."""
@@ -241,15 +243,15 @@ class TransferStep(Step):
 
     @override
     def laptop_files(self) -> tuple[str, ...]:
-        return (self.own_name(medium.FILE),)
+        return (self.prefixed_name(medium.FILE),)
 
     @property
     def _into(self) -> str:
-        return self.own_name(self.into)
+        return self.prefixed_name(self.into)
 
     @property
     def _logs(self) -> tuple[str, str]:
-        return self.own_name(f"{self.receiver}-listen.log"), self.own_name(f"{self.sender}-send.log")
+        return self.prefixed_name(f"{self.receiver}-listen.log"), self.prefixed_name(f"{self.sender}-send.log")
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
@@ -300,7 +302,7 @@ class TransferStep(Step):
 
     @property
     def _jobs(self) -> tuple[tuple[Role, str], tuple[Role, str]]:
-        return (self.receiver, self.own_name(_LISTEN)), (self.sender, self.own_name(_SEND))
+        return (self.receiver, self.prefixed_name(_LISTEN)), (self.sender, self.prefixed_name(_SEND))
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
         """Return how a netcat ended, as recorded by the robot; None if it was not recorded."""
@@ -309,9 +311,9 @@ class TransferStep(Step):
 
     @override
     def measure(self, view: View) -> Measured:
-        measured = figures.measure(view.evidence, self.transfer(view.scene, view.within), self.own_name(_LISTEN))
+        measured = figures.measure(view.evidence, self.transfer(view.scene, view.within), self.prefixed_name(_LISTEN))
         if self._shares_udp_counters(view.scene):
-            measured = host.shared(measured)
+            measured = host.without_shared_counters(measured)
         if self._shares_port(view):
             measured = measured.without(dict.fromkeys(paper.COUNTED, "the paper's filter counts another flow, too"))
         return measured
@@ -323,7 +325,9 @@ class TransferStep(Step):
 
     def deliveries(self, view: View) -> Sequence[Delivery]:
         """Return the deliveries of the transfer; see `SendsFlow.deliveries`."""
-        return transfer_stalls.read(view.evidence, self.transfer(view.scene, view.within), self.own_name(_LISTEN))
+        return transfer_stalls.read(
+            view.evidence, self.transfer(view.scene, view.within), self.prefixed_name(_LISTEN)
+        )
 
     def _shares_port(self, view: View) -> bool:
         """Return True if another flow in the same capture uses its port, also in the reverse direction."""

@@ -32,7 +32,7 @@ class WaitStep(AlongStep):
     @schema.model_validator(mode="after")
     def _has_one_end(self) -> "WaitStep":
         if [self.duration is not None, self.until is not None, self.along].count(True) != 1:
-            raise schema.complaint("a wait needs exactly one of duration, until and along: true")
+            raise schema.validation_error("a wait needs exactly one of duration, until and along: true")
         return self
 
     @override
@@ -66,7 +66,7 @@ class WaitStep(AlongStep):
         return ()
 
     @override
-    def asks(self) -> bool:
+    def may_prompt(self) -> bool:
         return self.until is not None
 
     @override

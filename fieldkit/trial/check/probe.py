@@ -8,7 +8,7 @@ from typing import Final
 from fieldkit.core.deadline import Deadline
 from fieldkit.remote.command import quote
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.scene import Said
+from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check import tools
 
 # In addition to the time of the tools; a command can hang, such as df on a dead network drive.
@@ -17,9 +17,9 @@ PROBE_S: Final = 20.0 + tools.PROBE_S
 _SCRIPT: Final = resources.files("fieldkit.trial.check").joinpath("probe.sh").read_text(encoding="ascii")
 _HEAD: Final = re.compile(r"^==> (.+): ([0-9]{1,3}) <==$", re.MULTILINE)
 
-Sections = Mapping[str, Said]
+Sections = Mapping[str, CommandResult]
 
-NOTHING: Final = Said(text="", code=Said.MISSING)
+NOTHING: Final = CommandResult(text="", code=CommandResult.MISSING)
 """Result of a section that the robot did not send."""
 
 
@@ -51,8 +51,8 @@ def script(commands: Mapping[str, Sequence[str]]) -> str:
 
 def parse(text: str) -> Sections:
     """Return the sections of a probe's output; of sections with the same name the first is used."""
-    sections: dict[str, Said] = {}
+    sections: dict[str, CommandResult] = {}
     parts = _HEAD.split(text)[1:]
     for name, code, section_text in zip(parts[::3], parts[1::3], parts[2::3], strict=True):
-        sections.setdefault(name, Said(section_text.strip("\n"), int(code)))
+        sections.setdefault(name, CommandResult(section_text.strip("\n"), int(code)))
     return sections

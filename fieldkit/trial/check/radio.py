@@ -7,7 +7,7 @@ from typing import Final
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import locations
 from fieldkit.core.model import Control
-from fieldkit.steps.scene import Said
+from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check.probe import NOTHING, Sections
 from fieldkit.trial.check.report import Report
 
@@ -44,7 +44,7 @@ def judge(robot: Robot, sections: Sections, report: Report) -> None:
         _judge_wifi(robot, sections, report)
     elif sections.get("wireless", NOTHING).ok and "link/ether" in sections.get("interface", NOTHING).text:
         section = sections.get("wifi-info", NOTHING)
-        if section.code == Said.MISSING:
+        if section.code == CommandResult.MISSING:
             report.warn("Wi-Fi", "signal and power save cannot be read without iw", "sudo apt-get install iw")
         else:
             report.warn("Wi-Fi", section.text, f"sudo iw dev {interface} info")
@@ -55,11 +55,13 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     check, section = f"interface {name}", sections.get("interface", NOTHING)
     flags = _FLAGS.search(section.text)
     addresses = _ADDRESS.findall(section.text)
-    if section.code == Said.MISSING:
+    if section.code == CommandResult.MISSING:
         report.fail(check, "ip is not installed", "sudo apt-get install iproute2")
     elif flags is None or is_missing(sections):
         report.fail(
-            check, section.text, f"ip link   # then correct radio.interface: {locations.own_copy(robot.profile.name)}"
+            check,
+            section.text,
+            f"ip link   # then correct radio.interface: {locations.copy_profile_command(robot.profile.name)}",
         )
     elif "UP" not in flags["flags"].split(","):
         report.fail(check, "down", f"sudo ip link set {name} up")
@@ -76,7 +78,7 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
 def is_missing(sections: Sections) -> bool:
     """Return True if the robot has no interface of the profile's name."""
     section = sections.get("interface", NOTHING)
-    return section.code != Said.MISSING and _FLAGS.search(section.text) is None
+    return section.code != CommandResult.MISSING and _FLAGS.search(section.text) is None
 
 
 def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:

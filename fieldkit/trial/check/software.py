@@ -13,7 +13,7 @@ from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
-from fieldkit.steps.scene import Need, Planned, Said
+from fieldkit.steps.scene import CommandResult, Need, Planned
 from fieldkit.steps.variants import Tool, Variants
 from fieldkit.trial.check import radio, tools
 from fieldkit.trial.check.probe import NOTHING, Sections
@@ -68,23 +68,23 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
     remedies = {planned.program: planned.remedy for planned in _planned(plan, role)}
     if profile.ros is not None and profile.ros.bridge is not None:
-        remedies[profile.ros.bridge.program] = f"{_BRIDGE}: {locations.own_copy(profile.name)}"
+        remedies[profile.ros.bridge.program] = f"{_BRIDGE}: {locations.copy_profile_command(profile.name)}"
     present = [program for program in programs if sections.get(_section(program), NOTHING).ok]
     report.ok("programs", ", ".join(present) or "none found")
     needs = _needs(plan, role)
     # A recorder that its setup file hides is explained by the finding on that file.
-    explained = {need.explains for need in needs if not sections.get(need.name, NOTHING).ok}
+    explained = {need.missing_program for need in needs if not sections.get(need.name, NOTHING).ok}
     for program in programs:
         if program not in present and program not in explained:
             package = _PACKAGES.get(Path(program).name)
             correct = remedies.get(program) or (
-                f"correct its name in profile {profile.name}: {locations.own_copy(profile.name)}"
+                f"correct its name in profile {profile.name}: {locations.copy_profile_command(profile.name)}"
             )
             report.fail(program, "not found", f"sudo apt-get install {package}" if package else correct)
     interface = profile.radio.interface if radio.is_missing(sections) else None
     for need in needs:
         # A need that uses a missing interface is skipped: the missing interface is reported separately.
-        if (not need.of or need.of in present) and interface not in need.argv:
+        if (not need.required_program or need.required_program in present) and interface not in need.argv:
             report.add(need.name, *need.judge(sections.get(need.name, NOTHING)))
     if len(present) < len(programs):
         return variants.expected(profile)
@@ -99,11 +99,11 @@ def ask_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: 
         RobotError: The agent cannot be installed.
     """
     for need in _needs(plan, role, by_agent=True):
-        if sections.get(_section(need.of), NOTHING).ok:
+        if sections.get(_section(need.required_program), NOTHING).ok:
             agent.install(shell)
             done = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
             text = (done.stdout + done.stderr).decode("utf-8", "replace")
-            report.add(need.name, *need.judge(Said(text, done.exit_code)))
+            report.add(need.name, *need.judge(CommandResult(text, done.exit_code)))
 
 
 def _section(program: str) -> str:
@@ -114,7 +114,7 @@ def _tools(plan: Plan, role: Role) -> set[Tool]:
     return {planned.tool for planned in _planned(plan, role) if planned.tool is not None}
 
 
-def _judge_tools(profile: RobotProfile, said: Said, report: Report) -> Variants:
+def _judge_tools(profile: RobotProfile, said: CommandResult, report: Report) -> Variants:
     try:
         detected = tools.parse(said.text.encode(), profile)
     except RobotError as error:
@@ -135,7 +135,7 @@ def can_record(plan: Plan, role: Role, sections: Sections) -> bool:
     if ros is None or not any(placed.step.live_topics(role) for placed in plan.procedure.walk()):
         return True
     program = ros.command.record[0]
-    needed = (_section(program), *(need.name for need in _needs(plan, role) if need.explains == program))
+    needed = (_section(program), *(need.name for need in _needs(plan, role) if need.missing_program == program))
     return all(sections.get(name, NOTHING).ok for name in needed)
 
 

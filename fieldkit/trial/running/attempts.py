@@ -21,7 +21,7 @@ from fieldkit.steps.motions import STOPPED, Motions
 from fieldkit.steps.origins import Origins
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import gates, hosts, size, store
-from fieldkit.trial.gates import Judged
+from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running.ledger import Ledger
@@ -77,7 +77,7 @@ class Attempts:
             KeyboardInterrupt: As for `FieldkitError`, but an attempt whose steps are done is left to `recover`.
             OSError: The disk is full or was removed.
         """
-        self._robots.demand_up()
+        self._robots.check_alive()
         store.demand_space(self._folder, size.attempt_bytes(self._plan))
         started = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
@@ -88,7 +88,7 @@ class Attempts:
             failure = self._measure(started, remote, partial)
             reasons = [failure.located] if failure else []
             if reasons:
-                self._robots.demand_up()  # fails immediately if a process that the robots need has exited
+                self._robots.check_alive()  # fails immediately if a process that the robots need has exited
             else:
                 self._ledger.measured(started)
                 self._reached = Status.MEASURED
@@ -98,11 +98,11 @@ class Attempts:
             reasons = reasons or list(verdict.problems)
             self._last_remote = remote
             if reasons:
-                self._robots.demand_up()
+                self._robots.check_alive()
                 self._robots.demand_held()  # an attempt aborted by another user is not counted
         invalid = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
         why = "; ".join(hosts.without_effects(reasons))
-        self._ledger.keep(
+        self._ledger.commit(
             partial, replace(started, status=invalid if reasons else Status.VALID, reason=why), verdict.measured
         )
         return failure.remedy if failure else ""
@@ -122,7 +122,7 @@ class Attempts:
             reasons = list(verdict.problems) if was_measured else ["fieldkit was killed during it"]
         status = Status.VOID if reasons else Status.VALID
         ended = replace(cut, status=status, reason="; ".join(reasons), excused=bool(reasons))
-        self._ledger.keep(evidence_folder, ended, verdict.measured)
+        self._ledger.commit(evidence_folder, ended, verdict.measured)
         self._last_remote = remote
 
     def _measure(self, started: Attempt, remote: str, here: Path) -> FieldkitError | None:
@@ -130,14 +130,14 @@ class Attempts:
         repeat = started.repeat
         self._reached = Status.RUNNING
         planned = self._plan.scene(repeat, remote, self._variants)
-        scene = replace(planned, here=here, motions=self._motions, origins=self._origins)
+        scene = replace(planned, laptop_folder=here, motions=self._motions, origins=self._origins)
 
         def announce(name: str, expected_s: float | None) -> None:
             self._sink(PhaseStarted(name, str(repeat), expected_s))
 
         try:
             self._robots.measure(scene, announce)
-            self._motions.ahead = ()  # the remaining work may be completed after a request to stop
+            self._motions.stop_notes = ()  # the remaining work may be completed after a request to stop
         except (RobotError, LinkError, EvidenceError) as error:
             if error.ends_trial:
                 raise
@@ -162,21 +162,21 @@ class Attempts:
             is_fetched_later = self._reached is Status.MEASURED and not self._robots.transient
             if is_fetched_later and isinstance(error, KeyboardInterrupt):
                 raise  # the attempt is intact: resume fetches the rest of it
-            reason = STOPPED if self._motions.called else _why_cut(error)
+            reason = STOPPED if self._motions.is_ordered else _why_cut(error)
             if self._reached:
                 self._robots.mark_unfetched(started.remote(self._plan.trial), partial, reason)
             ended = replace(started, status=Status.VOID, reason=reason, excused=True)
-            self._ledger.keep(partial, ended, self._judge(started, partial).measured)
+            self._ledger.commit(partial, ended, self._judge(started, partial).measured)
             if isinstance(error, LockLostError) and self._last_remote:
                 with suppress(FieldkitError):  # an aborted trial may never be resumed
                     self._robots.delete_remote(self._last_remote)
             raise
 
-    def _judge(self, attempt: Attempt, folder: Path) -> Judged:
+    def _judge(self, attempt: Attempt, folder: Path) -> EvidenceVerdict:
         try:
             return gates.judge(self._plan, attempt.repeat, AttemptEvidence(folder))
         except MemoryError:
-            return Judged(("this machine has too little memory to measure it",), Measured({}, {}))
+            return EvidenceVerdict(("this machine has too little memory to measure it",), Measured({}, {}))
 
 
 def _why_cut(error: BaseException) -> str:

@@ -14,7 +14,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError, TestbedLostError
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import BRIDGE_IS_UP, Role
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
@@ -92,11 +92,13 @@ def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator
         running_roles.append(role)
 
     try:
-        together(start, bridge_jobs)
+        run_parallel(start, bridge_jobs)
         yield
     finally:
         for role, error in zip(
-            running_roles, together(lambda role: _end(shells[role], bridge_jobs[role]), running_roles), strict=True
+            running_roles,
+            run_parallel(lambda role: _end(shells[role], bridge_jobs[role]), running_roles),
+            strict=True,
         ):
             if error:
                 sink(Note(f"the bridge on {cast[role].name} {error}"))
@@ -118,7 +120,7 @@ def _start(robot: Robot, shell: Shell, role: Role, job: Job) -> None:
 def _end(shell: Shell, job: Job) -> str:
     """Stop a bridge; return a description of what went wrong, empty if nothing did."""
     try:
-        runs = any(f"{job.folder}/" in line for line in jobs.left(shell, Deadline.after(jobs.REPLY_S)))
+        runs = any(f"{job.folder}/" in line for line in jobs.list_running(shell, Deadline.after(jobs.REPLY_S)))
         code = jobs.stop(shell, job, grace_s=_GRACE_S)
         evidence.discard(shell, job.folder.split("/")[-2])
     except TestbedLostError:

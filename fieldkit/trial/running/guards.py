@@ -9,7 +9,7 @@ A step `fly` has a separate guard.
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
-from fieldkit.core.model import in_order
+from fieldkit.core.model import sort_roles
 from fieldkit.steps import piloting
 from fieldkit.steps.scene import Scene, Shells
 from fieldkit.trial.plan import Plan
@@ -24,7 +24,7 @@ def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
         RobotError: A guard did not start, for example because the autopilot does not answer.
     """
     with ExitStack() as stack:
-        for role in in_order(set(plan.procedure.on_abort) - plan.procedure.moved()):
+        for role in sort_roles(set(plan.procedure.on_abort) - plan.procedure.moved()):
             job = piloting.guard(scene, role, f"{role}-guard")
             body_s = plan.procedure.expected_s(scene.protocol)
             stack.enter_context(piloting.guarding(scene, shells[role], job, body_s=body_s))

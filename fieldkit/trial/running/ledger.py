@@ -51,7 +51,7 @@ class Ledger:
         self._spent: Counter[RepeatId] = Counter()
         self._over: set[RepeatId] = set()
         self._counts: Counter[Status] = Counter()
-        journal.mend(folder)
+        journal.remove_torn_line(folder)
         past = journal.history(folder, plan)
         self._manifest = Manifest(folder)
         if not past:
@@ -78,7 +78,7 @@ class Ledger:
                 self._manifest.add(evidence)
         self.ended = tuple(ended)
         """The attempts that ended in earlier runs, in order."""
-        self.cut_short = tuple(journal.cut_short(past))
+        self.interrupted = tuple(journal.interrupted(past))
         """Attempts during which fieldkit was killed; they must be completed first."""
 
     @property
@@ -120,7 +120,7 @@ class Ledger:
         """Record that the steps of an attempt are done and its evidence is on the robots; errors as for `begin`."""
         self._append(attempt, time.time_ns(), Status.MEASURED)
 
-    def keep(self, evidence: Path, attempt: Attempt, measured: Measured) -> None:
+    def commit(self, evidence: Path, attempt: Attempt, measured: Measured) -> None:
         """Commit an attempt that ended to disk: its evidence, then its journal entry, then the derived files.
 
         Args:
@@ -192,7 +192,7 @@ class Ledger:
         if differing := manifest.differences(self._folder, [attempt.folder for attempt in attempts]):
             raise EvidenceError(
                 f"{store.TRIAL_CSV} must be rebuilt, but the evidence is not what was measured: "
-                f"{manifest.few(differing)}",
+                f"{manifest.summarize(differing)}",
                 where=str(self._folder),
                 remedy="restore both from a copy, or start a new trial",
             )

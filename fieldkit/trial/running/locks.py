@@ -11,7 +11,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.runtime import NameHeldError
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import REPLY_S, Aborted
 from fieldkit.remote.script import call, word
@@ -35,8 +35,8 @@ class Holder:
     """
 
     token: str
-    who: str
-    what: str
+    user: str
+    purpose: str
 
 
 @contextmanager
@@ -45,23 +45,23 @@ def held(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
 
     Raises:
         ConfigurationError: Another process has the token; it would use the same locks and release them.
-        FieldkitError: As for `taken`.
+        FieldkitError: As for `locked`.
     """
     with ExitStack() as stack:
         try:
-            stack.enter_context(runtime.held(f"trial-{word(holder.token)}"))
+            stack.enter_context(runtime.hold_lock(f"trial-{word(holder.token)}"))
         except NameHeldError as error:
             raise ConfigurationError(
                 "another fieldkit runs this trial, or another trial of its session",
-                where=holder.what,
+                where=holder.purpose,
                 remedy="wait until it has ended, or stop it",
             ) from error
-        stack.enter_context(taken(shells, holder, sink=sink))
+        stack.enter_context(locked(shells, holder, sink=sink))
         yield
 
 
 @contextmanager
-def taken(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
+def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
     """Lock all robots, or none, and unlock them after the body.
 
     Robots are contacted in parallel, but locked in the order of their names: of two trials that need the same robots,
@@ -79,11 +79,13 @@ def taken(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> 
     """
     touched: list[Shell] = []
     in_order = sorted(shells.values(), key=lambda shell: shell.robot)
-    together(lambda shell: jobs.install(shell, Deadline.after(REPLY_S)), in_order, hang_up=lambda: _hang_up(in_order))
+    run_parallel(
+        lambda shell: jobs.install(shell, Deadline.after(REPLY_S)), in_order, hang_up=lambda: _hang_up(in_order)
+    )
     try:
         for shell in in_order:
             touched.append(shell)  # added before it answers, because the answer of a successful lock may be lost
-            words = (word(holder.token), str(ttl_s), word(holder.who), word(holder.what))
+            words = (word(holder.token), str(ttl_s), word(holder.user), word(holder.purpose))
             call(shell, "lock", *words, deadline=Deadline.after(REPLY_S))
         yield
     except BaseException as error:
@@ -92,11 +94,11 @@ def taken(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> 
         raise
     finally:
         if touched:
-            together(lambda shell: _unlock(shell, holder, sink), touched)
+            run_parallel(lambda shell: _unlock(shell, holder, sink), touched)
 
 
 @dataclass(frozen=True)
-class Held:
+class LockState:
     """A valid lock.
 
     Attributes:
@@ -108,7 +110,7 @@ class Held:
     left_s: float
 
 
-def holder(shell: Shell) -> Held | None:
+def holder(shell: Shell) -> LockState | None:
     """Return the lock of a robot that has the job script, or None if it is not locked.
 
     Raises:
@@ -119,7 +121,7 @@ def holder(shell: Shell) -> Held | None:
     if match is None:
         return None
     token, who, what = (word(match[name].decode(errors="replace")) for name in ("token", "who", "what"))
-    return Held(Holder(token, who, what), float(match["left"]))
+    return LockState(Holder(token, who, what), float(match["left"]))
 
 
 def demand(shell: Shell, token: str) -> None:
@@ -152,7 +154,7 @@ def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> Mapping[str,
         robots: From `Backend.standing`.
         who: Name that is shown to the users whose trials end, see `runtime.me`.
     """
-    return dict(zip(robots, together(lambda name: _abort(robots[name], who), robots), strict=True))
+    return dict(zip(robots, run_parallel(lambda name: _abort(robots[name], who), robots), strict=True))
 
 
 def _abort(robot: Shell | FieldkitError, who: str) -> Aborted:

@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Attended, Backend, Testbed, Transient
 from fieldkit.core.errors import ConfigurationError, MotionHeldError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Role
-from fieldkit.core.prompts import Nobody, Operator, Question
+from fieldkit.core.prompts import Operator, Question, Unattended
 from fieldkit.steps.origins import MemoryOrigins, Origins
 from fieldkit.trial import motion
 from fieldkit.trial.motion import KeptOrigins, MotionJournal
@@ -26,7 +26,7 @@ def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator
     Raises:
         ConfigurationError: A robot must be at another place in a later trial, and with `--yes` no person moves it.
     """
-    if not backend.by_hand or not isinstance(operator, Nobody):
+    if not backend.by_hand or not isinstance(operator, Unattended):
         return
     for earlier, later in pairwise(plans):
         for role in _self_moving(later):
@@ -99,7 +99,7 @@ class MotionPermission:
     def _demand_placed(self, kept: KeptOrigins) -> None:
         """Raise an error if a robot must be at a new place but no person was asked: its origin would be wrong."""
         testbed = self._testbed
-        if isinstance(testbed, Attended) and not isinstance(testbed.operator, Nobody):
+        if isinstance(testbed, Attended) and not isinstance(testbed.operator, Unattended):
             return  # a person was asked to move it there
         for role, name in self._moving.items():
             if kept.is_new_place(role):

@@ -42,11 +42,11 @@ def opened(
         RobotError: A robot cannot be reached, has another host key, refuses the login, or is locked by another user.
     """
     with backend.open(cast, seed=seed, sink=sink, operator=operator) as testbed:
-        preflight.meet(cast, testbed.shells, sink)
+        preflight.connect_all(cast, testbed.shells, sink)
         # Failure to unlock a transient robot does not matter, because the robot ends now.
         on_lost_lock = (lambda _: None) if isinstance(testbed, Transient) else sink
         with (
-            locks.held(testbed.shells, Holder(session, runtime.me(), what), sink=on_lost_lock),
+            locks.held(testbed.shells, Holder(session, runtime.user_at_host(), what), sink=on_lost_lock),
             bridges.running(cast, testbed.shells, session, sink=sink),
         ):
             yield testbed

@@ -11,7 +11,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, RobotError
 from fieldkit.core.events import Finding, PhaseStarted, Sink
 from fieldkit.core.model import Role, Verdict
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.core.units import format_count, format_duration
 from fieldkit.remote import jobs
 from fieldkit.remote.script import HELD_REMEDY
@@ -23,14 +23,14 @@ from fieldkit.trial.check import contact, probe, radio, software, system, topics
 from fieldkit.trial.check.report import LAPTOP, Report
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import bridges, locks
-from fieldkit.trial.running.locks import Held
+from fieldkit.trial.running.locks import LockState
 
 JOBS_S: Final = 10.0
 
 _CONNECTION: Final = "connection"
 
 
-def meet(cast: Cast, shells: Shells, sink: Sink) -> None:
+def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
     """Log in on every robot, before a person carries any.
 
     Raises:
@@ -47,7 +47,7 @@ def meet(cast: Cast, shells: Shells, sink: Sink) -> None:
             report.fail(_CONNECTION, error.what, error.remedy)
         return report
 
-    demand(_joined(together(log_in, cast)))
+    demand(_joined(run_parallel(log_in, cast)))
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def check(plan: Plan, shells: Shells, out: Path, *, whole: bool) -> Checked:
     def check_robot(role: Role) -> None:
         _check(plan, role, shells[role], variants_by_role, reports[role], whole=whole)
 
-    together(check_robot, plan.cast)
+    run_parallel(check_robot, plan.cast)
     for refusal in plan.refusals(variants_by_role):
         reports[refusal.role].fail("tools", refusal.what, refusal.remedy)
     laptop = Report(LAPTOP)
@@ -133,7 +133,7 @@ def _check(
         stage = "probe"
         sections = probe.run_probe(shell, robot.profile.radio.interface, software.commands(plan, role))
         report.user_tools = system.user_tools(sections)
-        contact.judge_clock(offset, shell.by_hand, report)
+        contact.judge_clock(offset, shell.ssh_destination, report)
         system.judge(plan, role, sections, report)
         variants_by_role[role] = software.judge(plan, role, sections, report)
         radio.judge(robot, sections, report)
@@ -142,7 +142,7 @@ def _check(
         # A trial has locked its robots already. A recording would disturb jobs of another user.
         if whole and not _judge_lock(locks.holder(shell), report):
             return
-        _judge_jobs(plan, jobs.left(shell, Deadline.after(JOBS_S)), report)
+        _judge_jobs(plan, jobs.list_running(shell, Deadline.after(JOBS_S)), report)
         stage = "agent"
         software.ask_agent(plan, role, sections, shell, report)
         if not whole:
@@ -163,13 +163,13 @@ def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
         report.ok("jobs", "none of an earlier trial")
 
 
-def _judge_lock(held: Held | None, report: Report) -> bool:
+def _judge_lock(held: LockState | None, report: Report) -> bool:
     """Report the lock of a robot; return True if it is not locked."""
     if held is None:
         report.ok("lock", "the robot is not locked")
         return True
     holder, left = held.holder, format_duration(held.left_s)
-    report.fail("lock", f"{holder.who} holds the robot for {holder.what}, at most {left} more", HELD_REMEDY)
+    report.fail("lock", f"{holder.user} holds the robot for {holder.purpose}, at most {left} more", HELD_REMEDY)
     return False
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.core import plugins
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.trial import store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
@@ -29,7 +29,7 @@ def resumable(folder: Path) -> Plan:
             f"it was started by other code ({', '.join(changed)})",
             where=str(folder),
             remedy="resume it with that version, or start a new trial; the repeats that ended are complete: "
-            + typed("fieldkit", "rebuild", folder),
+            + shell_command("fieldkit", "rebuild", folder),
         )
     for put in plan.puts():
         put.program.content()
@@ -51,7 +51,7 @@ def demand_backend(plan: Plan, name: str, folder: Path) -> None:
         raise ConfigurationError(
             f"it was started on backend {plan.backend}, not {name}",
             where=str(folder),
-            remedy=typed("fieldkit", "resume", folder, "--backend", plan.backend),
+            remedy=shell_command("fieldkit", "resume", folder, "--backend", plan.backend),
         )
 
 

@@ -22,7 +22,7 @@ from fieldkit.core.errors import (
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.core.text import encodable
-from fieldkit.core.threads import together
+from fieldkit.core.threads import run_parallel
 from fieldkit.measure.evidence import lateness, link_samples, track
 from fieldkit.remote import evidence, fetching, jobs, programs
 from fieldkit.remote.fetching import FetchProgress, LateError, NoFolderError
@@ -94,7 +94,7 @@ class Robots:
             for put, content in puts:
                 if put.role == role:
                     sha256, executable = put.program.sha256, put.program.executable
-                    programs.place(self.shells[role], remote, put.at, content, sha256, executable=executable)
+                    programs.copy(self.shells[role], remote, put.at, content, sha256, executable=executable)
 
         self._everywhere(make)
 
@@ -106,21 +106,21 @@ class Robots:
             return
         before, since_ns = oracle.lateness(), time.time_ns()
         oracle.links(go_on=True)
-        oracle.record_air(scene.here)
+        oracle.record_air(scene.laptop_folder)
         try:
             self._run_steps(scene, announce)
         finally:
             oracle.record_air(None)
         after, where, links = oracle.lateness(), oracle.track(since_ns), oracle.links(go_on=False)
-        if scene.here is not None:
-            (scene.here / track.FILE).write_text(track.text(where), encoding="ascii")
-            (scene.here / link_samples.FILE).write_text(link_samples.text(links), encoding="ascii")
-            (scene.here / lateness.FILE).write_text(lateness.text(before, after), encoding="ascii")
+        if scene.laptop_folder is not None:
+            (scene.laptop_folder / track.FILE).write_text(track.text(where), encoding="ascii")
+            (scene.laptop_folder / link_samples.FILE).write_text(link_samples.text(links), encoding="ascii")
+            (scene.laptop_folder / lateness.FILE).write_text(lateness.text(before, after), encoding="ascii")
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         with self._watched(), guards.guarded(self._plan, scene, self.shells):
             for entry in self._plan.procedure.steps:
-                with step_errors.reported(entry.kind, scene.here):
+                with step_errors.reported(entry.kind, scene.laptop_folder):
                     entry.step.run(scene, self._testbed, announce)
 
     @contextmanager
@@ -131,7 +131,7 @@ class Robots:
         def watch() -> None:
             while not ended.wait(_WATCH_S):
                 try:
-                    self.demand_up()
+                    self.check_alive()
                 except TestbedLostError:
                     self.hang_up()
 
@@ -226,14 +226,14 @@ class Robots:
         """Return a message if a robot rebooted unexpectedly during the attempt; None if it did not, or is unknown."""
         booted = self._boots.get(role) if role not in hosts.restarted(self._plan.procedure) else None
         with suppress(FieldkitError):
-            if booted and hosts.rebooted(booted, evidence.boot(self.shells[role])):
+            if booted and hosts.rebooted(booted, evidence.boot_id(self.shells[role])):
                 return f"{self._plan.cast[role].name}: {hosts.REBOOTED}"
         return None
 
-    def demand_up(self) -> None:
-        """Raise an error if a process that the robots need has exited; errors as for `Transient.demand_up`."""
+    def check_alive(self) -> None:
+        """Raise an error if a process that the robots need has exited; errors as for `Transient.check_alive`."""
         if isinstance(self._testbed, Transient):
-            self._testbed.demand_up()
+            self._testbed.check_alive()
 
     def demand_held(self) -> None:
         """Raise an error if a robot reports that its lock was broken; robots that do not answer are ignored.
@@ -291,4 +291,4 @@ class Robots:
         return self._plan.cast[role].profile.radio.interface
 
     def _everywhere(self, call: Callable[[Role], T]) -> list[T]:
-        return together(call, self._roles, hang_up=self.hang_up)
+        return run_parallel(call, self._roles, hang_up=self.hang_up)

@@ -12,7 +12,7 @@ from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.judgements import Judgement, judge
 from fieldkit.backends.protocols import Testbed
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import (
     ExpectationJudged,
     Note,
@@ -73,7 +73,7 @@ def resume_trial(
     placement = place(resumable(folder), testbed, sink)
     if placement.answer.skip:
         return None
-    return go_on(folder, testbed, sink, stop or Stop(), failed=failed)
+    return continue_trial(folder, testbed, sink, stop or Stop(), failed=failed)
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
         return _run(plan, testbed, folder, sink, stop, report_resume=report_resume)
 
 
-def go_on(
+def continue_trial(
     folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, report_resume: bool = True, failed: bool = False
 ) -> Outcome:
     """Resume an interrupted trial: finished repeats are kept, each other repeat is attempted again.
@@ -160,7 +160,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
     repeats = list(plan.order())
     past = estimates.finished_repeats(plan, journal.read(folder))
     if ledger.differences:
-        sink(Note(f"the evidence has changed since it was stored: {manifest.few(ledger.differences)}"))
+        sink(Note(f"the evidence has changed since it was stored: {manifest.summarize(ledger.differences)}"))
     try:
         sink(TrialStarted(str(folder), ledger.done, len(repeats)))
         robots.end_left()
@@ -177,7 +177,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
             motions=stop.motions,
             origins=permission.origins,
         )
-        for cut in ledger.cut_short:
+        for cut in ledger.interrupted:
             attempts.recover(cut)
         for repeat in repeats:
             started_s = time.monotonic()
@@ -216,8 +216,8 @@ def _show_judgements(judgements: Iterable[Judgement], sink: Sink) -> None:
 
 
 def _judged(judgement: Judgement) -> ExpectationJudged:
-    _, protocol, measured, interval, _ = wording.judged(judgement)
-    estimate = judgement.found
+    _, protocol, measured, interval, _ = wording.judgement_texts(judgement)
+    estimate = judgement.estimate
     return ExpectationJudged(
         expectation=judgement.expectation.text,
         protocol=protocol.lower(),
@@ -251,7 +251,7 @@ def _ended(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: s
         attempt=attempt.number,
         status=attempt.status,
         reason=attempt.reason,
-        summary=rows.in_words(plan, row),
+        summary=rows.describe(plan, row),
         done=ledger.done,
         total=total,
         left_s=left.likely_s,
@@ -270,7 +270,7 @@ def _writing(folder: Path) -> Iterator[None]:
         raise ConfigurationError(
             f"cannot be written: {error.strerror or error}; the repeats that ended are saved",
             where=str(error.filename or folder),
-            remedy=f"{first}, then: {typed('fieldkit', 'resume', folder)}"
+            remedy=f"{first}, then: {shell_command('fieldkit', 'resume', folder)}"
             if folder.is_dir()
             else "fieldkit resume FOLDER, with the present path of the folder",
         ) from error

@@ -45,12 +45,12 @@ class Stop:
         Raises:
             KeyboardInterrupt: The body has finished, and a stop was requested meanwhile.
         """
-        self._ends, self.motions.ahead = Deadline.after(lasts_s), motions
+        self._ends, self.motions.stop_notes = Deadline.after(lasts_s), motions
         self.patient = True
         try:
             yield
         finally:
-            self.patient, self.motions.ahead = False, ()
+            self.patient, self.motions.stop_notes = False, ()
         if self.asked:
             raise KeyboardInterrupt
 

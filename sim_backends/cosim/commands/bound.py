@@ -8,7 +8,7 @@ from typing import Final
 
 from fieldkit.cli.display import working
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import progress_reporter
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     _sheet(scenario, seeds, costs, window_s, fixed).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        say(_summary(scenario, costs, window_s, fixed))
+        print_text(_summary(scenario, costs, window_s, fixed))
     return 0
 
 

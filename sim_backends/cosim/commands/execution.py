@@ -11,7 +11,7 @@ from sim_backends.cosim.commands.clock import progress_reporter
 from sim_backends.cosim.commands.folder import RunFolder
 from sim_backends.cosim.commands.results import SeedResult, seed_result
 from sim_backends.cosim.interrupts import between_windows
-from sim_backends.cosim.recording.manifest import About
+from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.samples import StateSamples
 from sim_backends.cosim.scenario.build import build
@@ -115,5 +115,5 @@ def _simulate(scenario: CosimScenario, folder: RunFolder | None, deadline_s: flo
     return simulate(scenario, task.policy, task.seed, folder, deadline_s=deadline_s)
 
 
-def _about(scenario: CosimScenario, policy: str, seed: int) -> About:
-    return About(schema.dump(scenario), policy, scenario.policy.parameters, seed)
+def _about(scenario: CosimScenario, policy: str, seed: int) -> RunSettings:
+    return RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)

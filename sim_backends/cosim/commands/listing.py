@@ -5,7 +5,7 @@ from typing import Final
 
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import FieldkitError
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.text import json_text
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
 from sim_backends.cosim.scenario.loading import load_scenario, scenario_files
@@ -39,7 +39,7 @@ def list_all(arguments: argparse.Namespace) -> int:
 
 def print_schema(_: argparse.Namespace) -> int:
     """Print the JSON schema of scenario files."""
-    say(json_text(CosimScenario.model_json_schema(by_alias=True), indent=2))
+    print_text(json_text(CosimScenario.model_json_schema(by_alias=True), indent=2))
     return 0
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from fieldkit.cli.display import show_note, working
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.folder import RunFolder
@@ -78,7 +78,7 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         sheets["followers"] = _formation_sheet(results)
     show_all(sheets, form)
     if form == "table":
-        say(_cost_text(results))
+        print_text(_cost_text(results))
     for result in results:
         if result.stopped:
             # The command reports the full error when it ends.

@@ -6,7 +6,7 @@ from typing import Final
 
 from fieldkit.cli.display import show_note, working
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count, parse_quantity
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import progress_reporter
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     title = f"{scenario.name}, {scenario.topology}, {arguments.policy}, seed {seed}: the satisfaction loop"
     _sheet(title, satisfaction).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        say(_summary(satisfaction, threshold))
+        print_text(_summary(satisfaction, threshold))
     if not satisfaction.satisfied:
         show_note(f"no round was satisfactory: {satisfaction.reason}")
     return 0 if satisfaction.satisfied else NOT_SATISFIED

@@ -9,7 +9,7 @@ from typing import Any, Final
 from fieldkit.cli.display import show_note
 from fieldkit.config import schema
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.units import format_count, parse_duration_s
 from fieldkit.report.theme import Format, format_of
 from sim_backends.cosim.scenario.loading import load_scenario
@@ -98,7 +98,7 @@ def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], Non
     form = format_of(path, option)
     if not path.parent.is_dir():
         raise ConfigurationError(
-            "there is no such folder", where=str(path.parent), remedy=typed("mkdir", "-p", path.parent)
+            "there is no such folder", where=str(path.parent), remedy=shell_command("mkdir", "-p", path.parent)
         )
 
     def write(draw: Callable[[Format], bytes]) -> None:

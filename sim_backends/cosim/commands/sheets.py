@@ -11,7 +11,7 @@ from typing import Final
 
 from fieldkit.cli.display import table
 from fieldkit.core.columns import csv_text
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.text import json_text
 
 Value = str | int | float | None
@@ -113,7 +113,7 @@ def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
     """
     if form == "json":
         records = {name: sheet.records() for name, sheet in sheets.items()}
-        say(json_text(records, indent=2, allow_nan=False))
+        print_text(json_text(records, indent=2, allow_nan=False))
         return
     for sheet in list(sheets.values())[: 1 if form == "csv" else None]:
         sheet.show(form)
@@ -140,17 +140,17 @@ def _table(sheet: Sheet) -> None:
         legend = sheet.legend(part, explained)
         explained |= legend.keys()
         if legend:
-            say(filled(_legend_text(legend)))
-        say()
+            print_text(filled(_legend_text(legend)))
+        print_text()
 
 
 def _markdown(sheet: Sheet) -> None:
     for part in sheet.parts:
         heads, rows = sheet.part_cells(part)
         for line in (heads, ["---"] * len(heads), *rows):
-            say(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
+            print_text(f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |")
         legend = sheet.legend(part)
-        say("\n" + ". ".join((part.title, *([_legend_text(legend)] if legend else []))) + ".\n")
+        print_text("\n" + ". ".join((part.title, *([_legend_text(legend)] if legend else []))) + ".\n")
 
 
 def _legend_text(legend: Mapping[str, str]) -> str:
@@ -159,11 +159,11 @@ def _legend_text(legend: Mapping[str, str]) -> str:
 
 def _csv(sheet: Sheet) -> None:
     rows = [[None if _is_missing(value) else value for value in row] for row in sheet.rows]
-    say(csv_text([column.name for column in sheet.columns], rows), end="")
+    print_text(csv_text([column.name for column in sheet.columns], rows), end="")
 
 
 def _json(sheet: Sheet) -> None:
-    say(json_text(sheet.records(), indent=2, allow_nan=False))
+    print_text(json_text(sheet.records(), indent=2, allow_nan=False))
 
 
 def _is_missing(value: Value) -> bool:

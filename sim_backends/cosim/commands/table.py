@@ -6,7 +6,7 @@ from functools import partial
 from typing import Final
 
 from fieldkit.cli.display import working
-from fieldkit.core.printing import say
+from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.clock import progress_reporter
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     rows = table.rows(samples)
     paper_sheet(title, rows, is_ping=which == "emane").show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        say(filled(summary(rows)))
+        print_text(filled(summary(rows)))
     return 0
 
 

@@ -7,7 +7,7 @@ from sim_backends.network.packets import Received
 from sim_backends.world.motion import State
 
 
-class Several:
+class CombinedProgram:
     """Combines programs of one agent: each wakes at its own times, and all receive all datagrams.
 
     Args:

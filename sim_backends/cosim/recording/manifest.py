@@ -37,7 +37,7 @@ class RunEnding(StrEnum):
 
 
 @dataclass(frozen=True)
-class About:
+class RunSettings:
     """The scenario and the settings of a run.
 
     Attributes:
@@ -73,7 +73,7 @@ class RunManifest:
         parts: BLAKE2b of each file of a table, by its path in the folder; empty during the run.
     """
 
-    about: About
+    about: RunSettings
     scenario_hash: str
     schema_version: int = SCHEMA_VERSION
     versions: Mapping[str, str] = field(default_factory=dict)

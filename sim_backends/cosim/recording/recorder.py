@@ -15,9 +15,9 @@ from sim_backends.cosim.observer import Window
 from sim_backends.cosim.recording import tables
 from sim_backends.cosim.recording.captures import Captures
 from sim_backends.cosim.recording.manifest import (
-    About,
     RunEnding,
     RunManifest,
+    RunSettings,
     recording_lock,
     versions,
     write_manifest,
@@ -59,7 +59,7 @@ class RunRecorder:
     def __init__(
         self,
         folder: Path,
-        about: About,
+        about: RunSettings,
         *,
         states_every_ns: int = EVERY_NS,
         part_every_s: float = 2.0,

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from fieldkit.config.schema import Location
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.units import format_bytes
 from sim_backends.cosim.scenario import memory
 from sim_backends.cosim.scenario.motions import FollowPlan, StationKeepingPlan
@@ -72,7 +72,7 @@ def _robots(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
             yield ScenarioProblem(
                 ("agents", name, "robot"),
                 f"there is no robot {plan.robot!r}",
-                nearest(plan.robot, robot_names, f"robots: {', '.join(robot_names)}"),
+                did_you_mean(plan.robot, robot_names, f"robots: {', '.join(robot_names)}"),
             )
 
 

@@ -42,7 +42,7 @@ class _TimedFault(_Fault):
     @schema.model_validator(mode="after")
     def _ends_after_begin(self) -> "_TimedFault":
         if self.end is not None and self.end <= self.begin:
-            raise schema.complaint(f"it ends at {self.end:g} s, not after it begins at {self.begin:g} s", "to")
+            raise schema.validation_error(f"it ends at {self.end:g} s, not after it begins at {self.begin:g} s", "to")
         return self
 
     @property
@@ -82,7 +82,7 @@ class LinkCutFault(_TimedFault):
     @schema.model_validator(mode="after")
     def _two_agents(self) -> "LinkCutFault":
         if self.between[0] == self.between[1]:
-            raise schema.complaint(f"{self.between[0]} has no link to itself", "between")
+            raise schema.validation_error(f"{self.between[0]} has no link to itself", "between")
         return self
 
     @property
@@ -111,7 +111,9 @@ class JammerFault(_TimedFault):
     @schema.model_validator(mode="after")
     def _one_place(self) -> "JammerFault":
         if (self.at_m is None) == (self.agent is None):
-            raise schema.complaint("a jammer needs either at_m: [EAST, NORTH], or an agent: NAME that carries it")
+            raise schema.validation_error(
+                "a jammer needs either at_m: [EAST, NORTH], or an agent: NAME that carries it"
+            )
         return self
 
     @property

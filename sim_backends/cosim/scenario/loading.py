@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.config import catalog, schema
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.world.world import load_world
@@ -37,7 +37,7 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
         for key, value in (changes or {}).items():
             _change(document.data, key.split("."), value)
         scenario = catalog.named(document, CosimScenario, path.stem)
-        with document.naming("world"):
+        with document.locating_errors("world"):
             world = load_world(scenario.world)
         check(scenario, world, document.where)
     except ConfigurationError as error:
@@ -71,6 +71,6 @@ def _path(name_or_path: str) -> Path:
         return Path(name_or_path)
     files = scenario_files()
     if name_or_path not in files:
-        hint = nearest(name_or_path, files, f"scenarios: {', '.join(files)}; or name a file that ends in .yaml")
+        hint = did_you_mean(name_or_path, files, f"scenarios: {', '.join(files)}; or name a file that ends in .yaml")
         raise ConfigurationError(f"there is no scenario {name_or_path!r}", remedy=hint)
     return files[name_or_path]

@@ -2,10 +2,11 @@
 
 from typing import Annotated
 
-from fieldkit.config.schema import BeforeValidator, Field, shaped
+from fieldkit.config.schema import BeforeValidator, Field, pattern_field
 
 Name = Annotated[
-    str, shaped(r"^[a-z][a-z0-9-]{0,30}$", "a name: small letters, digits and -, a small letter first, 31 at most")
+    str,
+    pattern_field(r"^[a-z][a-z0-9-]{0,30}$", "a name: small letters, digits and -, a small letter first, 31 at most"),
 ]
 """The name of an agent, or of an entry of the traffic."""
 

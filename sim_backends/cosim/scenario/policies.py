@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.event_driven import EventDriven
@@ -47,7 +47,8 @@ def make_policy(name: str, **parameters: float) -> SyncPolicy:
     """
     if name not in POLICIES:
         raise ConfigurationError(
-            f"there is no sync policy {name!r}", remedy=nearest(name, POLICIES, f"policies: {', '.join(POLICIES)}")
+            f"there is no sync policy {name!r}",
+            remedy=did_you_mean(name, POLICIES, f"policies: {', '.join(POLICIES)}"),
         )
     kind = POLICIES[name]
     accepted = inspect.signature(kind).parameters

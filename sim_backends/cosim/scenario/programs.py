@@ -9,7 +9,7 @@ from sim_backends.cosim.programs.clocks import AgentClock, Clocked
 from sim_backends.cosim.programs.outages import Outage
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.programs.pings import EchoRequester, EchoResponder
-from sim_backends.cosim.programs.several import Several
+from sim_backends.cosim.programs.several import CombinedProgram
 from sim_backends.cosim.scenario.faults import ClockSkewFault, NodeLossFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.scenario.traffic import BagTraffic, FileTraffic, PingTraffic, StreamTraffic, Traffic
@@ -38,7 +38,9 @@ def programs(
     for name in {to for traffic in scenario.traffic if isinstance(traffic, PingTraffic) for to in traffic.to}:
         parts[name].append(EchoResponder())
     combined: dict[str, Program] = {
-        name: of_agent[0] if len(of_agent) == 1 else Several(of_agent) for name, of_agent in parts.items() if of_agent
+        name: of_agent[0] if len(of_agent) == 1 else CombinedProgram(of_agent)
+        for name, of_agent in parts.items()
+        if of_agent
     }
     return dict(_with_faults(scenario, combined, stops))
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
 from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length, Location, Strict
-from fieldkit.core.errors import nearest
+from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
 from sim_backends.cosim.programs.beats import PERIOD_NS
@@ -22,8 +22,8 @@ from sim_backends.world.obstacles import Place, Real
 
 def _check_policy_name(name: str) -> str:
     if name not in POLICIES:
-        hint = nearest(name, POLICIES, f"policies: {', '.join(POLICIES)}")
-        raise schema.complaint(f"there is no sync policy {name!r}; {hint}")
+        hint = did_you_mean(name, POLICIES, f"policies: {', '.join(POLICIES)}")
+        raise schema.validation_error(f"there is no sync policy {name!r}; {hint}")
     return name
 
 
@@ -116,7 +116,7 @@ class AgentPlan(Strict):
     @schema.model_validator(mode="after")
     def _one_start(self) -> "AgentPlan":
         if (self.at_m is None) == (self.along is None):
-            raise schema.complaint(
+            raise schema.validation_error(
                 "it needs either at_m: [EAST, NORTH], or along: 20m, a distance on the world's line"
             )
         return self
@@ -187,8 +187,8 @@ class CosimScenario(Named):
     def _named_agents_exist(self) -> "CosimScenario":
         for name, location in self._agent_names():
             if name not in self.agents:
-                hint = nearest(name, self.agents, f"agents: {', '.join(self.agents)}")
-                raise schema.complaint(f"there is no agent {name!r}; {hint}", *location)
+                hint = did_you_mean(name, self.agents, f"agents: {', '.join(self.agents)}")
+                raise schema.validation_error(f"there is no agent {name!r}; {hint}", *location)
         return self
 
     def _agent_names(self) -> Iterator[tuple[str, Location]]:
@@ -207,10 +207,10 @@ class CosimScenario(Named):
     @schema.model_validator(mode="after")
     def _relay_is_named(self) -> "CosimScenario":
         if self.topology is Topology.MASTER and self.relay is None:
-            raise schema.complaint("the topology master needs a relay: AGENT", "topology")
+            raise schema.validation_error("the topology master needs a relay: AGENT", "topology")
         for number, traffic in enumerate(self.traffic):
             if traffic.transport == "ros1" and self.relay is None:
-                raise schema.complaint(
+                raise schema.validation_error(
                     "ros1 needs a master: name its host by relay: AGENT", "traffic", number, "protocol"
                 )
         return self
@@ -220,7 +220,7 @@ class CosimScenario(Named):
         titles: set[str] = set()
         for number, traffic in enumerate(self.traffic):
             if traffic.title in titles:
-                raise schema.complaint(
+                raise schema.validation_error(
                     f"two entries of the traffic have the name {traffic.title!r}; rename one of them",
                     "traffic",
                     number,
@@ -231,7 +231,7 @@ class CosimScenario(Named):
     @schema.model_validator(mode="after")
     def _seeds_are_different(self) -> "CosimScenario":
         if len(set(self.seeds)) < len(self.seeds):
-            raise schema.complaint("a seed is named twice, and would give the same run", "seeds")
+            raise schema.validation_error("a seed is named twice, and would give the same run", "seeds")
         return self
 
     @schema.model_validator(mode="after")
@@ -240,7 +240,9 @@ class CosimScenario(Named):
         for number, fault in enumerate(self.faults):
             if isinstance(fault, ClockSkewFault):
                 if fault.agent in agents:
-                    raise schema.complaint(f"{fault.agent} has two clock-skew faults", "faults", number, "agent")
+                    raise schema.validation_error(
+                        f"{fault.agent} has two clock-skew faults", "faults", number, "agent"
+                    )
                 agents.add(fault.agent)
         return self
 
@@ -248,7 +250,7 @@ class CosimScenario(Named):
     def _jammers_have_an_effect(self) -> "CosimScenario":
         for number, fault in enumerate(self.faults):
             if self.radio.fixed and isinstance(fault, JammerFault):
-                raise schema.complaint(
+                raise schema.validation_error(
                     "fixed links ignore a jammer; remove it, or remove loss, delay, rate and jitter of the radio",
                     "faults",
                     number,
@@ -262,7 +264,7 @@ class CosimScenario(Named):
         for agent, plan in self.agents.items():
             for leader in plan.motion.leader if isinstance(plan.motion, FollowPlan) else ():
                 if (leader, agent) not in received:
-                    raise schema.complaint(
+                    raise schema.validation_error(
                         f"{agent} follows {leader} and receives no states of it; add to the traffic "
                         f"{{kind: stream, from: {leader}, to: {agent}, rate: 10Hz}}",
                         "agents",
@@ -274,7 +276,7 @@ class CosimScenario(Named):
     @schema.model_validator(mode="after")
     def _window_is_at_least_a_step(self) -> "CosimScenario":
         if self.policy.window < self.physics.step:
-            raise schema.complaint(
+            raise schema.validation_error(
                 f"a window of {self.policy.window:.12g} s is shorter than the physics' own step of "
                 f"{self.physics.step:.12g} s, so that nothing changes in it",
                 "policy",

@@ -60,11 +60,11 @@ class _Traffic(Strict, ABC):
     @schema.model_validator(mode="after")
     def _ends_are_different(self) -> "_Traffic":
         if self.qos is not None and self.protocol != "topic":
-            raise schema.complaint(f"only a topic has a qos, and the protocol is {self.protocol}", "qos")
+            raise schema.validation_error(f"only a topic has a qos, and the protocol is {self.protocol}", "qos")
         if self.source in self.to:
-            raise schema.complaint(f"{self.source} sends to itself", "to")
+            raise schema.validation_error(f"{self.source} sends to itself", "to")
         if len(set(self.to)) < len(self.to):
-            raise schema.complaint("an agent is named twice", "to")
+            raise schema.validation_error("an agent is named twice", "to")
         return self
 
     @property
@@ -147,7 +147,7 @@ class BagTraffic(_Traffic):
     @schema.model_validator(mode="after")
     def _size_is_limited(self) -> "BagTraffic":
         if (messages := self.length * self.rate) > _MAX_MESSAGES:
-            raise schema.complaint(
+            raise schema.validation_error(
                 f"a bag has at most {_MAX_MESSAGES:,} messages, and {self.length:g} s of {self.rate:g} Hz are "
                 f"{messages:,.0f}",
                 "length",

@@ -156,9 +156,9 @@ class MediumClient:
         reply, _ = self._worker.request({"do": "links", "go_on": go_on})
         return unpack_links(reply)
 
-    def demand_up(self) -> None:
-        """Raise the errors of `Worker.demand_up` if the medium does not run."""
-        self._worker.demand_up()
+    def check_alive(self) -> None:
+        """Raise the errors of `Worker.check_alive` if the medium does not run."""
+        self._worker.check_alive()
 
     def close(self) -> None:
         """Stop the medium and wait until it has exited; a second call does nothing."""

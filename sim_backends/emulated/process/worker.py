@@ -110,7 +110,7 @@ class Worker:
             raise RobotError(reply["error"], where=self.name, remedy=reply.get("remedy", ""))
         return received
 
-    def demand_up(self) -> None:
+    def check_alive(self) -> None:
         """Raise if the process cannot serve requests.
 
         Raises:

@@ -19,7 +19,7 @@ from itertools import chain
 from random import Random
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.emulated.ros.laser import LaserTarget, ranges_m
 from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
 
@@ -151,7 +151,7 @@ def check(sensor: Sensor) -> None:
         ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
     """
     if sensor.type not in GENERATORS and sensor.template is None:
-        hint = nearest(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")
+        hint = did_you_mean(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")
         raise ConfigurationError(
             f"an emulated robot cannot publish {sensor.type}",
             where=f"topic {sensor.topic}",

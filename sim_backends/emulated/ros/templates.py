@@ -11,7 +11,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from fieldkit.config.profiles import PublishedTopic
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.emulated.ros.messages import GENERATORS, Definition, Template, packed_string
 
 if TYPE_CHECKING:
@@ -87,10 +87,10 @@ def _types(kind: str, definition: str) -> "Typestore":
     """Return ROS 1's types and those of a definition: fields of the type, then `MSG: package/Name` and fields."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (50 ms)
 
-    from fieldkit.ros.types import LACKING  # noqa: PLC0415 (as above)
+    from fieldkit.ros.types import EXTRA_DEFINITIONS  # noqa: PLC0415 (as above)
 
     store = get_typestore(Stores.ROS1_NOETIC)
-    for name, text in LACKING.items():
+    for name, text in EXTRA_DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))
     if definition:
         try:
@@ -109,7 +109,7 @@ def _unknown(topic: PublishedTopic) -> ConfigurationError:
     return ConfigurationError(
         f"an emulated robot cannot publish {topic.type}: ROS 1 itself has no definition of it, or of a type in it",
         where=f"topic {topic.name}",
-        remedy=f"{nearest(topic.type, GENERATORS, remedy)}",
+        remedy=f"{did_you_mean(topic.type, GENERATORS, remedy)}",
     )
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.network.packets import Packet
 from sim_backends.network.ros1 import options as sizes
 from sim_backends.network.ros1.calls import CallAnswer, RemoteCalls
@@ -71,7 +71,7 @@ class Ros1:
         if name not in self._links:
             raise ConfigurationError(
                 f"{packet.source} publishes in a flow {name!r} that is none of ROS 1",
-                remedy=nearest(name, self._links, "flows: " + ", ".join(self._links)),
+                remedy=did_you_mean(name, self._links, "flows: " + ", ".join(self._links)),
             )
         self._links[name].publish(packet)
 

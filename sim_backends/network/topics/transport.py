@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, nearest
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.network.packets import Packet
 from sim_backends.network.topics.discovery import DiscoveryTiming, TopicDiscovery
 from sim_backends.network.topics.flow import NOT_MATCHED, TopicSession
@@ -70,7 +70,7 @@ class Topics:
         if name not in self._flows:
             raise ConfigurationError(
                 f"{packet.source} publishes in a flow {name!r} that no topic is known for",
-                remedy=nearest(name, self._flows, "flows: " + ", ".join(self._flows)),
+                remedy=did_you_mean(name, self._flows, "flows: " + ", ".join(self._flows)),
             )
         writer = self._sessions[name].writer
         if writer.matched:

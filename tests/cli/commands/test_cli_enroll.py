@@ -126,5 +126,5 @@ def test_fingerprint_command_of_dropbear() -> None:
     text = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
     dropbear, openssh = HostKey(text, "SSH-2.0-dropbear_2022.83"), HostKey(text, "SSH-2.0-OpenSSH_9.2p1")
     assert dropbear == openssh == HostKey(text)
-    assert dropbear.by_hand == "dropbearkey -y -f /etc/dropbear/dropbear_ed25519_host_key"
-    assert openssh.by_hand == "ssh-keygen -lf /etc/ssh/ssh_host_ed25519_key.pub"
+    assert dropbear.fingerprint_command == "dropbearkey -y -f /etc/dropbear/dropbear_ed25519_host_key"
+    assert openssh.fingerprint_command == "ssh-keygen -lf /etc/ssh/ssh_host_ed25519_key.pub"

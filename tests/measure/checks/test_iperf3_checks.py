@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
 from fieldkit.measure.checks import iperf3_checks
-from fieldkit.measure.checks.iperf3_checks import IperfOrder
+from fieldkit.measure.checks.iperf3_checks import IperfSettings
 from fieldkit.measure.evidence import iperf3
 from tests.helpers.paths import DATA
 
@@ -26,17 +26,19 @@ def document(version: str, test: str, end: str) -> Any:  # noqa: ANN401 (of JSON
     return json.loads((DATA / "iperf3" / version / f"{test}-{end}.json").read_text(encoding="utf-8"))
 
 
-def order(test: str) -> IperfOrder:
+def order(test: str) -> IperfSettings:
     tcp = test == "tcp"
     protocol = Protocol.TCP if tcp else Protocol.UDP
-    return IperfOrder(protocol, streams=1 + tcp, payload_bytes=1400, reverse=test.endswith("reverse"), lasts_s=3.0)
+    return IperfSettings(protocol, streams=1 + tcp, payload_bytes=1400, reverse=test.endswith("reverse"), lasts_s=3.0)
 
 
 def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: ANN401 (of JSON)
     ends = [iperf3.parse(json.dumps(end)) for end in (client, server)]
     reverse = test.endswith("reverse")
-    own = (iperf3_checks.within(end, sends=sends) for end, sends in zip(ends, (not reverse, reverse), strict=True))
-    return [*chain(*own), *iperf3_checks.between(ends[0], ends[1], order(test))]
+    own = (
+        iperf3_checks.check_one_end(end, sends=sends) for end, sends in zip(ends, (not reverse, reverse), strict=True)
+    )
+    return [*chain(*own), *iperf3_checks.compare_ends(ends[0], ends[1], order(test))]
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -106,11 +108,11 @@ def test_a_test_with_other_settings_is_a_contradiction(version: str, key: str, v
 
 def test_a_test_that_ended_too_early_or_is_from_another_time() -> None:
     client, server = (iperf3.parse(json.dumps(document("3.12", "tcp", end))) for end in ("client", "server"))
-    (reason,) = iperf3_checks.between(client, server, replace(order("tcp"), lasts_s=10.0))
+    (reason,) = iperf3_checks.compare_ends(client, server, replace(order("tcp"), lasts_s=10.0))
     assert reason == "the client's intervals last 3.0 s in total instead of 10 s"
     began_ns = 10**9 * (client.start.began_utc_s or 0)
-    assert iperf3_checks.misdated(client, (began_ns - 10**9, began_ns + 5 * 10**9)) is None
-    assert iperf3_checks.misdated(client, None) is None
+    assert iperf3_checks.date_problem(client, (began_ns - 10**9, began_ns + 5 * 10**9)) is None
+    assert iperf3_checks.date_problem(client, None) is None
     hour_ns = 3600 * 10**9
-    late = iperf3_checks.misdated(client, (began_ns - hour_ns, began_ns - hour_ns + 10**10))
+    late = iperf3_checks.date_problem(client, (began_ns - hour_ns, began_ns - hour_ns + 10**10))
     assert late == "it began 3590 s after the attempt"

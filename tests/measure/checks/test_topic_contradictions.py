@@ -44,7 +44,7 @@ def with_samples(rows: Sequence[Row], change: Callable[[int, Row], Row | None]) 
 
 
 def changed(made: TopicAttempt, end: str, rows: Sequence[Row]) -> TopicAttempt:
-    return replace(made, sent=tuple(rows)) if end == "sent" else replace(made, came=tuple(rows))
+    return replace(made, sent=tuple(rows)) if end == "sent" else replace(made, received=tuple(rows))
 
 
 def later(row: Row, by_ns: int) -> Row:
@@ -68,7 +68,7 @@ def require_noticed(reasons: list[str], measured: Measured, before: Measured) ->
 @pytest.mark.parametrize("signed", [True, False], ids=["signed", "unsigned"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_valid_attempt_has_no_contradiction(kind: str, signed: bool, tmp_path: Path) -> None:
-    reasons, measured = topic_attempts.judged(KINDS[kind], tmp_path, signed=signed)
+    reasons, measured = topic_attempts.judge_attempt(KINDS[kind], tmp_path, signed=signed)
     assert reasons == []
     # The fastest packet took 1 ms and its record 0.2 ms; the slowest took 84 us more.
     assert measured.values["topic_delay_median_s"] == pytest.approx(1.24e-3, abs=6e-5)
@@ -82,8 +82,8 @@ SHIFTS = (HOUR, -HOUR, 50 * MS, -50 * MS, 10 * MS, -2 * MS, SECOND)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_path: Path) -> None:
     made = KINDS[kind]
-    came = with_samples(made.came, lambda _, row: later(row, shift_ns))
-    reasons, _ = topic_attempts.judged(replace(made, came=came), tmp_path)
+    received = with_samples(made.received, lambda _, row: later(row, shift_ns))
+    reasons, _ = topic_attempts.judge_attempt(replace(made, received=received), tmp_path)
     assert reasons
     which = "before their packets" if shift_ns < 0 else "later than its capture for every sample"
     which = "from before its start or after its end" if abs(shift_ns) == HOUR else which
@@ -93,8 +93,8 @@ def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_pa
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_log_without_half_of_the_arrivals_is_noticed(kind: str, tmp_path: Path) -> None:
     made = KINDS[kind]
-    came = with_samples(made.came, lambda place, row: row if place % 2 else None)
-    reasons, _ = topic_attempts.judged(replace(made, came=came), tmp_path)
+    received = with_samples(made.received, lambda place, row: row if place % 2 else None)
+    reasons, _ = topic_attempts.judge_attempt(replace(made, received=received), tmp_path)
     if kind == "reliable with samples given up":  # nothing behind a gap need ever be handed over
         assert reasons
         return
@@ -125,8 +125,8 @@ def other_sending(place: int, row: Row) -> Row:
 def test_a_subscribers_log_with_one_wrong_field_is_noticed(
     kind: str, change: Callable[[int, Row], Row], why: str, tmp_path: Path
 ) -> None:
-    made = replace(KINDS[kind], came=with_samples(KINDS[kind].came, change))
-    reasons, _ = topic_attempts.judged(made, tmp_path)
+    made = replace(KINDS[kind], received=with_samples(KINDS[kind].received, change))
+    reasons, _ = topic_attempts.judge_attempt(made, tmp_path)
     assert any(why in reason for reason in reasons)
 
 
@@ -143,7 +143,7 @@ def test_a_publishers_log_with_one_wrong_field_is_noticed(
     change: Callable[[int, Row], Row | None], why: str, tmp_path: Path
 ) -> None:
     made = KINDS["best effort with losses"]
-    reasons, _ = topic_attempts.judged(replace(made, sent=with_samples(made.sent, change)), tmp_path)
+    reasons, _ = topic_attempts.judge_attempt(replace(made, sent=with_samples(made.sent, change)), tmp_path)
     assert any(why in reason for reason in reasons)
 
 
@@ -153,8 +153,8 @@ def test_the_same_change_in_both_logs_is_noticed_by_the_captures(tmp_path: Path)
     def earlier(_: int, row: Row) -> Row:
         return (*row[:3], row[3] - 30 * MS, row[4])
 
-    both = replace(made, sent=with_samples(made.sent, earlier), came=with_samples(made.came, earlier))
-    reasons, _ = topic_attempts.judged(both, tmp_path)
+    both = replace(made, sent=with_samples(made.sent, earlier), received=with_samples(made.received, earlier))
+    reasons, _ = topic_attempts.judge_attempt(both, tmp_path)
     assert any("another time of sending than in its capture" in reason for reason in reasons)
 
 
@@ -165,7 +165,7 @@ def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp
     sent = (tmp_path / "sender-topic.bin").read_bytes()
     (tmp_path / "receiver-topic.bin").write_bytes(sent)
     log = topic_log.read(tmp_path / "receiver-topic.bin")
-    reasons = list(topic_checks.of_logs(PLAN, log, log))
+    reasons = list(topic_checks.check_logs(PLAN, log, log))
     assert "the subscriber's log is a copy of the publisher's" in reasons
     assert ("the subscriber's log was written by the publisher of the topic" in reasons) is signed
 
@@ -173,7 +173,7 @@ def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp
 def test_the_log_of_another_topic_is_noticed(tmp_path: Path) -> None:
     topic_attempts.write(KINDS["over TCP"], tmp_path)
     sent, came = (topic_log.read(tmp_path / f"{role}-topic.bin") for role in ("sender", "receiver"))
-    (publisher, subscriber) = topic_checks.of_logs(replace(PLAN, topic="/other"), sent, came)
+    (publisher, subscriber) = topic_checks.check_logs(replace(PLAN, topic="/other"), sent, came)
     assert "publisher's log is of another topic" in publisher
     assert "subscriber's log is of another topic" in subscriber
 
@@ -183,11 +183,11 @@ def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
     log = topic_log.read(tmp_path / "sender-topic.bin")
     role = Role.SENDER
     first, last = int(log.times_ns.min()), int(log.times_ns.max())
-    assert not list(topic_checks.of_window({role: log}, {role: (first, last)}))
-    assert not list(topic_checks.of_window({role: log}, {}))
-    (early,) = topic_checks.of_window({role: log}, {role: (first + SECOND, last)})
+    assert not list(topic_checks.check_times({role: log}, {role: (first, last)}))
+    assert not list(topic_checks.check_times({role: log}, {}))
+    (early,) = topic_checks.check_times({role: log}, {role: (first + SECOND, last)})
     assert "a record from 1.000 s before the attempt" in early
-    (late,) = topic_checks.of_window({role: log}, {role: (first, last - SECOND)})
+    (late,) = topic_checks.check_times({role: log}, {role: (first, last - SECOND)})
     assert "a record from 1.000 s after the attempt" in late
 
 
@@ -195,13 +195,16 @@ def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
 def test_samples_in_the_log_that_never_arrived_are_noticed(kind: str, tmp_path: Path) -> None:
     """The subscriber's capture lacks ten samples that are in its log."""
     made = KINDS[kind]
-    few = replace(made, far=tuple(frame for frame in made.far if not is_data(frame) or frame.time_ns % 4))
+    few = replace(
+        made,
+        receiver_frames=tuple(frame for frame in made.receiver_frames if not is_data(frame) or frame.time_ns % 4),
+    )
     sent_again = [row for row in made.sent if is_sample(row)]
-    there = {row[2] for row in made.came if is_sample(row)}
+    there = {row[2] for row in made.received if is_sample(row)}
     extra = [later(row, topic_attempts.AHEAD + 2 * MS) for row in sent_again if row[2] not in there]
-    came = tuple(sorted((*made.came, *extra), key=lambda row: row[4]))
+    received = tuple(sorted((*made.received, *extra), key=lambda row: row[4]))
     if extra:
-        reasons, _ = topic_attempts.judged(replace(few, came=came), tmp_path)
+        reasons, _ = topic_attempts.judge_attempt(replace(few, received=received), tmp_path)
         assert any("are not in its capture" in reason for reason in reasons)
 
 
@@ -212,14 +215,16 @@ def is_data(frame: Frame) -> bool:
 def test_an_overflowed_queue_is_no_contradiction(tmp_path: Path) -> None:
     """The program stopped for 15 samples; its queue of 10 has the newest."""
     made = KINDS["reliable over UDP"]
-    resumed = next(row for place, row in enumerate(filter(is_sample, made.came)) if place == 30)[4]
+    resumed = next(row for place, row in enumerate(filter(is_sample, made.received)) if place == 30)[4]
 
     def held(place: int, row: Row) -> Row | None:
         if not 15 <= place < 30:
             return row
         return None if place < 20 else (*row[:4], resumed - MS)
 
-    reasons, measured = topic_attempts.judged(replace(made, came=with_samples(made.came, held)), tmp_path)
+    reasons, measured = topic_attempts.judge_attempt(
+        replace(made, received=with_samples(made.received, held)), tmp_path
+    )
     assert reasons == []
     assert measured.values["topic_received"] == SAMPLES - 5
     assert "its program was delayed" in measured.missing["topic_delay_max_s"]
@@ -228,12 +233,17 @@ def test_an_overflowed_queue_is_no_contradiction(tmp_path: Path) -> None:
 def test_a_capture_without_heads_limits_the_number_of_arrivals(tmp_path: Path) -> None:
     """As with the shorter snap length of older captures: Zenoh's heads were not captured."""
     made = KINDS["over TCP"]
-    cut = replace(made, near=shorter(made.near), far=shorter(made.far))
-    assert topic_attempts.judged(cut, tmp_path)[0] == []
-    early = with_samples(made.came, lambda _, row: later(row, -20 * MS))
-    assert "before their bytes in its capture" in topic_attempts.judged(replace(cut, came=early), tmp_path)[0][0]
-    few = with_samples(made.came, lambda place, row: row if place < 8 else None)
-    assert "are not in the subscriber's log" in topic_attempts.judged(replace(cut, came=few), tmp_path)[0][0]
+    cut = replace(made, sender_frames=shorter(made.sender_frames), receiver_frames=shorter(made.receiver_frames))
+    assert topic_attempts.judge_attempt(cut, tmp_path)[0] == []
+    early = with_samples(made.received, lambda _, row: later(row, -20 * MS))
+    assert (
+        "before their bytes in its capture"
+        in topic_attempts.judge_attempt(replace(cut, received=early), tmp_path)[0][0]
+    )
+    few = with_samples(made.received, lambda place, row: row if place < 8 else None)
+    assert (
+        "are not in the subscriber's log" in topic_attempts.judge_attempt(replace(cut, received=few), tmp_path)[0][0]
+    )
 
 
 def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
@@ -258,13 +268,13 @@ def test_a_change_in_any_range_of_a_field_is_noticed(
 ) -> None:
     made, (first, count) = KINDS[kind], some
     rows: list[Row] = list(getattr(made, end))
-    before = topic_attempts.judged(made, folder)[1]
+    before = topic_attempts.judge_attempt(made, folder)[1]
     for place in range(first, min(first + count, len(rows))):
         row = list(rows[place])
         row[field] = row[field] + by if field else by % 7 + 1
         rows[place] = (row[0], abs(row[1]) % 2**32, row[2], row[3], row[4])
     try:
-        reasons, measured = topic_attempts.judged(changed(made, end, rows), folder)
+        reasons, measured = topic_attempts.judge_attempt(changed(made, end, rows), folder)
     except EvidenceError:
         return
     require_noticed(reasons, measured, before)
@@ -281,7 +291,7 @@ def test_missing_or_duplicated_records_are_noticed(
     kind: str, end: str, chosen: set[int], twice: bool, folder: Path
 ) -> None:
     made = KINDS[kind]
-    before = topic_attempts.judged(made, folder)[1]
+    before = topic_attempts.judge_attempt(made, folder)[1]
     rows: Sequence[Row] = getattr(made, end)
     times = [1 + twice if place in chosen else 1 if twice or place not in chosen else 0 for place in range(len(rows))]
     if not twice:
@@ -289,7 +299,7 @@ def test_missing_or_duplicated_records_are_noticed(
     kept = tuple(row for row, count in zip(rows, times, strict=True) for _ in range(count))
     if not kept:
         return
-    reasons, measured = topic_attempts.judged(changed(made, end, kept), folder)
+    reasons, measured = topic_attempts.judge_attempt(changed(made, end, kept), folder)
     if kind == "reliable with samples given up" and end == "came" and not twice:
         return  # behind a gap nothing shows whether the middleware handed a sample over
     require_noticed(reasons, measured, before)

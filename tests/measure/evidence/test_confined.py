@@ -34,15 +34,15 @@ def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[confined.Confined]:
+def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[confined.SandboxedReader]:
     """Reader that unpacks 1 kB and is killed by the signals of the query, one per try, before it answers."""
     (tmp_path / "unpacks.py").write_text(_UNPACKS, encoding="utf-8")
     (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    reader = confined.Confined("unpacks")
+    reader = confined.SandboxedReader("unpacks")
     yield reader
-    reader.end()
+    reader.stop()
 
 
 _UNPACKS = """
@@ -77,23 +77,23 @@ confined.serve(answer)
     ],
 )
 def test_a_reader_that_is_killed_externally_is_restarted_and_leaves_no_files(
-    unpacks: confined.Confined, tmp_path: Path, signals: list[signal.Signals], why: str | None
+    unpacks: confined.SandboxedReader, tmp_path: Path, signals: list[signal.Signals], why: str | None
 ) -> None:
     question = {"signals": signals, "ended": str(tmp_path / "ended")}
     if why is None:
-        assert unpacks.ask(question, 1) == {"said": "whole"}
+        assert unpacks.query(question, 1) == {"said": "whole"}
     else:
-        with pytest.raises(confined.ConfinedAnswerError, match=why):
-            unpacks.ask(question, 1)
+        with pytest.raises(confined.ReaderError, match=why):
+            unpacks.query(question, 1)
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_the_limit_of_an_answer_grows_with_the_file(unpacks: confined.Confined) -> None:
+def test_the_limit_of_an_answer_grows_with_the_file(unpacks: confined.SandboxedReader) -> None:
     large = confined.ANSWER_BYTES + 1000
-    assert len(unpacks.ask({"says": large}, 4096)["said"]) == large
-    with pytest.raises(confined.ConfinedAnswerError, match="its contents exceed the limit for a file of its size"):
-        unpacks.ask({"says": large}, 10)
-    assert len(unpacks.ask({"says": 10}, 10)["said"]) == 10, "the next query is answered"
+    assert len(unpacks.query({"says": large}, 4096)["said"]) == large
+    with pytest.raises(confined.ReaderError, match="its contents exceed the limit for a file of its size"):
+        unpacks.query({"says": large}, 10)
+    assert len(unpacks.query({"says": 10}, 10)["said"]) == 10, "the next query is answered"
 
 
 def test_a_reader_needs_no_disk_space_if_it_unpacks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,7 +106,7 @@ def test_sparse_and_large_files_have_limits_of_the_machine(tmp_path: Path) -> No
     path = tmp_path / "scan.bag"
     path.touch()
     os.truncate(path, 1 << 42)
-    assert bag.given_bytes(path) < 128 * MIB
+    assert bag.allocated_bytes(path) < 128 * MIB
     memory_bytes, _, cpu_s = confined._limits(1 << 42)
     assert memory_bytes < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     assert cpu_s == confined.MAX_CPU_S

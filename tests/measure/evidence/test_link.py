@@ -80,7 +80,7 @@ def test_any_values_of_a_driver_give_a_table_that_can_be_read(recorded: list[Lin
     measured_link = link.measure(Role.SENDER, recorded)
     for column in link.COLUMNS[: len(link.COLUMNS) // 2]:
         assert (column.name in measured_link.values) is not (column.name in measured_link.missing)
-        assert not column.problem(cell(measured_link.values.get(column.name)))
+        assert not column.invalid_value_reason(cell(measured_link.values.get(column.name)))
 
 
 def test_an_access_points_link_has_the_station_with_the_most_packets() -> None:

@@ -97,7 +97,7 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
         (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode()))
     else:
         (tmp_path / "sender-link.txt").write_text(OWN, encoding="utf-8")
-    samples_read = link_samples.read_own(tmp_path, Role.SENDER)
+    samples_read = link_samples.read_robot(tmp_path, Role.SENDER)
     at_s = [item.utc_ns / S - BOOTED_S for item in samples_read]
     assert at_s == pytest.approx([100.0, 101.0, 101.2, 101.4, 102.0], abs=0.02)
     packets = [[station.tx_packets for station in item.stations if station.station] for item in samples_read]
@@ -125,9 +125,9 @@ def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
 
 def test_without_a_clock_or_a_file_there_are_no_samples(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="does not contain the clock"):
-        link_samples.read_own(tmp_path, Role.SENDER)
+        link_samples.read_robot(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
-    assert link_samples.read_own(tmp_path, Role.SENDER) == ()
+    assert link_samples.read_robot(tmp_path, Role.SENDER) == ()
     (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode())[:-20])
     with pytest.raises(EvidenceError, match="cannot be read"):
-        link_samples.read_own(tmp_path, Role.SENDER)
+        link_samples.read_robot(tmp_path, Role.SENDER)

@@ -52,4 +52,4 @@ def test_other_lines_are_ignored(line: str) -> None:
 def test_terminations_that_are_not_acceptable(
     line: str, allowed: Collection[Cause], least_s: float, problem: str | None
 ) -> None:
-    assert endings.problem(endings.parse([line])["job"], allowed, least_s) == problem
+    assert endings.termination_error(endings.parse([line])["job"], allowed, least_s) == problem

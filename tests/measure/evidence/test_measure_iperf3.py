@@ -148,7 +148,7 @@ def test_no_output_gives_an_impossible_value(
             value = result.values[column.name]
             assert isinstance(value, int | float)
             assert math.isfinite(value)
-            assert column.problem(str(value)) is None or value > 1e15, (column.name, value)
+            assert column.invalid_value_reason(str(value)) is None or value > 1e15, (column.name, value)
 
 
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:

@@ -8,22 +8,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import FIXED_ROLES, Role, Whereabouts
+from fieldkit.core.model import FIXED_ROLES, Role, TrackPoint
 from fieldkit.measure.evidence import track
 from tests.helpers.measures import measure
 
 S = 10**9
 ENDS = (Role.SENDER, Role.RECEIVER)
-HERE = Whereabouts(5 * S, Role.SENDER, (1.0, 0.0, 0.2))
-THERE = Whereabouts(5 * S, Role.RECEIVER, (4.0, 4.0, 0.2))
+HERE = TrackPoint(5 * S, Role.SENDER, (1.0, 0.0, 0.2))
+THERE = TrackPoint(5 * S, Role.RECEIVER, (4.0, 4.0, 0.2))
 AWAY = (
     HERE,
     THERE,
-    Whereabouts(10 * S, Role.SENDER, (1.0, 0.0, 0.2), (-3.0, 0.0, 0.0)),
-    Whereabouts(11 * S, Role.SENDER, (-4.0, 4.0, 0.2), (-3.0, 0.0, 4.0)),
-    Whereabouts(12 * S, Role.RELAY, (0.0, 0.0, 0.2)),
-    Whereabouts(13 * S, Role.SENDER, None),
-    Whereabouts(15 * S, Role.SENDER, (1.0, 0.0, 0.2)),
+    TrackPoint(10 * S, Role.SENDER, (1.0, 0.0, 0.2), (-3.0, 0.0, 0.0)),
+    TrackPoint(11 * S, Role.SENDER, (-4.0, 4.0, 0.2), (-3.0, 0.0, 4.0)),
+    TrackPoint(12 * S, Role.RELAY, (0.0, 0.0, 0.2)),
+    TrackPoint(13 * S, Role.SENDER, None),
+    TrackPoint(15 * S, Role.SENDER, (1.0, 0.0, 0.2)),
 )
 PING = """\
 PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
@@ -35,23 +35,23 @@ PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
 COORDINATES = st.integers(-(10**7), 10**7).map(lambda tenths: tenths / 1e4)
 VECTORS = st.tuples(COORDINATES, COORDINATES, COORDINATES)
 TRACKS = st.lists(
-    st.builds(Whereabouts, st.integers(0, 2**63), st.sampled_from(FIXED_ROLES), st.none() | VECTORS, VECTORS),
+    st.builds(TrackPoint, st.integers(0, 2**63), st.sampled_from(FIXED_ROLES), st.none() | VECTORS, VECTORS),
     max_size=20,
 ).map(lambda track: sorted(track, key=lambda entry: entry.utc_ns))
 
 
 def test_distance_and_speed_are_means_over_times_with_positions() -> None:
-    separation = track.apart(AWAY, *ENDS, 10 * S + S // 2, 14 * S)
+    separation = track.separation_between(AWAY, *ENDS, 10 * S + S // 2, 14 * S)
     # 0.5 s at 5 m, 2 s at 8 m, then 1 s without a position.
     assert separation is not None
     assert astuple(separation) == pytest.approx((5.0, 5.0, 18.5 / 2.5, 8.0, 11.5 / 2.5, 11.5 / 2.5))
 
 
 def test_a_single_time_has_a_distance_and_times_before_the_track_have_none() -> None:
-    assert track.apart(AWAY, *ENDS, 11 * S, 11 * S) == track.Apart(8.0, 8.0, 8.0, 8.0, 5.0, 5.0)
-    assert track.apart(AWAY, *ENDS, 13 * S, 14 * S) is None
-    assert track.apart(AWAY, *ENDS, 1 * S, 14 * S) is None
-    assert track.apart((HERE,), *ENDS, 6 * S, 14 * S) is None
+    assert track.separation_between(AWAY, *ENDS, 11 * S, 11 * S) == track.Separation(8.0, 8.0, 8.0, 8.0, 5.0, 5.0)
+    assert track.separation_between(AWAY, *ENDS, 13 * S, 14 * S) is None
+    assert track.separation_between(AWAY, *ENDS, 1 * S, 14 * S) is None
+    assert track.separation_between((HERE,), *ENDS, 6 * S, 14 * S) is None
 
 
 def test_distances_change_with_both_robots_but_not_with_the_relay() -> None:
@@ -79,7 +79,7 @@ def test_columns_have_the_distance_between_first_and_last_reply(tmp_path: Path) 
 
 
 @given(TRACKS)
-def test_a_written_track_is_read(tmp_path_factory: pytest.TempPathFactory, whereabouts: list[Whereabouts]) -> None:
+def test_a_written_track_is_read(tmp_path_factory: pytest.TempPathFactory, whereabouts: list[TrackPoint]) -> None:
     path = tmp_path_factory.getbasetemp() / "track.csv"
     path.write_text(track.text(whereabouts), encoding="ascii")
     assert track.read(path) == tuple(whereabouts)
@@ -111,4 +111,4 @@ def test_other_contents_are_refused(tmp_path: Path, other: str) -> None:
 
 
 def test_no_minus_zero_is_written() -> None:
-    assert "-0.0000" not in track.text([Whereabouts(1, Role.SENDER, (-0.0, -1e-9, 0.0), (-0.0, 0.0, 0.0))])
+    assert "-0.0000" not in track.text([TrackPoint(1, Role.SENDER, (-0.0, -1e-9, 0.0), (-0.0, 0.0, 0.0))])

@@ -85,17 +85,17 @@ def test_an_expression_with_catastrophic_backtracking_is_fast(output: Path) -> N
 
 @pytest.mark.parametrize("text", ["(", "a", "(a)(b)", r"(a)\1", "(?=a)(b)"])
 def test_an_expression_without_exactly_one_group_is_refused(text: str) -> None:
-    assert printed.problem_of_expression(text)
+    assert printed.expression_error(text)
 
 
 @pytest.mark.parametrize("text", ["", "a[", "a b", "f("])
 def test_an_invalid_path_is_refused(text: str) -> None:
-    assert printed.problem_of_path(text)
+    assert printed.path_error(text)
 
 
 def test_valid_paths_and_expressions_are_accepted() -> None:
-    assert printed.problem_of_path("a.b[0].c") is None
-    assert printed.problem_of_expression("(?:a|b)([0-9.]+)") is None
+    assert printed.path_error("a.b[0].c") is None
+    assert printed.expression_error("(?:a|b)([0-9.]+)") is None
 
 
 @pytest.mark.parametrize("text", ["", "{", "{'a': 1}", 100_000 * "[", STATUS[:-9], "NaN x", "9" * 5000])
@@ -116,9 +116,9 @@ def test_a_path_that_does_not_match_the_data_is_an_error(output: Path) -> None:
 
 
 def test_truncated_output_is_an_error(output: Path) -> None:
-    output.write_bytes(b" " * (printed.MOST_BYTES - 1))
-    assert len(printed.text(output)) == printed.MOST_BYTES - 1
-    output.write_bytes(b" " * printed.MOST_BYTES)
+    output.write_bytes(b" " * (printed.MAX_OUTPUT_BYTES - 1))
+    assert len(printed.text(output)) == printed.MAX_OUTPUT_BYTES - 1
+    output.write_bytes(b" " * printed.MAX_OUTPUT_BYTES)
     with pytest.raises(EvidenceError, match="more than 1 MiB"):
         printed.text(output)
 
@@ -138,14 +138,14 @@ def test_any_extracted_value_is_a_valid_cell_or_an_error(extracted: object, unit
         return
     assert isinstance(value, column(unit).type)
     if not isinstance(value, str):
-        assert column(unit).problem(json.dumps(value)) is None
+        assert column(unit).invalid_value_reason(json.dumps(value)) is None
     else:
         assert value.isprintable()
 
 
 @pytest.mark.parametrize("where", ["(" * 5000 + "a" + ")" * 5000, "a" + "|a" * 5000])
 def test_a_path_that_is_nested_too_deeply_is_an_error(output: Path, where: str) -> None:
-    if reason := printed.problem_of_path(where):
+    if reason := printed.path_error(where):
         assert reason == "it is nested too deeply"
         return
     with pytest.raises(EvidenceError, match="nested too deeply"):

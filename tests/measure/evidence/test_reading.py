@@ -17,13 +17,13 @@ def test_files_are_compared_byte_for_byte(tmp_path: Path, at: int, change: bytes
     whole[at : at + len(change)] = change
     (tmp_path / "b").write_bytes(whole)
     assert reading.size(tmp_path / "a") == reading.size(tmp_path / "b") == 3 << 20
-    assert reading.same(tmp_path, "a", "b") is same
+    assert reading.have_equal_bytes(tmp_path, "a", "b") is same
 
 
 def test_a_prefix_of_a_file_is_not_equal_to_it(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"x" * 10)
     (tmp_path / "b").write_bytes(b"x" * 11)
-    assert not reading.same(tmp_path, "a", "b")
+    assert not reading.have_equal_bytes(tmp_path, "a", "b")
 
 
 @pytest.mark.parametrize("read", [reading.size, reading.text, reading.mapped])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Leg, Role, Whereabouts
+from fieldkit.core.model import Leg, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import numbered_lines, track
 from fieldkit.measure.motion import drive_checks, drive_log
@@ -150,7 +150,7 @@ def test_any_flipped_bit_is_detected(place: int, bit: int, tmp_path_factory: pyt
 def oracle(folder: Path, far_m: float) -> AttemptEvidence:
     """Evidence with a testbed's track of a robot that drives away in 4 s, and back."""
     places = [
-        Whereabouts(START_NS + at * 10**9, Role.RECEIVER, (10 + far_m * x, 0, 0), (0, 0, 0))
+        TrackPoint(START_NS + at * 10**9, Role.RECEIVER, (10 + far_m * x, 0, 0), (0, 0, 0))
         for at, x in ((0, 0), (4, 1), (9, 0))
     ]
     (folder / track.FILE).write_text(track.text(places), encoding="ascii")

@@ -152,4 +152,4 @@ def test_any_log_is_refused_or_gives_possible_values(
         if column.name in measured.values:
             value = measured.values[column.name]
             assert isinstance(value, column.type)
-            assert column.problem(str(value)) is None
+            assert column.invalid_value_reason(str(value)) is None

@@ -16,7 +16,7 @@ from fieldkit.agent.flying.origin import FlightOrigin
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.motion import fly_log
 from fieldkit.measure.motion.fly_log import FlightMoment
-from tests.agent.test_agent_flight import talk
+from tests.agent.test_agent_flight import state_from
 
 NAMES = {column.name for column in fly_log.COLUMNS}
 BEGIN_M = (10.0, -4.0, -1.5)
@@ -40,8 +40,8 @@ def written(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
 def at(place_m: tuple[float, float, float] | None, speed_m_s: float) -> AutopilotState:
     """Return the state of an autopilot that has reported this."""
     if place_m is None:
-        return talk()[0]
-    return talk(d.MAVLink_local_position_ned_message(1, *place_m, speed_m_s, 0.0, 0.0))[0]
+        return state_from()[0]
+    return state_from(d.MAVLink_local_position_ned_message(1, *place_m, speed_m_s, 0.0, 0.0))[0]
 
 
 def flown(path: Path, yaw_rad: float) -> None:
@@ -145,4 +145,4 @@ def test_the_columns_of_any_log_are_possible(log: list[FlightMoment]) -> None:
     assert measured.values.keys() | measured.missing.keys() == NAMES
     for column in fly_log.COLUMNS:
         if column.name in measured.values:
-            assert column.problem(str(measured.values[column.name])) is None
+            assert column.invalid_value_reason(str(measured.values[column.name])) is None

@@ -183,7 +183,7 @@ def _answered(data: bytes, question: Mapping[str, object]) -> object:
     autopilot = tlog_reader._autopilot(data, 0)
     if "positions" in question:
         return list(tlog_reader._positions(data, autopilot, str(question["positions"])))
-    return json.dumps(tlog_reader._summary(data, autopilot, 0))
+    return json.dumps(tlog_reader._summary(data, autopilot, 0, {}))
 
 
 SAID = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32": 2}}
@@ -192,7 +192,7 @@ SAID = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32"
 def test_the_summary_of_a_recorder(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
     path.write_text(json.dumps(SAID), encoding="utf-8")
-    assert tlog.told(path) == tlog.RecorderSummary(3, 0, 5, {32: 2})
+    assert tlog.read_summary(path) == tlog.RecorderSummary(3, 0, 5, {32: 2})
 
 
 WRONG: list[dict[str, object]] = [
@@ -212,26 +212,36 @@ def test_an_invalid_summary_is_refused(recorder_summary: str, tmp_path: Path) ->
     path = tmp_path / "mavlink.json"
     path.write_text(recorder_summary, encoding="utf-8")
     with pytest.raises(EvidenceError, match="is not a summary of a recording"):
-        tlog.told(path)
+        tlog.read_summary(path)
 
 
 def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.tlog"
     path.write_bytes(flight())
     log = tlog.read(path, 0, 0)
-    recorder_summary = tlog.RecorderSummary(log.frames, 0, log.last_us + 5, {}, tlog.sum_of(path))
+    recorder_summary = tlog.RecorderSummary(log.frames, 0, log.last_us + 5, {}, tlog.crc32_of(path))
     window = log.first_us * 1000, log.last_us * 1000 + 999
-    assert list(tlog.contradictions(log, recorder_summary, tlog.sum_of(path), window)) == []
+    assert list(tlog.contradictions(log, recorder_summary, tlog.crc32_of(path), window)) == []
     for other, total, around, why in (
         (recorder_summary, 7, window, "its checksum differs"),
         (
             replace(recorder_summary, ended_us=log.last_us - 10**6),
-            tlog.sum_of(path),
+            tlog.crc32_of(path),
             window,
             "1.000 s after its recorder ended",
         ),
-        (recorder_summary, tlog.sum_of(path), (window[0] + 10**9, window[1]), "from before the attempt or after it"),
-        (recorder_summary, tlog.sum_of(path), (window[0], window[1] - 10**9), "from before the attempt or after it"),
+        (
+            recorder_summary,
+            tlog.crc32_of(path),
+            (window[0] + 10**9, window[1]),
+            "from before the attempt or after it",
+        ),
+        (
+            recorder_summary,
+            tlog.crc32_of(path),
+            (window[0], window[1] - 10**9),
+            "from before the attempt or after it",
+        ),
     ):
         (reason,) = tlog.contradictions(log, other, total, around)
         assert why in reason

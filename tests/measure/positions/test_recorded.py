@@ -161,10 +161,10 @@ def test_odometry_is_transformed_to_the_robots_place_and_heading(tmp_path: Path)
     messages = [odometry(BEGAN_NS, *began), odometry(BEGAN_NS + S, 5.0, 7.0, math.pi / 2)]
     odometry_samples = recorded.read_bag(written(tmp_path, messages), Account(topic="/where"))
     account = Account(topic="/where", start=(10.0, 0.0, 0.0), heading_rad=math.pi, began_utc_ns=BEGAN_NS + S // 2)
-    samples = recorded.from_start(odometry_samples, account)
+    samples = recorded.to_placement_frame(odometry_samples, account)
     assert samples.values == pytest.approx(np.array([[10, 0, 0], [8, 0, 0]]), abs=1e-9), "2 m ahead, facing back"
     late = Account(topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS - 3 * S)
     with pytest.raises(EvidenceError, match=r"/where begins 3\.0 s after the step started"):
-        recorded.from_start(odometry_samples, late)
+        recorded.to_placement_frame(odometry_samples, late)
     with pytest.raises(EvidenceError, match="the robot's initial heading is unknown"):
-        recorded.from_start(odometry_samples, Account(topic="/where", began_utc_ns=BEGAN_NS))
+        recorded.to_placement_frame(odometry_samples, Account(topic="/where", began_utc_ns=BEGAN_NS))

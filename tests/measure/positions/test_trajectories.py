@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from fieldkit.measure.positions import trajectories
-from fieldkit.measure.positions.trajectories import Trajectory, apart, stationary
+from fieldkit.measure.positions.trajectories import Trajectory, separation_between, stationary
 
 S = 10**9
 EPOCH_NS = 1_795_365_294 * S
@@ -28,7 +28,7 @@ def at(seconds: float) -> int:
 
 def test_a_robot_that_passes_by_has_the_closed_form_of_smallest_and_mean_distance() -> None:
     passing = trajectory((0, -4, 3), (2, 0, 3), (4, 4, 3))
-    separation = apart(ORIGIN, passing, at(0), at(4))
+    separation = separation_between(ORIGIN, passing, at(0), at(4))
     integral = 4 * 5 / 2 + 9 / 2 * math.asinh(4 / 3)  # of sqrt(x^2 + 9) from 0 to 4
     assert separation.distance_start_m == separation.distance_max_m == pytest.approx(5)
     assert separation.distance_min_m == pytest.approx(3)
@@ -38,12 +38,14 @@ def test_a_robot_that_passes_by_has_the_closed_form_of_smallest_and_mean_distanc
 
 
 def test_the_smallest_distance_may_be_between_two_samples() -> None:
-    assert apart(ORIGIN, trajectory((0, -4, 3), (4, 4, 3), gap_s=5), at(0), at(4)).distance_min_m == pytest.approx(3)
+    assert separation_between(
+        ORIGIN, trajectory((0, -4, 3), (4, 4, 3), gap_s=5), at(0), at(4)
+    ).distance_min_m == pytest.approx(3)
 
 
 def test_two_robots_that_move_together_have_no_relative_speed() -> None:
     source, destination = trajectory((0, 0, 0), (2, 2, 0)), trajectory((0, 0, 5), (1, 1, 5), (2, 2, 5))
-    separation = apart(source, destination, at(0.5), at(1.5))
+    separation = separation_between(source, destination, at(0.5), at(1.5))
     assert (separation.distance_min_m, separation.distance_max_m, separation.distance_mean_m) == pytest.approx(
         (5, 5, 5)
     )
@@ -52,14 +54,14 @@ def test_two_robots_that_move_together_have_no_relative_speed() -> None:
 
 
 def test_a_single_time_has_a_distance_and_the_speed_around_it() -> None:
-    separation = apart(ORIGIN, trajectory((0, 0, 0), (3, 6, 0)), at(1), at(1))
+    separation = separation_between(ORIGIN, trajectory((0, 0, 0), (3, 6, 0)), at(1), at(1))
     assert separation.distance_start_m == separation.distance_mean_m == pytest.approx(2)
     assert separation.relative_speed_m_s == pytest.approx(2)
 
 
 def test_noise_in_close_samples_is_not_a_speed() -> None:
     trembling = trajectory(*((0.001 * n, 10 + 0.001 * (-1) ** n, 0) for n in range(1001)))
-    assert apart(ORIGIN, trembling, at(0), at(1)).relative_speed_m_s < 0.02
+    assert separation_between(ORIGIN, trembling, at(0), at(1)).relative_speed_m_s < 0.02
 
 
 @pytest.mark.parametrize(
@@ -99,7 +101,7 @@ def test_distances_equal_a_dense_sum(source: Trajectory, destination: Trajectory
     assume(last > first)
     start_ns = data.draw(st.integers(first, last - 1))
     end_ns = data.draw(st.integers(start_ns + 1, last))
-    separation = apart(source, destination, start_ns, end_ns)
+    separation = separation_between(source, destination, start_ns, end_ns)
     times_ns = np.linspace(start_ns - EPOCH_NS, end_ns - EPOCH_NS, 4001).astype(np.int64) + EPOCH_NS
     dense = np.linalg.norm(destination.at_m(times_ns) - source.at_m(times_ns), axis=1)
     assert separation.distance_start_m == pytest.approx(dense[0], abs=1e-6)
@@ -120,7 +122,7 @@ def test_results_do_not_depend_on_absolute_time(source: Trajectory, destination:
     late_source, late_destination = (
         Trajectory(each.times_ns + by_ns, each.places_m, each.gap_ns) for each in (source, destination)
     )
-    assert apart(late_source, late_destination, first + by_ns, last + by_ns) == apart(
+    assert separation_between(late_source, late_destination, first + by_ns, last + by_ns) == separation_between(
         source, destination, first, last
     )
 

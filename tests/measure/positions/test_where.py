@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pyproj import Geod
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import FIXED_ROLES, Role, Whereabouts
+from fieldkit.core.model import FIXED_ROLES, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping, track
 from fieldkit.measure.offsets import Offset
@@ -23,8 +23,8 @@ from tests.measure.positions.test_recorded import BEGAN_NS, S, odometry, stamped
 SENDER, RECEIVER = Role.SENDER, Role.RECEIVER
 ENDS = (SENDER, RECEIVER)
 ORACLE = (
-    Whereabouts(BEGAN_NS, SENDER, (0.0, 0.0, 0.2)),
-    Whereabouts(BEGAN_NS, RECEIVER, (100.0, 0.0, 0.2)),
+    TrackPoint(BEGAN_NS, SENDER, (0.0, 0.0, 0.2)),
+    TrackPoint(BEGAN_NS, RECEIVER, (100.0, 0.0, 0.2)),
 )
 AWAY = [odometry(BEGAN_NS + n * S, float(n), 0.0) for n in range(5)]
 """Odometry of a robot that moves away at 1 m/s for 4 s."""
@@ -50,9 +50,9 @@ def write_accounts(folder: Path, robots: Mapping[Role, Account], clocks: Mapping
 def mean_m(folder: Path, begin_s: float = 1.0, end_s: float = 3.0) -> float | str:
     """Return the mean distance during these seconds by the sender's clock, or the reason why it is missing."""
     times_ns = [BEGAN_NS + round(at_s * S) for at_s in (begin_s, end_s)]
-    measured = where.measure(AttemptEvidence(folder), ping.WAY_COLUMNS, ENDS, times_ns)
+    measured = where.measure(AttemptEvidence(folder), ping.MOTION_COLUMNS, ENDS, times_ns)
     name = "rtt_distance_mean_m"
-    assert measured.values.keys() | measured.missing.keys() == {column.name for column in ping.WAY_COLUMNS}
+    assert measured.values.keys() | measured.missing.keys() == {column.name for column in ping.MOTION_COLUMNS}
     return float(measured.values[name]) if name in measured.values else measured.missing[name]
 
 
@@ -63,7 +63,7 @@ def test_the_trials_sources_precede_the_attempts_and_those_the_testbeds(attempt:
     written(attempt, AWAY)
     write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt) == pytest.approx(12)
-    assert where.in_words(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
+    assert where.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
     trial = attempt.parent.parent
     lines = "".join(f"{BEGAN_NS + n * S},{30 + n},0\n" for n in range(5))
     (trial / "positions-receiver.csv").write_text(f"t_ns,x_m,y_m\n{lines}", encoding="ascii")

@@ -27,7 +27,7 @@ GAP = (100, 150)
 def measured(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
     result = load_streams.measure("iperf3", load, *captured(streams))
     assert result.values.keys() | result.missing.keys() == {
-        column.name for column in stalls.declared("iperf3", "iperf3", 0)
+        column.name for column in stalls.declare_columns("iperf3", "iperf3", 0)
     }
     return {name.removeprefix("iperf3_"): value for name, value in result.values.items()}
 

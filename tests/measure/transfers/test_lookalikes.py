@@ -15,7 +15,7 @@ from fieldkit.measure.transfers import fates, tcp, udp
 from fieldkit.measure.transfers.transfer import Transfer
 from tests.helpers import links
 from tests.helpers.captures import Frame, file_bytes, packets, segment, timed, transfer
-from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Fate, Link
+from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Link, PacketFates
 from tests.helpers.measures import measure
 
 shares = st.sampled_from((0.0, 0.02, 0.2))
@@ -39,7 +39,7 @@ def _to(protocol: Protocol, *, ipv6: bool) -> Transfer:
 
 def _udp(
     link: Link, contents: list[bytes], *, ids: list[int | None], step_ns: int = MS
-) -> tuple[udp.UdpCounts, Fate]:
+) -> tuple[udp.UdpCounts, PacketFates]:
     """Send datagrams one after the other; return the measured counts and the true fate."""
     sent = [
         Frame(10**18 + number * step_ns, links.udp(content, ip_id=ip_id), 2000)
@@ -48,15 +48,15 @@ def _udp(
     arrivals = link.arrivals([frame.time_ns for frame in sent])
     received = [Frame(at, sent[which].data, 2000) for at, which in arrivals]
     aim = _to(Protocol.UDP, ipv6=ids[0] is None)
-    counts = udp.count(udp.cross(packets(sent), packets(received), aim))
-    return counts, Fate.of(len(sent), [which for _, which in arrivals])
+    counts = udp.count(udp.match_transfer(packets(sent), packets(received), aim))
+    return counts, PacketFates.of(len(sent), [which for _, which in arrivals])
 
 
-def _fate(counts: udp.UdpCounts) -> Fate:
+def _fate(counts: udp.UdpCounts) -> PacketFates:
     assert counts.packets_reordered is not None
     assert counts.loss_bursts is not None
     lost = counts.packets_sent - counts.packets_received
-    return Fate(lost, counts.packets_duplicated, counts.packets_reordered, counts.loss_bursts)
+    return PacketFates(lost, counts.packets_duplicated, counts.packets_reordered, counts.loss_bursts)
 
 
 @given(lossy, same_ids)
@@ -92,7 +92,7 @@ def test_a_late_copy_hides_no_loss() -> None:
     sent = [Frame(10**18 + at * MS, links.udp(bytes(40), ip_id=0)) for at in range(10)]
     late_ns = [*(at * MS for at in range(10) if at != 5), 2 * MS + 2_400_000]
     received = [Frame(10**18 + 7 * MS + at, sent[0].data) for at in sorted(late_ns)]
-    counts = udp.count(udp.cross(packets(sent), packets(received), transfer(Protocol.UDP)))
+    counts = udp.count(udp.match_transfer(packets(sent), packets(received), transfer(Protocol.UDP)))
     assert (counts.packets_ambiguous, counts.possible_copies) == (10, 10)
 
 
@@ -101,7 +101,7 @@ def test_the_arrival_of_a_single_repeated_segment_is_ambiguous() -> None:
     syn, data = segment(0, 0, flags=2), segment(1, 700)
     sent = [Frame(10**18 + at * MS, packet) for at, packet in ((0, syn), (10, data), (220, data))]
     received = [Frame(10**18 + at * MS, packet) for at, packet in ((3, syn), (223, data))]
-    counts = tcp.count(tcp.cross(packets(sent), packets(received), transfer(Protocol.TCP)))
+    counts = tcp.count(tcp.match_transfer(packets(sent), packets(received), transfer(Protocol.TCP)))
     assert (counts.ambiguous_frames, counts.possible_copies, counts.received_bytes) == (2, 0, 700)
     assert counts.spurious_frames is counts.reordered_frames is None
 
@@ -111,7 +111,7 @@ def test_arrivals_of_joined_segments_repeated_immediately_are_ambiguous() -> Non
     syn = segment(0, 0, flags=2, ip_id=9, mss=700)
     sent = timed([syn, segment(1, 2100, ip_id=10), segment(1, 2100, ip_id=13)])
     cut = [segment(1 + 700 * (number % 3), 700, ip_id=10 + number) for number in range(6)]
-    counts = tcp.count(tcp.cross(packets(sent), packets(timed([syn, *cut])), transfer(Protocol.TCP)))
+    counts = tcp.count(tcp.match_transfer(packets(sent), packets(timed([syn, *cut])), transfer(Protocol.TCP)))
     assert (counts.ambiguous_frames, counts.lost_bytes, counts.received_bytes) == (2, 0, 4200)
     assert counts.spurious_frames is counts.reordered_frames is None
 
@@ -147,8 +147,8 @@ def test_ids_that_repeat_after_65536_datagrams(kept: bool) -> None:
         [(times_ns[index], index) for index in arrived] + [(times_ns[index] + 10_000, index) for index in copied]
     )
     received = [Frame(at, sent[which].data, 2000) for at, which in arrivals]
-    counts = udp.count(udp.cross(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
-    truth = Fate.of(count, [which for _, which in arrivals])
+    counts = udp.count(udp.match_transfer(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
+    truth = PacketFates.of(count, [which for _, which in arrivals])
     assert _fate(counts) == truth
     assert (truth.lost, truth.duplicated, truth.bursts) == (12, 2, 3)
     assert counts.packets_ambiguous == counts.possible_copies == 0
@@ -166,7 +166,9 @@ def test_time_stamps_identify_retransmissions_with_any_offload(
 ) -> None:
     ipv6 = name == "v6"
     truth = links.tcp(link, 100, ids=name == "ids", ipv6=ipv6, offload=offload, again=again)
-    counts = tcp.count(tcp.cross(packets(truth.sender), packets(truth.receiver), _to(Protocol.TCP, ipv6=ipv6)))
+    counts = tcp.count(
+        tcp.match_transfer(packets(truth.sender), packets(truth.receiver), _to(Protocol.TCP, ipv6=ipv6))
+    )
     _is(counts, truth)
     assert counts.received_bytes == truth.received_bytes
     assert (counts.spurious_frames, counts.reordered_frames) == (truth.spurious, truth.reordered)
@@ -178,7 +180,9 @@ def test_time_stamps_identify_retransmissions_with_any_offload(
 def test_without_time_stamps_order_is_correct_or_empty(link: Link, offload: int, again: float, name: str) -> None:
     ipv6 = name == "v6"
     truth = links.tcp(link, 100, ids=name == "ids", ipv6=ipv6, offload=offload, again=again, stamped=False)
-    counts = tcp.count(tcp.cross(packets(truth.sender), packets(truth.receiver), _to(Protocol.TCP, ipv6=ipv6)))
+    counts = tcp.count(
+        tcp.match_transfer(packets(truth.sender), packets(truth.receiver), _to(Protocol.TCP, ipv6=ipv6))
+    )
     _is(counts, truth)
     if counts.received_bytes != truth.received_bytes:
         assert counts.ambiguous_frames
@@ -198,12 +202,12 @@ def test_content_truncated_in_one_capture_is_not_used() -> None:
     sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(40), ip_id=0), 68) for at in range(200)]
     arrivals = link.arrivals([frame.time_ns for frame in sent])
     received = [Frame(at, sent[which].data[:58], 68) for at, which in arrivals]
-    counts = udp.count(udp.cross(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
+    counts = udp.count(udp.match_transfer(packets(sent), packets(received), _to(Protocol.UDP, ipv6=False)))
     assert (counts.packets_sent, counts.packets_ambiguous) == (200, 200)
     assert counts.possible_copies
     truth = links.tcp(Link(8, loss=0.1), 100, ids=False, again=0.2)
     short = [Frame(frame.time_ns, frame.data[:44], frame.wire_bytes) for frame in truth.receiver]
-    short_counts = tcp.count(tcp.cross(packets(truth.sender), packets(short), _to(Protocol.TCP, ipv6=False)))
+    short_counts = tcp.count(tcp.match_transfer(packets(truth.sender), packets(short), _to(Protocol.TCP, ipv6=False)))
     _is(short_counts, truth)
     assert short_counts.ambiguous_frames
     assert short_counts.spurious_frames is short_counts.reordered_frames is None
@@ -234,6 +238,6 @@ def test_captures_of_different_link_types_match(protocol: Protocol) -> None:
     )
     aim = _to(protocol, ipv6=False)
     if protocol is Protocol.UDP:
-        assert udp.count(udp.cross(*framed, aim)) == udp.count(udp.cross(*plain, aim))
+        assert udp.count(udp.match_transfer(*framed, aim)) == udp.count(udp.match_transfer(*plain, aim))
     else:
-        assert tcp.count(tcp.cross(*framed, aim)) == tcp.count(tcp.cross(*plain, aim))
+        assert tcp.count(tcp.match_transfer(*framed, aim)) == tcp.count(tcp.match_transfer(*plain, aim))

@@ -31,9 +31,9 @@ CLOCKS: list[Wrong] = [(0, 0), (3600, 0), (-3600, 0), (0, 100e-6), (0, -100e-6),
 
 def _measured(sender: Packets, receiver: Packets, aim: Transfer, sent: int | None = None) -> Measures:
     if aim.protocol is Protocol.UDP:
-        pairs = delay.udp_packets(udp.cross(sender, receiver, aim))
+        pairs = delay.udp_packets(udp.match_transfer(sender, receiver, aim))
     else:
-        pairs = delay.tcp_frames(tcp.cross(sender, receiver, aim))
+        pairs = delay.tcp_frames(tcp.match_transfer(sender, receiver, aim))
     columns = delay.measure(pairs, sender, receiver, aim, sent=len(pairs) if sent is None else sent)
     assert not columns.values.keys() & columns.missing.keys(), "no column has both a value and a reason"
     assert columns.values.keys() | columns.missing.keys() == {
@@ -239,7 +239,7 @@ def test_a_lost_tcp_frame_does_not_match_a_retransmission_in_a_larger_frame() ->
     sender, receiver = (
         packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, arrivals)
     )
-    own = delay.tcp_frames(tcp.cross(sender, receiver, transfer(Protocol.TCP)))
+    own = delay.tcp_frames(tcp.match_transfer(sender, receiver, transfer(Protocol.TCP)))
     assert ((own.receiver_ns - own.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]
 
 

@@ -38,7 +38,7 @@ def test_packets_with_unique_ids_are_matched_individually(count: int, data: st.D
     assert matched.duplicates.tolist() == [
         index < count and index in arrivals[:place] for place, index in enumerate(arrivals)
     ]
-    assert not matched.doubtful.any()
+    assert not matched.ambiguous.any()
 
 
 @given(st.integers(2, 5), st.integers(2, 5), st.data())
@@ -94,8 +94,8 @@ def test_equal_packets_are_matched_in_order_and_ambiguous() -> None:
     received = packets([Frame(10**17 + at * 10**6, datagram(0, 100)[0]) for at in (0, 2, 6, 9)])
     matched = match(sent, received)
     assert matched.sent_index.tolist() == [0, 2, 4, 5]
-    assert matched.doubtful.all()
-    assert match(sent, sent).doubtful.all(), "the same number of losses and copies is possible"
+    assert matched.ambiguous.all()
+    assert match(sent, sent).ambiguous.all(), "the same number of losses and copies is possible"
     assert not matched.possible_copy.any()
 
 
@@ -118,7 +118,7 @@ def test_ids_of_ipv6_fragments_have_32_bits() -> None:
     for index, ip_id in enumerate(ids):
         matched = match(sent, packets(timed([_v6(ip_id, 8)])))
         assert matched.arrived.tolist() == [place == index for place in range(len(ids))]
-        assert not matched.doubtful.any()
+        assert not matched.ambiguous.any()
 
 
 def test_other_lengths_ports_addresses_and_protocols_are_other_packets() -> None:

@@ -37,12 +37,12 @@ def through_link(data: Sequence[bytes], start_ns: int = START_NS) -> list[Frame]
 
 
 def of_udp(sent: list[Frame], received: list[Frame]) -> Rates:
-    return rates.of_udp(udp.cross(packets(sent), packets(received), transfer(Protocol.UDP)))
+    return rates.of_udp(udp.match_transfer(packets(sent), packets(received), transfer(Protocol.UDP)))
 
 
 def of_tcp(sent: list[Frame], received: list[Frame]) -> Rates:
     here, there, which = packets(sent), packets(received), transfer(Protocol.TCP)
-    crossing = tcp.cross(here, there, which)
+    crossing = tcp.match_transfer(here, there, which)
     return rates.of_tcp(crossing, there, which, tcp.count(crossing))
 
 

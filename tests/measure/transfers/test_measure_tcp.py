@@ -48,7 +48,9 @@ def _retransmitted(sent: Iterable[Range]) -> int:
 def test_ranges_equal_a_model_of_single_bytes(isn: int, sent: list[Range], received: list[Range], syn: bool) -> None:
     """Any frames at either end: partial overlaps, reordering, duplicates, offload, wrapping sequence numbers."""
     counts = tcp.count(
-        tcp.cross(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received, syn=syn))), TCP_TRANSFER)
+        tcp.match_transfer(
+            packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received, syn=syn))), TCP_TRANSFER
+        )
     )
     sent_bytes, received_bytes = _bytes(sent), _bytes(received)
     assert counts.sent_bytes == sent_bytes.total()
@@ -79,7 +81,9 @@ def test_counts_that_depend_on_the_order_equal_a_slow_count(isn: int, sent: list
     ])  # fmt: skip
     arrivals = data.draw(st.lists(st.integers(0, max(len(sent) - 1, 0)), max_size=40 if sent else 0))
     counts = tcp.count(
-        tcp.cross(packets(frames), packets(timed([frames[1 + index].data for index in arrivals])), TCP_TRANSFER)
+        tcp.match_transfer(
+            packets(frames), packets(timed([frames[1 + index].data for index in arrivals])), TCP_TRANSFER
+        )
     )
     assert (counts.spurious_frames, counts.reordered_frames) == _slow_order(sent, arrivals)
     received_bytes = _bytes(sent[index] for index in arrivals)
@@ -103,7 +107,7 @@ def test_offload_alone_is_not_loss_retransmission_or_reordering(
         ]
         for number, ranges in enumerate((sent, received))
     ]
-    counts = tcp.count(tcp.cross(packets(both[0]), packets(both[1]), TCP_TRANSFER))
+    counts = tcp.count(tcp.match_transfer(packets(both[0]), packets(both[1]), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes, counts.lost_bytes) == (end, end, end, 0)
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (0, 0, 0)
     assert (counts.duplicated_bytes, counts.ambiguous_frames) == (0, 0)
@@ -119,7 +123,9 @@ def _lengthless(seq: int, payload_bytes: int) -> bytes:
 def test_a_retransmission_is_spurious_only_if_an_earlier_copy_arrived() -> None:
     sent = [segment(0, 0, flags=SYN, ip_id=1), *(segment(1, 100, ip_id=number) for number in (2, 3, 4))]
     for kept, spurious in (((1,), 2), ((2,), 1), ((3,), 0), ((1, 2, 3), 2), ((), 0)):
-        counts = tcp.count(tcp.cross(packets(timed(sent)), packets(timed([sent[at] for at in kept])), TCP_TRANSFER))
+        counts = tcp.count(
+            tcp.match_transfer(packets(timed(sent)), packets(timed([sent[at] for at in kept])), TCP_TRANSFER)
+        )
         assert (counts.retransmitted_frames, counts.spurious_frames) == (2, spurious), kept
 
 
@@ -130,20 +136,20 @@ def test_without_ids_time_shows_which_copy_of_a_byte_arrived() -> None:
     sent = packets([Frame(second + at * 10**8, frame) for at, frame in enumerate(frames)])
     arrivals = [(0, segment(0, 0, flags=SYN)), (1, segment(1, 1000)), (2, segment(2001, 1000)), (3, frames[3])]
     received = packets([Frame(second * 5 + at * 10**8, frame) for at, frame in arrivals])
-    counts = tcp.count(tcp.cross(sent, received, TCP_TRANSFER))
+    counts = tcp.count(tcp.match_transfer(sent, received, TCP_TRANSFER))
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (1, 0, 0)
     assert (counts.lost_bytes, counts.duplicated_bytes) == (0, 0)
 
 
 def test_captures_that_started_late_or_ended_early() -> None:
     whole = timed(_frames(2**32 - 1500, [(start, 1000) for start in range(0, 10_000, 1000)]))
-    late_receiver = tcp.count(tcp.cross(packets(whole), packets(whole[4:-2]), TCP_TRANSFER))
+    late_receiver = tcp.count(tcp.match_transfer(packets(whole), packets(whole[4:-2]), TCP_TRANSFER))
     assert (late_receiver.received_bytes, late_receiver.lost_bytes) == (5000, 5000)
-    early_sender = tcp.count(tcp.cross(packets(whole[:5]), packets(whole), TCP_TRANSFER))
+    early_sender = tcp.count(tcp.match_transfer(packets(whole[:5]), packets(whole), TCP_TRANSFER))
     assert (early_sender.sent_bytes, early_sender.received_bytes, early_sender.lost_bytes) == (4000, 4000, 0)
     assert early_sender.duplicated_bytes == 0
     # Without its SYN it is unknown to which transfer a connection belongs.
-    assert tcp.count(tcp.cross(packets(whole[1:]), packets(whole), TCP_TRANSFER)).sent_bytes == 0
+    assert tcp.count(tcp.match_transfer(packets(whole[1:]), packets(whole), TCP_TRANSFER)).sent_bytes == 0
 
 
 def test_superframes_at_either_end_count_as_their_segments() -> None:
@@ -152,7 +158,9 @@ def test_superframes_at_either_end_count_as_their_segments() -> None:
     isn = 2**32 - 5000
     for sent, received in ((joined, segments), (segments, joined)):
         counts = tcp.count(
-            tcp.cross(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
+            tcp.match_transfer(
+                packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER
+            )
         )
         assert (counts.sent_bytes, counts.received_bytes, counts.lost_bytes) == (14480, 14480, 0)
         assert counts.retransmitted_frames == 0
@@ -163,7 +171,7 @@ def test_a_retransmission_that_repairs_a_loss() -> None:
     sent = [(0, 1000), (1000, 1000), (2000, 1000), (1000, 1000)]
     received = [(0, 1000), (2000, 1000), (1000, 1000)]
     counts = tcp.count(
-        tcp.cross(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
+        tcp.match_transfer(packets(timed(_frames(isn, sent))), packets(timed(_frames(isn, received))), TCP_TRANSFER)
     )
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes) == (4000, 3000, 3000)
     assert (counts.lost_bytes, counts.retransmitted_frames) == (0, 1)
@@ -173,7 +181,7 @@ def test_syn_and_fin_consume_sequence_numbers_but_are_not_payload() -> None:
     isn = 2**32 - 2
     # Data in the SYN (TCP Fast Open) starts after the SYN's sequence number.
     frames = timed([segment(isn, 10, flags=SYN), segment(isn + 1, 10), segment(isn + 11, 0, flags=FIN_ACK)])
-    counts = tcp.count(tcp.cross(packets(frames), packets(frames), TCP_TRANSFER))
+    counts = tcp.count(tcp.match_transfer(packets(frames), packets(frames), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.retransmitted_frames) == (20, 10, 1)
 
 
@@ -182,7 +190,7 @@ def test_connections_are_counted_separately_and_other_ports_are_ignored() -> Non
     other = [segment(10, 500, port=22)]
     back = [bytes(IP(src=RECEIVER, dst=SENDER) / TCP(sport=PORT, dport=40000, seq=1) / Raw(bytes(50)))]
     sent = packets(timed([*first, *other, *second, *back]))
-    counts = tcp.count(tcp.cross(sent, packets(timed(first)), TCP_TRANSFER))
+    counts = tcp.count(tcp.match_transfer(sent, packets(timed(first)), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.received_bytes, counts.lost_bytes) == (200, 100, 100)
     assert counts.frames_sent == 4
 
@@ -193,7 +201,7 @@ def test_retransmissions_of_an_earlier_transfer_are_not_counted() -> None:
     own = _frames(10, [(0, 100)], sport=42344)
     sent = packets(timed([own[0], orphan, *own[1:]]))
     received = packets(timed([orphan, *own]))
-    counts = tcp.count(tcp.cross(sent, received, TCP_TRANSFER))
+    counts = tcp.count(tcp.match_transfer(sent, received, TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes) == (100, 100, 100)
     assert (counts.frames_sent, counts.frames_received) == (2, 2)
     assert counts.transfer_s == pytest.approx(0.001)
@@ -202,14 +210,14 @@ def test_retransmissions_of_an_earlier_transfer_are_not_counted() -> None:
 def test_transfer_time_is_from_the_receivers_first_frame_to_its_last_payload() -> None:
     frames = _frames(10, [(0, 100), (100, 100)])
     received = [*timed(frames), Frame(timed(frames)[-1].time_ns + 10**9, segment(211, 0, flags=FIN_ACK))]
-    counts = tcp.count(tcp.cross(packets(timed(frames, start_ns=0)), packets(received), TCP_TRANSFER))
+    counts = tcp.count(tcp.match_transfer(packets(timed(frames, start_ns=0)), packets(received), TCP_TRANSFER))
     assert counts.transfer_s == pytest.approx(0.002)
-    nothing = tcp.count(tcp.cross(packets(timed(frames)), packets(timed(frames[:1])), TCP_TRANSFER))
+    nothing = tcp.count(tcp.match_transfer(packets(timed(frames)), packets(timed(frames[:1])), TCP_TRANSFER))
     assert nothing.transfer_s is None
 
 
 def test_empty_captures_give_zero_counts() -> None:
-    assert tcp.count(tcp.cross(packets([]), packets([]), TCP_TRANSFER)) == tcp.TcpCounts(
+    assert tcp.count(tcp.match_transfer(packets([]), packets([]), TCP_TRANSFER)) == tcp.TcpCounts(
         0, 0, 0, 0, 0, 0, 0, 0, 0, 0, None, 0, 0, None
     )
 
@@ -217,7 +225,7 @@ def test_empty_captures_give_zero_counts() -> None:
 def test_a_real_capture_with_segmentation_offload() -> None:
     captured = pcap.read(TCPDUMP / "nc-tcp.pcap").packets
     loopback = replace(TCP_TRANSFER, sender_address="127.0.0.1", receiver_address="127.0.0.1", port=1234)
-    counts = tcp.count(tcp.cross(captured, captured, loopback))
+    counts = tcp.count(tcp.match_transfer(captured, captured, loopback))
     assert counts.unique_bytes == counts.sent_bytes == counts.received_bytes == 293_797
     assert counts.lost_bytes == counts.retransmitted_frames == 0
     assert captured.tcp_payload_bytes.max() > 1460

@@ -233,9 +233,9 @@ def test_two_streams_of_one_pair_have_separate_fragments(seed: int) -> None:
 
 def test_only_columns_that_need_the_captures_are_withheld() -> None:
     without = topics.measure(FLOW, published(10), arrived(range(10)), None, None)
-    reasons = topics.without_captures(without, "packets were dropped")
+    reasons = topics.withheld_reasons(without, "packets were dropped")
     assert set(reasons) == without.missing.keys() - {"topic_deadline_misses"}
     assert set(reasons.values()) == {"packets were dropped"}
     assert without.values.keys() >= {"topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
-    assert topics.without_captures(without, "") == {}
+    assert topics.withheld_reasons(without, "") == {}
     assert topics.withheld_mark("packets were dropped").values == {"topic_capture_withheld": "packets were dropped"}

@@ -19,7 +19,7 @@ sizes = st.lists(st.integers(0, 9000), min_size=1, max_size=12)
 
 
 def _count(sent: list[Frame], received: list[Frame]) -> udp.UdpCounts:
-    return udp.count(udp.cross(packets(sent), packets(received), UDP_TRANSFER))
+    return udp.count(udp.match_transfer(packets(sent), packets(received), UDP_TRANSFER))
 
 
 @given(sizes, st.integers(0, 65535), st.data())

@@ -62,7 +62,7 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
     joined, single = (int(packets.tcp_payload_bytes.max()) for packets in (sender, receiver))
     assert joined > 2 * 1460 >= 2 * single > 0
 
-    counts = tcp.count(tcp.cross(sender, receiver, TRANSFER))
+    counts = tcp.count(tcp.match_transfer(sender, receiver, TRANSFER))
 
     # Veth with several cores reorders sometimes, and TCP then retransmits: the kernel's counters show whether it did.
     repeated, late = counted(tmp_path / "sent.nstat"), counted(tmp_path / "received.nstat")
@@ -76,8 +76,8 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
     assert matched.arrived.all()
     assert not matched.duplicates.any()
     # Joined segments that TCP retransmits within one millisecond have equal time stamps, and the router cuts both.
-    assert set(np.flatnonzero(matched.doubtful)) <= repeated_at_once(sent)
-    assert (counts.ambiguous_frames > 0) == matched.doubtful.any()
+    assert set(np.flatnonzero(matched.ambiguous)) <= repeated_at_once(sent)
+    assert (counts.ambiguous_frames > 0) == matched.ambiguous.any()
     if counts.ambiguous_frames:
         assert counts.spurious_frames is counts.reordered_frames is None
     else:

@@ -23,11 +23,11 @@ STEP_NS = 10 * MS
 
 
 def of_tcp(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[Delivery]:
-    return transfer_stalls.of_tcp(tcp.cross(sender, receiver, TCP), TCP.backward(sender), schedule)
+    return transfer_stalls.of_tcp(tcp.match_transfer(sender, receiver, TCP), TCP.backward(sender), schedule)
 
 
 def of_udp(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[Delivery]:
-    return transfer_stalls.of_udp(udp.cross(sender, receiver, UDP), schedule)
+    return transfer_stalls.of_udp(udp.match_transfer(sender, receiver, UDP), schedule)
 
 
 def measured(deliveries: list[Delivery]) -> dict[str, Any]:
@@ -238,4 +238,4 @@ def test_empty_captures_give_empty_columns(tmp_path: Path) -> None:
     for deliveries in (lambda: of_udp(*nothing), lambda: of_tcp(*nothing)):
         result = stalls.measure("transfer", deliveries)
         assert not result.values
-        assert result.missing.keys() == {column.name for column in stalls.declared("transfer", "it", 0)}
+        assert result.missing.keys() == {column.name for column in stalls.declare_columns("transfer", "it", 0)}

@@ -13,7 +13,7 @@ from sim_backends.cosim.federates import Action
 from sim_backends.cosim.observer import WindowObserver
 from sim_backends.cosim.policies.base import PolicyError, Situation
 from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.recording.manifest import About
+from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.network.disc import Disc
@@ -68,7 +68,7 @@ def test_events_at_one_instant_are_simulated_at_it_and_time_advances() -> None:
 
 
 def test_a_recording_of_empty_windows_equals_the_run(tmp_path: Path) -> None:
-    with RunRecorder(tmp_path / "run", About("a: 1", "event_driven", {}, 1)) as recorder:
+    with RunRecorder(tmp_path / "run", RunSettings("a: 1", "event_driven", {}, 1)) as recorder:
         live = rally(20, recorder)[0].advance(100 * MS)
     replayed = read_recording(tmp_path / "run").run
     assert (replayed.digest, replayed.windows_ns) == (live.digest, live.windows_ns)

@@ -18,7 +18,7 @@ from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
-from tests.helpers.faults import lasting
+from tests.helpers.faults import inject_until_exit
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
@@ -77,7 +77,7 @@ def test_a_link_goes_down_and_comes_up_with_all_its_routes(up: EmulatedTestbed) 
     sender = up.shells[Role.SENDER]
     routes = output_of(sender, "ip", "route")
     assert "224.0.0.0/4" in routes
-    with lasting(up, Fault(FaultKind.LINK_DOWN, Role.SENDER, 1.0)):
+    with inject_until_exit(up, Fault(FaultKind.LINK_DOWN, Role.SENDER, 1.0)):
         assert "state DOWN" in output_of(sender, "ip", "link", "show", "wlan0")
     assert output_of(sender, "ip", "route") == routes
     assert reaches(up, Role.RECEIVER, Role.SENDER)
@@ -94,7 +94,7 @@ def test_the_duration_of_a_fault_is_returned(up: EmulatedTestbed) -> None:
 @pytest.mark.parametrize("away", FIXED_ROLES)
 def test_a_robot_out_of_range_is_unreachable_and_without_the_relay_all_are(up: EmulatedTestbed, away: Role) -> None:
     assert reaches(up, Role.SENDER, Role.RECEIVER)
-    with lasting(up, Fault(FaultKind.OUT_OF_RANGE, away, 1.5)):
+    with inject_until_exit(up, Fault(FaultKind.OUT_OF_RANGE, away, 1.5)):
         wait_until(lambda: not reaches(up, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
     assert reaches(up, Role.SENDER, Role.RECEIVER), "back in its place"
 

@@ -32,7 +32,7 @@ from sim_backends.emulated.ros.laser import LaserTarget
 from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
-from tests.helpers.labs import changed
+from tests.helpers.labs import replace_text
 
 STORE = shipped().ros1
 FIELDS = (
@@ -156,7 +156,7 @@ class TestBackend:
     def test_unsupported_profiles_are_rejected_before_startup(
         self, change: tuple[str, ...], complaint: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        text = changed(locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8"), *change)
+        text = replace_text(locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8"), *change)
         profile = validate(parse(text, source="robot.yaml"), RobotProfile)
         monkeypatch.setattr("fieldkit.backends.registry.load_profile", lambda _: profile)
         with pytest.raises(ConfigurationError, match=complaint):

@@ -15,7 +15,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import ros_master
-from fieldkit.steps.scene import Need, Said, Scene
+from fieldkit.steps.scene import CommandResult, Need, Scene
 from sim_backends.emulated import requirements, testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.options import EmulatedOptions, RosChoice
@@ -67,9 +67,9 @@ def names(shell: Shell) -> set[str]:
     )  # some exit meanwhile
 
 
-def answer_to(shell: Shell, need: Need) -> Said:
+def answer_to(shell: Shell, need: Need) -> CommandResult:
     result = shell.run(need.argv, deadline=Deadline.after(LONG_S), check=False)
-    return Said((result.stdout + result.stderr).decode().strip(), result.exit_code)
+    return CommandResult((result.stdout + result.stderr).decode().strip(), result.exit_code)
 
 
 @pytest.mark.emulated

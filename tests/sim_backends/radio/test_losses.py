@@ -20,7 +20,7 @@ from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import Antenna
-from tests.helpers.stations import ByHand
+from tests.helpers.stations import FixedPowers
 
 MS = 1_000_000
 NAMES = "abcr"
@@ -100,7 +100,7 @@ def losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
 
 def test_retries_that_run_out_at_the_relay_too() -> None:
     for deaf, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
-        wifi: Wifi[int] = Wifi(ByHand("abr", G54, deaf=[deaf]), 1)
+        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[deaf]), 1)
         wifi.relay("r")
         found = losses(wifi)
         wifi.send(0, "a", 1, 100, "b")
@@ -109,7 +109,7 @@ def test_retries_that_run_out_at_the_relay_too() -> None:
 
 
 def test_a_frame_whose_acks_are_lost_was_delivered_not_lost() -> None:
-    channel = ByHand("ab", G54)
+    channel = FixedPowers("ab", G54)
     channel.rows[1][0] = 0.0
     wifi: Wifi[int] = Wifi(channel, 1)
     found, attempts = losses(wifi), Counter[int]()
@@ -121,7 +121,7 @@ def test_a_frame_whose_acks_are_lost_was_delivered_not_lost() -> None:
 
 
 def test_a_full_queue_and_a_broadcast_that_not_everyone_decodes() -> None:
-    channel = ByHand("abc", G54, deaf=[("a", "c")])
+    channel = FixedPowers("abc", G54, deaf=[("a", "c")])
     wifi: Wifi[int] = Wifi(channel, 1, queue_packets=1)
     found = losses(wifi)
     for number in range(3):
@@ -131,7 +131,7 @@ def test_a_full_queue_and_a_broadcast_that_not_everyone_decodes() -> None:
 
 
 def test_a_radio_that_is_switched_off_loses_its_queue_and_what_it_sends() -> None:
-    wifi: Wifi[int] = Wifi(ByHand("ab", G54), 1)
+    wifi: Wifi[int] = Wifi(FixedPowers("ab", G54), 1)
     found, decoded_by = losses(wifi), list[tuple[str, ...]]()
     wifi.log_attempts(lambda attempt: decoded_by.append(attempt.received))
     for number in range(3):

@@ -10,7 +10,7 @@ from fieldkit.core.model import StationSample
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT
 from sim_backends.radio.wifi import Wifi
-from tests.helpers.stations import NOISE_MW, STRONG_MW, ByHand
+from tests.helpers.stations import NOISE_MW, STRONG_MW, FixedPowers
 
 G54 = G_MODES[-1]
 END_NS = 300_000_000
@@ -19,7 +19,7 @@ END_NS = 300_000_000
 class Talk:
     """Stations a and b that always have something for r, which answers a fourth of it."""
 
-    def __init__(self, channel: ByHand, *, metered: bool = True, samples_ns: Iterable[int] = ()) -> None:
+    def __init__(self, channel: FixedPowers, *, metered: bool = True, samples_ns: Iterable[int] = ()) -> None:
         self.log: list[TransmissionAttempt] = []
         self.wifi: Wifi[str] = Wifi(channel, 1)
         if metered:
@@ -47,14 +47,14 @@ class Talk:
 
 
 @pytest.fixture(params=["clear", "noisy", "hidden"])
-def channel(request: pytest.FixtureRequest) -> ByHand:
-    made = ByHand("abr", G54, deaf=[("a", "b")] if request.param == "hidden" else [])
+def channel(request: pytest.FixtureRequest) -> FixedPowers:
+    made = FixedPowers("abr", G54, deaf=[("a", "b")] if request.param == "hidden" else [])
     if request.param == "noisy":
         made.noise_mw = [STRONG_MW / 10**2.22] * 3
     return made
 
 
-def test_attempts_retries_and_packets_are_those_of_the_log(channel: ByHand) -> None:
+def test_attempts_retries_and_packets_are_those_of_the_log(channel: FixedPowers) -> None:
     talk = Talk(channel)
     for name, other in (("a", "r"), ("r", "b")):
         known = talk.known(name, other)
@@ -70,7 +70,7 @@ def test_attempts_retries_and_packets_are_those_of_the_log(channel: ByHand) -> N
     assert talk.known("r", "b").rx_rate_bit_s == G54.rate_bit_s
 
 
-def test_a_failure_is_a_last_attempt_without_an_answer(channel: ByHand) -> None:
+def test_a_failure_is_a_last_attempt_without_an_answer(channel: FixedPowers) -> None:
     talk = Talk(channel)
     sent = [one for one in talk.log if one.number == 0 or one.transmitter == "a"]
     last = [
@@ -81,7 +81,7 @@ def test_a_failure_is_a_last_attempt_without_an_answer(channel: ByHand) -> None:
     assert talk.known("a", "r").tx_failures == pytest.approx(sum(last), abs=1)
 
 
-def test_the_channel_is_busy_while_somebody_is_heard_or_sends(channel: ByHand) -> None:
+def test_the_channel_is_busy_while_somebody_is_heard_or_sends(channel: FixedPowers) -> None:
     talk = Talk(channel)
     deaf = {("a", "b"), ("b", "a")} if channel.rows[0][1] == 0 else set()
     for name in "abr":
@@ -97,7 +97,7 @@ def test_the_channel_is_busy_while_somebody_is_heard_or_sends(channel: ByHand) -
         assert sample.noise_dbm == pytest.approx(-90.0 if channel.noise_mw[0] == NOISE_MW else -62.2)
 
 
-def test_who_is_measured_is_not_changed(channel: ByHand) -> None:
+def test_who_is_measured_is_not_changed(channel: FixedPowers) -> None:
     plain, measured = Talk(channel, metered=False), Talk(channel, samples_ns=range(0, END_NS, 1_000_000))
     assert plain.log == measured.log
     assert plain.wifi.sample(END_NS, END_NS) == {}

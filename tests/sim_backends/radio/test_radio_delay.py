@@ -13,7 +13,7 @@ from sim_backends.radio.fixed_links import FixedLinks
 from sim_backends.radio.links import LinkParameters
 from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.wifi import Wifi
-from tests.helpers.stations import ByHand
+from tests.helpers.stations import FixedPowers
 
 MS = 1_000_000
 LINK = st.builds(
@@ -119,7 +119,7 @@ def test_the_parts_are_all_of_the_time_from_sending_to_arriving(
 @pytest.mark.parametrize("relay", [None, "r"])
 @pytest.mark.parametrize("destination", ["b", None])
 def test_what_a_packet_was_delayed_by_before_is_a_part_of_it(relay: str | None, destination: str | None) -> None:
-    wifi: Wifi[int] = Wifi(ByHand("abr", G_MODES[-1]), 1)
+    wifi: Wifi[int] = Wifi(FixedPowers("abr", G_MODES[-1]), 1)
     wifi.relay(relay)
     fixed = engine(LinkParameters(delay_ns=MS), relay)
     for model in (wifi, fixed):

@@ -19,7 +19,7 @@ from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
-from tests.helpers.faults import lasting
+from tests.helpers.faults import inject_until_exit
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
@@ -132,7 +132,7 @@ def test_a_fault_of_the_relay_silences_the_stations_in_master_alone(
 ) -> None:
     up.place(Placement(Scenario.LOS, topology, parse_distance("5m")))
     assert hears(up)
-    with lasting(up, fault):
+    with inject_until_exit(up, fault):
         if topology is Topology.MASTER:
             wait_until(lambda: not hears(up, within_s=0.3), Deadline.after(60))
         else:

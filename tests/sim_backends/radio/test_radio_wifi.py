@@ -25,7 +25,7 @@ from sim_backends.radio.modes import (
 )
 from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.wifi import Wifi
-from tests.helpers.stations import HEADERS_BYTES, NOISE_MW, STRONG_MW, ByHand, saturate
+from tests.helpers.stations import HEADERS_BYTES, NOISE_MW, STRONG_MW, FixedPowers, saturate
 
 G54, G6 = G_MODES[-1], G_MODES[0]
 PAYLOAD_BYTES = 1000
@@ -42,7 +42,7 @@ def exchange_ns(mode: WifiMode) -> int:
 @pytest.mark.parametrize("mode", [G6, G54, N_MODES[-1]], ids=lambda mode: mode.name)
 def test_one_station_gets_what_the_closed_form_says(mode: WifiMode) -> None:
     """DIFS, mean backoff of CWmin / 2 slots, frame, SIFS, ACK, and no collision."""
-    goodput = saturate(ByHand("ab", mode), "a", "b", seconds=3)["a"]
+    goodput = saturate(FixedPowers("ab", mode), "a", "b", seconds=3)["a"]
     expected = 8 * PAYLOAD_BYTES / ((exchange_ns(mode) + CW_MIN / 2 * SLOT_NS) * 1e-9)
     assert goodput == pytest.approx(expected, rel=0.01)
 
@@ -66,7 +66,7 @@ def bianchi_bit_s(stations: int, mode: WifiMode) -> float:
 @pytest.mark.parametrize("stations", [2, 5, 10, 20])
 def test_many_stations_share_as_bianchi_says(stations: int) -> None:
     names = [f"s{n}" for n in range(stations)]
-    goodput = saturate(ByHand([*names, "r"], G54), names, "r", seconds=4)
+    goodput = saturate(FixedPowers([*names, "r"], G54), names, "r", seconds=4)
     total = sum(goodput.values())
     assert total == pytest.approx(bianchi_bit_s(stations, G54), rel=0.06)
     fairness = total**2 / (stations * sum(one**2 for one in goodput.values()))
@@ -75,21 +75,21 @@ def test_many_stations_share_as_bianchi_says(stations: int) -> None:
 
 
 def test_hidden_stations_collide_and_those_that_hear_each_other_do_not() -> None:
-    seen = saturate(ByHand("abr", G6), "ab", "r", seconds=4)
-    hidden = saturate(ByHand("abr", G6, deaf=[("a", "b")]), "ab", "r", seconds=4)
+    seen = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
+    hidden = saturate(FixedPowers("abr", G6, deaf=[("a", "b")]), "ab", "r", seconds=4)
     assert sum(hidden.values()) < 0.75 * sum(seen.values())
 
 
 def test_an_access_point_spends_the_airtime_twice() -> None:
-    direct = saturate(ByHand("abr", G54), "a", "b", seconds=2)["a"]
-    relayed = saturate(ByHand("abr", G54), "a", "b", seconds=2, relay="r")["a"]
+    direct = saturate(FixedPowers("abr", G54), "a", "b", seconds=2)["a"]
+    relayed = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
     # The access point competes with the station for each second hop, so a little is lost to collisions.
     assert relayed == pytest.approx(direct / 2, rel=0.06)
 
 
 def test_an_ack_follows_each_frame_that_arrived_after_sifs() -> None:
     log: list[TransmissionAttempt] = []
-    saturate(ByHand("abr", G54, deaf=[("a", "b")]), "ab", "r", seconds=0.2, log=log)
+    saturate(FixedPowers("abr", G54, deaf=[("a", "b")]), "ab", "r", seconds=0.2, log=log)
     acks = [attempt for attempt in log if not attempt.number]
     arrived = {(one.end_ns, one.receiver, one.transmitter) for one in log if one.number and one.received}
     assert {(ack.start_ns - SIFS_NS, ack.transmitter, ack.receiver) for ack in acks} <= arrived
@@ -100,7 +100,7 @@ def test_an_ack_follows_each_frame_that_arrived_after_sifs() -> None:
 
 def test_a_broadcast_goes_out_once_at_the_basic_rate_and_nobody_acknowledges() -> None:
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[bytes] = Wifi(ByHand("abc", G54), 1)
+    wifi: Wifi[bytes] = Wifi(FixedPowers("abc", G54), 1)
     wifi.log_attempts(log.append)
     wifi.send(0, "a", b"hello", 100, None)
     assert sorted(name for _, name, _, _, _ in wifi.deliveries(10**9)) == ["b", "c"]
@@ -110,7 +110,7 @@ def test_a_broadcast_goes_out_once_at_the_basic_rate_and_nobody_acknowledges() -
 
 
 def test_a_broadcast_through_an_access_point_reaches_everyone_once() -> None:
-    wifi: Wifi[bytes] = Wifi(ByHand("abr", G54), 1)
+    wifi: Wifi[bytes] = Wifi(FixedPowers("abr", G54), 1)
     wifi.relay("r")
     wifi.send(0, "a", b"hello", 100, None)
     assert sorted(name for _, name, _, _, _ in wifi.deliveries(10**9)) == ["b", "r"]
@@ -118,7 +118,7 @@ def test_a_broadcast_through_an_access_point_reaches_everyone_once() -> None:
 
 def test_a_receiver_that_is_gone_costs_every_retry() -> None:
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[bytes] = Wifi(ByHand("ab", G54, deaf=[("a", "b")]), 1)
+    wifi: Wifi[bytes] = Wifi(FixedPowers("ab", G54, deaf=[("a", "b")]), 1)
     wifi.log_attempts(log.append)
     wifi.send(0, "a", b"x", 100, "b")
     assert wifi.deliveries(10**9) == []
@@ -127,7 +127,7 @@ def test_a_receiver_that_is_gone_costs_every_retry() -> None:
 
 
 def test_a_full_queue_drops_what_comes_last() -> None:
-    wifi: Wifi[int] = Wifi(ByHand("ab", G54), 1, queue_packets=10)
+    wifi: Wifi[int] = Wifi(FixedPowers("ab", G54), 1, queue_packets=10)
     for number in range(20):
         wifi.send(0, "a", number, 100, "b")
     assert [payload for _, _, payload, _, _ in wifi.deliveries(10**9)] == list(range(11)), (
@@ -139,7 +139,7 @@ def test_a_full_queue_drops_what_comes_last() -> None:
 def test_interference_that_begins_late_spoils_a_frame() -> None:
     """Hidden from each other, the second begins in the midst of the first; at the receiver it is as strong."""
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[str] = Wifi(ByHand("abr", G6, deaf=[("a", "b")]), 1)
+    wifi: Wifi[str] = Wifi(FixedPowers("abr", G6, deaf=[("a", "b")]), 1)
     wifi.log_attempts(log.append)
     wifi.send(0, "a", "first", 1000, "r")
     wifi.send(500_000, "b", "second", 1000, "r")
@@ -148,7 +148,7 @@ def test_interference_that_begins_late_spoils_a_frame() -> None:
 
 
 def test_a_strong_frame_survives_weak_interference() -> None:
-    channel = ByHand("abr", G6, deaf=[("a", "b")])
+    channel = FixedPowers("abr", G6, deaf=[("a", "b")])
     channel.rows[1][2] = STRONG_MW / 1000
     wifi: Wifi[str] = Wifi(channel, 1)
     wifi.send(0, "a", "first", 1000, "r")
@@ -158,7 +158,7 @@ def test_a_strong_frame_survives_weak_interference() -> None:
 
 def test_a_weak_link_loses_what_its_packet_error_says() -> None:
     """Broadcasts, so that no retry hides a loss."""
-    channel, ratio_db, size_bytes, frames = ByHand("ab", G6), 4.05, 1500, 4000
+    channel, ratio_db, size_bytes, frames = FixedPowers("ab", G6), 4.05, 1500, 4000
     channel.rows[0][1] = NOISE_MW * 10 ** (ratio_db / 10)
     channel.sensitivity_mw = [NOISE_MW] * 2
     wifi: Wifi[int] = Wifi(channel, 1, queue_packets=frames)
@@ -171,7 +171,7 @@ def test_a_weak_link_loses_what_its_packet_error_says() -> None:
 
 
 def test_below_four_decibels_not_even_a_preamble_is_found() -> None:
-    channel = ByHand("ab", G6)
+    channel = FixedPowers("ab", G6)
     channel.rows[0][1] = NOISE_MW * 10 ** (3.9 / 10)
     channel.sensitivity_mw = [NOISE_MW] * 2
     wifi: Wifi[int] = Wifi(channel, 1)
@@ -184,7 +184,7 @@ def test_below_four_decibels_not_even_a_preamble_is_found() -> None:
 def test_equal_seeds_give_equal_fates_and_time_never_runs_back(seed: int, sends: list[tuple[int, int]]) -> None:
     def run() -> tuple[list[Delivery[int]], list[TransmissionAttempt]]:
         log: list[TransmissionAttempt] = []
-        wifi: Wifi[int] = Wifi(ByHand("abr", G54, deaf=[("a", "b")]), seed)
+        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[("a", "b")]), seed)
         wifi.log_attempts(log.append)
         for number, (at_ns, size) in enumerate(sorted(sends)):
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
@@ -202,7 +202,7 @@ def test_equal_seeds_give_equal_fates_and_time_never_runs_back(seed: int, sends:
 
 def test_deliveries_do_not_depend_on_when_they_are_asked_for() -> None:
     def run(step_ns: int) -> list[Delivery[int]]:
-        wifi: Wifi[int] = Wifi(ByHand("abr", G54), 3)
+        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54), 3)
         for number in range(50):
             wifi.send(0, "ab"[number % 2], number, 700, "r")
         found: list[Delivery[int]] = []
@@ -216,7 +216,7 @@ def test_deliveries_do_not_depend_on_when_they_are_asked_for() -> None:
 def test_the_engine_asks_for_attention_only_when_something_happens() -> None:
     """Stations that wait longer because others send cost no event each: the medium would be woken for nothing."""
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[int] = Wifi(ByHand([*"abcdefghijklmnopqrst"], G54), 1)
+    wifi: Wifi[int] = Wifi(FixedPowers([*"abcdefghijklmnopqrst"], G54), 1)
     wifi.log_attempts(log.append)
     for number in range(400):
         wifi.send(0, "abcdefghijklmnopqrs"[number % 19], number, 700, "t")
@@ -231,7 +231,7 @@ def test_the_engine_asks_for_attention_only_when_something_happens() -> None:
 
 
 def test_a_channel_that_changes_is_heard_as_it_is_then() -> None:
-    channel = ByHand("ab", G6)
+    channel = FixedPowers("ab", G6)
     wifi: Wifi[str] = Wifi(channel, 1)
     wifi.send(0, "a", "near", 100, None)
     assert len(wifi.deliveries(10**9)) == 1
@@ -250,7 +250,7 @@ def test_nobody_begins_while_it_hears_another(seed: int, deaf: set[tuple[int, in
     names = "abcde"
     pairs = [(names[one], names[other]) for one, other in deaf if one != other]
     log: list[TransmissionAttempt] = []
-    saturate(ByHand(names, G54, deaf=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
+    saturate(FixedPowers(names, G54, deaf=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
     hidden = {*pairs, *((other, one) for one, other in pairs)}
     sent = [attempt for attempt in log if attempt.number]
     begun = sorted(sent, key=lambda attempt: attempt.start_ns)
@@ -264,7 +264,7 @@ def test_nobody_begins_while_it_hears_another(seed: int, deaf: set[tuple[int, in
 
 @pytest.mark.parametrize("relay", [None, "r"])
 def test_the_parts_of_the_delay_sum_up_to_the_time_that_passed(relay: str | None) -> None:
-    wifi: Wifi[int] = Wifi(ByHand("abr", G54), 1)
+    wifi: Wifi[int] = Wifi(FixedPowers("abr", G54), 1)
     wifi.relay(relay)
     for number in range(100):
         wifi.send(number * 1000, "a", number * 1000, 1000, "b")
@@ -280,7 +280,7 @@ def test_the_parts_of_the_delay_sum_up_to_the_time_that_passed(relay: str | None
 
 
 def test_frames_to_who_is_out_of_range_are_lost_at_once() -> None:
-    class Apart(ByHand):
+    class Apart(FixedPowers):
         def linked(self, transmitter: int, receiver: int) -> bool:
             return False
 
@@ -296,7 +296,7 @@ def test_one_packet_less_changes_nothing_for_the_others(missing: set[int], relay
     """Every draw is keyed by the packet and the attempt at it, also where there are others of other flows."""
 
     def attempts(numbers: Sequence[int]) -> dict[int, list[tuple[int, str, bool]]]:
-        channel = ByHand("abr", G54)
+        channel = FixedPowers("abr", G54)
         channel.noise_mw = [WEAK_NOISE_MW] * 3
         log: list[TransmissionAttempt] = []
         wifi: Wifi[int] = Wifi(channel, 1)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol
-from fieldkit.core.prompts import DONE, NOBODY, UNKNOWN, Answer, Question
+from fieldkit.core.prompts import DONE, UNATTENDED, UNKNOWN, Answer, Question
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.kinds.ask import AskStep
 from fieldkit.steps.kinds.wait import WaitStep
@@ -54,8 +54,8 @@ def ignore(name: str, expected_s: float | None) -> None:
 def run_and_view(step: AskStep, here: Path, operator: ScriptedOperator | None = None) -> View:
     here.mkdir(parents=True)
     testbed = IdleTestbed()
-    testbed.operator = operator or NOBODY
-    step.run(replace(SCENE, here=here), testbed, ignore)
+    testbed.operator = operator or UNATTENDED
+    step.run(replace(SCENE, laptop_folder=here), testbed, ignore)
     return View(SCENE, AttemptEvidence(here))
 
 

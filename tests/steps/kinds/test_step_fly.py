@@ -14,7 +14,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
 from fieldkit.steps import arming_need
 from fieldkit.steps.kinds.fly import FlyStep
-from fieldkit.steps.scene import Said, Scene
+from fieldkit.steps.scene import CommandResult, Scene
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST, los_plan
 
@@ -120,7 +120,7 @@ def test_shipped_drone_profiles_have_limits() -> None:
     ],
 )
 def test_verdict_of_arming_check(text: str, code: int, verdict: Verdict) -> None:
-    actual, detail, remedy = arming_need._judge(Said(text, code))
+    actual, detail, remedy = arming_need._judge(CommandResult(text, code))
     assert actual is verdict
     assert detail
     assert bool(remedy) == (verdict is not Verdict.OK)
@@ -129,7 +129,7 @@ def test_verdict_of_arming_check(text: str, code: int, verdict: Verdict) -> None
 
 @given(st.text(max_size=200))
 def test_any_output_has_a_verdict(text: str) -> None:
-    assert arming_need._judge(Said(text, 0))[0] in Verdict
+    assert arming_need._judge(CommandResult(text, 0))[0] in Verdict
 
 
 def test_arming_check_has_limits_of_the_flight() -> None:

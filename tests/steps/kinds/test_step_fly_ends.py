@@ -62,7 +62,7 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
     jobs.install(made, Deadline.after(30))
     evidence.begin(made, FOLDER, "receiver", "lo")
     yield made
-    wait_until(lambda: jobs.left(made, Deadline.after(30)) == (), Deadline.after(60))
+    wait_until(lambda: jobs.list_running(made, Deadline.after(30)) == (), Deadline.after(60))
 
 
 def fly(
@@ -249,7 +249,7 @@ def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) ->
         assert "MAY STILL BE IN THE AIR" in str(caught.value)
         assert "MODE LOITER" in log(shell)
         evidence.end_jobs(shell, FOLDER)
-        wait_until(lambda: jobs.left(shell, Deadline.after(30)) == (), Deadline.after(60))
+        wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
         assert autopilot.vehicle.mode is Mode.LOITER
         assert autopilot.vehicle.armed
         assert not autopilot.vehicle.body.on_ground
@@ -263,7 +263,7 @@ def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(shell: She
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError, match="ended with exit code 137"):
             fly(shell, port, "60min", send_signal)
-        wait_until(lambda: jobs.left(shell, Deadline.after(30)) == (), Deadline.after(60))
+        wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
         assert autopilot.vehicle.mode is Mode.LOITER
         assert not autopilot.vehicle.body.on_ground
 

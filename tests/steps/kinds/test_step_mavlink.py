@@ -15,7 +15,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence.track import Apart
+from fieldkit.measure.evidence.track import Separation
 from fieldkit.measure.motion import tlog_reader
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions import accounts, trajectories, where
@@ -119,10 +119,12 @@ def attempt(
     return View(SCENE, AttemptEvidence(tmp_path))
 
 
-def apart(view: View, from_s: float, to_s: float) -> Apart:
-    source, destination = where.of_two(view.evidence, (Role.SENDER, Role.RECEIVER))
+def apart(view: View, from_s: float, to_s: float) -> Separation:
+    source, destination = where.trajectories_of_pair(view.evidence, (Role.SENDER, Role.RECEIVER))
     began_ns = START_NS + round(1e9 * START_S)
-    return trajectories.apart(source, destination, began_ns + round(from_s * 1e9), began_ns + round(to_s * 1e9))
+    return trajectories.separation_between(
+        source, destination, began_ns + round(from_s * 1e9), began_ns + round(to_s * 1e9)
+    )
 
 
 LOCAL = "positions: local, facing: left"
@@ -197,6 +199,6 @@ def test_sources_of_steps_inside_are_kept() -> None:
     placed, topic, file = Account(place=(0.0, 0.0, 0.0)), Account(file="a.bag", topic="/odom"), Account(file="b.tlog")
     inner = Accounts({Role.SENDER: topic, Role.RECEIVER: placed})
     outer = Accounts({Role.SENDER: placed, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True)
-    both = accounts.merged(inner, outer)
+    both = accounts.merge(inner, outer)
     assert both.robots == {Role.SENDER: topic, Role.RECEIVER: file}
     assert (both.clocks, both.heights) == (outer.clocks, True)

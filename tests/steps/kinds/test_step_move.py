@@ -85,7 +85,7 @@ def test_motion_is_in_metres_and_seconds() -> None:
     step = move(f"robot: receiver, path: [{{towards: 2km}}, {{away: 3m, right: 4m}}], speed: 3.6km/h, {PING}")
     assert step.motion == model.Move(Role.RECEIVER, (Leg(-2000.0), Leg(3.0, -4.0)), 1.0)
     assert geometry.length_m(step.motion) == pytest.approx(2005.0)
-    assert geometry.in_words(step.motion) == "2000 m towards, then 3 m away and 4 m right, at 1 m/s"
+    assert geometry.describe_move(step.motion) == "2000 m towards, then 3 m away and 4 m right, at 1 m/s"
     assert step.roles() == {Role.SENDER, Role.RECEIVER}
     assert [in_shell(planned.job) for planned in step.jobs(SCENE)] == [
         in_shell(planned.job) for planned in step.during[0].step.jobs(SCENE)
@@ -94,8 +94,8 @@ def test_motion_is_in_metres_and_seconds() -> None:
 
 def test_direction_of_path_depends_on_role() -> None:
     legs = (Leg(away_m=3.0), Leg(left_m=2.0))
-    assert geometry.way_m(model.Move(Role.SENDER, legs, 1.0)) == ((0.0, 0.0), (-3.0, 0.0), (-3.0, -2.0))
-    assert geometry.way_m(model.Move(Role.RECEIVER, legs, 1.0)) == ((0.0, 0.0), (3.0, 0.0), (3.0, 2.0))
+    assert geometry.path_corners_m(model.Move(Role.SENDER, legs, 1.0)) == ((0.0, 0.0), (-3.0, 0.0), (-3.0, -2.0))
+    assert geometry.path_corners_m(model.Move(Role.RECEIVER, legs, 1.0)) == ((0.0, 0.0), (3.0, 0.0), (3.0, 2.0))
     ends = {role: geometry.other_end(role, Topology.MASTER) for role in FIXED_ROLES}
     assert ends == {Role.SENDER: Role.RELAY, Role.RECEIVER: Role.RELAY, Role.RELAY: Role.SENDER}
     assert geometry.other_end(Role.SENDER, Topology.MASTERLESS) is Role.RECEIVER
@@ -221,7 +221,7 @@ legs = st.lists(st.builds(Leg, lengths, lengths).filter(lambda leg: leg != Leg()
 
 @given(legs, st.floats(0.5, 40))
 def test_path_is_shortened_at_the_fence(path: list[Leg], fence_m: float) -> None:
-    shortened = geometry.within(path, fence_m)
+    shortened = geometry.clip_path(path, fence_m)
     assert geometry.farthest_m(shortened) <= fence_m + 1e-6
     if geometry.farthest_m(path) <= fence_m:
         assert list(shortened) == path
@@ -237,7 +237,7 @@ def test_path_is_shortened_at_the_fence(path: list[Leg], fence_m: float) -> None
 
 @given(legs, st.floats(0.5, 40))
 def test_shortened_path_is_valid_in_a_procedure(path: list[Leg], fence_m: float) -> None:
-    segments = [PathLeg.of(leg) for leg in geometry.within(path, fence_m)]
+    segments = [PathLeg.of(leg) for leg in geometry.clip_path(path, fence_m)]
     for segment, leg in zip(segments, path, strict=False):
         if segment is not None:
             again = schema.validate(schema.parse(schema.dump(segment), source="x.yaml"), PathLeg)

@@ -22,7 +22,7 @@ from fieldkit.steps.view import View
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.paths import ROOT
-from tests.helpers.userlands import USERLANDS, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
 
 SCENE = Scene(Protocol.TCP, CAST, "folder")
 BATTERY = """
@@ -150,7 +150,7 @@ def test_summary_of_bool_is_as_in_the_table() -> None:
         ('{"cells": [{"V": "high"}]}', "battery.json: no volts: it is 'high', not a number"),
         ('{"cells": [{"V"', "battery.json: no volts: is not JSON"),
         (None, "battery.json: cannot be read"),
-        (" " * printed.MOST_BYTES, "battery.json: the program printed more than 1 MiB"),
+        (" " * printed.MAX_OUTPUT_BYTES, "battery.json: the program printed more than 1 MiB"),
     ],
 )
 def test_missing_or_out_of_bounds_value_makes_repeat_void(tmp_path: Path, output: str | None, problem: str) -> None:
@@ -181,7 +181,7 @@ def test_unexpected_exit_code_fails_the_attempt(monkeypatch: pytest.MonkeyPatch,
 
 def run_script(home: Path, userland: str, script: str) -> Completed:
     (planned,) = RunStep.model_validate({"robot": "sender", "argv": ["sh", "-c", script]}).jobs(SCENE)
-    robot = LocalShell(home, path_of(userland, home / "bin"))
+    robot = LocalShell(home, userland_path(userland, home / "bin"))
     return robot.run(jobs.limited_argv(planned.job), deadline=Deadline.after(60.0), check=False)
 
 
@@ -204,9 +204,9 @@ def test_output_and_exit_code_of_the_program(
 @pytest.mark.parametrize("userland", USERLANDS)
 def test_program_with_endless_output_is_stopped(tmp_path: Path, userland: str) -> None:
     result = run_script(tmp_path, userland, "yes")
-    assert (result.exit_code, len(result.stdout)) == (128 + signal.SIGPIPE, printed.MOST_BYTES)
+    assert (result.exit_code, len(result.stdout)) == (128 + signal.SIGPIPE, printed.MAX_OUTPUT_BYTES)
     result = run_script(tmp_path / "bin", userland, "yes >&2")
-    assert (result.exit_code, len(result.stderr)) == (128 + signal.SIGPIPE, printed.MOST_BYTES)
+    assert (result.exit_code, len(result.stderr)) == (128 + signal.SIGPIPE, printed.MAX_OUTPUT_BYTES)
 
 
 @pytest.mark.parametrize("userland", USERLANDS)

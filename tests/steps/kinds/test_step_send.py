@@ -13,11 +13,11 @@ from fieldkit.core.model import FIXED_ROLES, Protocol, Role, Verdict
 from fieldkit.measure.transfers.columns import COLUMNS
 from fieldkit.remote import jobs
 from fieldkit.steps.kinds.send import SendStep
-from fieldkit.steps.scene import Said, Scene
+from fieldkit.steps.scene import CommandResult, Scene
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
-from tests.helpers.userlands import USERLANDS, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
 
 SCENE = Scene(Protocol.UDP, CAST, "f")
 
@@ -45,7 +45,7 @@ def test_reference_generator_is_the_minimal_standard() -> None:
 @pytest.mark.parametrize(("seed", "size"), [(1, 1), (1, 64), (7, 1000), (2**31 - 2, 1_234), (42, 100_001)])
 def test_generated_bytes_are_equal_on_every_robot(tmp_path: Path, userland: str, seed: int, size: int) -> None:
     make = next(send(f"size: {size}B, seed: {seed}").jobs(SCENE))
-    robot = LocalShell(tmp_path, path_of(userland, tmp_path / "bin"))
+    robot = LocalShell(tmp_path, userland_path(userland, tmp_path / "bin"))
     done = robot.run(make.job.argv, deadline=Deadline.after(60.0))
     assert done.stdout == park_miller(seed, size)
 
@@ -81,22 +81,22 @@ def test_file_is_copied_from_its_path(tmp_path: Path, file: str, copied: str) ->
         assert (tmp_path / "send.bin").read_bytes() == b"map"
         (need,) = step.needs(SCENE)
         done = subprocess.run(need.argv, env={"HOME": str(tmp_path)}, capture_output=True, text=True, check=True)
-        assert need.judge(Said(done.stdout.strip(), 0))[0] is Verdict.WARN, "3 bytes instead of 1000"
+        assert need.judge(CommandResult(done.stdout.strip(), 0))[0] is Verdict.WARN, "3 bytes instead of 1000"
 
 
 @pytest.mark.parametrize(
     ("result", "verdict", "text"),
     [
-        (Said("1900", 0), Verdict.OK, "1.9 kB"),
-        (Said("501", 0), Verdict.OK, "0.5 kB"),
-        (Said("499", 0), Verdict.WARN, "but the procedure has 1.0 kB"),
-        (Said("2001", 0), Verdict.WARN, "but the procedure has 1.0 kB"),
-        (Said("0", 0), Verdict.FAIL, "it is empty"),
-        (Said("sh: 1: cannot open maps/lab.pgm: No such file", 2), Verdict.FAIL, "cannot open"),
-        (Said("", 0), Verdict.FAIL, ""),
+        (CommandResult("1900", 0), Verdict.OK, "1.9 kB"),
+        (CommandResult("501", 0), Verdict.OK, "0.5 kB"),
+        (CommandResult("499", 0), Verdict.WARN, "but the procedure has 1.0 kB"),
+        (CommandResult("2001", 0), Verdict.WARN, "but the procedure has 1.0 kB"),
+        (CommandResult("0", 0), Verdict.FAIL, "it is empty"),
+        (CommandResult("sh: 1: cannot open maps/lab.pgm: No such file", 2), Verdict.FAIL, "cannot open"),
+        (CommandResult("", 0), Verdict.FAIL, ""),
     ],
 )
-def test_preflight_checks_the_file(result: Said, verdict: Verdict, text: str) -> None:
+def test_preflight_checks_the_file(result: CommandResult, verdict: Verdict, text: str) -> None:
     (need,) = send("size: 1kB, file: maps/lab.pgm").needs(SCENE)
     actual, detail, remedy = need.judge(result)
     assert actual is verdict

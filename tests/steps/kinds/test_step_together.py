@@ -38,7 +38,7 @@ class CommandStep(Step):
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         argv = ("sh", "-c", self.command)
         yield Planned(
-            Role.SENDER, Job(scene.folder, self.own_name("says"), argv, limit_s=60, log=self.files()[0]), "sh"
+            Role.SENDER, Job(scene.folder, self.prefixed_name("says"), argv, limit_s=60, log=self.files()[0]), "sh"
         )
 
     def run(self, scene: Scene, testbed: IdleTestbed, announce: Announce) -> None:  # type: ignore[override]
@@ -57,7 +57,7 @@ class CommandStep(Step):
         return ()
 
     def files(self) -> tuple[str, ...]:
-        return (self.own_name("says.log"),)
+        return (self.prefixed_name("says.log"),)
 
 
 class SequenceStep(Nest):
@@ -111,14 +111,14 @@ def folder(robots: IdleTestbed, role: Role = Role.SENDER) -> Path:
 def run(step: Step, robots: IdleTestbed, *recorded: str) -> list[str]:
     announced: list[str] = []
     cast = {role: robot.model_copy(update={"address": "127.0.0.1"}) for role, robot in CAST.items()}
-    files = {Role.SENDER: tuple(RecordedFile(Role.SENDER, name, 1e4, called=name[:-4]) for name in recorded)}
+    files = {Role.SENDER: tuple(RecordedFile(Role.SENDER, name, 1e4, alias=name[:-4]) for name in recorded)}
     scene = Scene(Protocol.TCP, cast, FOLDER, files)
     step.run(scene, robots, lambda name, expected_s: announced.append(name))
     return announced
 
 
 def running(robots: IdleTestbed) -> Sequence[str]:
-    return jobs.left(robots.shells[Role.SENDER], Deadline.after(30))
+    return jobs.list_running(robots.shells[Role.SENDER], Deadline.after(30))
 
 
 @pytest.mark.emulated
@@ -173,14 +173,14 @@ def test_started_listener_is_stopped_if_another_step_is_not_ready(robots: IdleTe
 
     class Unready(CommandStep):
         def prepare(self, scene: Scene, testbed: IdleTestbed) -> Callable[[Announce], None]:  # type: ignore[override]
-            wait_until(lambda: bool(jobs.left(receiver, Deadline.after(30))), Deadline.after(30))
+            wait_until(lambda: bool(jobs.list_running(receiver, Deadline.after(30))), Deadline.after(30))
             raise RobotError("it is not ready")
 
     ends = {"from": "sender", "to": "receiver", "port": free_port()}
     entries = (StepEntry("transfer", TransferStep.model_validate(ends)), StepEntry("says", Unready(command="")))
     with pytest.raises(RobotError, match="it is not ready"):
         run(TogetherStep(during=entries), robots, "a.bag")
-    assert not jobs.left(receiver, Deadline.after(30))
+    assert not jobs.list_running(receiver, Deadline.after(30))
 
 
 @pytest.mark.emulated

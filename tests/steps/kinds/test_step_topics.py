@@ -20,7 +20,7 @@ from fieldkit.ros import ports
 from fieldkit.steps import streams
 from fieldkit.steps.kinds.capture import CaptureStep
 from fieldkit.steps.kinds.topics import TopicsStep
-from fieldkit.steps.scene import Said, Scene
+from fieldkit.steps.scene import CommandResult, Scene
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
 from tests.helpers.paths import ROOT
@@ -107,7 +107,7 @@ def test_ports_of_dds_follow_rtps() -> None:
     dds_ports = ports.dds(1, multicast=True)
     assert {7650, 7660, 7662} <= dds_ports.discovery
     assert {7651, 7661, 7663} <= dds_ports.data
-    assert max(ports.dds(ports.MOST_DOMAIN, multicast=True).data) < 32_768
+    assert max(ports.dds(ports.MAX_DOMAIN, multicast=True).data) < 32_768
 
 
 def test_constants_of_laptop_and_agent_are_equal() -> None:
@@ -118,7 +118,7 @@ def test_constants_of_laptop_and_agent_are_equal() -> None:
 def test_ports_of_domains_are_disjoint() -> None:
     """The ports of Zenoh and ROS 1 in each domain differ from each other and from the default ports."""
     all_ports = [7446, 7447, 11311]
-    for domain in range(ports.MOST_DOMAIN + 1):
+    for domain in range(ports.MAX_DOMAIN + 1):
         all_ports += [
             *ports.zenoh(domain, multicast=False).data,
             *ports.ros1(domain).data,
@@ -170,7 +170,7 @@ def test_ros_2_runs_with_environment_of_robot_and_settings() -> None:
     network = json.loads(publish.job.argv[10])["network"]
     assert (network["discovery"], network["peers"]) == ("peers", [CAST[Role.RECEIVER].address])
     assert (network["domain"], network["settings"]) == (42, {})
-    assert need.judge(Said("rmw_b", 0)) == (Verdict.OK, "rclpy, rmw_b", "")
+    assert need.judge(CommandResult("rmw_b", 0)) == (Verdict.OK, "rclpy, rmw_b", "")
 
 
 def together(*several: str, within: str = "together") -> str:
@@ -211,10 +211,12 @@ def test_missing_middleware_fails_with_remedy(over: str, remedy: str) -> None:
     step = topics(f"over: {over}")
     needs = list(step.needs(SCENE))
     assert [need.role for need in needs] == [Role.SENDER, Role.RECEIVER]
-    verdict, detail, remedy_text = needs[0].judge(Said("Traceback\nModuleNotFoundError: No module named 'x'", 1))
+    verdict, detail, remedy_text = needs[0].judge(
+        CommandResult("Traceback\nModuleNotFoundError: No module named 'x'", 1)
+    )
     assert (verdict, detail) == (Verdict.FAIL, "ModuleNotFoundError: No module named 'x'")
     assert remedy in remedy_text
-    assert needs[0].judge(Said("", 0))[0] is Verdict.OK
+    assert needs[0].judge(CommandResult("", 0))[0] is Verdict.OK
 
 
 PROCEDURE = """\

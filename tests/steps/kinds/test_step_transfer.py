@@ -8,7 +8,7 @@ import pytest
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import DelayParts, Lateness, LinkSample, Protocol, Role, Whereabouts
+from fieldkit.core.model import DelayParts, Lateness, LinkSample, Protocol, Role, TrackPoint
 from fieldkit.measure.evidence import medium
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Shell
@@ -36,7 +36,7 @@ class Medium:
         assert (source, destination, protocol, port) == (Role.SENDER, Role.RECEIVER, Protocol.TCP, self.port)
         return next(self.parts)
 
-    def track(self, since_utc_ns: int) -> tuple[Whereabouts, ...]:
+    def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
         raise AssertionError(since_utc_ns)
 
     def lateness(self) -> Lateness:
@@ -90,7 +90,7 @@ def transfer(
         {"from": "sender", "to": "receiver", "port": port, "idle": idle, "limit": limit}
     )
     bag = RecordedFile(Role.SENDER, "scan.bag", 20_000)
-    scene = Scene(protocol, cast, FOLDER, {Role.SENDER: (bag,)}, here=sender.home.parent)
+    scene = Scene(protocol, cast, FOLDER, {Role.SENDER: (bag,)}, laptop_folder=sender.home.parent)
     robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, delays, port)
     try:
         step.run(scene, robots, lambda name, expected_s: None)

@@ -16,7 +16,7 @@ from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
 from fieldkit.measure.evidence.bag import Bag
 from fieldkit.measure.offsets import Offset
-from fieldkit.steps.scene import Said
+from fieldkit.steps.scene import CommandResult
 from fieldkit.trial import size
 from fieldkit.trial.check import contact, radio, software, system, topics
 from fieldkit.trial.check.probe import Sections, parse
@@ -31,8 +31,8 @@ PLAN = los_plan()
 OK, WARN, FAIL = Verdict.OK, Verdict.WARN, Verdict.FAIL
 
 
-def said(name: str, code: int = 0) -> Said:
-    return Said((DATA / name).read_text(encoding="utf-8").strip("\n"), code)
+def said(name: str, code: int = 0) -> CommandResult:
+    return CommandResult((DATA / name).read_text(encoding="utf-8").strip("\n"), code)
 
 
 def only(findings: Sequence[Finding], check: str) -> Finding:
@@ -40,7 +40,7 @@ def only(findings: Sequence[Finding], check: str) -> Finding:
     return finding
 
 
-def heard(robot: Robot, **sections: Said) -> list[Finding]:
+def heard(robot: Robot, **sections: CommandResult) -> list[Finding]:
     """Judge the radio; an underscore in the name of a section is replaced by a hyphen."""
     base = {"interface": said("ip/6.1.0/up.txt")}
     report = Report(robot.name)
@@ -94,7 +94,7 @@ def test_a_signal_near_the_sensitivity_is_a_warning() -> None:
     link = said("iw/link-station.txt")
     # The TurtleBot's sensitivity is -82 dBm.
     for dbm, status in ((-72, OK), (-73, WARN)):
-        weak = Said(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
+        weak = CommandResult(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
         findings = heard(SENDER, wifi_info=said("iw/info-station.txt"), wifi_link=weak)
         assert only(findings, "Wi-Fi").status is status
 
@@ -122,7 +122,7 @@ def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
 
 
 def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
-    ibss = Said(said("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
+    ibss = CommandResult(said("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
     findings = heard(SENDER, wifi_info=ibss, wifi_link=said("iw/link-ibss.txt"))
     assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
 
@@ -144,22 +144,22 @@ def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:
 
 
 def test_a_radio_without_iw_is_a_warning() -> None:
-    ether = Said(said("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
-    findings = heard(SENDER, interface=ether, wireless=Said("/sys/class/net/wlan0/phy80211", 0))
+    ether = CommandResult(said("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
+    findings = heard(SENDER, interface=ether, wireless=CommandResult("/sys/class/net/wlan0/phy80211", 0))
     assert only(findings, "Wi-Fi").remedy == "sudo apt-get install iw"
 
 
-def probed(role: Role, **changes: Said) -> list[Finding]:
+def probed(role: Role, **changes: CommandResult) -> list[Finding]:
     """Judge the system of a robot that has everything except for `changes`."""
-    sections: dict[str, Said] = {
-        "system": Said("Raspbian GNU/Linux 10 (buster), Linux 5.10.63-v7+ armv7l", 0),
-        "disk": Said(
+    sections: dict[str, CommandResult] = {
+        "system": CommandResult("Raspbian GNU/Linux 10 (buster), Linux 5.10.63-v7+ armv7l", 0),
+        "disk": CommandResult(
             "Filesystem     1024-blocks    Used Available Capacity Mounted on\n"
             "/dev/root         14960428 3451724  10862848      25% /",
             0,
         ),
-        "listeners": Said("", 1),
-        "batteries": Said("", 2),
+        "listeners": CommandResult("", 1),
+        "batteries": CommandResult("", 2),
     }
     report = Report(CAST[role].name)
     system.judge(PLAN, role, sections | changes, report)
@@ -180,12 +180,12 @@ def probed(role: Role, **changes: Said) -> list[Finding]:
 )
 def test_a_robot_s_disk_must_hold_an_attempt(role: Role, free_kib: int, status: Verdict) -> None:
     head = "Filesystem           1024-blocks    Used Available Capacity Mounted on\n"
-    finding = only(probed(role, disk=Said(f"{head}/dev/root 14960428 3451724 {free_kib}  25% /", 0)), "disk")
+    finding = only(probed(role, disk=CommandResult(f"{head}/dev/root 14960428 3451724 {free_kib}  25% /", 0)), "disk")
     assert finding.status is status
 
 
 def test_a_disk_with_unknown_space_fails() -> None:
-    assert only(probed(Role.SENDER, disk=Said("df: .: Stale file handle", 1)), "disk").status is FAIL
+    assert only(probed(Role.SENDER, disk=CommandResult("df: .: Stale file handle", 1)), "disk").status is FAIL
 
 
 def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
@@ -213,16 +213,19 @@ LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 0
 
 
 def test_a_port_in_use_fails_on_the_receiver_only() -> None:
-    taken = Said(LISTENER, 0)
+    taken = CommandResult(LISTENER, 0)
     finding = only(probed(Role.RECEIVER, listeners=taken), "port 1234")
     assert finding.status is FAIL
     assert "1234" in finding.remedy
-    assert only(probed(Role.RECEIVER, listeners=Said(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status is OK
+    assert (
+        only(probed(Role.RECEIVER, listeners=CommandResult(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status
+        is OK
+    )
     assert "port 1234" not in {finding.check for finding in probed(Role.SENDER, listeners=taken)}
 
 
 def test_a_low_battery_is_a_warning() -> None:
-    findings = probed(Role.SENDER, batteries=Said("BAT0 81\nbq27000-0 19", 0))
+    findings = probed(Role.SENDER, batteries=CommandResult("BAT0 81\nbq27000-0 19", 0))
     assert [(finding.status, finding.detail) for finding in findings if finding.check == "battery"] == [
         (OK, "BAT0 at 81 %"),
         (WARN, "bq27000-0 at 19 %"),
@@ -247,7 +250,7 @@ def test_an_error_of_an_hour_is_reported_in_hours() -> None:
     assert "sudo date -u -s @$(date +%s)" in finding.remedy
 
 
-def installed(plan: Plan = PLAN) -> dict[str, Said]:
+def installed(plan: Plan = PLAN) -> dict[str, CommandResult]:
     asked = software.commands(plan, Role.SENDER)
     tools = "\n".join(
         f"==> {name} <==\n{text}\n==> exit 0 <=="
@@ -260,9 +263,9 @@ def installed(plan: Plan = PLAN) -> dict[str, Said]:
             "recorder": "Usage: rosbag record TOPIC1 [TOPIC2 TOPIC3...]",
         }.items()
     )
-    return dict.fromkeys(asked, Said("/usr/bin/it", 0)) | {
-        "tools": Said(tools, 0),
-        "ROS": Said("noetic http://127.0.0.1:11311", 0),
+    return dict.fromkeys(asked, CommandResult("/usr/bin/it", 0)) | {
+        "tools": CommandResult(tools, 0),
+        "ROS": CommandResult("noetic http://127.0.0.1:11311", 0),
     }
 
 
@@ -286,7 +289,7 @@ def test_a_robot_that_has_everything_passes() -> None:
 
 
 def test_a_missing_program_is_one_failure_with_its_package() -> None:
-    sections = installed() | {"program nc.traditional": Said("", 1)}
+    sections = installed() | {"program nc.traditional": CommandResult("", 1)}
     (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
     assert failed.check == "nc.traditional"
     assert failed.remedy == "sudo apt-get install netcat-traditional"
@@ -306,7 +309,7 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
 )
 def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, program: str, remedy: str) -> None:
     plan = PLAN.model_copy(update={"procedure": procedure_of(step)})
-    sections = installed(plan) | {f"program {program}": Said("", 127)}
+    sections = installed(plan) | {f"program {program}": CommandResult("", 127)}
     (failed,) = [finding for finding in judged(sections, plan) if finding.status is not OK]
     assert (failed.check, failed.remedy) == (program, remedy)
 
@@ -332,7 +335,7 @@ def test_a_recording_on_a_robot_without_ros_is_rejected() -> None:
 
 def test_a_setup_file_that_is_missing_is_one_failure() -> None:
     missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
-    sections = installed() | {"ROS": Said(missing, 1), "program rosbag": Said(missing, 1)}
+    sections = installed() | {"ROS": CommandResult(missing, 1), "program rosbag": CommandResult(missing, 1)}
     (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
     assert (failed.check, failed.detail) == ("ROS", missing)
     assert not software.can_record(PLAN, Role.SENDER, sections)
@@ -340,7 +343,7 @@ def test_a_setup_file_that_is_missing_is_one_failure() -> None:
 
 
 def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
-    refused = Said("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
+    refused = CommandResult("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
     (failed,) = [
         finding for finding in judged(installed() | {"right to capture": refused}) if finding.status is not OK
     ]
@@ -352,8 +355,8 @@ def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"tools": tools})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
     for said, remedy in (
-        (Said("sudo: a password is required", 1), "sudo tee /etc/sudoers.d/fieldkit"),
-        (Said("sh: 9: sudo: not found", Said.MISSING), "capture_right: direct"),
+        (CommandResult("sudo: a password is required", 1), "sudo tee /etc/sudoers.d/fieldkit"),
+        (CommandResult("sh: 9: sudo: not found", CommandResult.MISSING), "capture_right: direct"),
     ):
         (failed,) = [
             finding
@@ -364,7 +367,9 @@ def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
 
 
 def test_ros_1_without_a_master_is_a_warning() -> None:
-    (warned,) = [finding for finding in judged(installed() | {"ROS": Said("noetic", 0)}) if finding.status is not OK]
+    (warned,) = [
+        finding for finding in judged(installed() | {"ROS": CommandResult("noetic", 0)}) if finding.status is not OK
+    ]
     assert "ROS_MASTER_URI" in warned.detail
 
 
@@ -422,7 +427,7 @@ def test_any_output_can_be_parsed(text: str) -> None:
 @given(st.text())
 def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
     report = Report("turtlebot-1")
-    everything = {name: Said(text, 0) for name in (*installed(), "system", "disk", "interface", "wifi-info")}
+    everything = {name: CommandResult(text, 0) for name in (*installed(), "system", "disk", "interface", "wifi-info")}
     system.judge(PLAN, Role.SENDER, everything, report)
     software.judge(PLAN, Role.SENDER, everything, report)
     radio.judge(SENDER, everything, report)
@@ -441,14 +446,16 @@ def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
     ],
 )
 def test_the_route_of_ssh_is_detected(connection: str, control: Control, status: Verdict, detail: str) -> None:
-    finding = only(heard(SENDER.model_copy(update={"control": control}), control=Said(connection, 0)), "control")
+    finding = only(
+        heard(SENDER.model_copy(update={"control": control}), control=CommandResult(connection, 0)), "control"
+    )
     assert finding.status is status
     assert detail in finding.detail
 
 
 @pytest.mark.parametrize("file", ["ip/6.1.0/nope.txt", "busybox/1.35.0/ip-nope.txt"])
 def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
-    refused = Said("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
+    refused = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
     sections = installed() | {"right to capture": refused, "interface": said(file, 1)}
     assert "right to capture" not in {finding.check for finding in judged(sections)}
     there = judged(sections | {"interface": said("ip/6.1.0/up.txt")})
@@ -471,15 +478,17 @@ def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) ->
 )
 def test_a_remedy_can_be_typed_on_this_robot(user: str, programs: str, remedy: str, typed: str) -> None:
     report = Report("turtlebot-1")
-    report.user_tools = system.user_tools({"user": Said(user, 0), "means": Said("\n".join(programs.split()), 0)})
+    report.user_tools = system.user_tools(
+        {"user": CommandResult(user, 0), "means": CommandResult("\n".join(programs.split()), 0)}
+    )
     report.fail("iw", "not found", remedy)
     assert only(report.findings, "iw").remedy == typed
 
 
 def test_the_remedy_for_a_port_uses_an_available_tool() -> None:
     report = Report(RECEIVER.name)
-    report.user_tools = system.user_tools({"user": Said("0", 0), "means": Said("netstat", 0)})
-    system.judge(PLAN, Role.RECEIVER, {"listeners": Said(LISTENER, 0)}, report)
+    report.user_tools = system.user_tools({"user": CommandResult("0", 0), "means": CommandResult("netstat", 0)})
+    system.judge(PLAN, Role.RECEIVER, {"listeners": CommandResult(LISTENER, 0)}, report)
     assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # shows it; stop it"
 
 
@@ -490,11 +499,11 @@ def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:
         ("1000", "", "ssh -t -p 2222 pi@robot \"su -c 'date -u -s @$(date +%s)'\""),
     ):
         report = Report("turtlebot-1")
-        report.user_tools = system.user_tools({"user": Said(user, 0), "means": Said(programs, 0)})
+        report.user_tools = system.user_tools({"user": CommandResult(user, 0), "means": CommandResult(programs, 0)})
         contact.judge_clock(Offset(5.0, 0.1), "-p 2222 pi@robot", report)
         assert only(report.findings, "clock").remedy == f"{command} # on the laptop"
 
 
 def test_no_remedy_names_an_unknown_file() -> None:
-    finding = only(heard(SENDER, control=Said("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
+    finding = only(heard(SENDER, control=CommandResult("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
     assert finding.remedy == "write control: radio in the site file, or give host another network"

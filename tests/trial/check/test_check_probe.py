@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from fieldkit.steps.scene import Said
+from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check.probe import parse, script
 
 AWKWARD = 'it\'s $(touch x) `y` "z" \\ *'
@@ -23,7 +23,7 @@ def test_every_section_has_an_answer(shell: tuple[str, ...]) -> None:
     done = subprocess.run(argv, input=script(commands).encode(), capture_output=True, timeout=60, check=True)
     sections = parse(done.stdout.decode())
     assert sections["program it's"].text == AWKWARD
-    assert sections["no such"].code == Said.MISSING
+    assert sections["no such"].code == CommandResult.MISSING
     assert (sections["reads"].text, sections["reads"].code) == ("", 0), (
         "commands must not read the script from standard input"
     )

@@ -17,7 +17,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.events import Event, Note
 from fieldkit.core.model import BRIDGE_IS_UP, Placement, Role, Scenario, Topology
-from fieldkit.core.prompts import NOBODY
+from fieldkit.core.prompts import UNATTENDED
 from fieldkit.core.units import parse_distance
 from fieldkit.lab.protocol import LabRobot
 from fieldkit.remote import jobs
@@ -88,11 +88,11 @@ def test_dds_nodes_receive_ros_1_messages_during_the_session(up: EmulatedTestbed
     events: list[Event] = []
     shell, drone = up.shells[Role.SENDER], up.robots[Role.RECEIVER]
     with bridges.running(cast(), up.shells, "s1", sink=events.append):
-        (left,) = jobs.left(shell, soon())
-        assert f"/{bridges.folder_of('s1')}/" in left
+        (list_running,) = jobs.list_running(shell, soon())
+        assert f"/{bridges.folder_of('s1')}/" in list_running
         scan: Any = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
     assert (scan.header.frame_id, len(scan.ranges)) == ("base_scan", 360)
-    assert jobs.left(shell, soon()) == ()
+    assert jobs.list_running(shell, soon()) == ()
     assert not [event for event in events if isinstance(event, Note)], "the bridge exited successfully"
 
 
@@ -105,7 +105,7 @@ def test_a_bridge_that_does_not_start_is_reported_with_its_output(up: EmulatedTe
     ):
         raise AssertionError("it is not up")
     assert "its bridge does not start" in str(caught.value)
-    assert jobs.left(up.shells[Role.SENDER], soon()) == ()
+    assert jobs.list_running(up.shells[Role.SENDER], soon()) == ()
 
 
 @pytest.mark.emulated
@@ -115,7 +115,7 @@ def test_a_bridge_that_exits_early_is_reported(up: EmulatedTestbed) -> None:
     up.shells[Role.SENDER].run(("sh", "-c", "cat >short && chmod +x short"), stdin=short.encode(), deadline=soon())
     ends = cast(BRIDGE.model_copy(update={"program": "/root/short"}))
     with bridges.running(ends, up.shells, "s3", sink=events.append):
-        wait_until(lambda: not jobs.left(up.shells[Role.SENDER], soon()), soon())
+        wait_until(lambda: not jobs.list_running(up.shells[Role.SENDER], soon()), soon())
     (note,) = [event for event in events if isinstance(event, Note)]
     assert note.text == "the bridge on turtlebot-1 exited early, with exit code 3"
 
@@ -200,7 +200,7 @@ def test_an_emulated_lab_without_debian_s_ros_rejects_it(monkeypatch: pytest.Mon
     monkeypatch.setattr("sim_backends.emulated.requirements.check", lambda _: None)
     with (
         pytest.raises(ConfigurationError, match="has a bridge, which needs Debian's ROS"),
-        backend.open(cast(), seed=1, sink=lambda _: None, operator=NOBODY),
+        backend.open(cast(), seed=1, sink=lambda _: None, operator=UNATTENDED),
     ):
         raise AssertionError("it is open")
 

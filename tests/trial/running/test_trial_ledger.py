@@ -48,7 +48,7 @@ def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
     (partial / "ping.txt").write_text(PING, encoding="ascii")
     to.measured(begun)
     measured = gates.judge(plan, repeat, AttemptEvidence(partial)).measured
-    to.keep(partial, replace(begun, status=Status.VALID), measured)
+    to.commit(partial, replace(begun, status=Status.VALID), measured)
 
 
 @pytest.fixture

@@ -16,12 +16,12 @@ from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
-from fieldkit.trial.running.locks import Holder, held, taken
+from fieldkit.trial.running.locks import Holder, held, locked
 from fieldkit.trial.running.robots import Robots
 from tests.helpers.casts import los_plan
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import wait_until
-from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, path_of
+from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -34,7 +34,7 @@ FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 def robot(tmp_path: Path, request: pytest.FixtureRequest) -> LocalShell:
     home = tmp_path / "home"
     home.mkdir()
-    return LocalShell(home, path_of(request.param, tmp_path / "bin"), "turtlebot-1")
+    return LocalShell(home, userland_path(request.param, tmp_path / "bin"), "turtlebot-1")
 
 
 def quiet(event: Event) -> None:
@@ -59,25 +59,25 @@ def begin(robot: LocalShell, holder: Holder) -> None:
 
 
 def test_a_locked_robot_names_its_holder_and_is_unlocked(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         with (
             pytest.raises(
                 RobotError, match=r"turtlebot-1: anna@one holds it since \d\d:\d\d:\d\d UTC, \d\.0 s ago, for trial-a"
             ) as caught,
-            taken({Role.SENDER: robot}, BERT, sink=quiet),
+            locked({Role.SENDER: robot}, BERT, sink=quiet),
         ):
             raise AssertionError("taken twice")
         assert re.search(r"; expires in (1 h 00 min|59 min \d\d s)$", caught.value.what)
         assert caught.value.remedy == "wait, resume that trial if it is yours, or end it: fieldkit abort"
-    with taken({Role.SENDER: robot}, BERT, sink=quiet):
+    with locked({Role.SENDER: robot}, BERT, sink=quiet):
         begin(robot, BERT)
 
 
 def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     assert locks.holder(robot) is None
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=60):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=60):
         lock = locks.holder(robot)
         assert lock is not None
         assert lock.holder == ANNA
@@ -88,7 +88,7 @@ def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None
 
 
 def test_the_same_trial_can_lock_its_robot_again(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet), taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet), locked({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
 
 
@@ -97,7 +97,7 @@ def test_only_one_of_many_simultaneous_laptops_locks_the_robot(robot: LocalShell
     holders = [Holder(f"trial-{number}", f"laptop-{number}", "x") for number in range(12)]
 
     def take(holder: Holder) -> bool:
-        argv = ("sh", jobs.SCRIPT_PATH, "lock", holder.token, "60", holder.who, holder.what)
+        argv = ("sh", jobs.SCRIPT_PATH, "lock", holder.token, "60", holder.user, holder.purpose)
         return robot.run(argv, deadline=Deadline.after(60), check=False).exit_code == 0
 
     for turn in range(3):
@@ -122,9 +122,9 @@ def test_a_lock_number_that_was_used_and_removed_is_not_valid(robot: LocalShell)
 
 
 def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (4, "1"))
-        with taken({Role.SENDER: robot}, BERT, sink=quiet):
+        with locked({Role.SENDER: robot}, BERT, sink=quiet):
             with pytest.raises(LockLostError, match=r"bert@two took the robot at .* for trial-b") as caught:
                 begin(robot, ANNA)
             assert caught.value.exit_code == 3
@@ -132,17 +132,17 @@ def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShel
 
 
 def test_a_lock_of_an_earlier_boot_expires_by_the_clock(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (2, "another-boot"), (4, "1"))
-        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
+        with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: robot}, BERT, sink=quiet):
             raise AssertionError("taken twice")
         alter(robot, (5, "99999999999"), (6, "99999999999"))  # the robot's clock is in the past: it has no battery
-        with taken({Role.SENDER: robot}, BERT, sink=quiet):
+        with locked({Role.SENDER: robot}, BERT, sink=quiet):
             begin(robot, BERT)
 
 
 def test_begin_renews_at_half_time_and_not_before(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=1000):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=1000):
         fresh = record(robot)
         begin(robot, ANNA)
         assert record(robot) == fresh
@@ -154,14 +154,14 @@ def test_begin_renews_at_half_time_and_not_before(robot: LocalShell) -> None:
 
 
 def test_an_expired_lock_without_a_new_holder_is_renewed(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (4, "1"))
         begin(robot, ANNA)
         assert int(record(robot)[4]) > 1
 
 
 def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         evidence.begin(robot, jobs.work_folder("older", "udp-03-1"), "sender", "lo")
         for folder in (FOLDER, jobs.work_folder("older", "udp-03-1")):
@@ -173,16 +173,19 @@ def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell)
             ".fieldkit/older/udp-03-1/capture",
             ".fieldkit/trial-a/tcp-01-1/capture",
         ]
-        assert jobs.left(robot, Deadline.after(30)) == ()
+        assert jobs.list_running(robot, Deadline.after(30)) == ()
         with pytest.raises(RobotError, match="comes too late"):
             jobs.run(robot, Job(folder=FOLDER, name="ping", argv=("true",), limit_s=5, log="log"))
         with pytest.raises(
             LockLostError, match=r"^turtlebot-1: the trial was aborted by bert@two at \d\d:\d\d:\d\d UTC"
         ):
             begin(robot, ANNA)
-    with taken({Role.SENDER: robot}, BERT, sink=quiet), pytest.raises(LockLostError, match="bert@two took the robot"):
+    with (
+        locked({Role.SENDER: robot}, BERT, sink=quiet),
+        pytest.raises(LockLostError, match="bert@two took the robot"),
+    ):
         begin(robot, ANNA)
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
 
 
@@ -191,8 +194,8 @@ def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_pat
     (tmp_path / "bin" / "date").unlink(missing_ok=True)
     (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{says}\n", encoding="ascii")
     (tmp_path / "bin" / "date").chmod(0o755)
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
-        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+        with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: robot}, BERT, sink=quiet):
             raise AssertionError("taken")
         assert [ended.locked for ended in locks.abort({"turtlebot-1": robot}, "bert@two").values()] == [True]
 
@@ -201,7 +204,7 @@ def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     for content in ("", "held", "held trial-b boot x y z 1 bert trial"):
         (robot.home / ".fieldkit" / "lock.7").write_text(content, encoding="ascii")
-        with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+        with locked({Role.SENDER: robot}, ANNA, sink=quiet):
             begin(robot, ANNA)
         for path in (robot.home / ".fieldkit").glob("lock.*"):
             path.unlink()
@@ -209,22 +212,22 @@ def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
 
 def test_an_empty_record_hides_no_lock(robot: LocalShell) -> None:
     """An older fieldkit leaves such a record if the power fails just after it was written."""
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         (robot.home / ".fieldkit" / "lock.9").touch()
-        with pytest.raises(RobotError, match="anna@one holds it"), taken({Role.SENDER: robot}, BERT, sink=quiet):
+        with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: robot}, BERT, sink=quiet):
             raise AssertionError("taken twice")
         begin(robot, ANNA)
     assert record(robot)[0] == "free"
 
 
 def test_a_robot_that_lost_its_records_is_locked_again(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         for path in (robot.home / ".fieldkit").glob("lock.*"):
             path.unlink()
         begin(robot, ANNA)
         with (
             pytest.raises(RobotError, match=r"somebody holds it since .*, for trial-a"),
-            taken({Role.SENDER: robot}, BERT, sink=quiet),
+            locked({Role.SENDER: robot}, BERT, sink=quiet),
         ):
             raise AssertionError("taken twice")
 
@@ -240,7 +243,7 @@ def test_a_record_is_on_the_disk_before_it_is_a_lock(robot: LocalShell, tmp_path
             encoding="ascii",
         )
         (tmp_path / "bin" / name).chmod(0o755)
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         synced, linked, folder = calls.read_text(encoding="ascii").splitlines()
         assert re.fullmatch(r"sync held new-lock\.\d+", synced)
         assert linked.startswith("ln held new-lock.")
@@ -249,7 +252,7 @@ def test_a_record_is_on_the_disk_before_it_is_a_lock(robot: LocalShell, tmp_path
 
 
 def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
         lock = locks.holder(robot)
@@ -261,10 +264,10 @@ def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
 
 
 def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         alter(robot, (4, "1"))
-        with taken({Role.SENDER: robot}, BERT, sink=quiet):
+        with locked({Role.SENDER: robot}, BERT, sink=quiet):
             for call in (jobs.start, jobs.run):
                 one = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
                 with pytest.raises(LockLostError, match=r"bert@two took the robot at .* for trial-b"):
@@ -274,7 +277,7 @@ def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -
 
 def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tmp_path: Path) -> None:
     called, go = robot.home / "called", robot.home / "go"
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet), ThreadPoolExecutor(1) as pool:
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet), ThreadPoolExecutor(1) as pool:
         real = "busybox df" if (tmp_path / "bin" / "df").exists() else "/bin/df"
         (tmp_path / "bin" / "df").unlink(missing_ok=True)
         waits = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
@@ -294,7 +297,7 @@ def test_aborting_a_free_robot_reports_no_lock(robot: LocalShell) -> None:
     for _ in range(2):
         (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
         assert (ended.locked, ended.error) == (False, None)
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         pass
     assert not locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
 
@@ -304,7 +307,7 @@ def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Pat
     plan = los_plan()
     anna = Holder(plan.session, "anna@one", plan.trial)
     shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
-    with taken({Role.SENDER: robot}, anna, sink=quiet):
+    with locked({Role.SENDER: robot}, anna, sink=quiet):
         robots = Robots(plan, IdleTestbed(shells))
         robots.demand_held()
         locks.abort({"turtlebot-1": robot}, "bert@two")
@@ -313,7 +316,7 @@ def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Pat
 
 
 def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> None:
-    with taken({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         begin(robot, ANNA)
         locks.abort({"turtlebot-1": robot}, "bert@two")
         with pytest.raises(LockLostError):
@@ -344,15 +347,15 @@ def cast(tmp_path: Path) -> dict[Role, Unreachable]:
 
 
 def test_all_robots_are_locked_or_none(cast: dict[Role, Unreachable]) -> None:
-    with taken({Role.SENDER: cast[Role.SENDER]}, BERT, sink=quiet):
-        with pytest.raises(RobotError, match="zoe: bert@two holds it"), taken(cast, ANNA, sink=quiet):
+    with locked({Role.SENDER: cast[Role.SENDER]}, BERT, sink=quiet):
+        with pytest.raises(RobotError, match="zoe: bert@two holds it"), locked(cast, ANNA, sink=quiet):
             raise AssertionError("taken")
         assert record(cast[Role.RECEIVER])[0] == "free", "locked first, in the order of names, and unlocked"
 
 
 def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, Unreachable]) -> None:
     events: list[Event] = []
-    with taken(cast, ANNA, sink=events.append):
+    with locked(cast, ANNA, sink=events.append):
         cast[Role.SENDER].left = 0
     (note,) = events
     assert isinstance(note, Note)
@@ -362,7 +365,7 @@ def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, Unreachabl
 
 def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Unreachable]) -> None:
     with ExitStack() as stack:
-        stack.enter_context(taken(cast, ANNA, sink=lambda event: None))
+        stack.enter_context(locked(cast, ANNA, sink=lambda event: None))
         cast[Role.RECEIVER].left = 0
         gone = LinkError("did not answer", where="eve")
         ended = locks.abort({"abe": cast[Role.RECEIVER], "eve": gone, "zoe": cast[Role.SENDER]}, "bert@two")
@@ -371,7 +374,7 @@ def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Unr
 
 
 def test_the_user_of_this_machine_has_a_name() -> None:
-    user, _, machine = runtime.me().partition("@")
+    user, _, machine = runtime.user_at_host().partition("@")
     assert user
     assert machine
 
@@ -396,7 +399,7 @@ def test_ctrl_c_closes_connections_before_the_robots_are_unlocked(cast: dict[Rol
     done: list[str] = []
     for shell in cast.values():
         shell.close = lambda name=shell.robot: done.append(name)  # type: ignore[method-assign,misc]
-    with pytest.raises(KeyboardInterrupt), taken(cast, ANNA, sink=quiet):
+    with pytest.raises(KeyboardInterrupt), locked(cast, ANNA, sink=quiet):
         raise KeyboardInterrupt
     assert done == ["abe", "zoe"]
     assert {record(shell)[0] for shell in cast.values()} == {"free"}

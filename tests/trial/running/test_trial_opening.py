@@ -77,7 +77,7 @@ class Recorder:
         with self.around("open"):
             yield TESTBED
 
-    def standing(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
+    def persistent_shells(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
         raise AssertionError
 
     def run(self, plans: list[Plan], out: Path) -> list[Outcome | None]:
@@ -108,7 +108,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
             made.note("resume")
             return Outcome(folder, (), 2, 0)
 
-        monkeypatch.setattr(preflight, "meet", meet)
+        monkeypatch.setattr(preflight, "connect_all", meet)
         monkeypatch.setattr(locks, "held", held)
         monkeypatch.setattr(runner, "run_trial", run_trial)
         monkeypatch.setattr(runner, "resume_trial", resume_trial)
@@ -134,7 +134,7 @@ def test_trials_run_one_after_the_other_on_robots_opened_once(
     begun = ["open", "meet", "hold", "run_10ft", "run_20ft", "run_30ft"]
     assert made.done == [*begun, "hold ends", "open ends"]
     assert [one and one.valid for one in ended] == [2, 2, 2]
-    assert made.holder == Holder(plans()[0].session, runtime.me(), plans()[0].trial)
+    assert made.holder == Holder(plans()[0].session, runtime.user_at_host(), plans()[0].trial)
     assert out.is_dir()
     assert notes(made) == []
 
@@ -193,7 +193,7 @@ def test_a_trial_is_resumed_through_the_same_steps(recorder: Callable[..., Recor
     folder = store.create(tmp_path, plan)
     assert resume(made, folder) == Outcome(folder, (), 2, 0)
     assert made.done == ["open", "meet", "hold", "resume", "hold ends", "open ends"]
-    assert made.holder == Holder(plan.session, runtime.me(), plan.trial)
+    assert made.holder == Holder(plan.session, runtime.user_at_host(), plan.trial)
 
 
 def test_a_trial_of_another_backend_is_rejected_before_robots_are_opened(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.config import schema
-from fieldkit.core.errors import ConfigurationError, typed
+from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.model import Role
 from fieldkit.trial import store
 from fieldkit.trial.procedure import Procedure, load_procedure
@@ -23,14 +23,14 @@ def test_rows_of_different_code_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(ConfigurationError, match=f"started by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
         resumption.resumable(TRIAL)
     assert caught.value.where == str(TRIAL)
-    assert typed("fieldkit", "rebuild", TRIAL) in caught.value.remedy
+    assert shell_command("fieldkit", "rebuild", TRIAL) in caught.value.remedy
 
 
 def test_robots_of_another_backend_are_rejected() -> None:
     resumption.demand_backend(PLAN, PLAN.backend, TRIAL)
     with pytest.raises(ConfigurationError, match=f"it was started on backend {PLAN.backend}, not imagined") as caught:
         resumption.demand_backend(PLAN, "imagined", TRIAL)
-    assert caught.value.remedy == typed("fieldkit", "resume", TRIAL, "--backend", PLAN.backend)
+    assert caught.value.remedy == shell_command("fieldkit", "resume", TRIAL, "--backend", PLAN.backend)
 
 
 @pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])

@@ -14,7 +14,7 @@ from fieldkit.core.events import Event, ExpectationJudged, Note, RepeatEnded, Tr
 from fieldkit.core.model import Protocol, RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, manifest, store
-from fieldkit.trial.gates import Judged
+from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import rebuild
@@ -205,7 +205,7 @@ def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
 ) -> None:
     judge, calls = gates.judge, 0
 
-    def exhausted(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> Judged:
+    def exhausted(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVerdict:
         nonlocal calls
         calls += 1
         if calls == 2:
@@ -236,7 +236,7 @@ def test_an_attempt_stopped_during_fetching_is_fetched_by_resume(
         with pytest.raises(KeyboardInterrupt):
             run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     folder = only(tmp_path)
-    assert [cut.status for cut in journal.cut_short(journal.read(folder))] == [Status.MEASURED]
+    assert [cut.status for cut in journal.interrupted(journal.read(folder))] == [Status.MEASURED]
     fetched: list[str] = []
 
     def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:

@@ -12,7 +12,7 @@ from sim_backends.cosim.federates import Program
 from sim_backends.cosim.policies.event_driven import EventDriven
 from sim_backends.cosim.programs.follow import FollowAtHeadway, HoldStation
 from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.programs.several import Several
+from sim_backends.cosim.programs.several import CombinedProgram
 from sim_backends.cosim.programs.velocity_profile import ProfileLeg, VelocityProfile
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Received
@@ -67,7 +67,7 @@ def test_it_turns_to_a_leader_behind_it_and_stops_at_one_in_its_position(place_m
 def test_a_follower_stops_without_states_and_continues_when_it_receives_them_again() -> None:
     bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (4.0, 0.0)), "b": DifferentialDrive(HUSKY_A200, (0.0, 0.0))})
     programs: dict[str, Program] = {
-        "a": Several(
+        "a": CombinedProgram(
             [
                 VelocityProfile([ProfileLeg(100 * S, Twist(0.5))]),
                 Periodic("before", "b", period_ns=100 * MS, stop_ns=5 * S),
@@ -100,8 +100,10 @@ def test_a_drone_that_holds_station_flies_above_the_centre_of_its_leaders() -> N
     )
     forward = VelocityProfile([ProfileLeg(100 * S, Twist(0.8))])
     programs: dict[str, Program] = {
-        "a": Several([forward, Periodic("a", "uav", period_ns=50 * MS)]),
-        "b": Several([VelocityProfile([ProfileLeg(100 * S, Twist(0.8))]), Periodic("b", "uav", period_ns=50 * MS)]),
+        "a": CombinedProgram([forward, Periodic("a", "uav", period_ns=50 * MS)]),
+        "b": CombinedProgram(
+            [VelocityProfile([ProfileLeg(100 * S, Twist(0.8))]), Periodic("b", "uav", period_ns=50 * MS)]
+        ),
         "uav": HoldStation(["a", "b"], above_m=8.0),
     }
     coordinator = Coordinator(

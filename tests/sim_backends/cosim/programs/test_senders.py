@@ -12,7 +12,7 @@ from sim_backends.cosim.programs.bags import BagMessage, Playback, pieces, recor
 from sim_backends.cosim.programs.outages import Outage
 from sim_backends.cosim.programs.periodic import Periodic
 from sim_backends.cosim.programs.pings import EchoRequester, EchoResponder, PingRequest
-from sim_backends.cosim.programs.several import Several
+from sim_backends.cosim.programs.several import CombinedProgram
 from sim_backends.cosim.scenario.traffic import BagTraffic
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.radio.random_streams import RandomStream
@@ -125,7 +125,7 @@ class Steering:
 
 def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -> None:
     first, second = Steering("first", 3, 7), Steering("second", 5, 7)
-    program = Several([first, second])
+    program = CombinedProgram([first, second])
     commands = []
     while (wake_ns := program.next_wake_ns()) is not None:
         commands.append((wake_ns, program.wake(wake_ns, HERE, ()).command))
@@ -134,12 +134,12 @@ def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -
     assert program.wake(9, HERE, received) == Action()
     assert first.received == second.received == received
     # With a fast clock a program may wake later than planned.
-    assert Several([Steering("first", 3), Steering("second", 5)]).wake(4, HERE, ()).command == "first"
+    assert CombinedProgram([Steering("first", 3), Steering("second", 5)]).wake(4, HERE, ()).command == "first"
 
 
 def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() -> None:
     sends, steers = Periodic("f", "b", period_ns=10), Steering("go", 5, 15, 35)
-    program = Outage(Several([sends, steers]), 12, 31, "stop")
+    program = Outage(CombinedProgram([sends, steers]), 12, 31, "stop")
     actions = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= 50:
         action = program.wake(wake_ns, HERE, ())

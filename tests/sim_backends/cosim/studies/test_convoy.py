@@ -13,7 +13,7 @@ from sim_backends.cosim.policies.time_stepped import TimeStepped
 from sim_backends.cosim.policies.variable_stepped import VariableStepped
 from sim_backends.cosim.studies import convoy
 from sim_backends.cosim.studies.intervals import Floats
-from tests.helpers.convoys import STANDSTILL_M, places_m
+from tests.helpers.convoys import STANDSTILL_M, positions_m
 
 HEADWAY_S, GAIN_PER_S, RATE_RAD_S = 0.3, 2.0, 2.0
 PERIOD_S = math.tau / RATE_RAD_S
@@ -35,7 +35,7 @@ def test_a_row_amplifies_as_its_transfer_function_predicts(delay_s: float, stabl
     """On both sides of the limit, which is at 83 ms."""
     assert (delay_s < convoy.longest_delay_s(HEADWAY_S, GAIN_PER_S)) == stable
     settled_s = 3 * PERIOD_S
-    times_s, places = places_m(
+    times_s, places = positions_m(
         EventDriven(), delay_s=delay_s, headway_s=HEADWAY_S, followers=2, seconds=settled_s + PERIOD_S
     )
     speeds = convoy.speeds_m_s(times_s, places)[times_s >= settled_s]
@@ -47,7 +47,7 @@ def test_a_row_amplifies_as_its_transfer_function_predicts(delay_s: float, stabl
 
 
 def run(policy: SyncPolicy) -> tuple[Floats, Floats]:
-    return places_m(policy, delay_s=0.0537, headway_s=0.5, period_ms=10, seconds=3.0)
+    return positions_m(policy, delay_s=0.0537, headway_s=0.5, period_ms=10, seconds=3.0)
 
 
 def test_the_position_error_of_a_closed_loop_grows_with_the_window() -> None:
