@@ -41,6 +41,7 @@ _LONG: Final = (
     "test_selfheal",
     "test_master_loss",
     "test_fly",
+    "test_step_fly_ends",
     "test_step_conformance",
     "test_driveaway",
     "test_drive",
