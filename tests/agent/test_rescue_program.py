@@ -29,7 +29,7 @@ import sys, time
 from fieldkit.agent.flying.liveness import FLYING, IDLE, LivenessFile
 file = LivenessFile(sys.argv[1], int(sys.argv[2]))
 while True:
-    file.beat(IDLE if int(sys.argv[2]) else FLYING)
+    file.update(IDLE if int(sys.argv[2]) else FLYING)
     time.sleep(0.02)
 """
 

@@ -233,11 +233,11 @@ class HostileShell(LocalShell):
 @pytest.mark.parametrize(
     ("large", "said"),
     [
-        ("100 ../../evil\n", "no plain file"),
-        ("100 /etc/evil\n", "no plain file"),
-        ("100 -rf\n", "no plain file"),
-        ("-1 a.bag\n", "no plain file"),
-        ("a.bag\n", "no plain file"),
+        ("100 ../../evil\n", "not a regular file"),
+        ("100 /etc/evil\n", "not a regular file"),
+        ("100 -rf\n", "not a regular file"),
+        ("-1 a.bag\n", "not a regular file"),
+        ("a.bag\n", "not a regular file"),
         (f"{10**14} a.bag\n", "are to be fetched"),
         ("".join(f"1 f{number}\n" for number in range(501)), "more than 500 files"),
         ("100 x\n", "sent before"),

@@ -38,13 +38,13 @@ def test_quality_is_a_profile_with_policies(text: str, wanted: QosProfile) -> No
 
 @pytest.mark.parametrize("text", ["sensor", "depth=0", "default,,", "reliable,sensor_data", "depth=9999999", " "])
 def test_invalid_quality_is_rejected(text: str) -> None:
-    with pytest.raises(ConfigurationError, match="no quality of service"):
+    with pytest.raises(ConfigurationError, match="not a quality of service"):
         parse_qos(text)
 
 
 @pytest.mark.parametrize("text", ["", "scan:a/B", "/scan", "/scan:", "/:a/B", "/sc an:a/B", "/a//b:a/B", "/{x}:a/B"])
 def test_invalid_topic_is_rejected(text: str) -> None:
-    with pytest.raises(ConfigurationError, match="no topic and its type"):
+    with pytest.raises(ConfigurationError, match="not a topic with its type"):
         Crossing.parse(text)
 
 
