@@ -5,6 +5,7 @@ is killed leaves an open chunk without its length; if it is not compressed, its 
 """
 
 import bz2
+import os
 import shutil
 import sqlite3
 import struct
@@ -213,6 +214,8 @@ def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, BagConnection]]
             database.execute("SELECT topic_type, encoded_message_definition FROM message_definitions").fetchall()
         )
     available = _columns(database, "topics")
+    if missing := {"id", "name", "type"} - available:
+        raise DamagedError(f"the table topics has no {', '.join(sorted(missing))}")
     columns = [
         name for name in ("id", "name", "type", "offered_qos_profiles", "type_description_hash") if name in available
     ]
@@ -242,8 +245,11 @@ class _ExactReader:
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
+        self._size_bytes = os.fstat(file.fileno()).st_size
 
     def read(self, length: int) -> bytes:
+        if length > self._size_bytes:  # a corrupt length may be above what `read` accepts
+            raise EOFError(f"a record of {length} bytes in a file of {self._size_bytes}")
         data = self._file.read(length)
         if len(data) < length:
             raise EOFError(f"the file ends {length - len(data)} bytes before a record does")

@@ -1,7 +1,8 @@
 """Recovery of bags: hostile bytes cause messages and `DamagedError` only."""
 
 import random
-from contextlib import suppress
+import sqlite3
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,23 @@ def test_changed_bytes(
     file.write_bytes(data[: draw.randrange(len(data)) if flips % 2 else None])
     with suppress(DamagedError):
         assert sum(1 for _ in salvage.messages(form, file)) <= 20 or flips
+
+
+def test_a_table_of_topics_without_a_needed_column_is_damaged(tmp_path: Path) -> None:
+    bag = data_file(written(tmp_path / "bag", BagFormat.SQLITE, expected(3)))
+    with closing(sqlite3.connect(bag)) as database, database:
+        database.execute("ALTER TABLE topics RENAME COLUMN id TO ie")
+    with pytest.raises(DamagedError, match="the table topics has no id"):
+        list(salvage.messages(BagFormat.SQLITE, bag))
+
+
+def test_a_record_longer_than_an_integer_of_the_platform_is_damaged(tmp_path: Path) -> None:
+    bag = data_file(written(tmp_path / "bag", BagFormat.MCAP, expected(3)))
+    data = bytearray(bag.read_bytes())
+    data[9:17] = b"\xff" * 8  # the length of the first record, behind the magic and its opcode
+    bag.write_bytes(data)
+    with pytest.raises(DamagedError):
+        list(salvage.messages(BagFormat.MCAP, bag))
 
 
 @given(st.integers(13, len(WHOLE)))
