@@ -166,10 +166,10 @@ def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("{to: dds}", "it carries nothing"),
+        ("{to: dds}", "it carries no topics"),
         ("{to: ros1, topics: ['/scan:sensor_msgs/LaserScan']}", "bridge.to"),
         ("{to: dds, topics: [/scan]}", "bridge.topics.0"),
-        ("{to: dds, topics: ['/scan:sensor_msgs/LaserScan'], router: 10.42.0.3}", "a router is Zenoh's"),
+        ("{to: dds, topics: ['/scan:sensor_msgs/LaserScan'], router: 10.42.0.3}", "only Zenoh has a router"),
         ("{to: zenoh, topics: ['/scan:sensor_msgs/LaserScan'], router: 'a b'}", "bridge.router"),
         ("{to: dds, topics: ['/scan:sensor_msgs/LaserScan'], domain: 102}", "bridge.domain"),
         ("{to: dds, topic: ['/scan:sensor_msgs/LaserScan']}", "topics"),
