@@ -231,7 +231,7 @@ def test_columns_of_a_procedure_are_those_of_its_steps(
     )
     listed = output_of(capsys, "columns", "two")
     assert re.search(r"^ small\.rtt_median_s +s +median +Median round-trip time\.$", listed, re.MULTILINE)
-    assert re.search(r"^ wind +m/s +median +What the operator answered", listed, re.MULTILINE)
+    assert re.search(r"^ wind +m/s +median +Answer of the operator", listed, re.MULTILINE)
     assert "rtt_loss" in listed
     assert "ip_loss" not in listed.replace("small.", "")
     assert output_of(capsys, "columns", "procedures/two.yaml") == listed

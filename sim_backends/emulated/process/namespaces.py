@@ -119,9 +119,7 @@ def _check_subordinates(user: str, uid: int) -> None:
 def _refusal(user: str, cause: str) -> ConfigurationError:
     for name, remedy in forbidding_settings(Path("/proc/sys")).items():
         return ConfigurationError(f"the kernel forbids user namespaces: {name}", remedy=remedy)
-    return ConfigurationError(
-        f"{user} cannot create namespaces: {cause}", remedy="run fieldkit with sudo, or see man newuidmap"
-    )
+    return ConfigurationError(f"{user} cannot create namespaces: {cause}", remedy="use sudo, or see man newuidmap")
 
 
 def _command(as_root: tuple[str, ...], *words: str) -> tuple[str, ...]:
