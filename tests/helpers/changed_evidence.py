@@ -24,14 +24,23 @@ OF_THE_TESTBED = ("track.csv", "link.csv", "lateness.txt", "*medium.txt")
 """Files written by the emulator; no second source exists to verify them."""
 
 TOLERANCES: Mapping[str, float] = {
-    # One reply may be 20 ms late (measure.transfers.ping_checks), and one packet 0.1 s early (steps.kinds.capture).
+    # One reply may be 20 ms late (measure.checks.ping_checks). One packet may be 0.1 s early (steps.kinds.capture),
+    # because no other source has the time at which a robot captured it.
     "rtt_gap_s": 1.0,
     "rtt_*_s": 0.021,
     "paper_delay_s": 0.021,
     "paper_transfer_s": 10.0,
     "*delay*": 0.11,
     "*one_way*": 0.11,
+    "*jitter*": 0.11,
+    "*variation*": 0.11,
+    "*stall_s": 0.11,
+    "completion_s": 0.11,
+    "clock_offset*_s": 0.11,
     "*transfer_s": 0.11,
+    # Rates over the duration of the transfer: as a change of that duration, see `_within_tolerance`.
+    "throughput_bit_s": 0.11,
+    "goodput_bit_s": 0.11,
 }
 """Maximum undetected change of a column, by the pattern of its name without the step name."""
 
