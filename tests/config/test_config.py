@@ -145,7 +145,7 @@ def test_bags_of_two_robots_need_different_names() -> None:
     procedure = schema.validate(schema.parse(two, source="los.yaml"), Procedure)
     assert {role for placed in procedure.walk() for role in placed.step.records_on()} == {Role.SENDER, Role.RELAY}
     one = PROCEDURE.replace("\nsteps:", other.replace("NAME", "scan"), 1)
-    with pytest.raises(ConfigurationError, match=r"a file scan\.bag is there already"):
+    with pytest.raises(ConfigurationError, match=r"there is already a file scan\.bag"):
         schema.validate(schema.parse(one, source="los.yaml"), Procedure)
 
 
