@@ -50,6 +50,7 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         SafeConstructor.__init__(self)
         Resolver.__init__(self)
         self._depth = 0
+        self._text = text
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """Return a node, as PyYAML does; raise an error for unsupported YAML."""
@@ -70,7 +71,17 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
             raise _problem(
                 "this text has a character that no file can hold (\\0, or half of a surrogate pair)", event
             )
+        if isinstance(node, yaml.ScalarNode) and isinstance(parent, yaml.SequenceNode):
+            self._require_one_item(node)
         return node
+
+    def _require_one_item(self, node: yaml.ScalarNode) -> None:
+        """Raise an error if an item continues with a line that begins with a dash, because YAML joins the two."""
+        if not node.style:
+            lines = self._text.splitlines()[node.start_mark.line : node.end_mark.line + 1]
+            for number, line in enumerate(lines[1:], start=node.start_mark.line + 2):
+                if line.lstrip().startswith("- "):
+                    raise _Joined(number)
 
     def whole(self, node: yaml.ScalarNode) -> int:
         """Return a whole number. Leading zeros have no effect."""
@@ -83,6 +94,18 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         if len(node.value) > _MAX_DIGITS or not math.isfinite(number := float(node.value)):
             raise _problem("this number is too large, or has too many digits", node)
         return number
+
+
+class _Joined(yaml.YAMLError):
+    """An item of a list is indented more than the one before it, which is a text.
+
+    Attributes:
+        line: Its line, from 1.
+    """
+
+    def __init__(self, line: int) -> None:
+        super().__init__("this item is a part of the text before it")
+        self.line = line
 
 
 def _problem(text: str, place: yaml.Node | yaml.Event) -> yaml.MarkedYAMLError:
@@ -234,6 +257,7 @@ def _document(loader: _Loader, source: str) -> Document:
 _REMEDIES: Final = {
     "character '\\t'": "indent with spaces, not with tabs",
     "cannot start any token": "put this text in quotes",
+    "part of the text before it": "indent this item with as many spaces as the other items of its list",
     "expected <block end>": "indent this line with as many spaces as the other lines of its list or mapping",
     "mapping values are not allowed": "put text that has a colon in quotes; indent the keys of one mapping alike",
 }
@@ -244,6 +268,8 @@ def _configuration_error(error: Exception, text: str, source: str, line: int) ->
     if isinstance(error, yaml.reader.ReaderError):
         message = f"a text file cannot hold the character {error.character:#04x}"
         line = text.count("\n", 0, error.position) + 1
+    elif isinstance(error, _Joined):
+        message, line = str(error), error.line
     elif isinstance(error, yaml.MarkedYAMLError):
         message = str(error.problem or error.context)
         mark = error.problem_mark or error.context_mark

@@ -18,6 +18,9 @@ POSITIONS: Final = "positions.json"
 UNFETCHED: Final = "unfetched.txt"
 """File of each robot: `ROLE-unfetched.txt`."""
 ANSWER: Final = "answer-"
+FAULT: Final = "fault-"
+FAULT_TIMES: Final = "-times.txt"
+"""File of each fault: `fault-KIND-times.txt`."""
 PLAN: Final = "trial.yaml"
 JOURNAL: Final = "journal.jsonl"
 CAMPAIGN: Final = "campaign.yaml"
@@ -36,7 +39,8 @@ _NAMES: Final = (
 )
 _RESERVED: Final = re.compile(
     # The name of a step comes before the first dot.
-    rf"(?:[^./]*\.)?(?:{'|'.join(map(re.escape, _NAMES))}|{re.escape(ANSWER)}.*\.txt|.*-{re.escape(UNFETCHED)})\Z",
+    rf"(?:[^./]*\.)?(?:{'|'.join(map(re.escape, _NAMES))}|{re.escape(ANSWER)}.*\.txt|.*-{re.escape(UNFETCHED)}"
+    rf"|{re.escape(FAULT)}.*{re.escape(FAULT_TIMES)})\Z",
     re.IGNORECASE | re.DOTALL,
 )
 
@@ -44,6 +48,11 @@ _RESERVED: Final = re.compile(
 def answer_file(column: str) -> str:
     """Return the name of the file with the operator's answer for a column."""
     return f"{ANSWER}{column}.txt"
+
+
+def fault_times_file(kind: str) -> str:
+    """Return the name of the file with the times of a fault of this kind."""
+    return f"{FAULT}{kind}{FAULT_TIMES}"
 
 
 def is_reserved(name: str) -> bool:

@@ -26,7 +26,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import lease, streams
 from fieldkit.steps.lease import LeaseKeeper, orders_file
-from fieldkit.steps.middlewares import Middleware
+from fieldkit.steps.middlewares import MiddlewareName
 from fieldkit.steps.motions import Mover
 from fieldkit.steps.origins import RobotMotion
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
@@ -49,9 +49,9 @@ _ZENOH_PORT: Final = 7447
 
 _TOPIC_KEYS: Final = MappingProxyType(
     {
-        Middleware.ROS1: ("md5", "definition"),
-        Middleware.DDS: ("members", "dds_topic", "dds_types", "user_data"),
-        Middleware.ZENOH: ("key", "tokens"),
+        MiddlewareName.ROS1: ("md5", "definition"),
+        MiddlewareName.DDS: ("members", "dds_topic", "dds_types", "user_data"),
+        MiddlewareName.ZENOH: ("key", "tokens"),
     }
 )
 """Keys of a topic description that each middleware needs; others are omitted to keep command lines readable."""
@@ -60,12 +60,12 @@ _STATUS: Final = "drive.status"
 _TEXT: Final = "drive.log"
 
 
-def middleware_of(robot: Robot) -> Middleware:
+def middleware_of(robot: Robot) -> MiddlewareName:
     """Return the middleware through which a robot's base receives velocities."""
     ros = robot.profile.ros
     if ros is None or ros.variant == "ros1":
-        return Middleware.ROS1
-    return Middleware(ros.middleware)
+        return MiddlewareName.ROS1
+    return MiddlewareName(ros.middleware)
 
 
 def limit_s(move: Move) -> float:
@@ -194,7 +194,7 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
     arguments = {
         "over": middleware.value,
         "network": network,
-        "cdr": middleware is not Middleware.ROS1,
+        "cdr": middleware is not MiddlewareName.ROS1,
         "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default", 1),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
         "task": {**_task(robot, move), **_origin(scene, move)},
@@ -205,14 +205,14 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
     return streams.compact(arguments)
 
 
-def _network(robot: Robot, middleware: Middleware) -> dict[str, Any]:
+def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
     """Return the settings with which the driver discovers the nodes of its robot without multicast."""
     network = {
         "address": robot.address,
         "domain": robot.profile.ros.domain if robot.profile.ros else 0,
         "node": f"fieldkit_drive_{robot.name}".replace("-", "_"),
     }
-    if middleware is not Middleware.ZENOH:
+    if middleware is not MiddlewareName.ZENOH:
         return network | {"peers": [robot.address]}
     # The router of rmw_zenoh on the robot announces all sessions there. A session without a router may use its port.
     endpoints = [f"tcp/{address}:{_ZENOH_PORT}" for address in ("127.0.0.1", robot.address)]

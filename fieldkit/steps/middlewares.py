@@ -10,7 +10,7 @@ from fieldkit.core.model import Verdict
 from fieldkit.steps.scene import CommandResult
 
 
-class Middleware(StrEnum):
+class MiddlewareName(StrEnum):
     """A middleware."""
 
     DDS = "dds"
@@ -31,10 +31,10 @@ class Discovery(StrEnum):
 
 DISCOVERY_METHODS: Final = MappingProxyType(
     {
-        Middleware.DDS: (Discovery.MULTICAST, Discovery.PEERS),
-        Middleware.ZENOH: (Discovery.MULTICAST, Discovery.PEERS, Discovery.ROUTER),
-        Middleware.ROS1: (Discovery.MASTER,),
-        Middleware.ROS2: (Discovery.ENVIRONMENT, Discovery.MULTICAST, Discovery.PEERS),
+        MiddlewareName.DDS: (Discovery.MULTICAST, Discovery.PEERS),
+        MiddlewareName.ZENOH: (Discovery.MULTICAST, Discovery.PEERS, Discovery.ROUTER),
+        MiddlewareName.ROS1: (Discovery.MASTER,),
+        MiddlewareName.ROS2: (Discovery.ENVIRONMENT, Discovery.MULTICAST, Discovery.PEERS),
     }
 )
 """Discovery methods of each middleware, the default first."""
@@ -58,17 +58,19 @@ class Binding:
 _LAB_NOTE: Final = "; for a robot of a lab, into the Python that runs fieldkit"
 BINDINGS: Final = MappingProxyType(
     {
-        Middleware.DDS: Binding("cyclonedds", "import cyclonedds", f"python3 -m pip install cyclonedds{_LAB_NOTE}"),
-        Middleware.ZENOH: Binding(
+        MiddlewareName.DDS: Binding(
+            "cyclonedds", "import cyclonedds", f"python3 -m pip install cyclonedds{_LAB_NOTE}"
+        ),
+        MiddlewareName.ZENOH: Binding(
             "eclipse-zenoh", "import zenoh", f"python3 -m pip install eclipse-zenoh{_LAB_NOTE}"
         ),
-        Middleware.ROS1: Binding(
+        MiddlewareName.ROS1: Binding(
             "rospy",
             # The agent searches this folder, too.
             "import sys; sys.path.append('/usr/lib/python3/dist-packages'); import rospy",
             "sudo apt-get install python3-rospy",
         ),
-        Middleware.ROS2: Binding(
+        MiddlewareName.ROS2: Binding(
             "rclpy",
             # The RMW is loaded only when its name is queried.
             "import rclpy, std_msgs.msg; print(rclpy.get_rmw_implementation_identifier())",
@@ -82,7 +84,7 @@ _KEY_OF_VARIABLE: Final = MappingProxyType(
 )
 """Environment variables of ROS 2 that are set by another key of the step, with this key."""
 
-OVER_DDS: Final = frozenset({Middleware.DDS, Middleware.ROS2})
+OVER_DDS: Final = frozenset({MiddlewareName.DDS, MiddlewareName.ROS2})
 """Middlewares whose ports follow the rule of RTPS (for ROS 2, if its RMW uses DDS)."""
 
 _VARIABLE: Final = re.compile(r"[A-Za-z_]\w*", re.ASCII)
@@ -96,11 +98,11 @@ def invalid_setting_reason(name: str) -> str:
     return f"{name} is set by the key {_KEY_OF_VARIABLE[name]}, not in settings" if name in _KEY_OF_VARIABLE else ""
 
 
-def judge_binding(over: Middleware, result: CommandResult) -> tuple[Verdict, str, str]:
+def judge_binding(over: MiddlewareName, result: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy from the output of `Binding.load`; for ROS 2 the detail includes the RMW."""
     lines = [line for line in result.text.splitlines() if line.strip()]
     if result.ok:
-        rmw = [line for line in lines if over is Middleware.ROS2 and _RMW.fullmatch(line)]
+        rmw = [line for line in lines if over is MiddlewareName.ROS2 and _RMW.fullmatch(line)]
         return Verdict.OK, ", ".join([BINDINGS[over].package, *rmw]), ""
     remedy = f"on the robot: {BINDINGS[over].remedy}; to use another Python, write python: in its profile"
     return Verdict.FAIL, lines[-1] if lines else "the program printed nothing", remedy

@@ -19,7 +19,7 @@ from fieldkit.steps.middlewares import (
     DISCOVERY_METHODS,
     OVER_DDS,
     Discovery,
-    Middleware,
+    MiddlewareName,
     invalid_setting_reason,
     judge_binding,
 )
@@ -119,7 +119,7 @@ class StreamOptions(Strict):
 
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
-    over: Middleware = Middleware.DDS
+    over: MiddlewareName = MiddlewareName.DDS
     topic: TopicName = "/fieldkit/stream"
     rate: Annotated[Hertz, Field(gt=0, le=100_000)] = 10.0
     bytes: Annotated[Bytes, Field(ge=LEAST_BYTES, le=MOST_BYTES)] = 1000.0
@@ -141,9 +141,9 @@ class StreamOptions(Strict):
             raise schema.validation_error(
                 f"{self.over} has {' and '.join(methods)}, not {self.discovery}", "discovery"
             )
-        if self.transport != "tcp" and self.over is not Middleware.ZENOH:
+        if self.transport != "tcp" and self.over is not MiddlewareName.ZENOH:
             raise schema.validation_error("only zenoh has a choice of transport; leave it out", "transport")
-        if self.over is Middleware.ROS1 and (self.qos.reliability or self.qos.profile) in {
+        if self.over is MiddlewareName.ROS1 and (self.qos.reliability or self.qos.profile) in {
             "best_effort",
             "sensor_data",
         }:
@@ -152,7 +152,7 @@ class StreamOptions(Strict):
             raise schema.validation_error(
                 "it ends before its second sample; write a longer duration or a higher rate", "duration"
             )
-        for name in self.middleware_settings if self.over is Middleware.ROS2 else ():
+        for name in self.middleware_settings if self.over is MiddlewareName.ROS2 else ():
             if why := invalid_setting_reason(name):
                 raise schema.validation_error(why, "settings")
         return self
@@ -180,7 +180,7 @@ class StreamOptions(Strict):
             return ports.dds(self.domain, multicast=multicast)
         return (
             ports.zenoh(self.domain, multicast=multicast)
-            if self.over is Middleware.ZENOH
+            if self.over is MiddlewareName.ZENOH
             else ports.ros1(self.domain)
         )
 
@@ -189,7 +189,9 @@ class StreamOptions(Strict):
         """Port of the router, of the master, or of Zenoh's listeners; 0 for DDS, which has no fixed one."""
         if self.over in OVER_DDS:
             return 0
-        return ports.zenoh_listener(self.domain) if self.over is Middleware.ZENOH else ports.ros1_master(self.domain)
+        return (
+            ports.zenoh_listener(self.domain) if self.over is MiddlewareName.ZENOH else ports.ros1_master(self.domain)
+        )
 
     @property
     def middleware_settings(self) -> Mapping[str, str]:
@@ -201,7 +203,7 @@ class StreamOptions(Strict):
     def network(self, scene: Scene, role: Role) -> dict[str, Any]:
         """Return the fields of a `fieldkit.agent.middleware.Network` for a robot."""
         other = self.receiver if role == self.sender else self.sender
-        node_ports = ports.ros1_node(self.domain) if self.over is Middleware.ROS1 else {}
+        node_ports = ports.ros1_node(self.domain) if self.over is MiddlewareName.ROS1 else {}
         settings = {**{name: str(port) for name, port in node_ports.items()}, **self.middleware_settings}
         return {
             "address": scene.robot(role).address,
@@ -212,12 +214,12 @@ class StreamOptions(Strict):
             "domain": self.domain,
             "node": f"fieldkit_{role}",
             "transport": self.transport,
-            "settings": {} if self.over is Middleware.ROS2 else settings,
+            "settings": {} if self.over is MiddlewareName.ROS2 else settings,
         }
 
     def environment(self, robot: Robot) -> dict[str, str]:
         """Return the agent's environment variables: for ROS 2 those of the robot and the settings, else empty."""
-        return {**robot.ros_environment, **self.middleware_settings} if self.over is Middleware.ROS2 else {}
+        return {**robot.ros_environment, **self.middleware_settings} if self.over is MiddlewareName.ROS2 else {}
 
     def need(self, role: Role, robot: Robot) -> Need:
         """Return the preflight check that a robot's Python has the middleware."""
@@ -261,7 +263,7 @@ def agent_command(robot: Robot, *words: str, environment: Mapping[str, str] | No
     return python(robot, agent.path_from_job(), *words, environment=environment)
 
 
-def need(role: Role, robot: Robot, over: Middleware, environment: Mapping[str, str] | None = None) -> Need:
+def need(role: Role, robot: Robot, over: MiddlewareName, environment: Mapping[str, str] | None = None) -> Need:
     """Return the preflight check that a robot's Python has a middleware, run with these environment variables."""
     argv = python(robot, "-c", BINDINGS[over].load, environment=environment)
     return Need(

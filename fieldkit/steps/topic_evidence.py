@@ -15,7 +15,7 @@ from fieldkit.measure.transfers.sample_heads import SampleFlow
 from fieldkit.measure.transfers.topic_log import TopicLog
 from fieldkit.measure.transfers.topics import first_arrivals
 from fieldkit.ros.qos import History, Reliability
-from fieldkit.steps.middlewares import Middleware
+from fieldkit.steps.middlewares import MiddlewareName
 from fieldkit.steps.streams import StreamOptions
 from fieldkit.steps.view import View, capture_around
 
@@ -31,18 +31,18 @@ def plan(step: StreamOptions) -> TopicPlan:
     """Return the plan of a step's topic, with which its logs are compared."""
     quality = step.qos.resolved()
     keeps_last = quality.history is not History.KEEP_ALL and quality.depth > 0
-    depth = quality.depth if keeps_last else _ROS1_QUEUE if step.over is Middleware.ROS1 else None
+    depth = quality.depth if keeps_last else _ROS1_QUEUE if step.over is MiddlewareName.ROS1 else None
     return TopicPlan(
         topic=step.topic,
         samples=round(step.duration * step.rate),
         size_bytes=round(step.bytes),
-        envelope_bytes=_ENVELOPE_BYTES if step.over is Middleware.ROS1 else _CDR_BYTES,
-        reliable=step.over in {Middleware.ROS1, Middleware.ZENOH}
+        envelope_bytes=_ENVELOPE_BYTES if step.over is MiddlewareName.ROS1 else _CDR_BYTES,
+        reliable=step.over in {MiddlewareName.ROS1, MiddlewareName.ZENOH}
         or quality.reliability is not Reliability.BEST_EFFORT,
         # Zenoh passes samples to the callback without a queue.
-        depth=None if step.over is Middleware.ZENOH else depth,
-        in_order=step.over in {Middleware.DDS, Middleware.ROS1},
-        on_ports=step.over is not Middleware.ROS2,
+        depth=None if step.over is MiddlewareName.ZENOH else depth,
+        in_order=step.over in {MiddlewareName.DDS, MiddlewareName.ROS1},
+        on_ports=step.over is not MiddlewareName.ROS2,
     )
 
 

@@ -21,7 +21,7 @@ from fieldkit.analysis.judgements import Judgement, Ruling
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.measure.evidence import reading
 from fieldkit.steps.base import Step
-from fieldkit.steps.middlewares import Middleware
+from fieldkit.steps.middlewares import MiddlewareName
 from fieldkit.steps.streams import StreamOptions
 from fieldkit.trial import store
 from fieldkit.trial.link_cells import LinkCell, LinkCriterion, figure, link_cell, topic_columns
@@ -124,7 +124,7 @@ def _measured(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, 
 
 def _rmw(folder: Path, step: StreamOptions) -> str:
     """Return the RMW that the publishers of a trial reported; `unknown` unless exactly one was reported."""
-    if step.over is not Middleware.ROS2 or not isinstance(step, Step):
+    if step.over is not MiddlewareName.ROS2 or not isinstance(step, Step):
         return ""
     logs = folder.glob(f"repeats/*/{step.prefixed_name(f'{step.sender}-topic.log')}")
     reported = {match[0] for log in logs for match in _RMW.finditer(reading.text(log))}
@@ -136,7 +136,7 @@ def _candidate(stream: StreamOptions, rmw: str) -> Candidate:
     words = (quality.reliability.name.lower(), quality.history.name.lower(), str(quality.depth))
     by_path = {
         **stream.middleware_settings,
-        **({"RMW_IMPLEMENTATION": rmw} if stream.over is Middleware.ROS2 else {}),
+        **({"RMW_IMPLEMENTATION": rmw} if stream.over is MiddlewareName.ROS2 else {}),
     }
     settings = json.dumps(by_path, sort_keys=True)
     return Candidate(stream.over.value, stream.transport, settings, " ".join(words))

@@ -64,7 +64,7 @@ def test_commands_in_remedies_exist_and_accept_their_options() -> None:
     for place, text in REMEDIES:
         for match in COMMAND.finditer(text):
             command, _ = parser_of(match[1], parser)
-            if command is parser and match[1].split()[0] not in {"is", "runs", "itself", "reads"}:
+            if command is parser and match[1].split()[0] not in {"is", "runs", "itself", "reads", "with"}:
                 wrong.append((place, match[0], "no such command"))
             taken = set(re.findall(r"--[a-z][a-z-]+", command.format_help()))
             wrong += [(place, match[0], option) for option in OPTION.findall(match[2]) if option not in taken]

@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldkit.campaign.plan import CampaignFile
-from fieldkit.config import schema
+from fieldkit.config import documents, schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
@@ -17,6 +17,19 @@ from fieldkit.trial.procedure import Procedure
 from sim_backends.emulated.options import EmulatedOptions
 from sim_backends.world.world import World
 from tests.helpers.paths import DATA, ROOT
+
+
+@pytest.mark.parametrize("first", ["ip_loss < 2 %", "[a, b]", "x: 1", "'a'"])
+def test_an_item_that_is_indented_too_far_is_refused_with_its_line(first: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        documents.parse(f"expect:\n  - {first}\n   - rtt_loss < 5 %\n", source="p.yaml")
+    assert caught.value.where == "p.yaml:3"
+    assert "indent" in caught.value.remedy
+
+
+@pytest.mark.parametrize("text", ["- a\n  -b\n", "- a - b\n", "- |\n  a\n  - b\n", "- 'a\n  - b'\n", "x: a\n  - b\n"])
+def test_texts_with_dashes_are_accepted(text: str) -> None:
+    documents.parse(text, source="p.yaml")
 
 
 @pytest.mark.parametrize(

@@ -78,10 +78,7 @@ EXAMPLES: Mapping[str, Example] = {
         outlives=frozenset({"listen", "send"}),
     ),
     "ping": Example(f"[{PING}]"),
-    "fault": Example(
-        f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 4s, during: [{PING}]}}]",
-        spare=frozenset({"fault-link-down-times.txt"}),  # needed only for recoveries of flows
-    ),
+    "fault": Example(f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 4s, during: [{PING}]}}]"),
     "move": Example(f"[move: {{robot: sender, path: [away: 1m], speed: 0.2m/s, during: [{PING}]}}]"),
     "wait": Example("[wait: {duration: 100ms}]"),
     "ask": Example("[ask: {column: wind, question: How strong is the wind, usual: '3'}]"),

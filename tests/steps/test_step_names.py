@@ -151,7 +151,10 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
     assert "bare: bare.recv.bag is missing" in judged.problems
     assert "cut.link_down_outage_s" in missing
     text = rows.describe(plan, values)
-    assert text.startswith("up: file loss 0.0 %, up: ping loss 90.0 %, ping loss 90.0 %, up: RTT 16.0 ms, RTT 4.0 ms")
+    assert text.startswith(
+        "up: file loss 0.0 %, up: ping loss 90.0 %, ping loss 90.0 %, "
+        "up: RTT 16.0 ms (8192 bytes), RTT 4.0 ms (8192 bytes)"
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
@@ -37,6 +37,7 @@ def test_the_stored_attempts_are_valid(protocol: Protocol) -> None:
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@example(protocol=Protocol.UDP, seed=1409700485)  # the time of one iperf3 datagram by 8 us
 @given(protocol=st.sampled_from(Protocol), seed=st.integers(0, 2**32))
 def test_a_source_changed_at_random_never_moves_a_column_of_a_valid_repeat(
     tmp_path_factory: pytest.TempPathFactory, protocol: Protocol, seed: int

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core import laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Role
 from fieldkit.measure.evidence import reading
@@ -20,7 +21,7 @@ _FILE: Final = re.compile(
 
 def file(kind: FaultKind) -> str:
     """Return the name of the file with the times of a fault."""
-    return f"fault-{kind}-times.txt"
+    return laptop_files.fault_times_file(kind)
 
 
 @dataclass(frozen=True)

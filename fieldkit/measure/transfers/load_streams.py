@@ -52,7 +52,10 @@ JITTER_CROSS_CHECKS: Final = (
         columns=tuple(column.name for column in JITTER),
         source="both captures: times of sending and arrival of each datagram",
         against=("both captures: packets of the other direction, and the clock offset that fits all",),
-        tolerance="two quartz clocks may drift by 0.1 ms a second relative to each other",
+        tolerance=(
+            "two quartz clocks may drift by 0.1 ms a second relative to each other; no other source has the time of "
+            "a single datagram, which the order of packets bounds to 0.1 s"
+        ),
         outcome=CheckOutcome.WITHHELD,
     ),
 )

@@ -238,7 +238,7 @@ class FaultStep(Nest):
 
     @override
     def files(self) -> tuple[str, ...]:
-        names = (recovery.note_file, recovery.observed_file, recovery.log_file, fault_times.file)
+        names = (recovery.note_file, recovery.observed_file, recovery.log_file)
         return tuple(self.prefixed_name(name(self.kind)) for name in names)
 
     @override

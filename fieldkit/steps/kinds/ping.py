@@ -281,7 +281,10 @@ class PingStep(AlongStep):
         if isinstance(open_s := values.get("rtt_gap_at_least_s"), float):
             yield f"longest gap >= {open_s:.1f} s with {values['rtt_gap_lost_at_least']} lost"
         if isinstance(median_s := values.get("rtt_median_s"), float):
-            yield f"RTT {1e3 * median_s:.1f} ms"
+            # Times of different sizes are not comparable: a large request takes longer on the same link.
+            payload = values.get("rtt_payload_bytes")
+            size = f" ({format_count(payload, 'byte')})" if isinstance(payload, int) else ""
+            yield f"RTT {1e3 * median_s:.1f} ms{size}"
 
     @override
     def expected_s(self, protocol: Protocol) -> float:

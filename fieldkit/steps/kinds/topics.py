@@ -18,7 +18,7 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
 from fieldkit.steps.along import AlongStep
-from fieldkit.steps.middlewares import Discovery, Middleware
+from fieldkit.steps.middlewares import Discovery, MiddlewareName
 from fieldkit.steps.scene import (
     BY_FIELDKIT,
     BY_ITSELF,
@@ -175,7 +175,7 @@ class TopicsStep(StreamOptions, AlongStep):
         listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}
         if self.server_role:
             # Clients of a router do not listen.
-            listeners = listeners if self.over is Middleware.ROS1 else set()
+            listeners = listeners if self.over is MiddlewareName.ROS1 else set()
             listeners |= {(self.server_role, self.sender if self.server_role != self.sender else self.receiver)}
         ports = (ListeningPort(role, self.listening_port, peer, by="domain") for role, peer in listeners)
         return tuple(sorted(ports, key=lambda port: (port.role, port.peer)))

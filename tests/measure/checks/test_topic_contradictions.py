@@ -255,14 +255,14 @@ def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
 @settings(max_examples=150, deadline=None)
 @given(
     kind=ANY,
-    end=st.sampled_from(["sent", "came"]),
+    end=st.sampled_from(["sent", "received"]),
     field=st.integers(0, 4),
     some=st.tuples(st.integers(0, SAMPLES + 1), st.integers(1, SAMPLES + 2)),
     by=st.sampled_from(
         [1, -1, 7, 1000, -500, 3 * MS, -3 * MS, 15 * MS, 35 * MS, -35 * MS, PERIOD, SECOND, HOUR, -HOUR]
     ),
 )
-@example(kind="over TCP", end="came", field=4, some=(0, 5), by=35 * MS)
+@example(kind="over TCP", end="received", field=4, some=(0, 5), by=35 * MS)
 def test_a_change_in_any_range_of_a_field_is_noticed(
     kind: str, end: str, field: int, some: tuple[int, int], by: int, *, folder: Path
 ) -> None:
@@ -283,7 +283,7 @@ def test_a_change_in_any_range_of_a_field_is_noticed(
 @settings(max_examples=60, deadline=None)
 @given(
     kind=ANY,
-    end=st.sampled_from(["sent", "came"]),
+    end=st.sampled_from(["sent", "received"]),
     chosen=st.sets(st.integers(0, SAMPLES + 1), min_size=1),
     twice=st.booleans(),
 )
@@ -300,7 +300,7 @@ def test_missing_or_duplicated_records_are_noticed(
     if not kept:
         return
     reasons, measured = topic_attempts.judge_attempt(changed(made, end, kept), folder)
-    if kind == "reliable with samples given up" and end == "came" and not twice:
+    if kind == "reliable with samples given up" and end == "received" and not twice:
         return  # behind a gap nothing shows whether the middleware handed a sample over
     require_noticed(reasons, measured, before)
 

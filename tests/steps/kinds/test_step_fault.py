@@ -61,7 +61,7 @@ def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
         ("robot: sender, kind: link-down, for: 3", "has no unit"),
         ("robot: sender, kind: link-down, for: 0s", "greater than 0"),
         ("robot: sender, kind: linkdown, for: 3s", "'link-down'"),
-        ("robot: Laptop, kind: reboot", "a role is named by small letters"),
+        ("robot: Laptop, kind: reboot", "the name of a role consists of lower-case letters"),
         ('robot: sender, kind: kill, process: "nc; reboot"', "is not the name of a process"),
         ("robot: sender, kind: kill, process: longer-than-a-comm", "is not the name of a process, as ps"),
         ("robot: sender, kind: reboot, during: [{ping: {from: sender}}]", "'to' is missing"),

@@ -66,7 +66,10 @@ def move(text: str) -> MoveStep:
         (f"robot: sender, path: [{{away: 1m}}], speed: 0m/s, {PING}", "greater than 0"),
         ("robot: sender, path: [{away: 1m}], speed: 1m/s", "'during' is missing"),
         ("robot: sender, path: [{away: 1m}], speed: 1m/s, during: []", "at least 1 item"),
-        (f"robot: Laptop, path: [{{away: 1m}}], speed: 1m/s, {PING}", "a role is named by small letters"),
+        (
+            f"robot: Laptop, path: [{{away: 1m}}], speed: 1m/s, {PING}",
+            "name of a role consists of lower-case letters",
+        ),
     ],
 )
 def test_invalid_keys_are_refused(text: str, message: str) -> None:

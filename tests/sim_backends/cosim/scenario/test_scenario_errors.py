@@ -183,6 +183,8 @@ TOO_FAST = [
         "a climb rate of 3.91.* m/s, .* 3 m/s at most",
     ),
     ("iris", "kind: velocity-profile, legs: [{duration: 1s, climb_m_s: -2}]", "a sink rate of 2 m/s, .* 1.5 m/s"),
+    ("husky", "kind: velocity-profile, legs: [{duration: 1s, climb_m_s: 0.1}]", "climb rate of 0.1 m/s, .* 0 m/s at"),
+    ("iris", "kind: velocity-profile, legs: [{duration: 1s, turn_deg_s: -5}]", "turn of 5 deg/s, .* 0 deg/s at most"),
 ]
 
 
