@@ -145,9 +145,9 @@ def test_stamps_of_another_clock_are_rejected_unless_times_are_the_recorders(tmp
 @pytest.mark.parametrize(
     ("messages", "topic", "message"),
     [
-        ([stamped(BEGAN_NS, 0.0, 0.0)], "/other", "no position of /other"),
+        ([stamped(BEGAN_NS, 0.0, 0.0)], "/other", "no position in /other"),
         ([TYPES["std_msgs/msg/String"]("here")], "/where", "contains no position"),
-        ([stamped(BEGAN_NS, 0.0, 0.0), stamped(BEGAN_NS, 0.0, 0.0, "odom")], "/where", "in map, odom"),
+        ([stamped(BEGAN_NS, 0.0, 0.0), stamped(BEGAN_NS, 0.0, 0.0, "odom")], "/where", "frames: map, odom"),
     ],
 )
 def test_topics_without_positions_are_rejected(tmp_path: Path, messages: list[Any], topic: str, message: str) -> None:
