@@ -124,7 +124,7 @@ class Ros1:
         self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
 
     def _request_topic(self, name: str) -> None:
-        """Request the connection parameters from a publisher, at the subscriber, unless they were already requested."""
+        """Request the connection parameters from a publisher, at the subscriber, unless this has been done."""
         if name in self._topic_requested:
             return
         self._topic_requested.add(name)
@@ -142,9 +142,7 @@ class Ros1:
         self._calls.call(flow.subscriber, flow.publisher, size_bytes, serve, request, about=name)
 
     def _connect(self, name: str) -> None:
-        """Open a connection, at a subscriber, which queries the master for the keep-alive setting before its first
-        one.
-        """
+        """Open a connection, at a subscriber; before the first one, query the master for the keep-alive setting."""
         subscriber, link = self._flows[name].subscriber, self._links[name]
         if subscriber in self._has_keepalive:
             link.connect()
