@@ -227,7 +227,7 @@ class Bodies:
             place_m = places_m[name]
             if not all(map(math.isfinite, place_m)):
                 raise ConfigurationError(f"{name} starts at {place_m}", remedy="use finite coordinates in metres")
-            others = [self.names[other] for other in grid.candidates(place_m)]
+            others = [self.names[other] for other in grid.near(place_m)]
             footprints = [cylinder_footprint(other, places_m[other], self._bodies[other]) for other in others]
             for footprint in (*self._grounds[name].around, *footprints):
                 if overlaps(footprint, body, place_m):

@@ -60,18 +60,18 @@ class ContactStop:
 
     Attributes:
         place_m: Its position.
-        new_contacts: Its contacts, in order.
+        contacts: Its contacts, in order.
     """
 
     place_m: Vector
-    new_contacts: Sequence[Contact]
+    contacts: Sequence[Contact]
 
     def sliding_velocity(self, velocity: Vector) -> Vector:
         """Return the part of a velocity that leads into none of the touched obstacles."""
-        for contact in self.new_contacts:
+        for contact in self.contacts:
             inward = sum(v * n for v, n in zip(velocity, contact.normal, strict=True))
             velocity = _plus(velocity, contact.normal, -min(inward, 0.0))
-        for contact in self.new_contacts:
+        for contact in self.contacts:
             if sum(v * n for v, n in zip(velocity, contact.normal, strict=True)) < -TOUCH_M:
                 return (0.0, 0.0, 0.0)  # a corner: the direction away from one side leads into the other
         return velocity

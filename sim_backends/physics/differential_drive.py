@@ -192,7 +192,7 @@ class DifferentialDrive:
         self.antenna_m = limits.height_m if antenna_m is None else antenna_m
         self.top_speed_m_s = limits.speed_m_s
 
-    def start(self) -> DrivePose:
+    def initial_pose(self) -> DrivePose:
         """Implement `Body.initial_pose`."""
         return DrivePose(self.place_m, self._heading_rad)
 

@@ -71,7 +71,7 @@ class Neighbours:
         grid = CellGrid(2 * reach_m)
         for number, mover in enumerate(bodies_now):
             self._add_ground_candidates(mover, grounds[mover.name])
-            for other in grid.candidates(mover.place_m):
+            for other in grid.near(mover.place_m):
                 self._add_pair_candidates(mover, bodies_now[other])
             grid.add(number, mover.place_m)
 

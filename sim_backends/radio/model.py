@@ -147,8 +147,8 @@ class WifiInWorld(Wifi[Payload]):
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
         """Implement `RadioModel.jam`."""
-        heard_mw = self._world_channel.heard_mw
-        self.hear(
+        received_mw = self._world_channel.received_mw
+        self.set_emissions(
             now_ns,
-            {emitter.name: Emission(now_ns, heard_mw(emitter.place_m, emitter.power_dbm)) for emitter in emitters},
+            {emitter.name: Emission(now_ns, received_mw(emitter.place_m, emitter.power_dbm)) for emitter in emitters},
         )

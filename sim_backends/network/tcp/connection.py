@@ -93,7 +93,7 @@ class TcpConnection:
             name.destination,
             options,
             transmit=self._send_to_source,
-            read=self._read,
+            on_readable=self._read,
             is_open=round_trip_ns is not None,
         )
         self._sender = Sender(
@@ -162,7 +162,7 @@ class TcpConnection:
                 event,
                 control.window_bytes,
                 control.threshold_bytes,
-                self._sender.board.pipe_bytes,
+                self._sender.scoreboard.pipe_bytes,
                 round_trips.smoothed_ns,
                 round_trips.timeout_ns,
             )

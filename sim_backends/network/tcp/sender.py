@@ -224,8 +224,8 @@ class Sender:
             self._give_up(f"tcp: not acknowledged, sent {self._timeouts} times")
             return
         scoreboard = self.scoreboard
-        resend = self._timeouts > 1 or (self._reduction is not None and not self.control.reduces_in_recovery)
-        self.control.on_timeout(self._flight_bytes(), resend=resend)
+        is_repeated = self._timeouts > 1 or (self._reduction is not None and not self.control.reduces_in_recovery)
+        self.control.on_timeout(self._flight_bytes(), again=is_repeated)
         scoreboard.lose_all()
         self._recovery_end = scoreboard.next
         self._reduction = None
