@@ -1,4 +1,4 @@
-"""A campaign from the outside: killed and run again on emulated robots; skipped and noted on the field backend."""
+"""A campaign, end to end: killed and run again on emulated robots; skipped trials and notes on the field backend."""
 
 import json
 import subprocess
@@ -47,7 +47,7 @@ def trials(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir())
 
 
-def test_a_campaign_killed_in_a_trial_goes_on_and_has_each_trial_once(tmp_path: Path) -> None:
+def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path: Path) -> None:
     folder = begin(tmp_path, "10ft, 20ft")
     process = start(tmp_path, "campaign", "lawn.yaml", "--json")
     wait_for_line(process, '"campaign_went"')
@@ -129,7 +129,7 @@ def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> 
     assert what(folder)[first, "ended"] == what(folder)[second, "ended"] == 1
 
 
-def test_a_program_answers_through_a_pipe(tmp_path: Path) -> None:
+def test_a_program_can_answer_through_a_pipe(tmp_path: Path) -> None:
     folder = begin(tmp_path, "10ft")
     with robots_outside(tmp_path, topology=Topology.MASTERLESS):
         text = (tmp_path / "lawn.yaml").read_text(encoding="utf-8").replace("[master, masterless]", "[masterless]")

@@ -1,4 +1,4 @@
-"""Pages are short, use terms that they introduce, and name commands that exist."""
+"""Pages are short, introduce their terms, and name existing commands."""
 
 import ast
 import re
@@ -58,7 +58,7 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_parser_accepts_a_command_that_is_not_run(command: str) -> None:
+def test_the_parser_accepts_commands_that_no_test_runs(command: str) -> None:
     arguments = words(command)
     if arguments[0] in EXTERNAL:
         pytest.skip("a command of another package")
@@ -71,11 +71,11 @@ def test_the_parser_refuses_a_wrong_option() -> None:
 
 
 @pytest.mark.parametrize("page", HAND_WRITTEN, ids=page_id)
-def test_a_hand_written_page_is_short(page: Path) -> None:
+def test_a_hand_written_page_has_a_limited_length(page: Path) -> None:
     assert page.stat().st_size <= LONGEST_BYTES
 
 
-def test_all_hand_written_pages_together_are_short() -> None:
+def test_all_hand_written_pages_have_a_limited_total_length() -> None:
     assert sum(page.stat().st_size for page in HAND_WRITTEN) <= TOTAL_BYTES
 
 
@@ -98,7 +98,7 @@ def test_the_paper_is_introduced_where_it_is_first_mentioned(page: Path) -> None
 
 
 def labels() -> tuple[set[str], set[str]]:
-    """Return the labels of all figures in the code, and of labels with variable parts the longest constant part."""
+    """Return the labels of all figures in the code; for labels with variable parts the longest constant part."""
     whole, parts = set(), set()
     for path in (ROOT / "fieldkit").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
