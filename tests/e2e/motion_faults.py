@@ -68,16 +68,16 @@ def all_outcomes(tasks: Sequence[_Task], jobs: int) -> Iterator[MotionOutcome]:
     """Yield the outcomes of trials as they end; `jobs` run in parallel, each in a lab of its process."""
     context = multiprocessing.get_context("spawn")
     task_queue: Queue[_Task | None] = context.Queue()
-    is_finished: Queue[str | None] = context.Queue()
+    outcome_queue: Queue[str | None] = context.Queue()
     for task in (*tasks, None):
         task_queue.put(task)
-    workers = [context.Process(target=_work, args=(task_queue, is_finished)) for _ in range(jobs)]
+    workers = [context.Process(target=_work, args=(task_queue, outcome_queue)) for _ in range(jobs)]
     for worker in workers:
         worker.start()
     running_workers = jobs
     try:
         while running_workers:
-            line = is_finished.get()
+            line = outcome_queue.get()
             if line is None:
                 running_workers -= 1
             else:

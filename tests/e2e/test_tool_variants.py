@@ -110,5 +110,5 @@ def test_unsuitable_tools_are_rejected_before_repeat_1(tmp_path: Path, pair: Pai
     assert run.code == 3, run.out + run.err
     what, package = words
     assert what in run.err
-    assert f"  apt-get install {package}" in run.err, "as root, who needs no sudo"
+    assert f"  apt-get install {package}" in run.err, "root needs no sudo"
     assert rows(only_trial(tmp_path)) == [], "no repeat began"
