@@ -1,4 +1,4 @@
-"""Mean path loss in the open, for many paths at once."""
+"""Mean path loss in the open, for many paths together."""
 
 import math
 from typing import Final

@@ -169,7 +169,7 @@ TYPED: dict[str, Setup] = {
     "a threshold of nothing": two_runs("compare a b --threshold ip_loss=0%"),
     "a lab that is not up": typed("lab ps"),
     "a lab of no robots": typed("lab up --robots 0"),
-    "a lab of a backend that brings up none": site(FIELD, command="lab up --backend field"),
+    "a lab of a backend that cannot start robots": site(FIELD, command="lab up --backend field"),
     "a figure of no known kind": typed("lab plot -o lab.gif"),
 }
 

@@ -135,7 +135,7 @@ def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(outside: O
         run = fieldkit(lab, *CHECK)
         evidence.end_jobs(sender[Role.SENDER], job.folder)
     assert run.code == 3
-    assert failed(run) == {("turtlebot-1", "lock")}, "what anna runs is no leftover"
+    assert failed(run) == {("turtlebot-1", "lock")}, "a process of anna is no leftover"
     lock = findings_by_check(run)["turtlebot-1", "lock"]
     assert "anna@one holds the robot for trial-a" in lock["detail"]
     assert lock["remedy"].endswith(": fieldkit abort")

@@ -182,4 +182,4 @@ def test_evidence_of_a_sender_that_was_out_of_range_is_fetched_and_nothing_runs_
     assert 0 < int(row["bag_messages"]) <= 11, "2 s of a 5 Hz laser, less what it takes to subscribe"
     packets = rdpcap(str(trial / "repeats" / f"{protocol}-01" / "sender.pcap"))
     ports = {packet[layer].sport for packet in packets for layer in (TCP, UDP) if layer in packet}
-    assert len(ports - {1234}) == 1, "each netcat sends from a port of its own"
+    assert len(ports - {1234}) == 1, "each netcat sends from its own port"

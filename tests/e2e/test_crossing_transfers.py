@@ -34,7 +34,7 @@ emulated:
 """
 PROCEDURE = """\
 name: cross
-summary: both ways at once with a competing flow from a third robot, and pings meanwhile
+summary: both directions at once with a competing flow from a third robot, and pings meanwhile
 scenario: los
 topology: master
 protocols: [tcp, udp]

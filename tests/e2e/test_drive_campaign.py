@@ -99,7 +99,7 @@ def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_applies_to_all_tria
     assert motions(lab, out) == ["origin", "begun", "held", "allowed", *("begun", "ended") * 2], "one origin"
     assert [row["status"] for trial in trials(lab, out) for row in rows(trial)] == ["void", "valid", "valid"]
     farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(begun_ns))
-    assert farthest_m == pytest.approx(WAY_M, abs=BEYOND_M), "not as far again from where it was stopped"
+    assert farthest_m == pytest.approx(WAY_M, abs=BEYOND_M), "not the whole distance again from the point of the stop"
     assert lab.place_m == pytest.approx(home_m, abs=0.1)
 
 

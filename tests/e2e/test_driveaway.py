@@ -96,7 +96,7 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     assert receiver_track[-2].velocity_m_s == receiver_track[-1].velocity_m_s == (0.0, 0.0, 0.0)
 
     end_m = range_m()
-    assert 60 < end_m < 40 + WAY_M, "the way leads out of range"
+    assert 60 < end_m < 40 + WAY_M, "the route leads out of range"
     sent = frames(folder, where)
     heard = [metres for metres, _, received in sent if received]
     assert end_m - 10 < max(heard) <= end_m

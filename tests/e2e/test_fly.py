@@ -86,7 +86,7 @@ def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
     ground_m = flown_m[0][2]
     assert max(up_m for _, _, up_m in flown_m) == pytest.approx(ground_m + 1.0, abs=0.4)
     assert flown_m[-1][2] == pytest.approx(ground_m, abs=1e-6), "it landed"
-    assert flown_m[-1][0] - flown_m[0][0] > 8.0, "where it was"
+    assert flown_m[-1][0] - flown_m[0][0] > 8.0, "the drone has flown from its start"
     log = (trial / "repeats/tcp-01/fly.log").read_text(encoding="utf-8").split("\n")
     log_texts = [line.partition(" ")[2] for line in log if line]
     phases = "ready", "standing", "climbing", "up", "flying", "coming down", "landed"

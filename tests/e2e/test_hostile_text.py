@@ -104,7 +104,7 @@ def test_no_output_contains_control_characters(
     for text in written:
         assert_shown(text)
     if form != "mcap":
-        assert any("?[31mb" in text or "\\u001b[31mb" in text for text in written), "the test sees what is hostile"
+        assert any("?[31mb" in text or "\\u001b[31mb" in text for text in written), "the texts contain the sequence"
     if form == "csv":
         cells = [cell for line in csv.reader(io.StringIO(written[0])) for cell in line]
         assert not [cell for cell in cells if cell.startswith("=")]

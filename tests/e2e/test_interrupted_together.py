@@ -23,7 +23,7 @@ roles:
 """
 PROCEDURE = """\
 name: beside
-summary: Four things at once, none of which ends by itself in time
+summary: Four concurrent activities, none of which ends by itself in time
 scenario: los
 topology: masterless
 protocols: [tcp]

@@ -102,7 +102,7 @@ def test_the_parts_of_the_delay_are_those_of_a_link_of_50_mbit_s(lossy_udp: dict
     queuing_s, transmission_s = (
         median(float(row[f"delay_{part}_s"]) for row in alone) for part in ("queuing", "transmission")
     )
-    assert queuing_s > transmission_s, "the six fragments of a datagram come at once"
+    assert queuing_s > transmission_s, "the six fragments of a datagram arrive together"
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)

@@ -38,10 +38,10 @@ def untested_commands(page: Path) -> Iterator[str]:
     """Yield fieldkit commands of indented blocks and tables, which no other test runs."""
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     lines = re.sub(r"\\\n\s*", " ", text).splitlines()
-    found = [line.strip() for line in lines if re.match(r" {4,}fieldkit [a-z-]", line)]
+    commands = [line.strip() for line in lines if re.match(r" {4,}fieldkit [a-z-]", line)]
     if page.name == "cheat-sheet.md":
-        found += IN_TABLE.findall(text)
-    for command in found:
+        commands += IN_TABLE.findall(text)
+    for command in commands:
         yield END_OF_COMMAND.split(command)[0]
 
 
@@ -91,8 +91,8 @@ def test_the_paper_is_introduced_where_it_is_first_mentioned(page: Path) -> None
     mention = re.search(r"\bthe \[?paper\b(?!'s loss \(eq)", text, re.IGNORECASE)
     if mention is None or page.name == "index.md":
         return
-    beginning, found, _ = text.partition(CITATION)
-    assert found, f"{page.name} mentions the paper and has no link to {CITATION}"
+    beginning, citation, _ = text.partition(CITATION)
+    assert citation, f"{page.name} mentions the paper and has no link to {CITATION}"
     mentions_before = re.findall(r"\bthe \[?paper\b", beginning, re.IGNORECASE)
     assert len(mentions_before) <= 2, "the link is in the same paragraph as the first mention"
 

@@ -19,7 +19,7 @@ LONG_S = 300.0
 # The killed ping never recovers; the sensors restart; the sender is rebooted while it records.
 NEVER = """\
 name: never
-summary: a process that nobody starts again, and steps that a fault makes fail
+summary: a process that is never restarted, and steps that a fault makes fail
 scenario: los
 topology: masterless
 protocols: [tcp]
@@ -225,7 +225,7 @@ def test_a_fault_that_cannot_be_injected_fails_the_attempt(tmp_path: Path) -> No
     recording = "during: [{record: {robot: receiver, topics: [/pidrone/imu], duration: 500s}}]"
     run = run_procedure(tmp_path, HEALS.replace("sensors, after: 0.3s", f"roscore, after: 0.3s, {recording}"))
     assert run.code == 4, run.err + run.out
-    assert not began.expired, "what ran inside was ended"
+    assert not began.expired, "the steps inside the block were ended"
     (row,) = rows(only_trial(tmp_path))
     assert "no process named roscore runs" in row["reason"]
 

@@ -84,7 +84,7 @@ def test_the_step_runs_and_is_judged_measured_and_reported(fieldkit: Fieldkit, t
     assert (row["status"], row["route_device"]) == ("valid", route["dev"])
     assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
     (folder / "repeats" / "tcp-01" / "route.txt").write_text("[]\n", encoding="ascii")
-    assert fieldkit("rebuild", str(folder)).returncode == 4, "it is not what was summed"
+    assert fieldkit("rebuild", str(folder)).returncode == 4, "its checksum no longer matches"
     (folder / "MANIFEST.sha256").unlink()
     assert fieldkit("rebuild", str(folder)).returncode == 0
     assert rows(folder)[0]["route_device"] == "", "a figure that is not there is empty, and never guessed"

@@ -59,7 +59,7 @@ def test_changed_evidence_is_detected(trials: list[Path]) -> None:
     lines = ping.read_text(encoding="utf-8").splitlines(keepends=True)
     reply = next(index for index, line in enumerate(lines) if "icmp_seq=" in line and "time=" in line)
     ping.write_text("".join(lines[:reply] + lines[reply + 1 :]), encoding="utf-8")
-    assert main(["rebuild", str(lossy)]) == EvidenceError.exit_code, "it is not what was summed"
+    assert main(["rebuild", str(lossy)]) == EvidenceError.exit_code, "its checksum no longer matches"
     (lossy / store.MANIFEST_FILE).unlink()
     assert "changed: trial.csv" in said("rebuild", str(lossy))
     assert {"export.csv", "mcap.json", "report.txt", "figures.json"} <= set(differing(trials))

@@ -75,9 +75,9 @@ _GPX: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
 
 def _measure_drive(data: bytes, place: Path) -> None:
     (place / drive_log.FILE).write_bytes(data)
-    found = drive_log.measure(drive_log.read(place / drive_log.FILE))
+    measured = drive_log.measure(drive_log.read(place / drive_log.FILE))
     for column in drive_log.COLUMNS:
-        assert column.problem(cell(found.values.get(column.name))) is None, column.name
+        assert column.problem(cell(measured.values.get(column.name))) is None, column.name
 
 
 def _read_drive_status(data: bytes, _: Path) -> None:
@@ -204,9 +204,9 @@ def _read_reception(data: bytes, place: Path) -> None:
     """Measure when topics were received, with a mutated log and an intact bag."""
     (place / "log").write_bytes(data)
     (place / "scan.bag").write_bytes(_recorded_bag())
-    found = reception.measure(reception.read(place, "log", "scan.bag", ["/scan"], 5.0))
+    measured = reception.measure(reception.read(place, "log", "scan.bag", ["/scan"], 5.0))
     for column in reception.COLUMNS:
-        assert column.problem(cell(found.values.get(column.name))) is None, column.name
+        assert column.problem(cell(measured.values.get(column.name))) is None, column.name
 
 
 def _lines(lines: Iterator[dict[str, Any]]) -> bytes:

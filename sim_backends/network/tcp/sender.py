@@ -1,4 +1,4 @@
-"""The sending end of a connection: opens it, sends the stream, and sends again what is lost."""
+"""The sending end of a connection: opens it, sends the stream, and retransmits lost segments."""
 
 from collections.abc import Callable, Mapping
 from typing import Final
