@@ -304,9 +304,9 @@ def test_the_walk_names_each_method_of_a_step() -> None:
 
 def test_class_names_are_unique() -> None:
     """Each class name is unique, private classes included, so that a search finds one class."""
-    imports: dict[str, list[str]] = {}
+    places_by_name: dict[str, list[str]] = {}
     for path in modules("fieldkit") + modules("sim_backends"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ClassDef):
-                imports.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
-    assert {name: places for name, places in imports.items() if len(places) > 1} == {}
+                places_by_name.setdefault(node.name, []).append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert {name: places for name, places in places_by_name.items() if len(places) > 1} == {}
