@@ -1,4 +1,4 @@
-"""Fixtures that several folders share, and what holds for all tests: no time limit on an example, long ones first."""
+"""Fixtures shared by several folders, and settings of all tests: no time limit on examples, long test files first."""
 
 import gc
 import signal
@@ -18,15 +18,16 @@ __all__ = ["server"]
 
 pytest_plugins = ("pytester", "tests.helpers.leaks", "tests.helpers.reruns")
 
-# Tests that a shell started in the background ignore SIGINT, and so would every program that they start.
+# Tests started in the background of a shell ignore SIGINT, and so would all programs that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# A busy machine makes any example slow. `make test` adds `--hypothesis-profile ci`, the same examples each time.
+# A busy machine makes any example slow. `make test` adds `--hypothesis-profile ci`, which uses the same examples each
+# time.
 settings.register_profile("fieldkit", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("fieldkit")
 
-# Files that take long, the longest first: one that begins late is waited for alone. Three of them run several trials
-# at once and stand apart, so that they do not compete.
+# Files that take long, the longest first, because a long file that starts late would run alone at the end. Three of
+# them run several trials in parallel and are separated, so that they do not compete.
 _LONG: Final = (
     "test_known_loss_tcp",
     "test_chaos",
@@ -71,8 +72,8 @@ _LONG: Final = (
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_reader_waits() -> Iterator[None]:
-    """End the readers of files: each would wait a minute for another one, and the watch on processes for it."""
+def _stop_readers() -> Iterator[None]:
+    """Stop the file readers: each would wait a minute for another file, and the process check would wait for it."""
     yield
     bag._READER.stop()
     contents._WORKER.stop()
@@ -80,23 +81,23 @@ def _no_reader_waits() -> Iterator[None]:
     tlog._READER.stop()
 
 
-# What collecting makes lives to the end of the run: nobody is to look through it, then or later.
+# Objects created by collection live until the end of the run, so the garbage collector must not scan them.
 gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """Look for garbage among what tests make alone."""
+    """Restrict garbage collection to objects created by tests."""
     gc.freeze()
     gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put long files first and let the others keep their order."""
+    """Move long files to the front and keep the order of the others."""
     items.sort(key=lambda item: _LONG.index(item.path.stem) if item.path.stem in _LONG else len(_LONG))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print what passing tests recorded under `said`: figures an issue wants to see."""
+    """Print the text that passing tests recorded as the property `said`, for use in issues."""
     for report in terminalreporter.stats.get("passed", []):
         for name, text in report.user_properties:
             if name == "said":

@@ -1,1 +1,1 @@
-"""Network federates: what becomes of packets."""
+"""Network federates: they decide which packets arrive, and when."""

@@ -1,4 +1,4 @@
-"""What goes wrong with radios: nodes that are lost, links that are cut, jammers; each from one moment to another."""
+"""Radio disturbances: nodes that are off, links that are cut, jammers; each with a start and an end time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,14 +8,14 @@ from fieldkit.core.model import Vector
 
 @dataclass(frozen=True, slots=True)
 class NodeLoss:
-    """A node is off: what waits in its radio's queue is lost, and what its programs send meanwhile.
+    """A node is off: packets in its radio's queue are lost, and so is all that its programs send in this time.
 
-    Its transports stand still: their timers ring when it is on again, if it ever is, and not before.
+    Its transports are suspended: timers that expire in this time fire when the node is on again.
 
     Attributes:
         name: The node.
-        begin_ns: From when on.
-        end_ns: Until when; None to the end of the run.
+        begin_ns: Start time.
+        end_ns: End time; None for the end of the run.
     """
 
     name: str
@@ -25,13 +25,13 @@ class NodeLoss:
 
 @dataclass(frozen=True, slots=True)
 class LinkCut:
-    """Two nodes are out of each other's range, in both directions.
+    """Two nodes are out of range of each other, in both directions.
 
     Attributes:
-        one: One of them.
-        other: The other.
-        begin_ns: From when on.
-        end_ns: Until when; None to the end of the run.
+        one: One of the nodes.
+        other: The other node.
+        begin_ns: Start time.
+        end_ns: End time; None for the end of the run.
     """
 
     one: str
@@ -42,17 +42,17 @@ class LinkCut:
 
 @dataclass(frozen=True, slots=True)
 class Jammer:
-    """Noise in the whole channel, sent without a pause from a place, or by an agent wherever it is.
+    """Continuous noise in the whole channel, from a fixed position or from the position of an agent.
 
     Attributes:
-        power_dbm: Power that it sends with, within the channel's 20 MHz.
-        begin_ns: From when on.
-        end_ns: Until when; None to the end of the run.
-        place_m: Where it stands, metres east, north, up; None where an agent carries it.
-        agent: Who carries it; empty for nobody.
+        power_dbm: Transmit power within the channel's 20 MHz.
+        begin_ns: Start time.
+        end_ns: End time; None for the end of the run.
+        place_m: Its position, metres east, north, up; None if an agent carries it.
+        agent: The agent that carries it; empty if it has a fixed position.
 
     Raises:
-        ValueError: It has neither a place nor an agent, or both.
+        ValueError: It has neither a position nor an agent, or both.
     """
 
     power_dbm: float
@@ -63,18 +63,22 @@ class Jammer:
 
     def __post_init__(self) -> None:
         if (self.place_m is None) == (not self.agent):
-            raise ValueError("a jammer needs either a place or an agent that carries it")
+            raise ValueError("a jammer needs either a position or an agent that carries it")
 
 
 Disturbance = NodeLoss | LinkCut | Jammer
 
 
 def active(disturbances: Sequence[Disturbance], now_ns: int) -> list[Disturbance]:
-    """Return those that have begun and not ended at `now_ns`."""
-    return [one for one in disturbances if one.begin_ns <= now_ns and (one.end_ns is None or now_ns < one.end_ns)]
+    """Return the disturbances that are active at `now_ns`."""
+    return [
+        disturbance
+        for disturbance in disturbances
+        if disturbance.begin_ns <= now_ns and (disturbance.end_ns is None or now_ns < disturbance.end_ns)
+    ]
 
 
 def changes_ns(disturbances: Sequence[Disturbance]) -> list[int]:
-    """Return when any begins or ends, each time once, in order."""
-    edges = {one.begin_ns for one in disturbances}
-    return sorted(edges | {one.end_ns for one in disturbances if one.end_ns is not None})
+    """Return the distinct start and end times of all disturbances, in order."""
+    starts = {disturbance.begin_ns for disturbance in disturbances}
+    return sorted(starts | {disturbance.end_ns for disturbance in disturbances if disturbance.end_ns is not None})

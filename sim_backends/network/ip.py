@@ -1,6 +1,6 @@
-"""The internet layer: IPv4 packets in fragments no longer than the MTU, put together again where all arrive.
+"""The internet layer: IPv4 packets are sent in fragments up to the MTU, and reassembled if all fragments arrive.
 
-RFC 791, without options. A fragment that is lost takes its packet with it: nothing sends it again down here.
+RFC 791, without options. If a fragment is lost, its whole packet is lost: this layer does not retransmit.
 """
 
 from collections.abc import Callable, Iterator
@@ -14,29 +14,30 @@ from sim_backends.radio.random_streams import PacketIdentity
 HEADER_BYTES: Final = 20
 """RFC 791, 3.1, without options."""
 
-LONGEST_BYTES: Final = 65535
-"""What the 16 bits of its length can say, RFC 791, 3.1."""
+MAX_PACKET_BYTES: Final = 65535
+"""Maximum of the 16-bit total length, RFC 791, 3.1."""
 
 MTU_BYTES: Final = 1500
-"""Linux's for Wi-Fi as for Ethernet."""
+"""Linux's default for Wi-Fi and Ethernet."""
 
 REASSEMBLY_NS: Final = 30 * 10**9
-"""How long Linux waits for the rest of a packet after the first fragment of it: net.ipv4.ipfrag_time."""
+"""The time for which Linux waits for the other fragments after the first one: net.ipv4.ipfrag_time."""
 
 TIMED_OUT: Final = "reassembly timed out"
 
 
 @dataclass(frozen=True, slots=True)
 class Fragment:
-    """A fragment of an IP packet, or a whole one.
+    """A fragment of an IP packet, or a whole packet.
 
     Attributes:
         packet: The packet.
-        ip_id: Which it is of its source's, the identification of its header but for the 16 bits of that.
-        index: Which it is of the packet's fragments, from 0.
-        count: How many there are.
-        offset_bytes: Where what it carries begins in what the packet carries.
-        size_bytes: Its size, header included.
+        ip_id: Number of the packet among those of its source: the header's identification without its limit of 16
+            bits.
+        index: Index of the fragment in the packet, from 0.
+        count: Number of fragments of the packet.
+        offset_bytes: Offset of its payload in the payload of the packet.
+        size_bytes: Its size with the header.
     """
 
     packet: IpPacket
@@ -48,92 +49,92 @@ class Fragment:
 
     @property
     def identity(self) -> PacketIdentity:
-        """What its draws are keyed by: the first fragment's are those of a packet that needs no other."""
+        """The key of its random draws; the first fragment has that of an unfragmented packet."""
         flow, number = self.packet.identity
         return (f"{flow} fragment {self.index}", number) if self.index else (flow, number)
 
 
 def fragments(packet: IpPacket, ip_id: int, mtu_bytes: int = MTU_BYTES) -> Iterator[Fragment]:
-    """Yield the fragments of a packet: all but the last as long as fits, in units of 8 bytes (RFC 791, 3.2).
+    """Yield the fragments of a packet; all but the last have the maximum size, in units of 8 bytes (RFC 791, 3.2).
 
     Raises:
-        ConfigurationError: It is longer than an IP packet can be.
+        ConfigurationError: The packet is longer than an IP packet can be.
     """
     if packet.size_bytes <= mtu_bytes:
         yield Fragment(packet, ip_id, 0, 1, 0, packet.size_bytes)
         return
-    if packet.size_bytes > LONGEST_BYTES:
+    if packet.size_bytes > MAX_PACKET_BYTES:
         raise ConfigurationError(
-            f"an IP packet of {packet.size_bytes} bytes is longer than {LONGEST_BYTES} bytes",
+            f"an IP packet of {packet.size_bytes} bytes is longer than {MAX_PACKET_BYTES} bytes",
             where=f"flow {packet.identity[0]}",
-            remedy="send smaller messages, or by tcp",
+            remedy="send smaller messages, or use tcp",
         )
-    carried_bytes = packet.size_bytes - HEADER_BYTES
-    most_bytes = (mtu_bytes - HEADER_BYTES) // 8 * 8
-    count = -(-carried_bytes // most_bytes)
+    payload_bytes = packet.size_bytes - HEADER_BYTES
+    max_fragment_bytes = (mtu_bytes - HEADER_BYTES) // 8 * 8
+    count = -(-payload_bytes // max_fragment_bytes)
     for index in range(count):
-        offset_bytes = index * most_bytes
-        size_bytes = HEADER_BYTES + min(most_bytes, carried_bytes - offset_bytes)
+        offset_bytes = index * max_fragment_bytes
+        size_bytes = HEADER_BYTES + min(max_fragment_bytes, payload_bytes - offset_bytes)
         yield Fragment(packet, ip_id, index, count, offset_bytes, size_bytes)
 
 
 @dataclass(slots=True)
 class _Partial:
-    """What a host has of a packet: how many of its fragments arrived or will not, since when, and whether in vain."""
+    """State of a packet at a host: fragments that arrived or were lost, time of the first arrival, and failure."""
 
     packet: IpPacket
-    known: int = 0
+    fragments_counted: int = 0
     since_ns: int | None = None
-    in_vain: bool = False
+    failed: bool = False
 
 
 class Reassembly:
-    """Puts fragments together at the hosts they arrive at, each told once for each host: as arrived, or as lost.
+    """Reassembles fragments at their receiving hosts; reports each packet once per host, as complete or as lost.
 
     Args:
-        lost: Called with a packet, a host and a reason once that host cannot get it any more.
+        on_lost: Called with a packet, a host and a reason when the host can no longer receive the packet.
     """
 
-    def __init__(self, lost: Callable[[IpPacket, str, str], None]) -> None:
-        self._lost = lost
+    def __init__(self, on_lost: Callable[[IpPacket, str, str], None]) -> None:
+        self._on_lost = on_lost
         self._partials: dict[tuple[str, str, int], _Partial] = {}
 
-    def arrived(self, now_ns: int, host: str, fragment: Fragment) -> bool:
-        """Take a fragment that arrived at a host; return whether its packet is whole there now.
+    def on_arrival(self, now_ns: int, host: str, fragment: Fragment) -> bool:
+        """Record a fragment that arrived at a host; return True if its packet is now complete there.
 
-        Where the rest comes after `REASSEMBLY_NS`, it finds nothing left of the packet.
+        If the last fragments arrive later than `REASSEMBLY_NS` after the first, the packet is lost.
         """
         if fragment.count == 1:
             return True
-        partial = self._next(host, fragment)
+        partial = self._count_fragment(host, fragment)
         if partial.since_ns is None:
             partial.since_ns = now_ns
         elif now_ns - partial.since_ns >= REASSEMBLY_NS:
             self._fail(host, partial, TIMED_OUT)
-        return partial.known == fragment.count and not partial.in_vain
+        return partial.fragments_counted == fragment.count and not partial.failed
 
-    def missing(self, host: str, fragment: Fragment, reason: str) -> None:
-        """Take it that a fragment will not arrive at a host."""
+    def on_loss(self, host: str, fragment: Fragment, reason: str) -> None:
+        """Record that a fragment will not arrive at a host."""
         if fragment.count == 1:
-            self._lost(fragment.packet, host, reason)
+            self._on_lost(fragment.packet, host, reason)
         else:
-            self._fail(host, self._next(host, fragment), reason)
+            self._fail(host, self._count_fragment(host, fragment), reason)
 
-    def forget(self, host: str, reason: str) -> None:
-        """Let what a host has of packets be of no use to it any more, as when it is switched off."""
+    def discard(self, host: str, reason: str) -> None:
+        """Discard the incomplete packets of a host, for example when it is switched off."""
         for (name, _, _), partial in self._partials.items():
             if name == host:
                 self._fail(host, partial, reason)
 
-    def _next(self, host: str, fragment: Fragment) -> _Partial:
+    def _count_fragment(self, host: str, fragment: Fragment) -> _Partial:
         key = host, fragment.packet.source, fragment.ip_id
         partial = self._partials.pop(key, None) or _Partial(fragment.packet)
-        partial.known += 1
-        if partial.known < fragment.count:
+        partial.fragments_counted += 1
+        if partial.fragments_counted < fragment.count:
             self._partials[key] = partial
         return partial
 
     def _fail(self, host: str, partial: _Partial, reason: str) -> None:
-        if not partial.in_vain:
-            partial.in_vain = True
-            self._lost(partial.packet, host, reason)
+        if not partial.failed:
+            partial.failed = True
+            self._on_lost(partial.packet, host, reason)

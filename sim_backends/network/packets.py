@@ -1,4 +1,4 @@
-"""Packets of a co-simulation and what becomes of them; times are integer nanoseconds of simulated time."""
+"""Packets of a co-simulation and their results; times are integer nanoseconds of simulated time."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,14 +8,14 @@ from sim_backends.radio.random_streams import PacketIdentity
 
 @dataclass(frozen=True, slots=True)
 class Datagram:
-    """What a program hands to its agent's network.
+    """A message that a program passes to its agent's network.
 
     Attributes:
-        destination: Name of the agent that it is for.
+        destination: Name of the receiving agent.
         size_bytes: Size of the packet.
-        flow: Stream of packets that it belongs to; names are unique in a scenario.
-        number: Which it is of its flow: with the flow its identity, by which runs are compared.
-        payload: What the receiver's program gets; the network never sees it.
+        flow: Stream of packets to which it belongs; names are unique in a scenario.
+        number: Number of the packet in its flow; flow and number identify the packet when runs are compared.
+        payload: Content for the receiver's program; the network does not inspect it.
         protocol: Name of the transport that carries it.
     """
 
@@ -29,16 +29,16 @@ class Datagram:
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A packet as the network sees it.
+    """A packet in the network.
 
     Attributes:
-        packet_id: Counts the packets of a run.
-        source: Who sends it.
-        destination: Who shall get it.
+        packet_id: Number of the packet in the run.
+        source: Name of the sender.
+        destination: Name of the receiver.
         size_bytes: Its size.
-        identity: Flow and number, by which random draws are keyed.
-        sent_ns: When its program sent it.
-        enters_ns: When the network gets it: later than `sent_ns` where a policy keeps it until then.
+        identity: Flow and number, which key random draws.
+        sent_ns: Time at which its program sent it.
+        enters_ns: Time at which the network receives it; later than `sent_ns` if a policy delays it.
         protocol: Name of the transport that carries it.
     """
 
@@ -57,9 +57,9 @@ class Arrival:
     """A packet that arrived.
 
     Attributes:
-        packet_id: Which.
-        receiver: At whom.
-        at_ns: When, by the network's clock.
+        packet_id: Its number.
+        receiver: Name of the receiver.
+        at_ns: Arrival time by the network's clock.
     """
 
     packet_id: int
@@ -69,11 +69,11 @@ class Arrival:
 
 @dataclass(frozen=True, slots=True)
 class Drop:
-    """A packet that never arrives.
+    """A packet that will never arrive.
 
     Attributes:
-        packet_id: Which.
-        reason: Why, in a few words.
+        packet_id: Its number.
+        reason: The reason, in a few words.
     """
 
     packet_id: int
@@ -82,13 +82,13 @@ class Drop:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A datagram as its receiver's program gets it.
+    """A datagram as it is passed to the receiver's program.
 
     Attributes:
-        source: Who sent it.
-        payload: What it says.
-        sent_ns: When its program sent it.
-        arrived_ns: When it arrived, by the time that the policy gives it.
+        source: Name of the sender.
+        payload: Its content.
+        sent_ns: Time at which its program sent it.
+        arrived_ns: Arrival time, as assigned by the policy.
     """
 
     source: str

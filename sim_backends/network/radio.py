@@ -23,7 +23,7 @@ from sim_backends.world.motion import State
 TransportFactory = Callable[[Wire], Transport]
 
 IpLog = Callable[[int, str, Fragment], None]
-"""Is called with when an IP packet, or a fragment, was sent by a host or arrived at it, the host, and the packet."""
+"""Called with the time, the host, and the packet or fragment that the host sent or received."""
 
 UDP_ONLY: Final[Mapping[str, TransportFactory]] = MappingProxyType({"udp": Udp})
 
@@ -31,32 +31,32 @@ UDP_ONLY: Final[Mapping[str, TransportFactory]] = MappingProxyType({"udp": Udp})
 class RadioNetwork:
     """Carries packets of programs by transports, over the internet protocol and a radio model.
 
-    Everything happens in order of time. At the same nanosecond the radio's own events come first, then disturbances
-    begin and end, then come timers of transports in the order in which they were set, then packets that enter, in the
-    order in which they are given; what one of these brings about at once happens before the next.
+    Events are processed in order of time. At the same nanosecond the order is: events of the radio; starts and ends
+    of disturbances; timers of transports, in the order in which they were set; entering packets, in the given order.
+    The immediate consequences of an event are processed before the next event.
 
-    The radio is told where stations are when something happens, not at every window: what a link does then depends
-    on nothing that was told before. It is not told how they move: stations stand, for the radio, where the
-    coordinator said that they are, or move on by whole steps where it said so by dead reckoning, so that the policy
-    alone decides how wrong that is.
+    The radio receives the positions of stations when an event is processed, not at every window, so the result does
+    not depend on earlier updates. It receives no velocities: for the radio, stations stay at the coordinator's
+    positions, or move in steps if the coordinator passes dead-reckoned states. The position error is therefore
+    decided by the policy alone.
 
-    `Transport.lost` is called for packets to one destination only: of a broadcast each host may miss its own.
+    `Transport.lost` is called for packets with a single destination only, because each host may miss a broadcast.
 
     Args:
         radio: The radio model.
         names: The stations.
-        transports: What makes each transport, by the name that packets have it by.
-        disturbances: What goes wrong.
-        relay: Whose access point relays between the others; None for direct links.
+        transports: Factories of the transports, by the protocol name that packets use.
+        disturbances: Radio disturbances.
+        relay: Station whose access point relays between the others; None for direct links.
 
     Attributes:
         now_ns: See `Wire`.
         extrapolates: See `NetworkFederate.advance`.
-        transmitters: Stations that forward or interfere, whatever is sent: the relay, and who carries a jammer.
-        fixed_emitters_m: Places of jammers that nobody carries.
+        transmitters: Stations that send independently of the traffic: the relay, and agents that carry a jammer.
+        fixed_emitters_m: Positions of the jammers that no agent carries.
 
     Raises:
-        ConfigurationError: A disturbance or the relay names a station that there is not.
+        ConfigurationError: A disturbance or the relay names an unknown station.
     """
 
     def __init__(
@@ -75,49 +75,49 @@ class RadioNetwork:
         self._relay = relay
         self._disturbances = tuple(disturbances)
         self._check_names()
-        jammers = [one for one in disturbances if isinstance(one, Jammer)]
-        self.transmitters = frozenset({relay or "", *(one.agent for one in jammers)} - {""})
-        self.fixed_emitters_m = tuple(one.place_m for one in jammers if one.place_m is not None)
+        jammers = [disturbance for disturbance in disturbances if isinstance(disturbance, Jammer)]
+        self.transmitters = frozenset({relay or "", *(jammer.agent for jammer in jammers)} - {""})
+        self.fixed_emitters_m = tuple(jammer.place_m for jammer in jammers if jammer.place_m is not None)
         self._changes_ns = changes_ns(disturbances)[::-1]
         self._off: set[str] = set()
         self._jammers: dict[str, Jammer] = {}
-        self._known: Mapping[str, State] = {}
-        self._placed: Mapping[str, State] | None = None
+        self._states: Mapping[str, State] = {}
+        self._placed_states: Mapping[str, State] | None = None
         self._timers: list[tuple[int, int, str | None, Callable[[], None]]] = []
-        # What is to be called on hosts that are off, once they are on again.
-        self._asleep: list[tuple[str, Callable[[], None]]] = []
+        # Timer calls of hosts that are off; they run when the host is on again.
+        self._suspended: list[tuple[str, Callable[[], None]]] = []
         self._timers_set = 0
         self._ip_ids = dict.fromkeys(names, 0)
         self._log_ip: IpLog | None = None
-        self._reassembly = ip.Reassembly(self._tell_lost)
-        self._open: dict[int, Packet] = {}
+        self._reassembly = ip.Reassembly(self._on_packet_lost)
+        self._pending: dict[int, Packet] = {}
         self._arrivals: list[Arrival] = []
         self._drops: list[Drop] = []
         self._transports = {name: make(self) for name, make in transports.items()}
         radio.log_losses(self._lose)
 
     def log_ip(self, log: IpLog | None) -> None:
-        """Hand `log` every IP packet that a host sends or gets from now on, or nobody."""
+        """Pass every IP packet that a host sends or receives from now on to `log`; None stops logging."""
         self._log_ip = log
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy has, which is all but the log: what happens in a copy did not happen."""
+        """Return the state for a copy, without the log: events in a copy are not logged."""
         return self.__dict__ | {"_log_ip": None}
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
     ) -> tuple[list[Arrival], list[Drop]]:
-        """See `NetworkFederate.advance`.
+        """Implement `NetworkFederate.advance`.
 
         Raises:
-            ConfigurationError: A packet names a transport that there is not, or is too long for it.
+            ConfigurationError: A packet names an unknown transport, or is too long for its transport.
         """
-        self._known = states
+        self._states = states
         for packet in packets:
             self._run(packet.enters_ns)
             self._place(packet.enters_ns)
             self.now_ns = packet.enters_ns
-            self._open[packet.packet_id] = packet
+            self._pending[packet.packet_id] = packet
             self._transport(packet.protocol).send(packet)
             self._collect()
         self._run(to_ns)
@@ -127,7 +127,7 @@ class RadioNetwork:
         return arrivals, drops
 
     def next_event_ns(self) -> int | None:
-        """See `NetworkFederate.next_event_ns`."""
+        """Implement `NetworkFederate.next_event_ns`."""
         at_ns = self._radio.next_event_ns()
         if self._timers and (at_ns is None or self._timers[0][0] < at_ns):
             at_ns = self._timers[0][0]
@@ -136,7 +136,7 @@ class RadioNetwork:
         return at_ns
 
     def transmit(self, packet: IpPacket) -> None:
-        """See `Wire.transmit`. What a host sends to itself arrives at once, also where its radio is off."""
+        """Implement `Wire.transmit`; packets of a host to itself arrive immediately, even if its radio is off."""
         now_ns, source, destination = self.now_ns, packet.source, packet.destination
         ip_id = self._ip_ids[source]
         self._ip_ids[source] = ip_id + 1
@@ -144,37 +144,37 @@ class RadioNetwork:
             if self._log_ip is not None:
                 self._log_ip(now_ns, source, fragment)
             if destination == source:
-                self._plan(now_ns, None, partial(self._receive, source, fragment))
+                self._schedule(now_ns, None, partial(self._receive, source, fragment))
             elif source in self._off:
                 for name in self._names if destination is None else (destination,):
                     if name != source:
-                        self._reassembly.missing(name, fragment, RADIO_OFF)
+                        self._reassembly.on_loss(name, fragment, RADIO_OFF)
             else:
                 self._radio.send(now_ns, source, fragment, fragment.size_bytes, destination, packet=fragment.identity)
 
     def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
-        """See `Wire.at`.
+        """Implement `Wire.at`.
 
         Raises:
-            ValueError: That has passed.
+            ValueError: The time is in the past.
         """
         if at_ns < self.now_ns:
             raise ValueError(f"a timer for {at_ns} ns was set at {self.now_ns} ns")
-        self._plan(at_ns, host, call)
+        self._schedule(at_ns, host, call)
 
     def deliver(self, packet_id: int) -> None:
-        """See `Wire.deliver`."""
-        packet = self._open.pop(packet_id, None)
+        """Implement `Wire.deliver`."""
+        packet = self._pending.pop(packet_id, None)
         if packet is not None:
             self._arrivals.append(Arrival(packet_id, packet.destination, self.now_ns))
 
     def drop(self, packet_id: int, reason: str) -> None:
-        """See `Wire.drop`."""
-        if self._open.pop(packet_id, None) is not None:
+        """Implement `Wire.drop`."""
+        if self._pending.pop(packet_id, None) is not None:
             self._drops.append(Drop(packet_id, reason))
 
     def _run(self, to_ns: int) -> None:
-        """Let everything happen up to `to_ns`, one event after the other."""
+        """Process all events up to `to_ns` in order."""
         while (at_ns := self.next_event_ns()) is not None and at_ns <= to_ns:
             self._place(at_ns)
             self.now_ns = at_ns
@@ -183,97 +183,99 @@ class RadioNetwork:
                     self._changes_ns.pop()
                     self._disturb()
                 else:
-                    self._ring()
+                    self._fire_timer()
             self._collect()
 
-    def _plan(self, at_ns: int, host: str | None, call: Callable[[], None]) -> None:
-        """Call `call` at `at_ns`, on a host that has to be on, or on none."""
+    def _schedule(self, at_ns: int, host: str | None, call: Callable[[], None]) -> None:
+        """Schedule `call` for `at_ns`, on a host that must be on, or on no host."""
         self._timers_set += 1
         heapq.heappush(self._timers, (at_ns, self._timers_set, host, call))
 
-    def _ring(self) -> None:
-        """Let the next timer ring, unless its host is off."""
+    def _fire_timer(self) -> None:
+        """Run the next timer's call, or suspend it if its host is off."""
         _, _, host, call = heapq.heappop(self._timers)
         if host is not None and host in self._off:
-            self._asleep.append((host, call))
+            self._suspended.append((host, call))
         else:
             call()
 
     def _place(self, at_ns: int) -> None:
-        """Tell the radio where the stations are at `at_ns`, when something happens next, if that changed."""
-        states = self._known.at(at_ns) if isinstance(self._known, DeadReckoned) else self._known
-        if states is self._placed:
+        """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio if they changed."""
+        states = self._states.at(at_ns) if isinstance(self._states, DeadReckoned) else self._states
+        if states is self._placed_states:
             return
-        self._placed = states
+        self._placed_states = states
         self._radio.place(self.now_ns, {name: states[name].position_m for name in self._names}, self._relay)
         if self._jammers:
             self._jam()
 
     def _collect(self) -> None:
-        """Let hosts have what the radio delivers now, and what that brings about at once."""
+        """Pass the packets that the radio delivers now to their hosts, until no immediate consequence is left."""
         while arrived := self._radio.deliveries(self.now_ns):
             for _, host, fragment, _, _ in arrived:
                 self._receive(host, fragment)
 
     def _receive(self, host: str, fragment: Fragment) -> None:
         if host in self._off and host != fragment.packet.source:
-            self._reassembly.missing(host, fragment, RADIO_OFF)
+            self._reassembly.on_loss(host, fragment, RADIO_OFF)
             return
         if self._log_ip is not None:
             self._log_ip(self.now_ns, host, fragment)
-        if self._reassembly.arrived(self.now_ns, host, fragment):
+        if self._reassembly.on_arrival(self.now_ns, host, fragment):
             self._transports[fragment.packet.transport].receive(host, fragment.packet)
 
     def _lose(self, at_ns: int, fragment: Fragment, host: str, reason: str) -> None:  # noqa: ARG002 (see LossLog)
-        self._reassembly.missing(host, fragment, reason)
+        self._reassembly.on_loss(host, fragment, reason)
 
-    def _tell_lost(self, packet: IpPacket, host: str, reason: str) -> None:
+    def _on_packet_lost(self, packet: IpPacket, host: str, reason: str) -> None:
         if packet.destination == host:
             self._transports[packet.transport].lost(packet, reason)
 
     def _disturb(self) -> None:
-        """Let begin what begins now, and end what ends now."""
-        now_on = active(self._disturbances, self.now_ns)
-        off = {one.name for one in now_on if isinstance(one, NodeLoss)}
-        cut = {(one.one, one.other) for one in now_on if isinstance(one, LinkCut)}
+        """Apply the disturbances that are active now, after one has started or ended."""
+        active_now = active(self._disturbances, self.now_ns)
+        off = {disturbance.name for disturbance in active_now if isinstance(disturbance, NodeLoss)}
+        cut = {(link.one, link.other) for link in active_now if isinstance(link, LinkCut)}
         newly_off, self._off = off - self._off, off
         self._radio.disturb(self.now_ns, off, cut)
         for host in sorted(newly_off):
-            self._reassembly.forget(host, RADIO_OFF)
-        asleep, self._asleep = self._asleep, []
-        for host, call in asleep:
-            self._plan(self.now_ns, host, call)
-        jammers = {f"jammer {one}": one for one in now_on if isinstance(one, Jammer)}
+            self._reassembly.discard(host, RADIO_OFF)
+        suspended, self._suspended = self._suspended, []
+        for host, call in suspended:
+            self._schedule(self.now_ns, host, call)
+        jammers = {f"jammer {jammer}": jammer for jammer in active_now if isinstance(jammer, Jammer)}
         if jammers or self._jammers:
             self._jammers = jammers
             self._jam()
 
     def _jam(self) -> None:
-        emitters = [Emitter(name, self._where_m(one), one.power_dbm) for name, one in self._jammers.items()]
+        emitters = [
+            Emitter(name, self._position_m(jammer), jammer.power_dbm) for name, jammer in self._jammers.items()
+        ]
         self._radio.jam(self.now_ns, emitters)
 
-    def _where_m(self, jammer: Jammer) -> Vector:
-        known = self._known if self._placed is None else self._placed
-        return known[jammer.agent].position_m if jammer.place_m is None else jammer.place_m
+    def _position_m(self, jammer: Jammer) -> Vector:
+        states = self._states if self._placed_states is None else self._placed_states
+        return states[jammer.agent].position_m if jammer.place_m is None else jammer.place_m
 
     def _transport(self, name: str) -> Transport:
         if name not in self._transports:
             raise ConfigurationError(
                 f"there is no transport {name!r}",
-                remedy=did_you_mean(name, self._transports, f"take one of {', '.join(self._transports)}"),
+                remedy=did_you_mean(name, self._transports, f"use one of {', '.join(self._transports)}"),
             )
         return self._transports[name]
 
     def _check_names(self) -> None:
-        named = [] if self._relay is None else [self._relay]
-        for one in self._disturbances:
-            if isinstance(one, NodeLoss):
-                named.append(one.name)
-            elif isinstance(one, LinkCut):
-                named += [one.one, one.other]
-        for name in named:
+        names = [] if self._relay is None else [self._relay]
+        for disturbance in self._disturbances:
+            if isinstance(disturbance, NodeLoss):
+                names.append(disturbance.name)
+            elif isinstance(disturbance, LinkCut):
+                names += [disturbance.one, disturbance.other]
+        for name in names:
             if name not in self._names:
                 raise ConfigurationError(
                     f"there is no station {name!r}",
-                    remedy=did_you_mean(name, self._names, f"take one of {', '.join(self._names)}"),
+                    remedy=did_you_mean(name, self._names, f"use one of {', '.join(self._names)}"),
                 )

@@ -1,4 +1,4 @@
-"""UDP (RFC 768): a header of 8 bytes, and no word about what is lost."""
+"""UDP (RFC 768): a header of 8 bytes, without retransmission."""
 
 from typing import Final
 
@@ -13,23 +13,23 @@ class Udp:
     """Carries each packet of a program in one datagram.
 
     Args:
-        wire: What it stands on.
+        wire: The network below.
     """
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
 
     def send(self, packet: Packet) -> None:
-        """See `Transport.send`."""
+        """Implement `Transport.send`."""
         size_bytes = ip.HEADER_BYTES + HEADER_BYTES + packet.size_bytes
         self._wire.transmit(
             IpPacket(packet.source, packet.destination, "udp", size_bytes, packet.identity, packet.packet_id)
         )
 
     def receive(self, host: str, packet: IpPacket) -> None:  # noqa: ARG002 (see Transport)
-        """See `Transport.receive`."""
+        """Implement `Transport.receive`."""
         self._wire.deliver(packet.body)
 
     def lost(self, packet: IpPacket, reason: str) -> None:
-        """See `Transport.lost`."""
+        """Implement `Transport.lost`."""
         self._wire.drop(packet.body, reason)

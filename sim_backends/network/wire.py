@@ -1,7 +1,7 @@
-"""Protocols between transports and what is below them: IP packets, timers, and what becomes of a program's packets.
+"""Protocols between transports and the network below: IP packets, timers, and results of the programs' packets.
 
-A transport holds what both ends know, yet an end learns nothing but by what it receives. It runs on whatever keeps
-these protocols: on the radio, or in a test on a link whose losses are written down.
+One transport object holds the state of both ends of a connection, but an end uses only information that it has
+received. A transport runs on any implementation of `Wire`: on the radio, or in a test on a link with fixed losses.
 """
 
 from collections.abc import Callable
@@ -17,12 +17,12 @@ class IpPacket:
     """A packet of the internet protocol, before any fragmentation.
 
     Attributes:
-        source: Who sends it.
-        destination: Who shall get it; None is everyone, as by multicast.
-        transport: Name of the transport that it belongs to.
-        size_bytes: Its size, the header of the internet protocol included.
-        identity: What the random draws that decide over it are keyed by; what is sent again has another.
-        body: What the transport put into it; the network below does not look at it.
+        source: Name of the sender.
+        destination: Name of the receiver; None for all stations (multicast).
+        transport: Name of the transport to which it belongs.
+        size_bytes: Its size with the IP header.
+        identity: Key of its random draws; a retransmission has a different one.
+        body: Content for the transport; the network below does not inspect it.
     """
 
     source: str
@@ -34,48 +34,48 @@ class IpPacket:
 
 
 class Wire(Protocol):
-    """What a transport stands on.
+    """The network below a transport.
 
     Attributes:
-        now_ns: Now, in nanoseconds of simulated time.
+        now_ns: Current simulated time.
     """
 
     now_ns: int
 
     def transmit(self, packet: IpPacket) -> None:
-        """Send an IP packet now; it arrives, later, by `Transport.receive`, or not."""
+        """Send an IP packet now; if it arrives, `Transport.receive` is called later."""
         ...
 
     def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
-        """Call `call` on a host at `at_ns`, not before now, or once the host is on again if it is off then.
+        """Call `call` on a host at `at_ns`, which is not in the past, or when the host is on again if it is off then.
 
-        A timer that is no longer wanted does nothing when it is called.
+        Calls cannot be cancelled; a function whose timer was stopped must do nothing.
         """
         ...
 
     def deliver(self, packet_id: int) -> None:
-        """Take it that a program's packet is whole at its destination now."""
+        """Report that a program's packet is complete at its destination now."""
         ...
 
     def drop(self, packet_id: int, reason: str) -> None:
-        """Take it that a program's packet never arrives; one that was delivered stays so."""
+        """Report that a program's packet will never arrive; this is ignored if it was delivered."""
         ...
 
 
 class Transport(Protocol):
-    """Carries packets of programs in IP packets."""
+    """A transport that carries packets of programs in IP packets."""
 
     def send(self, packet: Packet) -> None:
-        """Carry a program's packet, which its source hands over now."""
+        """Send a program's packet, which its source passes now."""
         ...
 
     def receive(self, host: str, packet: IpPacket) -> None:
-        """Take an IP packet of this transport that arrived, whole, at `host` now."""
+        """Process an IP packet of this transport that has arrived, complete, at `host` now."""
         ...
 
     def lost(self, packet: IpPacket, reason: str) -> None:
-        """Learn, for the account only, that an IP packet, or a part of it, will not arrive at its destination.
+        """Record, for statistics only, that an IP packet or a fragment of it will not arrive at its destination.
 
-        No end of a real connection is told this, so it must change nothing that an end does.
+        The ends of a real connection do not have this information, so it must not change their behaviour.
         """
         ...

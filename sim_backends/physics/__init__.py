@@ -1,1 +1,1 @@
-"""Physics federates: how agents move."""
+"""Physics federates: they compute the motion of agents."""

@@ -1,10 +1,10 @@
-"""The physics federate of bodies in a world: each follows its course, and stops at what it meets.
+"""The physics federate of bodies in a world: each follows its course, and stops at what it touches.
 
-Bodies go in steps. A command takes effect at the first step that is not before the time that it was given at, and
-what they do does not depend on how time is cut into calls. Two things make it fast. A course is computed where
-somebody asks for a state, and only then. And whether bodies meet is looked at only for those that may, by a list of
-neighbours (Verlet, Phys. Rev. 159, 98, 1967): who is farther from everything than its top speed brings it is free
-until the list ends.
+Bodies move in time steps. A command takes effect at the first step that is not before the time at which it was given,
+and the motion does not depend on how the time is divided into calls. Two things make it fast. A course is evaluated
+only when a state is requested. And contacts are checked only between bodies in a neighbour list (Verlet, Phys. Rev.
+159, 98, 1967): a body that is farther from everything than its top speed allows cannot touch anything until the list
+expires.
 """
 
 import math
@@ -15,10 +15,10 @@ from typing import Any
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import Body, Pose
-from sim_backends.physics.collisions import move, of_cylinder, overlaps
+from sim_backends.physics.collisions import cylinder_footprint, move, overlaps
 from sim_backends.physics.grid import CellGrid
 from sim_backends.physics.ground import Ground
-from sim_backends.physics.neighbours import HORIZON_S, Near, Neighbours
+from sim_backends.physics.neighbours import HORIZON_S, ContactCandidates, Neighbours
 from sim_backends.physics.paths import STEP_NS
 from sim_backends.physics.tracks import NEVER, Snapshot, Track
 from sim_backends.world.motion import State
@@ -27,12 +27,12 @@ from sim_backends.world.world import World
 
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """The beginning of a contact.
+    """The start of a contact.
 
     Attributes:
         at_ns: Its time.
-        body: Who met something.
-        obstacle: What it met: an obstacle, another body, or the ground.
+        body: The moving body.
+        obstacle: What it touched: an obstacle, another body, or the ground.
     """
 
     at_ns: int
@@ -45,190 +45,195 @@ class Bodies:
 
     Args:
         bodies: The bodies, by the name of their agent.
-        world: What they stand on and may run into; None for open flat ground.
-        step_ns: Own step: states are those at whole steps.
+        world: Ground and obstacles; None for open flat ground.
+        step_ns: Time step; states are those at whole steps.
 
     Attributes:
-        step_ns: As given.
-        names: Of the bodies, in order.
-        limits_m_s2: See `BodyLimits`; they hold from the states on that were asked for last.
-        collisions: The beginnings of all contacts so far, in order of time.
+        step_ns: Time step.
+        names: Names of the bodies, in order.
+        limits_m_s2: See `BodyLimits`; they hold from the last returned states on.
+        collisions: The starts of all contacts so far, in order of time.
 
     Raises:
-        ConfigurationError: A body stands in something at time 0, or the step is no positive time.
+        ConfigurationError: A body overlaps something at time 0, or the step is not positive.
     """
 
     def __init__(
         self, bodies: Mapping[str, Body[Any]], world: World | None = None, *, step_ns: int = STEP_NS
     ) -> None:
         if step_ns <= 0:
-            raise ConfigurationError(f"a step of {step_ns} ns is no positive time", remedy="1000000 ns is usual")
+            raise ConfigurationError(f"a step of {step_ns} ns is not positive", remedy="use for example 1000000 ns")
         self.step_ns = step_ns
         self.collisions: list[Collision] = []
         self._bodies = dict(sorted(bodies.items()))
         self.names = tuple(self._bodies)
-        kinds = {name: None if body.flies else body.steepest for name, body in self._bodies.items()}
-        grounds = {steepest: Ground(world, steepest) for steepest in set(kinds.values())}
-        self._grounds = {name: grounds[steepest] for name, steepest in kinds.items()}
+        grades = {name: None if body.flies else body.max_grade for name, body in self._bodies.items()}
+        grounds = {max_grade: Ground(world, max_grade) for max_grade in set(grades.values())}
+        self._grounds = {name: grounds[max_grade] for name, max_grade in grades.items()}
         self._step_s = step_ns / 1e9
         self._horizon = max(round(HORIZON_S / self._step_s), 1)
         self._commands: dict[str, Any] = dict.fromkeys(self._bodies)
-        self._told: dict[str, Any] = {}
-        self._told_from = 0
-        self._asked_ns = 0
+        self._pending_commands: dict[str, Any] = {}
+        self._commands_step = 0
+        self._last_to_ns = 0
         self.limits_m_s2: Mapping[str, float] = BodyLimits(self)
         self._step = 0
-        self._moves = False
-        self._ends = NEVER
+        self._any_moves = False
+        self._courses_end_step = NEVER
         self._touching: Mapping[str, Collection[str]] = {}
         self._tracks: dict[str, Track] = {}
-        self._take_up({name: self._track(name, self._begin(name), 0) for name in self._bodies})
-        self._listed = 0
-        self._check_free()
+        self._replace_tracks({name: self._track(name, self._initial_pose(name), 0) for name in self._bodies})
+        self._list_step = 0
+        self._check_no_overlap()
         self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
         self._states = Snapshot(self._tracks, 0)
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of one body, as `limits_m_s2` has it."""
+        """Return the limit of one body, see `limits_m_s2`."""
         pose = self._tracks[name].pose(self._step)
         speed_m_s = math.hypot(*pose.velocity_m_s)
         limit_m_s2: float = self._bodies[name].limit_m_s2(pose)
         if not speed_m_s:
             return limit_m_s2
-        free_s = self._list().free_s(name) - (self._step - self._listed) * self._step_s
-        return limit_m_s2 + speed_m_s / free_s if free_s > 0 else math.inf
+        min_time_to_contact_s = (
+            self._current_neighbours().min_time_to_contact_s(name) - (self._step - self._list_step) * self._step_s
+        )
+        return limit_m_s2 + speed_m_s / min_time_to_contact_s if min_time_to_contact_s > 0 else math.inf
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        """See `PhysicsFederate.advance`.
+        """Implement `PhysicsFederate.advance`.
 
         Raises:
-            ConfigurationError: A command is for no body, or for another kind of body.
+            ConfigurationError: A command is for an unknown body, or for another kind of body.
         """
         if commands:
-            self._told |= commands
-            self._told_from = -(-self._asked_ns // self.step_ns)
-        self._asked_ns = to_ns
+            self._pending_commands |= commands
+            self._commands_step = -(-self._last_to_ns // self.step_ns)
+        self._last_to_ns = to_ns
         step = to_ns // self.step_ns
-        if self._told and self._told_from <= step:
-            self._go(self._told_from)
-            self._obey()
+        if self._pending_commands and self._commands_step <= step:
+            self._advance_steps(self._commands_step)
+            self._apply_commands()
         if step != self._step:
-            self._go(step)
+            self._advance_steps(step)
         return self._states
 
-    def _obey(self) -> None:
-        told, self._told = self._told, {}
+    def _apply_commands(self) -> None:
+        commands_by_name, self._pending_commands = self._pending_commands, {}
         tracks = {}
-        for name, command in told.items():
+        for name, command in commands_by_name.items():
             if name not in self._bodies:
                 remedy = did_you_mean(name, self._bodies, f"bodies: {', '.join(self._bodies)}")
-                raise ConfigurationError(f"a command is for {name}, which is no body", remedy=remedy)
+                raise ConfigurationError(f"a command is for {name}, which is not a body", remedy=remedy)
             if command != self._commands[name]:
                 self._commands[name] = command
                 tracks[name] = self._track(name, self._tracks[name].pose(self._step), self._step)
-        self._take_up(tracks)
+        self._replace_tracks(tracks)
 
-    def _go(self, step: int) -> None:
+    def _advance_steps(self, step: int) -> None:
         while self._step < step:
             until = step
-            near: Mapping[str, Near] = {}
-            if self._moves:
-                near = self._list().near
-                if not any(self._tracks[name].course.moves for name in near):
-                    near = {}  # none of those that are near anything will move until it is told to
-                until = self._step + 1 if near else min(step, self._listed + self._horizon)
-            self._follow(until)
-            if near:
-                self._meet(near, until)
+            candidates: Mapping[str, ContactCandidates] = {}
+            if self._any_moves:
+                candidates = self._current_neighbours().candidates
+                if not any(self._tracks[name].course.moves for name in candidates):
+                    candidates = {}  # no candidate moves before its next command
+                until = self._step + 1 if candidates else min(step, self._list_step + self._horizon)
+            self._extend_courses(until)
+            if candidates:
+                self._resolve_contacts(candidates, until)
             self._step = until
         self._states = Snapshot(self._tracks, step)
 
-    def _list(self) -> Neighbours:
-        """Return the list of neighbours, made anew if it has ended."""
-        if self._step >= self._listed + self._horizon:
-            self._listed = self._step
+    def _current_neighbours(self) -> Neighbours:
+        """Return the neighbour list, rebuilt if it has expired."""
+        if self._step >= self._list_step + self._horizon:
+            self._list_step = self._step
             self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
         return self._neighbours
 
-    def _follow(self, step: int) -> None:
-        """Let each body have a course that is known until a step."""
-        while self._ends < step:
-            self._take_up(
+    def _extend_courses(self, step: int) -> None:
+        """Compute new courses for the bodies whose courses end before a step."""
+        while self._courses_end_step < step:
+            self._replace_tracks(
                 {
-                    name: self._track(name, track.pose(track.ends), track.ends)
+                    name: self._track(name, track.pose(track.end_step), track.end_step)
                     for name, track in self._tracks.items()
-                    if track.ends < step
+                    if track.end_step < step
                 }
             )
 
-    def _meet(self, near: Mapping[str, Near], step: int) -> None:
-        """Let bodies that move stop at what they meet in the step that ends now, one after the other."""
-        before_m = {name: self._tracks[name].pose(step - 1).place_m for name in near}
-        now_m = dict(before_m)
+    def _resolve_contacts(self, candidates: Mapping[str, ContactCandidates], step: int) -> None:
+        """Stop moving bodies at what they touch in the step that ends now, in order of their names."""
+        before_m = {name: self._tracks[name].pose(step - 1).place_m for name in candidates}
+        current_m = dict(before_m)
         tracks, touching = {}, {}
-        for name in sorted(near):
+        for name in sorted(candidates):
             track = self._tracks[name]
             if not track.course.moves:
                 continue
             pose = track.pose(step)
-            around = [
-                *near[name].footprints,
-                *(of_cylinder(other, now_m[other], self._bodies[other]) for other in near[name].bodies),
+            footprints = [
+                *candidates[name].footprints,
+                *(
+                    cylinder_footprint(other, current_m[other], self._bodies[other])
+                    for other in candidates[name].bodies
+                ),
             ]
-            body, ground = self._bodies[name], near[name].ground
-            stop = move(body, before_m[name], pose.place_m, around, ground)
+            body, ground = self._bodies[name], candidates[name].ground
+            stop = move(body, before_m[name], pose.place_m, footprints, ground)
             if stop is not None:
                 touching[name] = {contact.name: None for contact in stop.contacts}
                 pose = body.stopped(pose, stop, self._commands[name])
-            settled = pose if ground is None and stop is None else self._settled(name, pose)
-            if stop is not None or settled is not pose:
-                tracks[name] = self._track(name, settled, step)
-            now_m[name] = settled.place_m
-        self._report(touching, step)
-        self._take_up(tracks)
+            grounded = pose if ground is None and stop is None else self._on_ground(name, pose)
+            if stop is not None or grounded is not pose:
+                tracks[name] = self._track(name, grounded, step)
+            current_m[name] = grounded.place_m
+        self._record_collisions(touching, step)
+        self._replace_tracks(tracks)
 
-    def _report(self, touching: Mapping[str, Collection[str]], step: int) -> None:
+    def _record_collisions(self, touching: Mapping[str, Collection[str]], step: int) -> None:
         for name, names in touching.items():
             new = [other for other in names if other not in self._touching.get(name, ())]
             self.collisions += [Collision(step * self.step_ns, name, other) for other in new]
         self._touching = touching
 
-    def _take_up(self, tracks: Mapping[str, Track]) -> None:
+    def _replace_tracks(self, tracks: Mapping[str, Track]) -> None:
         if tracks:
-            # Never in place: snapshots keep the mapping that they were made from.
+            # A new mapping is created, because snapshots keep the mapping from which they were made.
             self._tracks = {**self._tracks, **tracks}
-            self._moves = any(track.course.moves for track in self._tracks.values())
-            self._ends = min(track.ends for track in self._tracks.values())
+            self._any_moves = any(track.course.moves for track in self._tracks.values())
+            self._courses_end_step = min(track.end_step for track in self._tracks.values())
 
     def _track(self, name: str, pose: Pose, step: int) -> Track:
         body = self._bodies[name]
         return Track(body.course(pose, self._commands[name], self._step_s), step, body.antenna_m)
 
-    def _begin(self, name: str) -> Pose:
-        return self._settled(name, self._bodies[name].begin())
+    def _initial_pose(self, name: str) -> Pose:
+        return self._on_ground(name, self._bodies[name].initial_pose())
 
-    def _settled(self, name: str, pose: Pose) -> Pose:
-        """Return a pose on the ground that is below it; the pose itself where it is there, or flies."""
-        settled: Pose = self._bodies[name].placed(pose, self._grounds[name].surface(*pose.place_m[:2]))
-        return settled
+    def _on_ground(self, name: str, pose: Pose) -> Pose:
+        """Return a pose moved to the ground below it; the same object if it is on the ground or flies."""
+        grounded: Pose = self._bodies[name].on_surface(pose, self._grounds[name].surface(*pose.place_m[:2]))
+        return grounded
 
     def _poses(self) -> dict[str, Pose]:
         return {name: track.pose(self._step) for name, track in self._tracks.items()}
 
-    def _check_free(self) -> None:
+    def _check_no_overlap(self) -> None:
         places_m = {name: pose.place_m for name, pose in self._poses().items()}
         grid = CellGrid(2 * max((body.radius_m for body in self._bodies.values()), default=0.0))
         for number, (name, body) in enumerate(self._bodies.items()):
             place_m = places_m[name]
             if not all(map(math.isfinite, place_m)):
-                raise ConfigurationError(f"{name} begins at {place_m}", remedy="give it a place in finite metres")
+                raise ConfigurationError(f"{name} starts at {place_m}", remedy="use finite coordinates in metres")
             others = [self.names[other] for other in grid.near(place_m)]
-            around = [of_cylinder(other, places_m[other], self._bodies[other]) for other in others]
-            for footprint in (*self._grounds[name].around, *around):
+            footprints = [cylinder_footprint(other, places_m[other], self._bodies[other]) for other in others]
+            for footprint in (*self._grounds[name].around, *footprints):
                 if overlaps(footprint, body, place_m):
                     raise ConfigurationError(
-                        f"{name} begins within {footprint.name}, at {_metres(place_m)} m",
-                        remedy=f"let it begin at least {body.radius_m:g} m away from everything",
+                        f"{name} starts within {footprint.name}, at {_metres(place_m)} m",
+                        remedy=f"start it at least {body.radius_m:g} m away from everything",
                     )
             grid.add(number, place_m)
 
@@ -238,14 +243,14 @@ def _metres(place_m: Vector) -> str:
 
 
 class BodyLimits(Mapping[str, float]):
-    """The most that each body's velocity changes per second, so that no place is off by more than a t^2 / 2.
+    """The maximum acceleration a of each body, such that its extrapolated position is wrong by at most a t^2 / 2.
 
-    The place meant is that after a time t at the velocity of now. A body that meets something stops at once, which no
-    acceleration bounds, but this does. Let A be the most that its drive changes its velocity per second, v its speed,
-    and c the time for which it certainly meets nothing. Contacts only take from its speed, which is at most v + A t;
-    so from c on its velocity is off by at most 2 v + A t, and its place by at most A t^2 / 2 + 2 v (t - c), which is
-    never more than (A + v / c) t^2 / 2. Who may be about to meet something has no limit: what is known of it holds
-    for one step.
+    The extrapolation keeps the current velocity for a time t. A body that touches something stops immediately, with
+    unbounded acceleration, but its position error is still bounded. Let A be the maximum acceleration by its drive, v
+    its speed, and c the minimum time to a contact. A contact only reduces its speed, which is at most v + A t; so
+    after c its velocity is wrong by at most 2 v + A t, and its position by at most A t^2 / 2 + 2 v (t - c), which is
+    at most (A + v / c) t^2 / 2. A body that may be about to touch something has an infinite limit: its extrapolation
+    is valid for one step.
     """
 
     def __init__(self, bodies: Bodies) -> None:

@@ -1,7 +1,7 @@
-"""Protocols of a body that physics moves, what it is asked to do, and where it is.
+"""Protocols of a body moved by the physics, its commands, and its pose.
 
-A body is pure: from a pose under a command it tells a course, which is where it will be at every step from then on,
-and nothing is computed before somebody asks. So the result does not depend on who asks when, and who stands costs
+A body has no mutable state: from a pose and a command it derives a course, which gives the pose at every later step
+and is evaluated on request. The result therefore does not depend on when it is requested, and a body at rest costs
 nothing.
 """
 
@@ -17,11 +17,11 @@ GRAVITY_M_S2: Final = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class Twist:
-    """Command to a body on wheels, as ROS's `geometry_msgs/Twist` gives it.
+    """Command to a body on wheels, like ROS's `geometry_msgs/Twist`.
 
     Attributes:
-        forward_m_s: Speed ahead, below 0 for backwards.
-        turn_rad_s: Rate of turn, above 0 to the left.
+        forward_m_s: Forward speed; negative for backwards.
+        turn_rad_s: Yaw rate, positive to the left.
     """
 
     forward_m_s: float = 0.0
@@ -30,11 +30,11 @@ class Twist:
 
 @dataclass(frozen=True, slots=True)
 class Velocity:
-    """Command to a body that flies.
+    """Command to a flying body.
 
     Attributes:
         velocity_m_s: Metres per second east, north, up.
-        yaw_rad: Where its nose points, from east towards north; None for where it points.
+        yaw_rad: Direction of its nose, from east towards north; None keeps the current direction.
     """
 
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
@@ -42,11 +42,11 @@ class Velocity:
 
 
 class Pose(Protocol):
-    """Where a body is and how it moves."""
+    """Position and motion of a body."""
 
     @property
     def place_m(self) -> Vector:
-        """The lowest point of its middle, metres east, north, up."""
+        """The lowest point on its vertical axis, metres east, north, up."""
         ...
 
     @property
@@ -56,7 +56,7 @@ class Pose(Protocol):
 
     @property
     def heading_rad(self) -> float:
-        """Where it heads, from east towards north."""
+        """Its heading, from east towards north."""
         ...
 
 
@@ -65,70 +65,70 @@ PoseT_co = TypeVar("PoseT_co", bound=Pose, covariant=True)
 
 
 class Course(Protocol[PoseT_co]):
-    """Where a body is from a step on, if nothing else happens."""
+    """The poses of a body from a step on, if nothing else happens."""
 
     @property
     def steps(self) -> int | None:
-        """For how many steps it is known; None for ever."""
+        """Number of steps for which it is valid; None for no limit."""
         ...
 
     @property
     def moves(self) -> bool:
-        """Whether its place changes; where it does not, the body stays until it is told something else."""
+        """True if the position changes; otherwise the body stays until its next command."""
         ...
 
     def at(self, steps: int) -> PoseT_co:
-        """Return where it is so many steps later, at most `Course.steps`."""
+        """Return the pose after this number of steps, at most `Course.steps`."""
         ...
 
 
 class Body(Protocol[PoseT]):
-    """A kind of body, at its place of departure.
+    """A kind of body, with its initial position.
 
     Attributes:
-        place_m: Where it is at time 0, metres east, north, up; up counts only if it flies.
-        flies: Whether it is where it is whatever the ground's height; else it stands on it.
-        steepest: The steepest ground that it drives on, rise over run; counts only if it does not fly.
-        radius_m: Of the upright cylinder that contains it.
-        height_m: Of that cylinder, whose lower face is at its place.
-        antenna_m: How far its antenna is above its place.
-        top_speed_m_s: What its speed never exceeds.
+        place_m: Position at time 0, metres east, north, up; up is used only if it flies.
+        flies: True if its height is independent of the ground; otherwise it stands on the ground.
+        max_grade: Maximum grade of ground on which it drives, rise over run; used only if it does not fly.
+        radius_m: Radius of the upright cylinder that contains it.
+        height_m: Height of that cylinder, whose lower face is at its position.
+        antenna_m: Height of its antenna above its position.
+        top_speed_m_s: Upper bound of its speed.
     """
 
     place_m: Vector
     flies: bool
-    steepest: float
+    max_grade: float
     radius_m: float
     height_m: float
     antenna_m: float
     top_speed_m_s: float
 
-    def begin(self) -> PoseT:
+    def initial_pose(self) -> PoseT:
         """Return its pose at time 0."""
         ...
 
-    def placed(self, pose: PoseT, surface: Surface) -> PoseT:
-        """Return a pose where it is, on the ground below it; the pose itself if it is there, or flies."""
+    def on_surface(self, pose: PoseT, surface: Surface) -> PoseT:
+        """Return the pose moved vertically to the ground; the same object if it is on the ground or flies."""
         ...
 
     def course(self, pose: PoseT, command: object, step_s: float) -> Course[PoseT]:
-        """Return what it does from a pose on under a command; None is the command of who was told nothing.
+        """Return its course from a pose under a command; None if it has not received a command.
 
         Raises:
-            ConfigurationError: It cannot be told this.
+            ConfigurationError: The command does not suit the body.
         """
         ...
 
     def stopped(self, pose: PoseT, stop: ContactStop, command: object) -> PoseT:
-        """Return what becomes of a pose that a body would have had, had it not met anything.
+        """Return the pose after a contact.
 
         Args:
-            pose: That pose.
-            stop: Where it is instead, and what it met.
-            command: What it was told last, None for nothing.
+            pose: The pose that the body would have without the contact.
+            stop: Its position after the contact, and what it touched.
+            command: Its last command, None for none.
         """
         ...
 
     def limit_m_s2(self, pose: PoseT) -> float:
-        """Return the most that its velocity changes per second from a pose on, whatever it is told."""
+        """Return the maximum acceleration from a pose on, for any command."""
         ...

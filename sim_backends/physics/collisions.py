@@ -1,8 +1,8 @@
-"""Contacts of upright cylinders with what stands around them: they stop there, and slide along it.
+"""Contacts of upright cylinders with their surroundings: they stop there, and slide along it.
 
-Who moves goes around what is in the way, as far as it comes; nobody is pushed. A move is cut into pieces shorter than
-half a radius, so that nobody gets through anything, however thin. Who would still overlap stays where it was, which
-was free, so no two bodies ever overlap, and none overlaps an obstacle.
+A moving body slides around an obstacle as far as possible; no body is pushed. A move is divided into pieces shorter
+than half a radius, so that a body cannot pass through anything, however thin. A body that would still overlap stays
+at its previous position, which was free, so no body ever overlaps another body or an obstacle.
 """
 
 import math
@@ -14,22 +14,23 @@ from fieldkit.core.model import Vector
 from sim_backends.world.shapes import Box, Shape
 
 TOUCH_M: Final = 1e-9
-"""Who overlaps by less touches: rounding alone is that large."""
+"""A smaller overlap counts as a touch, because rounding errors are that large."""
 _PASSES: Final = 4
-"""Of pushing out, when what one obstacle pushes out of itself gets into another."""
+"""Maximum number of passes, needed when a body that is moved out of one obstacle enters another."""
 
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """Something upright that is in the way.
+    """The outline of an upright obstacle.
 
     Attributes:
-        name: What it is called.
-        closest_m: Returns the point of it from above that is nearest to a point outside, metres east and north.
-        reach_m: How far it reaches around that point: the radius of a round one, 0 for one with edges.
+        name: Name of the obstacle.
+        closest_m: Returns the point of its outline that is closest to a point outside, metres east and north.
+        reach_m: Radius around that point: the radius of a round obstacle, 0 for one with edges.
         low_m: Height of its lower face.
         high_m: Height of its upper face.
-        wall_m: Returns the height up to which it is in the way at a point of it; None where that is `high_m`.
+        wall_m: Returns the height up to which it is an obstacle at a point of it; None if that is `high_m`
+            everywhere.
     """
 
     name: str
@@ -42,11 +43,11 @@ class Footprint:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """A touch.
+    """A contact with an obstacle.
 
     Attributes:
-        name: Of what was touched.
-        normal: Direction, of length 1, that leads away from it.
+        name: Name of the obstacle.
+        normal: Unit vector that points away from it.
     """
 
     name: str
@@ -55,29 +56,29 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class ContactStop:
-    """Where a body stopped short.
+    """The position at which a body was stopped.
 
     Attributes:
-        place_m: Where it is now.
-        contacts: What it touched, in the order in which it met it.
+        place_m: Its position.
+        contacts: Its contacts, in order.
     """
 
     place_m: Vector
     contacts: Sequence[Contact]
 
-    def along(self, velocity: Vector) -> Vector:
-        """Return what is left of a velocity when it leads into nothing that was touched."""
+    def sliding_velocity(self, velocity: Vector) -> Vector:
+        """Return the part of a velocity that leads into none of the touched obstacles."""
         for contact in self.contacts:
-            into = sum(v * n for v, n in zip(velocity, contact.normal, strict=True))
-            velocity = _plus(velocity, contact.normal, -min(into, 0.0))
+            inward = sum(v * n for v, n in zip(velocity, contact.normal, strict=True))
+            velocity = _plus(velocity, contact.normal, -min(inward, 0.0))
         for contact in self.contacts:
             if sum(v * n for v, n in zip(velocity, contact.normal, strict=True)) < -TOUCH_M:
-                return (0.0, 0.0, 0.0)  # a corner: what leads out of one side leads into the other
+                return (0.0, 0.0, 0.0)  # a corner: the direction away from one side leads into the other
         return velocity
 
 
 class Extent(Protocol):
-    """An upright cylinder that contains a body; its place is the centre of its lower face.
+    """An upright cylinder that contains a body; its position is the centre of its lower face.
 
     Attributes:
         radius_m: Its radius.
@@ -91,10 +92,10 @@ class Extent(Protocol):
 
 
 class Edge(Protocol):
-    """Where ground ends in the air."""
+    """Edges of raised ground, below which there is air."""
 
-    def back_m(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
-        """Return the edge that a body would drive off on its way, and where it stops there; None for none."""
+    def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
+        """Return the edge over which a body would drive, and the point where it stops; None if there is no edge."""
         ...
 
 
@@ -104,15 +105,15 @@ class Surface:
 
     Attributes:
         height_m: Its height.
-        grade: How much it rises per metre east and north.
+        grade: Its slope: rise per metre east and north.
     """
 
     height_m: float
     grade: tuple[float, float] = (0.0, 0.0)
 
 
-def of_shape(name: str, shape: Shape) -> Footprint:
-    """Return the footprint of an obstacle's part."""
+def shape_footprint(name: str, shape: Shape) -> Footprint:
+    """Return the footprint of a part of an obstacle."""
     east_m, north_m, _ = shape.centre_m
     if not isinstance(shape, Box):
         return Footprint(name, lambda _e, _n: (east_m, north_m), shape.radius_m, *_heights_m(shape))
@@ -123,7 +124,7 @@ def _heights_m(shape: Shape) -> tuple[float, float]:
     return 2 * shape.centre_m[2] - shape.top_m, shape.top_m
 
 
-def of_cylinder(name: str, place_m: Vector, extent: Extent) -> Footprint:
+def cylinder_footprint(name: str, place_m: Vector, extent: Extent) -> Footprint:
     """Return the footprint of a body."""
     east_m, north_m, up_m = place_m
     return Footprint(name, lambda _e, _n: (east_m, north_m), extent.radius_m, up_m, up_m + extent.height_m)
@@ -132,12 +133,12 @@ def of_cylinder(name: str, place_m: Vector, extent: Extent) -> Footprint:
 def rectangle(
     centre_m: Sequence[float], size_m: Sequence[float], yaw_rad: float
 ) -> Callable[[float, float], tuple[float, float]]:
-    """Return what gives the point of a rectangle that is nearest to a point; that point itself if it is inside.
+    """Return a function that maps a point to the closest point of a rectangle (to itself inside the rectangle).
 
     Args:
-        centre_m: Its centre, metres east, north, anything.
+        centre_m: Its centre, metres east, north; further items are ignored.
         size_m: Its edges, in metres.
-        yaw_rad: How far its first edge is turned from east towards north.
+        yaw_rad: Rotation of its first edge from east towards north.
     """
     centre_e_m, centre_n_m = centre_m[0], centre_m[1]
     half_along_m, half_across_m = size_m[0] / 2, size_m[1] / 2
@@ -153,108 +154,110 @@ def rectangle(
 
 
 def gap_m(footprint: Footprint, extent: Extent, place_m: Vector) -> float:
-    """Return how far a cylinder has to go, at least, before it touches a footprint; 0 where it does."""
-    aside_m = _apart_m(footprint, extent, place_m)
-    over_m = max(place_m[2] - footprint.high_m, footprint.low_m - place_m[2] - extent.height_m)
-    return math.hypot(max(aside_m, 0.0), max(over_m, 0.0))
+    """Return the distance that a cylinder must at least move to touch a footprint; 0 if it touches it."""
+    horizontal_m = _horizontal_gap_m(footprint, extent, place_m)
+    vertical_m = max(place_m[2] - footprint.high_m, footprint.low_m - place_m[2] - extent.height_m)
+    return math.hypot(max(horizontal_m, 0.0), max(vertical_m, 0.0))
 
 
 def overlaps(footprint: Footprint, extent: Extent, place_m: Vector) -> bool:
-    """Return whether a cylinder and a footprint have more than a touch in common."""
+    """Return True if a cylinder and a footprint overlap by more than a touch."""
     low_m, high_m = place_m[2], place_m[2] + extent.height_m
     if low_m >= footprint.high_m - TOUCH_M or high_m <= footprint.low_m + TOUCH_M:
         return False
-    if _apart_m(footprint, extent, place_m) >= -TOUCH_M:
+    if _horizontal_gap_m(footprint, extent, place_m) >= -TOUCH_M:
         return False
     return footprint.wall_m is None or low_m < footprint.wall_m(*footprint.closest_m(place_m[0], place_m[1]))
 
 
 def move(
-    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], edge: Edge | None = None
+    extent: Extent, from_m: Vector, to_m: Vector, footprints: Sequence[Footprint], edge: Edge | None = None
 ) -> ContactStop | None:
-    """Return where a cylinder stops short of where it wants to go; None where nothing is in its way.
+    """Return the position and contacts of a cylinder that is stopped before its target; None if its path is free.
 
     Args:
         extent: Its size.
-        from_m: Where it is, free.
-        to_m: Where it wants to go, straight.
-        around: What is around it, and may be in its way.
-        edge: What it cannot drive off, if anything.
+        from_m: Its position, which is free.
+        to_m: Its target, reached on a straight path.
+        footprints: Footprints that may be in its way.
+        edge: Edges over which it cannot drive, or None.
     """
-    way_m = math.dist(from_m, to_m)
-    place_m, met = _walk(extent, from_m, to_m, around, edge)
-    if not met:
+    path_m = math.dist(from_m, to_m)
+    place_m, contacts = _walk(extent, from_m, to_m, footprints, edge)
+    if not contacts:
         return None
-    went_m = math.dist(from_m, place_m)
-    if went_m > way_m:
-        # Who was pushed around a bend further than it wanted to go goes less far; in a corner, nowhere.
-        place_m, more = _walk(extent, from_m, _between(from_m, to_m, way_m / went_m), around, edge)
-        met += more
-        if math.dist(from_m, place_m) > way_m:
+    moved_m = math.dist(from_m, place_m)
+    if moved_m > path_m:
+        # If sliding around a corner made the path longer than the intended one, it is shortened; in a corner, to
+        # nothing.
+        place_m, retry_contacts = _walk(extent, from_m, _between(from_m, to_m, path_m / moved_m), footprints, edge)
+        contacts += retry_contacts
+        if math.dist(from_m, place_m) > path_m:
             place_m = from_m
-    return ContactStop(place_m, tuple(met))
+    return ContactStop(place_m, tuple(contacts))
 
 
 def _walk(
-    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], edge: Edge | None
+    extent: Extent, from_m: Vector, to_m: Vector, footprints: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:
-    """Return where a cylinder is after a way, and what it met."""
+    """Return the position of a cylinder after a path, and its contacts."""
     pieces = max(math.ceil(2 * math.dist(from_m, to_m) / extent.radius_m), 1)
-    piece_m = _scaled(_minus(to_m, from_m), 1 / pieces)
+    offset_m = _scaled(_minus(to_m, from_m), 1 / pieces)
     place_m = from_m
-    met: list[Contact] = []
+    contacts: list[Contact] = []
     for number in range(1, pieces + 1):
-        # Who met nothing yet is where it would be without all this, to the last digit.
-        ahead_m = _plus(place_m, piece_m) if met else _between(from_m, to_m, number / pieces)
-        place_m, contacts = _push_out(extent, place_m, ahead_m, around, edge)
-        met += contacts
-    return place_m, met
+        # Without a contact, the position is computed exactly as without this division into pieces.
+        next_m = _plus(place_m, offset_m) if contacts else _between(from_m, to_m, number / pieces)
+        place_m, new_contacts = _push_out(extent, place_m, next_m, footprints, edge)
+        contacts += new_contacts
+    return place_m, contacts
 
 
 def _push_out(
-    extent: Extent, from_m: Vector, to_m: Vector, around: Sequence[Footprint], edge: Edge | None
+    extent: Extent, from_m: Vector, to_m: Vector, footprints: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:
-    """Return where a cylinder is after a short way, and what it met."""
+    """Return the position of a cylinder after a short path, and its contacts."""
     place_m = to_m
-    met: list[Contact] = []
+    contacts: list[Contact] = []
     for _ in range(_PASSES):
-        contacts = []
-        for footprint in around:
+        new_contacts = []
+        for footprint in footprints:
             if overlaps(footprint, extent, place_m):
-                normal, depth_m = _normal(footprint, extent, from_m, place_m)
+                normal, depth_m = _exit_direction(footprint, extent, from_m, place_m)
                 place_m = _plus(place_m, normal, depth_m)
-                contacts.append(Contact(footprint.name, normal))
-        if edge is not None and (back := edge.back_m(from_m, place_m)) is not None:
-            name, back_m = back
-            normal = _minus(back_m, place_m)
-            contacts.append(Contact(name, _scaled(normal, 1 / math.hypot(*normal))))
-            place_m = back_m
-        if not contacts:
-            return place_m, met
-        met += contacts
-    return from_m, met
+                new_contacts.append(Contact(footprint.name, normal))
+        if edge is not None and (edge_stop := edge.edge_stop(from_m, place_m)) is not None:
+            name, stop_m = edge_stop
+            normal = _minus(stop_m, place_m)
+            new_contacts.append(Contact(name, _scaled(normal, 1 / math.hypot(*normal))))
+            place_m = stop_m
+        if not new_contacts:
+            return place_m, contacts
+        contacts += new_contacts
+    return from_m, contacts
 
 
-def _normal(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
-    """Return the way out of an obstacle that a cylinder got into: up or down if it came from there, else aside.
+def _exit_direction(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
+    """Return the direction and distance out of an obstacle that a cylinder overlaps.
 
-    Who drives goes neither up nor down, but back: it meets something above itself on a ramp.
+    The direction is vertical if the cylinder came from above or below, else horizontal. A driving body is moved
+    neither up nor down but back: on a ramp it may touch something above itself.
     """
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m
-    apart_m = math.hypot(east_m, north_m)
+    distance_m = math.hypot(east_m, north_m)
     above, below = from_m[2] >= footprint.high_m - TOUCH_M, from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M
     if extent.flies and above:
         return (0.0, 0.0, 1.0), footprint.high_m - place_m[2]
     if extent.flies and below:
         return (0.0, 0.0, -1.0), place_m[2] + extent.height_m - footprint.low_m
-    if above or below or not apart_m:
-        way_m = math.dist(from_m, place_m)
-        return _scaled(_minus(from_m, place_m), 1 / (way_m or 1.0)), way_m
-    return (east_m / apart_m, north_m / apart_m, 0.0), footprint.reach_m + extent.radius_m - apart_m
+    if above or below or not distance_m:
+        path_m = math.dist(from_m, place_m)
+        return _scaled(_minus(from_m, place_m), 1 / (path_m or 1.0)), path_m
+    return (east_m / distance_m, north_m / distance_m, 0.0), footprint.reach_m + extent.radius_m - distance_m
 
 
-def _apart_m(footprint: Footprint, extent: Extent, place_m: Vector) -> float:
+def _horizontal_gap_m(footprint: Footprint, extent: Extent, place_m: Vector) -> float:
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     to_centre_m = math.hypot(place_m[0] - closest_e_m, place_m[1] - closest_n_m)
     return to_centre_m - footprint.reach_m - extent.radius_m
@@ -264,13 +267,13 @@ def _between(from_m: Vector, to_m: Vector, share: float) -> Vector:
     return _plus(from_m, _minus(to_m, from_m), share)
 
 
-def _plus(one: Vector, other: Vector, times: float = 1.0) -> Vector:
-    return one[0] + times * other[0], one[1] + times * other[1], one[2] + times * other[2]
+def _plus(left: Vector, right: Vector, factor: float = 1.0) -> Vector:
+    return left[0] + factor * right[0], left[1] + factor * right[1], left[2] + factor * right[2]
 
 
-def _minus(one: Vector, other: Vector) -> Vector:
-    return _plus(one, other, -1.0)
+def _minus(left: Vector, right: Vector) -> Vector:
+    return _plus(left, right, -1.0)
 
 
-def _scaled(vector: Vector, times: float) -> Vector:
-    return _plus((0.0, 0.0, 0.0), vector, times)
+def _scaled(vector: Vector, factor: float) -> Vector:
+    return _plus((0.0, 0.0, 0.0), vector, factor)

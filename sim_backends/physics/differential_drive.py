@@ -1,15 +1,14 @@
-"""Robots that steer by the difference of their wheels' speeds: unicycles with limits.
+"""Robots with differential drive: unicycles with limits.
 
-Forward speed and rate of turn go to what was commanded as fast as their limits let them, each by itself, as ROS's
-`diff_drive_controller` lets them. With the acceleration a and the rate of turn w constant, the way in a time t is
-exact (the integral of speed along the heading, about its middle): with the speed in the middle v, the heading in the
-middle h and x = w t / 2,
+Forward speed and yaw rate approach the commanded values as fast as their limits allow, independently of each other,
+like in ROS's `diff_drive_controller`. With a constant acceleration a and yaw rate w, the displacement in a time t is
+exact (the integral of the speed along the heading, about its middle): with the mean speed v, the mean heading h and x
+= w t / 2,
 
-    along h:     v t sin(x) / x
-    left of h:   a t^2 / 2 (sin(x) - x cos(x)) / x^2
+    along h:     v t sin(x) / x left of h:   a t^2 / 2 (sin(x) - x cos(x)) / x^2
 
-Where the rate of turn changes while the robot moves, that is a Fresnel integral: then one step is taken with the
-rate in its middle, which is wrong by less than v (dw/dt) t^3 / 12.
+If the yaw rate changes while the robot moves, this is a Fresnel integral; a single step with the mean yaw rate is
+then used, with an error below v (dw/dt) t^3 / 12.
 """
 
 import math
@@ -22,25 +21,25 @@ from sim_backends.physics.body import GRAVITY_M_S2, Twist
 from sim_backends.physics.collisions import TOUCH_M, ContactStop, Surface
 
 _LEVEL: Final = (0.0, 0.0)
-_SAME: Final = 1e-12
-"""What is nearer to its target, in m/s or rad/s, has reached it: rounding alone is that large."""
+_REACHED: Final = 1e-12
+"""Tolerance for reaching a target, in m/s or rad/s: rounding errors are that large."""
 
 _NO_GRIP_M_S2: Final = 1e-9
-"""With less its speed cannot be changed on a slope: what is left of friction there is rounding."""
+"""Below this acceleration the speed cannot be changed on a slope: the remaining friction is a rounding error."""
 
 
 @dataclass(frozen=True)
 class DriveLimits:
-    """What a robot with a differential drive can do, and how large it is.
+    """Limits and size of a robot with a differential drive.
 
     Attributes:
-        speed_m_s: Most it drives, ahead or back.
-        acceleration_m_s2: Most its speed changes per second, also when it brakes.
-        turn_rad_s: Most it turns.
-        turn_acceleration_rad_s2: Most its rate of turn changes per second.
-        radius_m: Of the upright cylinder that contains it.
-        height_m: Of that cylinder.
-        friction: Coefficient of friction of its tires; it holds on slopes that rise by less than that over their run.
+        speed_m_s: Maximum speed in both directions.
+        acceleration_m_s2: Maximum acceleration and deceleration.
+        turn_rad_s: Maximum yaw rate.
+        turn_acceleration_rad_s2: Maximum change of the yaw rate per second.
+        radius_m: Radius of the upright cylinder that contains it.
+        height_m: Height of that cylinder.
+        friction: Coefficient of friction of its tires; it has grip on slopes with a smaller rise over run.
     """
 
     speed_m_s: float
@@ -59,56 +58,57 @@ turn of `husky_control/config/control.yaml` (github.com/husky/husky)."""
 TURTLEBOT3_BURGER: Final = DriveLimits(0.22, 2.5, 2.84, 3.2, radius_m=0.113, height_m=0.192)
 """ROBOTIS TurtleBot3 Burger: 0.22 m/s, 2.84 rad/s, 138 mm x 178 mm x 192 mm (e-Manual, specifications); accelerations
 of `turtlebot3_navigation2/param/burger.yaml` (github.com/ROBOTIS-GIT/turtlebot3); friction of rubber on dry ground,
-an estimate of ours."""
+our estimate.
+"""
 
 
 class DrivePose(NamedTuple):
-    """Where a robot on wheels is and how it moves.
+    """Position and motion of a robot on wheels.
 
     Attributes:
-        place_m: Metres east, north, up, of the ground below its centre.
-        heading_rad: From east towards north; it is counted on over full turns.
-        speed_m_s: Ahead, below 0 for backwards.
-        turn_rad_s: Rate of turn, above 0 to the left.
-        slides_m_s: How it moves along what it touches; None where it moves as it heads.
-        grade: How much the ground below it rises per metre east and north.
+        place_m: Position of the ground below its centre, metres east, north, up.
+        heading_rad: From east towards north; continuous over full turns.
+        speed_m_s: Forward speed, negative for backwards.
+        turn_rad_s: Yaw rate, positive to the left.
+        sliding_m_s: Its velocity along an obstacle that it touches; None if it moves along its heading.
+        grade: Slope of the ground below it: rise per metre east and north.
     """
 
     place_m: Vector
     heading_rad: float
     speed_m_s: float = 0.0
     turn_rad_s: float = 0.0
-    slides_m_s: Vector | None = None
+    sliding_m_s: Vector | None = None
     grade: tuple[float, float] = (0.0, 0.0)
 
     @property
     def velocity_m_s(self) -> Vector:
-        """See `Pose.velocity_m_s`."""
-        if self.slides_m_s is not None:
-            return self.slides_m_s
-        ahead, up = _ahead(self.grade, self.heading_rad)
+        """Implement `Pose.velocity_m_s`."""
+        if self.sliding_m_s is not None:
+            return self.sliding_m_s
+        level, up = _slope_factors(self.grade, self.heading_rad)
         return (
-            self.speed_m_s * ahead * math.cos(self.heading_rad),
-            self.speed_m_s * ahead * math.sin(self.heading_rad),
+            self.speed_m_s * level * math.cos(self.heading_rad),
+            self.speed_m_s * level * math.sin(self.heading_rad),
             self.speed_m_s * up,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Arc:
-    """A course of constant accelerations.
+    """A course with constant accelerations.
 
     Attributes:
-        begin: Where it begins.
-        speed_m_s: Speed from there on, which is its own but for rounding.
-        turn_rad_s: Likewise, the rate of turn.
-        acceleration_m_s2: Change of speed per second.
-        turn_acceleration_rad_s2: Change of the rate of turn per second.
+        start: Its initial pose.
+        speed_m_s: Initial speed, equal to that of the initial pose except for rounding.
+        turn_rad_s: Initial yaw rate, likewise.
+        acceleration_m_s2: Change of the speed per second.
+        turn_acceleration_rad_s2: Change of the yaw rate per second.
         steps: See `Course.steps`.
-        step_s: How long a step is.
+        step_s: Length of a step.
     """
 
-    begin: DrivePose
+    start: DrivePose
     speed_m_s: float
     turn_rad_s: float
     acceleration_m_s2: float
@@ -118,29 +118,29 @@ class Arc:
 
     @property
     def moves(self) -> bool:
-        """See `Course.moves`."""
+        """Implement `Course.moves`."""
         return bool(self.speed_m_s or self.acceleration_m_s2)
 
     def at(self, steps: int) -> DrivePose:
-        """See `Course.at`."""
+        """Implement `Course.at`."""
         if not steps:
-            return self.begin
+            return self.start
         t = steps * self.step_s
-        (east_m, north_m, up_m), heading_rad = self.begin.place_m, self.begin.heading_rad
+        (east_m, north_m, up_m), heading_rad = self.start.place_m, self.start.heading_rad
         middle_m_s = self.speed_m_s + self.acceleration_m_s2 * t / 2
-        half_rad = (self.turn_rad_s + self.turn_acceleration_rad_s2 * t / 2) * t / 2
-        sinc, lean = _arc(half_rad)
-        ahead_m, left_m = middle_m_s * t * sinc, self.acceleration_m_s2 * t * t / 2 * lean
-        cos, sin = math.cos(heading_rad + half_rad), math.sin(heading_rad + half_rad)
+        half_turn_rad = (self.turn_rad_s + self.turn_acceleration_rad_s2 * t / 2) * t / 2
+        sinc, bend = _arc(half_turn_rad)
+        ahead_m, left_m = middle_m_s * t * sinc, self.acceleration_m_s2 * t * t / 2 * bend
+        cos, sin = math.cos(heading_rad + half_turn_rad), math.sin(heading_rad + half_turn_rad)
         east, north = ahead_m * cos - left_m * sin, ahead_m * sin + left_m * cos
-        grade = self.begin.grade
+        grade = self.start.grade
         if grade != _LEVEL:
-            flat, _ = _ahead(grade, heading_rad + half_rad)
-            east, north = east * flat, north * flat
+            level, _ = _slope_factors(grade, heading_rad + half_turn_rad)
+            east, north = east * level, north * level
             up_m += grade[0] * east + grade[1] * north
         return DrivePose(
             (east_m + east, north_m + north, up_m),
-            heading_rad + 2 * half_rad,
+            heading_rad + 2 * half_turn_rad,
             self.speed_m_s + self.acceleration_m_s2 * t,
             self.turn_rad_s + self.turn_acceleration_rad_s2 * t,
             None,
@@ -148,30 +148,30 @@ class Arc:
         )
 
 
-def _ahead(grade: tuple[float, float], heading_rad: float) -> tuple[float, float]:
-    """Return how far it is ahead on the map, and up, for each metre that is driven on a slope."""
+def _slope_factors(grade: tuple[float, float], heading_rad: float) -> tuple[float, float]:
+    """Return the horizontal and the vertical distance per metre driven on a slope."""
     if grade == _LEVEL:
         return 1.0, 0.0
     rise = grade[0] * math.cos(heading_rad) + grade[1] * math.sin(heading_rad)
-    flat = 1 / math.hypot(1.0, rise)
-    return flat, rise * flat
+    level = 1 / math.hypot(1.0, rise)
+    return level, rise * level
 
 
 def _arc(x: float) -> tuple[float, float]:
     """Return sin(x) / x and (sin(x) - x cos(x)) / x^2."""
-    if abs(x) < 1e-3:  # of the series the next terms, x^4 / 120 and x^5 / 840, are below rounding
+    if abs(x) < 1e-3:  # the next terms of the series, x^4 / 120 and x^5 / 840, are below rounding errors
         return 1 - x * x / 6, x / 3 - x**3 / 30
     return math.sin(x) / x, (math.sin(x) - x * math.cos(x)) / (x * x)
 
 
 class DifferentialDrive:
-    """A robot on wheels that takes `Twist` commands; without one it stands.
+    """A robot on wheels that follows `Twist` commands; without a command it is at rest.
 
     Args:
-        limits: What it can do.
-        place_m: Where it is at time 0, metres east and north.
-        heading_rad: Where it heads, from east towards north.
-        antenna_m: Height of its antenna over the ground.
+        limits: Its limits and size.
+        place_m: Position at time 0, metres east and north.
+        heading_rad: Its heading, from east towards north.
+        antenna_m: Height of its antenna above the ground.
     """
 
     def __init__(
@@ -186,42 +186,42 @@ class DifferentialDrive:
         self.place_m = (*place_m, 0.0)
         self._heading_rad = heading_rad
         self.flies = False
-        self.steepest = limits.friction
+        self.max_grade = limits.friction
         self.radius_m = limits.radius_m
         self.height_m = limits.height_m
         self.antenna_m = limits.height_m if antenna_m is None else antenna_m
         self.top_speed_m_s = limits.speed_m_s
 
-    def begin(self) -> DrivePose:
-        """See `Body.begin`."""
+    def initial_pose(self) -> DrivePose:
+        """Implement `Body.initial_pose`."""
         return DrivePose(self.place_m, self._heading_rad)
 
-    def placed(self, pose: DrivePose, surface: Surface) -> DrivePose:
-        """See `Body.placed`."""
+    def on_surface(self, pose: DrivePose, surface: Surface) -> DrivePose:
+        """Implement `Body.on_surface`."""
         if surface.grade == pose.grade and abs(surface.height_m - pose.place_m[2]) <= TOUCH_M:
             return pose
         return pose._replace(place_m=(*pose.place_m[:2], surface.height_m), grade=surface.grade)
 
     def course(self, pose: DrivePose, command: object, step_s: float) -> Arc:
-        """See `Body.course`."""
+        """Implement `Body.course`."""
         limits = self._limits
         twist = _twist(command)
-        speed_m_s = _within(twist.forward_m_s, limits.speed_m_s)
-        turn_rad_s = _within(twist.turn_rad_s, limits.turn_rad_s)
-        most_m_s2 = self._acceleration_m_s2(pose, faster=speed_m_s > pose.speed_m_s)
-        slips = most_m_s2 <= _NO_GRIP_M_S2 and speed_m_s != pose.speed_m_s
-        if slips:  # the slope takes all of the friction
+        speed_m_s = _clamp(twist.forward_m_s, limits.speed_m_s)
+        turn_rad_s = _clamp(twist.turn_rad_s, limits.turn_rad_s)
+        max_m_s2 = self._acceleration_m_s2(pose, faster=speed_m_s > pose.speed_m_s)
+        no_grip = max_m_s2 <= _NO_GRIP_M_S2 and speed_m_s != pose.speed_m_s
+        if no_grip:  # the friction is just sufficient to hold the robot on the slope
             speed_m_s = pose.speed_m_s
-        a_m_s2, speeding = _towards(pose.speed_m_s, speed_m_s, most_m_s2, step_s)
-        a_rad_s2, turning = _towards(pose.turn_rad_s, turn_rad_s, limits.turn_acceleration_rad_s2, step_s)
-        steps = min((some for some in (speeding, turning) if some), default=None)
-        turns = bool(turning or turn_rad_s)
-        if (turning or (turns and pose.grade != _LEVEL)) and (speeding or speed_m_s or slips):
+        a_m_s2, speed_steps = _approach(pose.speed_m_s, speed_m_s, max_m_s2, step_s)
+        a_rad_s2, turn_steps = _approach(pose.turn_rad_s, turn_rad_s, limits.turn_acceleration_rad_s2, step_s)
+        steps = min((count for count in (speed_steps, turn_steps) if count), default=None)
+        is_turning = bool(turn_steps or turn_rad_s)
+        if (turn_steps or (is_turning and pose.grade != _LEVEL)) and (speed_steps or speed_m_s or no_grip):
             steps = 1  # see the top of this module
         return Arc(
             pose,
-            pose.speed_m_s if speeding else speed_m_s,
-            pose.turn_rad_s if turning else turn_rad_s,
+            pose.speed_m_s if speed_steps else speed_m_s,
+            pose.turn_rad_s if turn_steps else turn_rad_s,
             a_m_s2,
             a_rad_s2,
             steps,
@@ -229,43 +229,43 @@ class DifferentialDrive:
         )
 
     def _acceleration_m_s2(self, pose: DrivePose, *, faster: bool) -> float:
-        """Return how fast its speed can grow or fall on the ground that it is on.
+        """Return the maximum change of its speed per second on the ground below it.
 
-        Its tires carry friction times the normal force, m g cos(slope), in all directions together; across its
-        heading they hold it against gravity, along it gravity helps or hinders.
+        The total friction force in all directions is friction times the normal force, m g cos(slope). Across the
+        heading it holds the robot against gravity; along the heading gravity adds to it or reduces it.
         """
         limits = self._limits
         if pose.grade == _LEVEL:
             return min(limits.acceleration_m_s2, limits.friction * GRAVITY_M_S2)
         steepness = math.hypot(*pose.grade)
         normal_m_s2 = GRAVITY_M_S2 / math.hypot(1.0, steepness)
-        _, up = _ahead(pose.grade, pose.heading_rad)
-        back_m_s2 = GRAVITY_M_S2 * up
-        across_m_s2 = math.sqrt(max((steepness * normal_m_s2) ** 2 - back_m_s2**2, 0.0))
-        held_m_s2 = math.sqrt(max((limits.friction * normal_m_s2) ** 2 - across_m_s2**2, 0.0))
-        return min(limits.acceleration_m_s2, held_m_s2 - back_m_s2 if faster else held_m_s2 + back_m_s2)
+        _, up = _slope_factors(pose.grade, pose.heading_rad)
+        downhill_m_s2 = GRAVITY_M_S2 * up
+        sideways_m_s2 = math.sqrt(max((steepness * normal_m_s2) ** 2 - downhill_m_s2**2, 0.0))
+        grip_m_s2 = math.sqrt(max((limits.friction * normal_m_s2) ** 2 - sideways_m_s2**2, 0.0))
+        return min(limits.acceleration_m_s2, grip_m_s2 - downhill_m_s2 if faster else grip_m_s2 + downhill_m_s2)
 
     def stopped(self, pose: DrivePose, stop: ContactStop, command: object) -> DrivePose:
-        """See `Body.stopped`.
+        """Implement `Body.stopped`.
 
-        Against a wall it goes on along it with what its velocity has of that direction; its drive does no more than
-        what it was commanded has of it, so that one which heads straight into a wall stands.
+        At a wall it slides on with the component of its velocity along the wall, limited to that component of the
+        commanded velocity; a robot that heads straight into a wall stops.
         """
         heading: Vector = (math.cos(pose.heading_rad), math.sin(pose.heading_rad), 0.0)
-        left: Vector = stop.along(heading if pose.speed_m_s > 0 else (-heading[0], -heading[1], 0.0))
-        share = math.hypot(*left)
-        most_m_s = min(abs(pose.speed_m_s), abs(_twist(command).forward_m_s) * share)
+        direction: Vector = stop.sliding_velocity(heading if pose.speed_m_s > 0 else (-heading[0], -heading[1], 0.0))
+        share = math.hypot(*direction)
+        max_m_s = min(abs(pose.speed_m_s), abs(_twist(command).forward_m_s) * share)
         return pose._replace(
             place_m=stop.place_m,
-            speed_m_s=math.copysign(most_m_s, pose.speed_m_s),
-            slides_m_s=(most_m_s * left[0], most_m_s * left[1], 0.0),
+            speed_m_s=math.copysign(max_m_s, pose.speed_m_s),
+            sliding_m_s=(max_m_s * direction[0], max_m_s * direction[1], 0.0),
         )
 
     def limit_m_s2(self, pose: DrivePose) -> float:
-        """See `Body.limit_m_s2`: along the heading by the drive, across it by turning."""
+        """Implement `Body.limit_m_s2`: along the heading by the drive, across it by turning."""
         limits = self._limits
-        leans = math.hypot(1.0, *pose.grade)
-        return math.hypot(limits.acceleration_m_s2, limits.speed_m_s * limits.turn_rad_s * leans)
+        stretch = math.hypot(1.0, *pose.grade)
+        return math.hypot(limits.acceleration_m_s2, limits.speed_m_s * limits.turn_rad_s * stretch)
 
 
 def _twist(command: object) -> Twist:
@@ -275,22 +275,22 @@ def _twist(command: object) -> Twist:
         math.isfinite(command.forward_m_s) and math.isfinite(command.turn_rad_s)
     ):
         raise ConfigurationError(
-            f"a robot on wheels cannot do {command!r}", remedy="command it by a Twist of finite numbers"
+            f"a robot on wheels cannot follow {command!r}", remedy="use a Twist of finite numbers"
         )
     return command
 
 
-def _within(value: float, limit: float) -> float:
+def _clamp(value: float, limit: float) -> float:
     return max(-limit, min(value, limit))
 
 
-def _towards(now: float, target: float, limit: float, step_s: float) -> tuple[float, int]:
-    """Return the rate at which a value goes to its target, and for how many whole steps; 0 and 0 where it is there.
+def _approach(now: float, target: float, limit: float, step_s: float) -> tuple[float, int]:
+    """Return the rate at which a value approaches its target, and the number of whole steps; 0 and 0 at the target.
 
-    What is left when no whole step at the limit fits any more takes one step at a smaller rate.
+    A remainder that is less than a whole step at the limit is covered in one step at a smaller rate.
     """
-    missing = target - now
-    if abs(missing) <= _SAME:
+    difference = target - now
+    if abs(difference) <= _REACHED:
         return 0.0, 0
-    whole = math.floor(abs(missing) / (limit * step_s) + 1e-9)
-    return (math.copysign(limit, missing), whole) if whole else (missing / step_s, 1)
+    steps = math.floor(abs(difference) / (limit * step_s) + 1e-9)
+    return (math.copysign(limit, difference), steps) if steps else (difference / step_s, 1)

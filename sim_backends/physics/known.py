@@ -1,4 +1,4 @@
-"""Robots whose bodies are known, by the name of their profile."""
+"""Limits of the robots of known profiles, by profile name."""
 
 from typing import Final
 
@@ -6,15 +6,15 @@ from sim_backends.physics.differential_drive import HUSKY_A200, TURTLEBOT3_BURGE
 from sim_backends.physics.quadrotor import DUCKIEDRONE, IRIS, QuadrotorLimits
 
 QUADROTORS: Final[dict[str, QuadrotorLimits]] = {"duckiedrone": DUCKIEDRONE, "iris": IRIS}
-"""Those that fly."""
+"""Flying robots."""
 BODIES: Final[dict[str, DriveLimits | QuadrotorLimits]] = {
     "husky": HUSKY_A200,
     "turtlebot3_burger": TURTLEBOT3_BURGER,
     **QUADROTORS,
 }
-"""What robots can do; those of them that have a robot profile have a radio too."""
+"""All robots; those with a robot profile also have a radio."""
 
 
 def quadrotor(profile: str) -> QuadrotorLimits:
-    """Return what a drone of this profile can do: one whose body nobody knows, what the paper's can."""
+    """Return the limits of a drone of this profile; those of the paper's drone if the profile is unknown."""
     return QUADROTORS.get(profile, DUCKIEDRONE)

@@ -1,4 +1,4 @@
-"""Lists of neighbours: who may meet what before a list ends, and how long everybody is free for certain."""
+"""Neighbour lists: what each body may touch before a list expires, and the minimum time to a contact."""
 
 import math
 from collections.abc import Mapping
@@ -12,17 +12,17 @@ from sim_backends.physics.grid import CellGrid
 from sim_backends.physics.ground import Ground
 
 HORIZON_S: Final = 0.2
-"""How long a list holds: long enough that making it costs little, short enough that most bodies are in none."""
+"""Validity of a list: long enough that building it costs little, short enough that most bodies have no neighbour."""
 
 
 @dataclass(slots=True)
-class Near:
-    """What a body may meet.
+class ContactCandidates:
+    """Possible contacts of a body.
 
     Attributes:
-        footprints: Of obstacles, and of the ground for who flies.
+        footprints: Footprints of obstacles, and of the ground for a flying body.
         bodies: Names of other bodies.
-        ground: The ground, if it is another nearby.
+        ground: The ground, if its height changes nearby.
     """
 
     footprints: list[Footprint] = field(default_factory=list)
@@ -30,8 +30,8 @@ class Near:
     ground: Ground | None = None
 
 
-class _Mover(NamedTuple):
-    """A body as it is now."""
+class _Kinematics(NamedTuple):
+    """The current position, speed and limits of a body."""
 
     name: str
     body: Body[Any]
@@ -42,16 +42,16 @@ class _Mover(NamedTuple):
 
 
 class Neighbours:
-    """A list of neighbours.
+    """A neighbour list.
 
     Args:
         bodies: All bodies.
-        poses: How they are now, at places in finite metres.
-        grounds: What each stands on, or flies over.
-        horizon_s: For how long the list shall hold.
+        poses: Their current poses, with finite positions.
+        grounds: The ground of each body.
+        horizon_s: Validity of the list.
 
     Attributes:
-        near: What each body may meet within the horizon, for those that may meet something.
+        candidates: Possible contacts within the horizon, for the bodies that have any.
     """
 
     def __init__(
@@ -61,69 +61,71 @@ class Neighbours:
         grounds: Mapping[str, Ground],
         horizon_s: float,
     ) -> None:
-        self.near: dict[str, Near] = {}
+        self.candidates: dict[str, ContactCandidates] = {}
         self._grounds = grounds
         self._horizon_s = horizon_s
-        self._movers = {name: _mover(name, body, poses[name]) for name, body in bodies.items()}
-        self._free_s: dict[str, float] = {}
-        movers = list(self._movers.values())
-        reach_m = max((one.body.radius_m + one.top_speed_m_s * horizon_s for one in movers), default=0.0)
+        self._kinematics_by_name = {name: _kinematics(name, body, poses[name]) for name, body in bodies.items()}
+        self._min_times_s: dict[str, float] = {}
+        bodies_now = list(self._kinematics_by_name.values())
+        reach_m = max((mover.body.radius_m + mover.top_speed_m_s * horizon_s for mover in bodies_now), default=0.0)
         grid = CellGrid(2 * reach_m)
-        for number, mover in enumerate(movers):
-            self._stand(mover, grounds[mover.name])
+        for number, mover in enumerate(bodies_now):
+            self._add_ground_candidates(mover, grounds[mover.name])
             for other in grid.near(mover.place_m):
-                self._pair(mover, movers[other])
+                self._add_pair_candidates(mover, bodies_now[other])
             grid.add(number, mover.place_m)
 
-    def free_s(self, name: str) -> float:
-        """Return for how long a body meets nothing, at least, from when the list was made."""
-        if name not in self._free_s:
-            mover, ground = self._movers[name], self._grounds[name]
-            others = (_pair_free_s(mover, other) for other in self._movers.values() if other is not mover)
-            self._free_s[name] = min(*_ground_free_s(mover, ground), *others, math.inf)
-        return self._free_s[name]
+    def min_time_to_contact_s(self, name: str) -> float:
+        """Return the minimum time from the creation of the list to a contact of a body."""
+        if name not in self._min_times_s:
+            mover, ground = self._kinematics_by_name[name], self._grounds[name]
+            others = (_pair_time_s(mover, other) for other in self._kinematics_by_name.values() if other is not mover)
+            self._min_times_s[name] = min(*_ground_times_s(mover, ground), *others, math.inf)
+        return self._min_times_s[name]
 
-    def _stand(self, mover: _Mover, ground: Ground) -> None:
-        edge_s, *footprints_s = _ground_free_s(mover, ground)
-        for footprint, free_s in zip(ground.around, footprints_s, strict=True):
-            if free_s <= self._horizon_s:
-                self._near(mover.name).footprints.append(footprint)
+    def _add_ground_candidates(self, mover: _Kinematics, ground: Ground) -> None:
+        edge_s, *obstacle_times_s = _ground_times_s(mover, ground)
+        for footprint, time_s in zip(ground.around, obstacle_times_s, strict=True):
+            if time_s <= self._horizon_s:
+                self._candidates_of(mover.name).footprints.append(footprint)
         if edge_s <= self._horizon_s:
-            self._near(mover.name).ground = ground
+            self._candidates_of(mover.name).ground = ground
 
-    def _pair(self, mover: _Mover, other: _Mover) -> None:
-        if _pair_free_s(mover, other) <= self._horizon_s:
-            self._near(mover.name).bodies.append(other.name)
-            self._near(other.name).bodies.append(mover.name)
+    def _add_pair_candidates(self, mover: _Kinematics, other: _Kinematics) -> None:
+        if _pair_time_s(mover, other) <= self._horizon_s:
+            self._candidates_of(mover.name).bodies.append(other.name)
+            self._candidates_of(other.name).bodies.append(mover.name)
 
-    def _near(self, name: str) -> Near:
-        return self.near.setdefault(name, Near())
+    def _candidates_of(self, name: str) -> ContactCandidates:
+        return self.candidates.setdefault(name, ContactCandidates())
 
 
-def _ground_free_s(mover: _Mover, ground: Ground) -> list[float]:
-    """Return for how long a body meets neither the ground's edge nor, one by one, what stands on it."""
+def _ground_times_s(mover: _Kinematics, ground: Ground) -> list[float]:
+    """Return the minimum times to reach the ground's edge and each obstacle on the ground."""
     body, place_m = mover.body, mover.place_m
     gaps_m = [ground.edge_m(place_m), *(gap_m(footprint, body, place_m) for footprint in ground.around)]
-    return [_free_s(gap, mover) for gap in gaps_m]
+    return [_closing_time_s(gap, mover) for gap in gaps_m]
 
 
-def _pair_free_s(mover: _Mover, other: _Mover) -> float:
-    """Return for how long two bodies do not meet; the same, to the last digit, whichever is named first."""
-    one, two = mover.body, other.body
+def _pair_time_s(mover: _Kinematics, other: _Kinematics) -> float:
+    """Return the minimum time to a contact of two bodies; bitwise independent of their order."""
+    first, second = mover.body, other.body
     (e, n, u), (other_e, other_n, other_u) = mover.place_m, other.place_m
-    aside_m = math.hypot(e - other_e, n - other_n) - (one.radius_m + two.radius_m)
-    over_m = max(u - other_u - two.height_m, other_u - u - one.height_m, 0.0)
-    return _free_s(math.hypot(max(aside_m, 0.0), over_m), mover, other)
+    horizontal_m = math.hypot(e - other_e, n - other_n) - (first.radius_m + second.radius_m)
+    vertical_m = max(u - other_u - second.height_m, other_u - u - first.height_m, 0.0)
+    return _closing_time_s(math.hypot(max(horizontal_m, 0.0), vertical_m), mover, other)
 
 
-def _mover(name: str, body: Body[Any], pose: Pose) -> _Mover:
-    return _Mover(name, body, pose.place_m, math.hypot(*pose.velocity_m_s), body.limit_m_s2(pose), body.top_speed_m_s)
+def _kinematics(name: str, body: Body[Any], pose: Pose) -> _Kinematics:
+    return _Kinematics(
+        name, body, pose.place_m, math.hypot(*pose.velocity_m_s), body.limit_m_s2(pose), body.top_speed_m_s
+    )
 
 
-def _free_s(gap_m: float, one: _Mover, other: _Mover | None = None) -> float:
-    """Return how long it takes at least until a gap is closed, by one or by two, who may speed up."""
-    v, a, top = one.speed_m_s, one.limit_m_s2, one.top_speed_m_s
+def _closing_time_s(gap_m: float, mover: _Kinematics, other: _Kinematics | None = None) -> float:
+    """Return the minimum time in which one body, or two, can close a gap, including acceleration."""
+    v, a, top = mover.speed_m_s, mover.limit_m_s2, mover.top_speed_m_s
     if other is not None:
         v, a, top = v + other.speed_m_s, a + other.limit_m_s2, top + other.top_speed_m_s
-    # The positive root of a t^2 / 2 + v t = gap, in the form that loses no digits where a is small.
+    # The positive root of a t^2 / 2 + v t = gap, in a form that loses no digits for small a.
     return max(gap_m / top, 2 * gap_m / (v + math.sqrt(v * v + 2 * a * gap_m)) if gap_m else 0.0)

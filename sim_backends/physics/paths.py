@@ -1,4 +1,4 @@
-"""Physics of agents whose motion is known in advance: way-points and velocity profiles."""
+"""Physics of agents with prescribed motion: way-points and velocity profiles."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,44 +7,44 @@ from typing import Any, Final
 from sim_backends.world.motion import Motion, State, WayPoints
 
 STEP_NS: Final = 1_000_000
-"""Gazebo's and ns-3 co-simulations' usual step, 1 ms."""
+"""The usual step of Gazebo and of ns-3 co-simulations, 1 ms."""
 
 
 class Paths:
-    """Moves agents along given motions, in steps; commands change nothing.
+    """Moves agents along given motions, in steps; commands have no effect.
 
     Args:
-        motions: The motions; no two move the same agent.
-        step_ns: Own step: states are those at whole steps.
-        limits_m_s2: The most that each agent's velocity changes per second. For agents that are left out it follows
-            from the corners of `WayPoints`; of any other motion nothing is known, so that it is infinite.
+        motions: The motions; no two of them move the same agent.
+        step_ns: Time step; states are those at whole steps.
+        limits_m_s2: Maximum acceleration of each agent. For agents that are not listed it follows from the corners of
+            `WayPoints`; for any other motion it is infinite.
     """
 
     def __init__(
         self, motions: Sequence[Motion], *, step_ns: int = STEP_NS, limits_m_s2: Mapping[str, float] | None = None
     ) -> None:
         self._motions = tuple(motions)
-        self._ways = {motion.name: motion for motion in motions if isinstance(motion, WayPoints)}
+        self._way_points = {motion.name: motion for motion in motions if isinstance(motion, WayPoints)}
         self.step_ns = step_ns
         self._at_ns = 0
         self._states = self._at(0)
         self.limits_m_s2: Mapping[str, float] = PathLimits(self, dict(limits_m_s2 or {}))
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (see PhysicsFederate)
-        """See `PhysicsFederate.advance`."""
+        """Implement `PhysicsFederate.advance`."""
         at_ns = to_ns // self.step_ns * self.step_ns
         if at_ns != self._at_ns:
             self._at_ns, self._states = at_ns, self._at(at_ns)
         return self._states
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of an agent without a given one, from the states on that were asked for last."""
-        way = self._ways.get(name)
-        return math.inf if way is None else way.limit_m_s2(self._at_ns)
+        """Return the limit of an agent that was not given one, valid from the last returned states on."""
+        way_points = self._way_points.get(name)
+        return math.inf if way_points is None else way_points.limit_m_s2(self._at_ns)
 
     @property
     def names(self) -> frozenset[str]:
-        """The agents that it moves now."""
+        """Names of the agents that it moves now."""
         return frozenset(self._states)
 
     def _at(self, time_ns: int) -> Mapping[str, State]:
@@ -52,7 +52,7 @@ class Paths:
 
 
 class PathLimits(Mapping[str, float]):
-    """The most that the velocity of each agent of `Paths` changes per second."""
+    """The maximum acceleration of each agent of `Paths`."""
 
     def __init__(self, paths: Paths, given: Mapping[str, float]) -> None:
         self._paths = paths

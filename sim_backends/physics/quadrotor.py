@@ -1,12 +1,13 @@
-"""Quadrotors: point masses with an attitude, moved by thrust, gravity and drag, and flown by an autopilot.
+"""Quadrotors: point masses with an attitude, moved by thrust, gravity and drag, and controlled by an autopilot.
 
-The autopilot is a cascade, as PX4's is (PX4 user guide, controller diagrams): a wanted velocity gives an acceleration
-within limits; with gravity and drag, which it knows, that gives a thrust vector within bounds of tilt and size; that
-gives roll and pitch. Those follow with a first-order lag and a limited rate, and thrust is such that its vertical
-part is the wanted one at the attitude that is. With f the thrust per mass, along its yaw (forward, left, up),
+The autopilot is a cascade, like PX4's (PX4 user guide, controller diagrams): the target velocity gives an
+acceleration within limits; with gravity and drag, which are known to the controller, it gives a thrust vector within
+bounds of tilt and size; that gives roll and pitch. These follow with a first-order lag and a limited rate; the thrust
+is chosen so that its vertical component at the actual attitude has the desired value. With f the thrust per mass, in
+axes of its yaw (forward, left, up),
 
-    f = |f| (cos(roll) sin(pitch), -sin(roll), cos(roll) cos(pitch)),
-    acceleration = f - g - (linear + quadratic |v|) v / mass.
+    f = |f| (cos(roll) sin(pitch), -sin(roll), cos(roll) cos(pitch)), acceleration = f - g - (linear + quadratic |v|)
+    v / mass.
 """
 
 import math
@@ -18,32 +19,32 @@ from fieldkit.core.model import Vector
 from sim_backends.physics.body import GRAVITY_M_S2, Velocity
 from sim_backends.physics.collisions import ContactStop, Surface
 
-_SAME: Final = 1e-9
-"""What is nearer to its target, in m/s or rad, is there: a lag alone never gets there."""
-_LONGEST: Final = 64
-"""Steps of a course: so many poses it keeps at most."""
+_REACHED: Final = 1e-9
+"""Tolerance for reaching a target, in m/s or rad: a first-order lag alone never reaches it."""
+_MAX_STEPS: Final = 64
+"""Maximum number of steps, and so of stored poses, of a course."""
 
 
 @dataclass(frozen=True)
 class QuadrotorLimits:
-    """What a quadrotor can do, and how large it is.
+    """Limits and size of a quadrotor.
 
     Attributes:
         mass_kg: Its mass.
-        thrust_n: Least and most thrust of all rotors together.
-        tilt_rad: Most roll, and most pitch.
-        tilt_rate_rad_s: Most that roll and pitch change per second.
-        yaw_rate_rad_s: Most that it turns.
+        thrust_n: Minimum and maximum thrust of all rotors together.
+        tilt_rad: Maximum roll, and maximum pitch.
+        tilt_rate_rad_s: Maximum rate of roll and pitch.
+        yaw_rate_rad_s: Maximum yaw rate.
         lag_s: Time constant of its attitude.
-        drag_n_s_m: Linear drag, in newtons for each m/s.
-        drag_n_s2_m2: Quadratic drag, in newtons for each m^2/s^2.
-        speed_m_s: Most speed that its autopilot asks for, horizontally.
-        climb_m_s: Most that it asks for downwards and upwards.
-        acceleration_m_s2: Most acceleration that it asks for, horizontally.
-        climb_m_s2: Most that it asks for downwards and upwards.
-        gains_per_s: Acceleration for each m/s that is missing, horizontally and vertically.
-        radius_m: Of the upright cylinder that contains it.
-        height_m: Of that cylinder.
+        drag_n_s_m: Linear drag, in newtons per m/s.
+        drag_n_s2_m2: Quadratic drag, in newtons per m^2/s^2.
+        speed_m_s: Maximum horizontal speed that its autopilot commands.
+        climb_m_s: Maximum commanded speeds downwards and upwards.
+        acceleration_m_s2: Maximum commanded horizontal acceleration.
+        climb_m_s2: Maximum commanded accelerations downwards and upwards.
+        gains_per_s: Acceleration per m/s of velocity error, horizontally and vertically.
+        radius_m: Radius of the upright cylinder that contains it.
+        height_m: Height of that cylinder.
     """
 
     mass_kg: float
@@ -63,13 +64,13 @@ class QuadrotorLimits:
     height_m: float
 
     def drag_m_s2(self, speed_m_s: float) -> float:
-        """Return what drag takes from a speed per second."""
+        """Return the deceleration by drag at a speed."""
         return (self.drag_n_s_m + self.drag_n_s2_m2 * speed_m_s) * speed_m_s / self.mass_kg
 
     def drive_m_s2(self) -> float:
-        """Return the most that thrust and gravity together change its velocity per second.
+        """Return the maximum acceleration by thrust and gravity together.
 
-        Largest at the least or at the most thrust, by the law of cosines, with roll and pitch both as far as they go.
+        By the law of cosines it occurs at the minimum or the maximum thrust, with maximum roll and pitch.
         """
         upright = math.cos(self.tilt_rad) ** 2
         return max(
@@ -78,7 +79,7 @@ class QuadrotorLimits:
         )
 
     def top_speed_m_s(self) -> float:
-        """Return the speed at which drag takes what drives it, however it flies."""
+        """Return the speed at which drag equals the maximum acceleration by thrust and gravity."""
         a, b, c = self.drag_n_s2_m2, self.drag_n_s_m, self.drive_m_s2() * self.mass_kg
         return 2 * c / (b + math.sqrt(b * b + 4 * a * c))
 
@@ -100,12 +101,13 @@ IRIS: Final = QuadrotorLimits(
     radius_m=0.384,
     height_m=0.11,
 )
-"""3DR Iris as PX4's simulation has it (github.com/PX4/PX4-SITL_gazebo-classic, `models/iris`): 1.5 kg; four rotors of
+"""3DR Iris as in PX4's simulation (github.com/PX4/PX4-SITL_gazebo-classic, `models/iris`): 1.5 kg; four rotors of
 5.84e-6 N/(rad/s)^2 up to 1100 rad/s, so 28.27 N; rotor drag 1.75e-4 N/(rad/s)/(m/s) at the 794 rad/s of hovering;
 0.47 m x 0.47 m x 0.11 m, rotors of 0.128 m around (0.13, 0.22) m. Limits and gains are PX4's defaults (parameter
 reference: MPC_TILTMAX_AIR, MC_ROLLRATE_MAX, MC_YAWRATE_MAX, 1 / MC_ROLL_P, MPC_XY_VEL_MAX, MPC_Z_VEL_MAX_DN and UP,
-MPC_ACC_HOR_MAX, MPC_ACC_DOWN_MAX and UP, MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC). Least thrust is a tenth, ours; so is the
-drag of the body, that of a cube's face of 0.47 m x 0.11 m: 1.225 kg/m^3 x 1.05 x 0.052 m^2 / 2."""
+MPC_ACC_HOR_MAX, MPC_ACC_DOWN_MAX and UP, MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC). The minimum thrust of a tenth is our
+choice, and the drag of the body is that of a cube's face of 0.47 m x 0.11 m: 1.225 kg/m^3 x 1.05 x 0.052 m^2 / 2.
+"""
 
 DUCKIEDRONE: Final = QuadrotorLimits(
     mass_kg=0.45,
@@ -124,19 +126,21 @@ DUCKIEDRONE: Final = QuadrotorLimits(
     radius_m=0.2,
     height_m=0.12,
 )
-"""Duckietown Duckiedrone: a frame of the 250 mm class. No data sheet tells its flight; all these are our estimates,
-from the mass of its parts and twice its weight in thrust, and slow, as it is flown indoors by a camera."""
+"""Duckietown Duckiedrone: a frame of the 250 mm class. No data sheet describes its flight; all values are our
+estimates, from the mass of its parts and twice its weight in thrust, with low speeds, as it is flown indoors by a
+camera.
+"""
 
 
 class FlightPose(NamedTuple):
-    """Where a quadrotor is and how it moves.
+    """Position and motion of a quadrotor.
 
     Attributes:
-        place_m: Metres east, north, up, of its lowest point.
+        place_m: Position of its lowest point, metres east, north, up.
         velocity_m_s: Metres per second east, north, up.
-        roll_rad: Above 0 with its left side up.
-        pitch_rad: Above 0 with its nose down.
-        heading_rad: Where its nose points, from east towards north.
+        roll_rad: Positive with its left side up.
+        pitch_rad: Positive with its nose down.
+        heading_rad: Direction of its nose, from east towards north.
     """
 
     place_m: Vector
@@ -148,101 +152,101 @@ class FlightPose(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Glide:
-    """A course at one velocity.
+    """A course at constant velocity.
 
     Attributes:
-        begin: Where it begins.
-        velocity_m_s: Its velocity, which is that of `begin` but for rounding.
-        step_s: How long a step is.
+        start: Its initial pose.
+        velocity_m_s: Its velocity, equal to that of the initial pose except for rounding.
+        step_s: Length of a step.
     """
 
-    begin: FlightPose
+    start: FlightPose
     velocity_m_s: Vector
     step_s: float
 
     @property
     def steps(self) -> None:
-        """See `Course.steps`."""
+        """Implement `Course.steps`."""
 
     @property
     def moves(self) -> bool:
-        """See `Course.moves`."""
+        """Implement `Course.moves`."""
         return any(self.velocity_m_s)
 
     def at(self, steps: int) -> FlightPose:
-        """See `Course.at`."""
+        """Implement `Course.at`."""
         if not steps:
-            return self.begin
-        (e, n, u), (v_e, v_n, v_u) = self.begin.place_m, self.velocity_m_s
+            return self.start
+        (e, n, u), (v_e, v_n, v_u) = self.start.place_m, self.velocity_m_s
         t = steps * self.step_s
-        return self.begin._replace(place_m=(e + t * v_e, n + t * v_n, u + t * v_u), velocity_m_s=self.velocity_m_s)
+        return self.start._replace(place_m=(e + t * v_e, n + t * v_n, u + t * v_u), velocity_m_s=self.velocity_m_s)
 
 
 class Flight:
-    """A course that changes from step to step; poses are worked out when they are asked for.
+    """A course that is integrated step by step; poses are computed on request.
 
     Args:
-        begin: Where it begins.
-        autopilot: Flies it.
-        wanted: What it shall do.
-        step_s: How long a step is.
+        start: Its initial pose.
+        autopilot: The controller.
+        target: The target velocity.
+        step_s: Length of a step.
     """
 
-    steps = _LONGEST
+    steps = _MAX_STEPS
     moves = True
 
-    def __init__(self, begin: FlightPose, autopilot: "VelocityController", wanted: Velocity, step_s: float) -> None:
-        self._poses = [begin]
+    def __init__(self, start: FlightPose, autopilot: "VelocityController", target: Velocity, step_s: float) -> None:
+        self._poses = [start]
         self._autopilot = autopilot
-        self._wanted = wanted
+        self._target = target
         self._step_s = step_s
 
     def at(self, steps: int) -> FlightPose:
-        """See `Course.at`."""
+        """Implement `Course.at`."""
         poses = self._poses
         while len(poses) <= steps:
-            poses.append(self._autopilot.fly(poses[-1], self._wanted, self._step_s))
+            poses.append(self._autopilot.fly(poses[-1], self._target, self._step_s))
         return poses[steps]
 
 
 class VelocityController:
-    """Flies a quadrotor at a wanted velocity.
+    """Controls the velocity of a quadrotor.
 
     Args:
-        limits: Of the quadrotor.
+        limits: Limits of the quadrotor.
     """
 
     def __init__(self, limits: QuadrotorLimits) -> None:
         self._limits = limits
-        self._leans = math.tan(limits.tilt_rad)
+        self._max_tilt_ratio = math.tan(limits.tilt_rad)
 
-    def thrust_m_s2(self, velocity_m_s: Vector, wanted: Velocity) -> Vector:
-        """Return the thrust per mass that it wants, east, north, up."""
+    def thrust_m_s2(self, velocity_m_s: Vector, target: Velocity) -> Vector:
+        """Return the desired thrust per mass, east, north, up."""
         limits = self._limits
         v_e, v_n, v_u = velocity_m_s
-        to_e, to_n, to_u = wanted.velocity_m_s
+        to_e, to_n, to_u = target.velocity_m_s
         gain_per_s, climb_per_s = limits.gains_per_s
-        a_e, a_n = _shortened(gain_per_s * (to_e - v_e), gain_per_s * (to_n - v_n), limits.acceleration_m_s2)
-        a_u = _between(climb_per_s * (to_u - v_u), limits.climb_m_s2)
+        a_e, a_n = _limited(gain_per_s * (to_e - v_e), gain_per_s * (to_n - v_n), limits.acceleration_m_s2)
+        a_u = _clip_range(climb_per_s * (to_u - v_u), limits.climb_m_s2)
         drag_per_s = (limits.drag_n_s_m + limits.drag_n_s2_m2 * math.hypot(v_e, v_n, v_u)) / limits.mass_kg
         up = max(a_u + GRAVITY_M_S2 + drag_per_s * v_u, limits.thrust_n[0] / limits.mass_kg)
-        east, north = _shortened(a_e + drag_per_s * v_e, a_n + drag_per_s * v_n, up * self._leans)
+        east, north = _limited(a_e + drag_per_s * v_e, a_n + drag_per_s * v_n, up * self._max_tilt_ratio)
         return east, north, up
 
-    def fly(self, pose: FlightPose, wanted: Velocity, step_s: float) -> FlightPose:
-        """Return where it is a step later."""
+    def fly(self, pose: FlightPose, target: Velocity, step_s: float) -> FlightPose:
+        """Return the pose a step later."""
         limits = self._limits
         (e, n, u), (v_e, v_n, v_u), roll, pitch, yaw = pose
-        f_e, f_n, f_u = self.thrust_m_s2(pose.velocity_m_s, wanted)
+        f_e, f_n, f_u = self.thrust_m_s2(pose.velocity_m_s, target)
         cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
         forward, left = f_e * cos_yaw + f_n * sin_yaw, f_n * cos_yaw - f_e * sin_yaw
-        share, most = -math.expm1(-step_s / limits.lag_s), limits.tilt_rate_rad_s * step_s
-        pitch = _followed(pitch, math.atan2(forward, f_u), share, most)
-        roll = _followed(roll, -math.atan2(left, math.hypot(forward, f_u)), share, most)
-        if wanted.yaw_rad is not None:
-            off_rad = math.remainder(wanted.yaw_rad - yaw, math.tau)
-            yaw = _followed(yaw, yaw + off_rad, share, limits.yaw_rate_rad_s * step_s)
-        # What it has: the wanted vertical part, as far as its bounds let it.
+        share, limit = -math.expm1(-step_s / limits.lag_s), limits.tilt_rate_rad_s * step_s
+        pitch = _lagged(pitch, math.atan2(forward, f_u), share, limit)
+        roll = _lagged(roll, -math.atan2(left, math.hypot(forward, f_u)), share, limit)
+        if target.yaw_rad is not None:
+            error_rad = math.remainder(target.yaw_rad - yaw, math.tau)
+            yaw = _lagged(yaw, yaw + error_rad, share, limits.yaw_rate_rad_s * step_s)
+        # Actual thrust: its vertical component has the desired value, within the bounds of thrust.
         upright = math.cos(roll) * math.cos(pitch)
         f = _clip(f_u / upright, limits.thrust_n[0] / limits.mass_kg, limits.thrust_n[1] / limits.mass_kg)
         forward, left = f * math.cos(roll) * math.sin(pitch), -f * math.sin(roll)
@@ -260,32 +264,32 @@ class VelocityController:
         )
 
 
-def _followed(now: float, target: float, share: float, most: float) -> float:
-    return now + _clip(share * (target - now), -most, most)
+def _lagged(now: float, target: float, share: float, limit: float) -> float:
+    return now + _clip(share * (target - now), -limit, limit)
 
 
-def _clip(value: float, least: float, most: float) -> float:
-    return max(least, min(value, most))
+def _clip(value: float, minimum: float, limit: float) -> float:
+    return max(minimum, min(value, limit))
 
 
-def _between(value: float, limits: tuple[float, float]) -> float:
+def _clip_range(value: float, limits: tuple[float, float]) -> float:
     return _clip(value, -limits[0], limits[1])
 
 
-def _shortened(one: float, other: float, most: float) -> tuple[float, float]:
-    """Return a vector, shortened to a length if it is longer."""
-    length = math.hypot(one, other)
-    return (one, other) if length <= most else (one * most / length, other * most / length)
+def _limited(first: float, second: float, limit: float) -> tuple[float, float]:
+    """Return a vector, shortened to a maximum length if it is longer."""
+    length = math.hypot(first, second)
+    return (first, second) if length <= limit else (first * limit / length, second * limit / length)
 
 
 class Quadrotor:
-    """A quadrotor that takes `Velocity` commands; without one it hovers.
+    """A quadrotor that follows `Velocity` commands; without a command it hovers.
 
     Args:
-        limits: What it can do.
-        place_m: Where it is at time 0, metres east, north, up.
-        heading_rad: Where its nose points, from east towards north.
-        antenna_m: Height of its antenna over its lowest point.
+        limits: Its limits and size.
+        place_m: Position at time 0, metres east, north, up.
+        heading_rad: Direction of its nose, from east towards north.
+        antenna_m: Height of its antenna above its lowest point.
     """
 
     def __init__(
@@ -296,57 +300,59 @@ class Quadrotor:
         self._heading_rad = heading_rad
         self.place_m = place_m
         self.flies = True
-        self.steepest = 0.0
+        self.max_grade = 0.0
         self.radius_m = limits.radius_m
         self.height_m = limits.height_m
         self.antenna_m = antenna_m
         self.top_speed_m_s = limits.top_speed_m_s()
 
-    def begin(self) -> FlightPose:
-        """See `Body.begin`."""
+    def initial_pose(self) -> FlightPose:
+        """Implement `Body.initial_pose`."""
         return FlightPose(self.place_m, heading_rad=self._heading_rad)
 
-    def placed(self, pose: FlightPose, surface: Surface) -> FlightPose:  # noqa: ARG002 (see Body)
-        """See `Body.placed`: it flies."""
+    def on_surface(self, pose: FlightPose, surface: Surface) -> FlightPose:  # noqa: ARG002 (see Body)
+        """Implement `Body.on_surface`: it flies, so the pose does not change."""
         return pose
 
     def course(self, pose: FlightPose, command: object, step_s: float) -> Glide | Flight:
-        """See `Body.course`."""
-        wanted = self._wanted(command)
-        if self._is_steady(pose, wanted):
-            return Glide(pose, wanted.velocity_m_s, step_s)
-        return Flight(pose, self._autopilot, wanted, step_s)
+        """Implement `Body.course`."""
+        target = self._target(command)
+        if self._is_steady(pose, target):
+            return Glide(pose, target.velocity_m_s, step_s)
+        return Flight(pose, self._autopilot, target, step_s)
 
     def stopped(self, pose: FlightPose, stop: ContactStop, command: object) -> FlightPose:  # noqa: ARG002 (see Body)
-        """See `Body.stopped`: it keeps what its velocity has along what it touches."""
-        return pose._replace(place_m=stop.place_m, velocity_m_s=stop.along(pose.velocity_m_s))
+        """Implement `Body.stopped`: it keeps the component of its velocity along the obstacle."""
+        return pose._replace(place_m=stop.place_m, velocity_m_s=stop.sliding_velocity(pose.velocity_m_s))
 
     def limit_m_s2(self, pose: FlightPose) -> float:
-        """See `Body.limit_m_s2`.
+        """Implement `Body.limit_m_s2`.
 
-        Drag grows with speed along it, so it never drives two velocities apart: what drag adds to how a velocity
-        changes is bounded by the drag of now, however long it goes on.
+        Drag opposes the velocity and grows with speed, so it never increases the difference of two velocities; its
+        contribution to a velocity change is bounded by the current drag for any duration.
         """
         return self._limits.drive_m_s2() + self._limits.drag_m_s2(math.hypot(*pose.velocity_m_s))
 
-    def _wanted(self, command: object) -> Velocity:
-        """Return a command within the limits."""
+    def _target(self, command: object) -> Velocity:
+        """Return a command limited to the quadrotor's limits."""
         if command is None:
             return Velocity()
         if not isinstance(command, Velocity) or not all(
             map(math.isfinite, (*command.velocity_m_s, command.yaw_rad or 0))
         ):
             raise ConfigurationError(
-                f"a quadrotor cannot do {command!r}", remedy="command it by a Velocity of finite numbers"
+                f"a quadrotor cannot follow {command!r}", remedy="use a Velocity of finite numbers"
             )
         east, north, up = command.velocity_m_s
         limits = self._limits
-        return Velocity((*_shortened(east, north, limits.speed_m_s), _between(up, limits.climb_m_s)), command.yaw_rad)
+        return Velocity(
+            (*_limited(east, north, limits.speed_m_s), _clip_range(up, limits.climb_m_s)), command.yaw_rad
+        )
 
-    def _is_steady(self, pose: FlightPose, wanted: Velocity) -> bool:
-        """Return whether it goes on for ever as it is wanted, but for rounding."""
-        if math.dist(pose.velocity_m_s, wanted.velocity_m_s) > _SAME:
+    def _is_steady(self, pose: FlightPose, target: Velocity) -> bool:
+        """Return True if it will keep the target velocity for ever, except for rounding."""
+        if math.dist(pose.velocity_m_s, target.velocity_m_s) > _REACHED:
             return False
-        then = self._autopilot.fly(pose, wanted, 1.0)
-        changes = (abs(one - other) for one, other in zip(then[2:], pose[2:], strict=True))
-        return max(changes) <= _SAME and math.dist(then.velocity_m_s, pose.velocity_m_s) <= _SAME
+        later = self._autopilot.fly(pose, target, 1.0)
+        changes = (abs(first - second) for first, second in zip(later[2:], pose[2:], strict=True))
+        return max(changes) <= _REACHED and math.dist(later.velocity_m_s, pose.velocity_m_s) <= _REACHED

@@ -1,4 +1,4 @@
-"""Tracks of bodies from a step on, and their states at a step, worked out when they are asked for."""
+"""Tracks of bodies from a step on, and their states at a step, computed on request."""
 
 from collections.abc import Iterator, KeysView, Mapping
 from typing import Final, NamedTuple
@@ -7,30 +7,30 @@ from sim_backends.physics.body import Course, Pose
 from sim_backends.world.motion import State
 
 NEVER: Final = 1 << 62
-"""A step that no run comes to."""
+"""A step after the end of any run."""
 
 
 class Track(NamedTuple):
-    """What a body does from a step on.
+    """The motion of a body from a step on.
 
     Attributes:
         course: Its course.
-        began: The step with which that begins.
-        antenna_m: How far its antenna is above its place.
+        first_step: The first step of the course.
+        antenna_m: Height of its antenna above its position.
     """
 
     course: Course[Pose]
-    began: int
+    first_step: int
     antenna_m: float
 
     @property
-    def ends(self) -> int:
-        """The step until which it is known."""
-        return NEVER if self.course.steps is None else self.began + self.course.steps
+    def end_step(self) -> int:
+        """The last step for which the course is valid."""
+        return NEVER if self.course.steps is None else self.first_step + self.course.steps
 
     def pose(self, step: int) -> Pose:
         """Return the pose at a step."""
-        return self.course.at(step - self.began)
+        return self.course.at(step - self.first_step)
 
     def state(self, step: int) -> State:
         """Return the state of the antenna at a step."""
@@ -40,26 +40,26 @@ class Track(NamedTuple):
 
 
 class Snapshot(Mapping[str, State]):
-    """The states of all bodies at one step, each worked out when it is asked for.
+    """The states of all bodies at one step, each computed on request.
 
     Args:
-        tracks: What they do at that step; the mapping never changes.
+        tracks: Their tracks at that step; the mapping must not be modified.
         step: The step.
     """
 
     def __init__(self, tracks: Mapping[str, Track], step: int) -> None:
         self._tracks = tracks
         self._step = step
-        self._known: dict[str, State] = {}
+        self._cache: dict[str, State] = {}
 
     def __getitem__(self, name: str) -> State:
-        state = self._known.get(name)
+        state = self._cache.get(name)
         if state is None:
-            state = self._known[name] = self._tracks[name].state(self._step)
+            state = self._cache[name] = self._tracks[name].state(self._step)
         return state
 
     def keys(self) -> KeysView[str]:
-        """Return the names of the bodies; as quick as a dict's, and it is asked in every window."""
+        """Return the names of the bodies; as fast as a dict's, because it is called in every window."""
         return self._tracks.keys()
 
     def __iter__(self) -> Iterator[str]:

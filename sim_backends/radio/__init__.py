@@ -1,1 +1,1 @@
-"""The radio between robots: pure models on integer nanoseconds, for a virtual clock or the monotonic one."""
+"""Radio models between robots: pure, on integer nanoseconds, for a virtual clock or the monotonic clock."""

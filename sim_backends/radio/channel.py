@@ -1,4 +1,4 @@
-"""Protocol of a channel: how strong stations hear each other, as Wi-Fi needs to know it."""
+"""Protocol of a radio channel: the power at which each station receives each other station, as Wi-Fi needs it."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -7,12 +7,13 @@ from sim_backends.radio.rate_control import RateControl
 
 
 class RadioChannel(Protocol):
-    """How strong each station is heard by each other.
+    """The received power of each station at each other station.
 
     Attributes:
-        names: The stations; everything else counts them by index.
-        noise_mw: Noise at each, in mW.
-        sensitivity_mw: Weakest frame that each detects, in mW; what it detects keeps it from sending.
+        names: Names of the stations; all other methods identify stations by their index in this list.
+        noise_mw: Noise power at each station, in mW.
+        sensitivity_mw: Weakest frame that each station detects, in mW; a station does not send while it detects a
+            frame.
     """
 
     names: Sequence[str]
@@ -20,20 +21,20 @@ class RadioChannel(Protocol):
     sensitivity_mw: Sequence[float]
 
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
-        """Return how strong `transmitter` arrives at each station at `now_ns`, 0 at itself.
+        """Return the received power of `transmitter` at each station at `now_ns`, in mW; 0 at the transmitter.
 
-        A list once returned never changes; the same one says that nothing has.
+        A returned list is never modified. If the same list object is returned again, the powers have not changed.
         """
         ...
 
     def linked(self, transmitter: int, receiver: int) -> bool:
-        """Return whether the two are near enough to be associated; no frame is sent to who is not."""
+        """Return True if the stations can be associated; frames are sent only to associated stations."""
         ...
 
     def delay_ns(self, transmitter: int, receiver: int) -> int:
-        """Return how long a wave takes."""
+        """Return the propagation delay, in ns."""
         ...
 
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
-        """Return what chooses modes on a link; called once per link."""
+        """Return the rate control of a link; called once per link."""
         ...

@@ -6,17 +6,22 @@ from typing import Final
 from sim_backends.radio.modes import CW_MAX, CW_MIN, DIFS_NS, SLOT_NS
 
 BLIND_NS: Final = 4_000
-"""What began so little ago is not sensed yet, so that two who begin within it collide: aCCATime, table 17-21."""
+"""Stations that start within this time of each other do not sense each other and collide: aCCATime, table 17-21."""
 
 
 class Contention:
     """Carrier sense and backoff of one station.
 
-    Backoff slots count down only while the channel has been idle for an inter-frame space; what is left waits for the
-    next idle time. After every frame a new backoff is drawn, so that no station keeps the channel.
+    Backoff slots count down only after the channel has been idle for an inter-frame space (DIFS); the remaining slots
+    wait for the next idle period. A new backoff is drawn after every frame, so that no station keeps the channel.
 
     Args:
-        draw: Gives uniform numbers on [0, 1), one per call.
+        draw: Returns a uniform random number on [0, 1) per call.
+
+    Attributes:
+        busy_until_ns: End of the last frame or reservation that the station has sensed or sent.
+        count_from_ns: Time from which backoff slots count down.
+        slots: Backoff slots that remain.
     """
 
     __slots__ = ("_draw", "_window", "busy_until_ns", "count_from_ns", "slots")
@@ -28,64 +33,65 @@ class Contention:
         self.count_from_ns = 0
         self.slots = 0
 
-    def wanted(self, now_ns: int) -> int:
-        """Return when a station that wants to send at `now_ns` may begin, if the channel stays as it is."""
-        self._count(now_ns)
+    def earliest_start_ns(self, now_ns: int) -> int:
+        """Return the earliest start time of a station that wants to send at `now_ns`, if the channel stays idle."""
+        self._count_down(now_ns)
         if now_ns < self.busy_until_ns and not self.slots:
-            self._back_off()
+            self._draw_backoff()
         return max(now_ns, self.count_from_ns + self.slots * SLOT_NS)
 
-    def sensed(self, now_ns: int, until_ns: int) -> None:
-        """Take it that the channel is busy from `now_ns` to `until_ns` for a station that has nothing to send."""
+    def on_busy(self, now_ns: int, until_ns: int) -> None:
+        """Record that the channel is busy from `now_ns` to `until_ns`, for a station that has nothing to send."""
         if self.slots:
-            self._count(now_ns)
-        self.sent(until_ns)
+            self._count_down(now_ns)
+        self.set_busy_until(until_ns)
 
-    def postponed(self, now_ns: int, until_ns: int) -> int:
-        """Take it that the channel is busy from `now_ns` to `until_ns` for a station that waits to send.
+    def postpone(self, now_ns: int, until_ns: int) -> int:
+        """Record that the channel is busy from `now_ns` to `until_ns`, for a station that waits to send.
 
         Returns:
-            When it may begin, if the channel stays as it is.
+            The time at which it may start if the channel then stays idle.
         """
         if not self.slots:
-            self._back_off()
+            self._draw_backoff()
         elif now_ns > self.count_from_ns:
-            self._count(now_ns)
-        # An ACK changes nothing for who heard the frame and reserved its time.
+            self._count_down(now_ns)
+        # An ACK changes nothing for stations that decoded the data frame, which reserved the time of its ACK.
         if until_ns > self.busy_until_ns or until_ns + DIFS_NS > self.count_from_ns:
-            self.sent(until_ns)
-        # Who drew none draws again, as `wanted` has it.
+            self.set_busy_until(until_ns)
+        # A station that drew 0 slots draws again if the channel is busy, as in `earliest_start_ns`.
         if not self.slots:
-            self._back_off()
+            self._draw_backoff()
         return self.count_from_ns + self.slots * SLOT_NS
 
-    def deferred(self, until_ns: int) -> None:
-        """Count no slot before `until_ns`: after a frame that was not decoded, for the time of its ACK (EIFS)."""
+    def defer_until(self, until_ns: int) -> None:
+        """Count down no slot before `until_ns`: EIFS, the time of the ACK, after a frame that was not decoded."""
         self.count_from_ns = max(self.count_from_ns, until_ns)
 
-    def sent(self, until_ns: int) -> None:
-        """Take it that the station itself has the channel until `until_ns`."""
-        # Everyone in range is told of every frame; `max` would take longer than all the rest.
+    def set_busy_until(self, until_ns: int) -> None:
+        """Record that the station itself occupies the channel until `until_ns`."""
+        # This runs for every station in range of every frame; a call of `max` would take longer than all other
+        # statements.
         if until_ns > self.busy_until_ns:  # noqa: PLR1730 (see above)
             self.busy_until_ns = until_ns
         if until_ns + DIFS_NS > self.count_from_ns:  # noqa: PLR1730 (see above)
             self.count_from_ns = until_ns + DIFS_NS
 
-    def succeeded(self) -> None:
-        """Begin anew after a frame that arrived, or that was given up."""
+    def on_success(self) -> None:
+        """Reset the contention window and draw a backoff, after a frame that was delivered or given up."""
         self._window = CW_MIN
-        self._back_off()
+        self._draw_backoff()
 
-    def failed(self) -> None:
-        """Take twice the window after a frame that was not acknowledged."""
+    def on_failure(self) -> None:
+        """Double the contention window and draw a backoff, after a frame that was not acknowledged."""
         self._window = min(2 * self._window + 1, CW_MAX)
-        self._back_off()
+        self._draw_backoff()
 
-    def _back_off(self) -> None:
+    def _draw_backoff(self) -> None:
         self.slots = int(self._draw() * (self._window + 1))
 
-    def _count(self, now_ns: int) -> None:
-        """Count down the slots that were idle until `now_ns`."""
+    def _count_down(self, now_ns: int) -> None:
+        """Subtract the slots that were idle until `now_ns`."""
         if self.slots and now_ns > self.count_from_ns:
             idle = min((now_ns - self.count_from_ns) // SLOT_NS, self.slots)
             self.slots -= idle

@@ -1,8 +1,8 @@
 """Delays of packets, in the four parts of the paper's eq. 2, to the nanosecond.
 
-A `Delay` is one integer that holds a number of packets and their parts, summed, in fields of 64 bits (584 years). So
-delays add up by `+`, and accounting for a packet costs 45 ns; five counters cost 100 ns, of the 4 us that the medium
-has for it.
+A `Delay` is one integer with five fields of 64 bits (584 years each): a number of packets and the sums of their four
+parts. Delays are added with `+`. Updating the delay of a packet costs 45 ns; five separate counters cost 100 ns, and
+the medium has only 4 us per packet.
 """
 
 from typing import Final, TypeVar
@@ -12,15 +12,15 @@ from fieldkit.core.model import DelayParts
 Delay = int
 
 Payload = TypeVar("Payload")
-"""Whatever a packet carries; models do not look at it."""
+"""The content of a packet, which radio models do not inspect."""
 
 Delivery = tuple[int, str, Payload, str, Delay]
-"""When a packet arrived, in ns, at whom, what it carries, from whom, and what it was delayed by on all its hops.
+"""Arrival time in ns, receiver, payload, source, and total delay over all hops.
 
-A bare tuple: one is made per packet.
+A plain tuple, because one is created per packet.
 """
 
-# One of each, to be multiplied by how many.
+# The unit of each field; multiply it by the number of nanoseconds, or of packets.
 PROCESSING_NS: Final = 1
 TRANSMISSION_NS: Final = 1 << 64
 PROPAGATION_NS: Final = 1 << 128
@@ -31,12 +31,12 @@ _FIELD: Final = (1 << 64) - 1
 
 
 def processing_ns(delay: Delay) -> int:
-    """Return that part of a delay."""
+    """Return the processing part of a delay, in ns."""
     return delay & _FIELD
 
 
 def parts(delay: Delay) -> DelayParts:
-    """Return what a delay, or a sum of delays, consists of."""
+    """Return the parts of a delay, or of a sum of delays."""
     return DelayParts(
         packets=delay // PACKET,
         processing_ns=processing_ns(delay),

@@ -1,4 +1,4 @@
-"""Fading of links: fast by echoes, as ends or their surroundings move; slow by shadowing, from place to place."""
+"""Fading of links: fast fading by multipath as the ends or the scatterers move; slow fading by shadowing in space."""
 
 import math
 from collections.abc import Sequence
@@ -17,25 +17,26 @@ _WAVES: Final = 256
 
 
 class Fading:
-    """The gains of some links by where their ends are, each with mean 1: Rician with line of sight, Rayleigh without.
+    """Power gains of links by the positions of their ends, with mean 1: Rician with line of sight, else Rayleigh.
 
-    A sum of 12 echoes, each leaving one end and reaching the other in a direction of its own, beside a steady wave of
-    K times their power. Where an end goes, the phase of each echo turns with its way in the echo's direction, as a
-    ring of scatterers around each end makes it (Akki and Haber, IEEE Trans. Veh. Technol. 35:2, 1986; Patel, Stuber
-    and Pratt, IEEE Trans. Commun. 53:374, 2005). So the echoes' autocorrelation is J0(2 pi d / wavelength) over a way
-    d of one end (Clarke, Bell Syst. Tech. J. 47:957, 1968), and the product of both where both go. What stirs around
-    two that stand turns them alike, J0(2 pi v t / wavelength). It is one gain for the whole channel: over some tens
-    of metres outdoors echoes come less than 1/20 MHz = 50 ns late.
+    A gain is the sum of 12 multipath components (echoes), each with its own directions of departure and arrival, and
+    a constant component of K times their power. When an end moves, the phase of each echo changes with the distance
+    moved in the echo's direction, as in the model of a ring of scatterers around each end (Akki and Haber, IEEE
+    Trans. Veh. Technol. 35:2, 1986; Patel, Stuber and Pratt, IEEE Trans. Commun. 53:374, 2005). The autocorrelation
+    of the echoes is therefore J0(2 pi d / wavelength) over a distance d moved by one end (Clarke, Bell Syst. Tech. J.
+    47:957, 1968), and the product of both if both ends move. Moving scatterers around two ends at rest give the same
+    kind of autocorrelation, J0(2 pi v t / wavelength). One gain applies to the whole channel: over some tens of
+    metres outdoors, echoes arrive less than 1/20 MHz = 50 ns late.
 
-    A gain depends on nothing but time and places, so whoever asks later, or more often, gets the same. Directions and
-    phases of a link are drawn when it is asked for first: of n stations that do not all send, few of n^2 / 2 are.
+    A gain depends only on time and positions, not on the number or order of calls. Directions and phases of a link
+    are drawn when the link is first used: if few of n stations send, few of the n^2 / 2 links are needed.
 
     Args:
-        seed: Of the directions and phases.
-        names: Of the stations.
+        seed: Seed of the directions and phases.
+        names: Names of the stations.
         ends: Indices of the first and second end of each link, shape (2, n); both directions have the same gain.
-        wavelength_m: Of the carrier.
-        stir_m_s: Speed of what moves around the ends.
+        wavelength_m: Wavelength of the carrier.
+        stir_m_s: Speed of the moving scatterers around the ends.
     """
 
     def __init__(
@@ -48,33 +49,38 @@ class Fading:
         self._stir_m_s = stir_m_s
         count = ends.shape[1]
         self._drawn = np.zeros(count, dtype=bool)
-        # East and north of each echo at its first end, then at its second.
+        # East and north components of each echo's direction at its first end, then at its second.
         self._directions = np.empty((count, 4, _ECHOES))
-        self._stirred, self._begin_rad = np.empty((2, count, _ECHOES))
+        self._stir_cosines, self._initial_rad = np.empty((2, count, _ECHOES))
 
     def echoes(self, links: NDArray[np.int64]) -> "Echoes":
-        """Return the echoes of the links of these indices."""
+        """Return the echoes of the links with these indices."""
         undrawn = links[~self._drawn[links]]
         if len(undrawn):
             self._draw(np.unique(undrawn))
         return Echoes(
-            self._rad_per_m, self._directions[links], self._stir_m_s * self._stirred[links], self._begin_rad[links]
+            self._rad_per_m,
+            self._directions[links],
+            self._stir_m_s * self._stir_cosines[links],
+            self._initial_rad[links],
         )
 
     def _draw(self, links: NDArray[np.int64]) -> None:
-        names = [(self._names[one], self._names[other], "fading") for one, other in self._ends[:, links].T.tolist()]
+        names = [
+            (self._names[first], self._names[second], "fading") for first, second in self._ends[:, links].T.tolist()
+        ]
         draws = first_draws(self._seed, names, 4 * _ECHOES).reshape(-1, 4, _ECHOES)
-        leaving, reaching, stirred, begin = np.moveaxis(draws, 1, 0)
-        # Directions spread evenly, each within its own sector, so that a dozen echoes have the moments of many; the
-        # sectors of an echo at both ends, and of what stirs it, are paired by steps that have no divisor in common
-        # with 12, so that none goes with another.
+        departure, arrival, stir, phase = np.moveaxis(draws, 1, 0)
+        # Directions are spread evenly, one per sector, so that 12 echoes have the statistical moments of many. The
+        # sectors of departure, arrival and scatterer motion are paired by step widths that have no common divisor
+        # with 12, so that the three directions of an echo are independent.
         sector = np.arange(_ECHOES)
-        leaving_rad, reaching_rad = _angles(sector, leaving), _angles(5 * sector, reaching)
+        departure_rad, arrival_rad = _angles(sector, departure), _angles(5 * sector, arrival)
         self._directions[links] = np.stack(
-            [turned(angle) for angle in (leaving_rad, reaching_rad) for turned in (np.cos, np.sin)], axis=1
+            [function(angle) for angle in (departure_rad, arrival_rad) for function in (np.cos, np.sin)], axis=1
         )
-        self._stirred[links] = np.cos(_angles(7 * sector, stirred))
-        self._begin_rad[links] = 2 * math.pi * begin
+        self._stir_cosines[links] = np.cos(_angles(7 * sector, stir))
+        self._initial_rad[links] = 2 * math.pi * phase
         self._drawn[links] = True
 
 
@@ -83,50 +89,52 @@ class Echoes:
     """The echoes of some links.
 
     Attributes:
-        rad_per_m: How far a phase turns per metre.
-        directions: East and north of each echo at its first end, then at its second, shape (n, 4, 12).
-        stirred_m_s: How fast what stirs makes each longer, shape (n, 12).
-        begin_rad: Their phases at time 0 where all ends are at the origin, shape (n, 12).
+        rad_per_m: Phase change per metre.
+        directions: East and north components of each echo's direction at its first end, then at its second, shape (n,
+            4, 12).
+        stir_rates_m_s: Rate at which moving scatterers lengthen each echo's path, shape (n, 12).
+        initial_rad: Phases at time 0 with all ends at the origin, shape (n, 12).
     """
 
     rad_per_m: float
     directions: Floats
-    stirred_m_s: Floats
-    begin_rad: Floats
+    stir_rates_m_s: Floats
+    initial_rad: Floats
 
     def fades(
         self, start_m: Floats, end_m: Floats, velocities_m_s: tuple[Floats, Floats] | None, k: Floats, since_ns: int
     ) -> "Fades":
-        """Return the gains over time of the links, whose ends go on as they do at `since_ns`.
+        """Return the gains of the links over time, for ends that keep their velocities.
 
         Args:
-            start_m: Where their first ends are, shape (n, 3).
-            end_m: Where their second ends are.
-            velocities_m_s: How first and second ends move, each of shape (n, 3); None where all stand.
-            k: Power of the steady wave over that of the echoes, shape (n,).
-            since_ns: When the ends are where they are said to be.
+            start_m: Positions of the first ends, shape (n, 3).
+            end_m: Positions of the second ends, shape (n, 3).
+            velocities_m_s: Velocities of the first and second ends, each of shape (n, 3); None if all ends are at
+                rest.
+            k: Power ratio of the constant component and the echoes, shape (n,).
+            since_ns: Time at which the ends have the given positions.
         """
-        way_m = _along(start_m, end_m, self.directions)
+        path_m = _along(start_m, end_m, self.directions)
         steady_rad = self.rad_per_m * (end_m - start_m)
-        rate_m_s = self.stirred_m_s
+        rate_m_s = self.stir_rates_m_s
         square: tuple[Floats, ...] = (_dot(steady_rad, steady_rad),)
         if velocities_m_s is not None:
             rate_m_s = _along(*velocities_m_s, self.directions) + rate_m_s
             steady_rad_s = self.rad_per_m * (velocities_m_s[1] - velocities_m_s[0])
             square += _dot(2 * steady_rad, steady_rad_s), _dot(steady_rad_s, steady_rad_s)
-        echoes_rad = self.rad_per_m * (way_m + since_ns * 1e-9 * self.stirred_m_s) + self.begin_rad
+        echoes_rad = self.rad_per_m * (path_m + since_ns * 1e-9 * self.stir_rates_m_s) + self.initial_rad
         return Fades(echoes_rad, self.rad_per_m * rate_m_s, square, k)
 
 
 class Fades:
-    """The gains of links whose ends move evenly.
+    """The gains of links whose ends move with constant velocities.
 
     Args:
-        echoes_rad: Phases of the echoes at the beginning, shape (n, 12).
-        echoes_rad_s: How fast they turn.
-        square: The square of the distance from end to end in radians of the carrier, shape (n,), at the beginning,
-            and what it grows by with time and with the square of time, or neither where it stays.
-        k: Power of the steady wave over that of the echoes, shape (n,).
+        echoes_rad: Phases of the echoes at the reference time, shape (n, 12).
+        echoes_rad_s: Phase rates of the echoes.
+        square: The squared distance between the ends in radians of the carrier, shape (n,), at the reference time;
+            followed by its coefficients of time and of squared time, unless all ends are at rest.
+        k: Power ratio of the constant component and the echoes, shape (n,).
     """
 
     def __init__(self, echoes_rad: Floats, echoes_rad_s: Floats, square: tuple[Floats, ...], k: Floats) -> None:
@@ -136,10 +144,10 @@ class Fades:
         self._share = 1 / np.sqrt(_ECHOES * (k + 1))
 
     def gains(self, after_s: float) -> Floats:
-        """Return the power gains, shape (n,), at a time after, or shortly before, the beginning."""
-        begin, rate = self._echoes
-        turned_rad = begin + after_s * rate
-        echoes = np.cos(turned_rad).sum(axis=1) + 1j * np.sin(turned_rad).sum(axis=1)
+        """Return the power gains, shape (n,), at `after_s` from the reference time; it may be slightly negative."""
+        initial_rad, rate_rad_s = self._echoes
+        phases_rad = initial_rad + after_s * rate_rad_s
+        echoes = np.cos(phases_rad).sum(axis=1) + 1j * np.sin(phases_rad).sum(axis=1)
         square, *changes = self._square
         if changes:
             slope, bend = changes
@@ -150,35 +158,35 @@ class Fades:
 
 
 def _along(start: Floats, end: Floats, directions: Floats) -> Floats:
-    """Return how far links' two ends are, or go, in the directions of their echoes, in all."""
+    """Return the sum of both ends' projections (of positions or velocities) on the directions of the echoes."""
     along: Floats = np.einsum("ld,lde->le", np.hstack((start[:, :2], end[:, :2])), directions)
     return along
 
 
-def _dot(one: Floats, other: Floats) -> Floats:
-    product: Floats = (one * other).sum(axis=1)
+def _dot(left: Floats, right: Floats) -> Floats:
+    product: Floats = (left * right).sum(axis=1)
     return product
 
 
 def _angles(sectors: NDArray[np.int64], within: Floats) -> Floats:
-    """Return an angle in each of 12 sectors, by where it is within its own, on [0, 1)."""
+    """Return an angle in each of 12 sectors, at the fraction `within` [0, 1) of the sector."""
     angles: Floats = 2 * math.pi / _ECHOES * (sectors % _ECHOES + within)
     return angles
 
 
 class Shadowing:
-    """A Gaussian field over the plane, and the shadowing between any two points of it.
+    """A Gaussian random field over the plane, and the shadowing between any two of its points.
 
-    The shadowing of a path is sigma (F(a) + F(b)) / sqrt(2), F being a field with mean 0, variance 1 and the
-    autocorrelation exp(-d / d0) of Gudmundson (Electron. Lett. 27:2145, 1991); so it is the same in both directions,
-    and paths with a common end are correlated (Agrawal and Patwari, IEEE Trans. Wirel. Commun. 8:5576, 2009). F is a
-    sum of 256 plane waves whose wave numbers have the density of that autocorrelation in two dimensions, with the
+    The shadowing of a path is sigma (F(a) + F(b)) / sqrt(2), where F is a field with mean 0, variance 1 and the
+    autocorrelation exp(-d / d0) of Gudmundson (Electron. Lett. 27:2145, 1991); it is the same in both directions, and
+    paths with a common end are correlated (Agrawal and Patwari, IEEE Trans. Wirel. Commun. 8:5576, 2009). F is a sum
+    of 256 plane waves whose wave numbers have the density of that autocorrelation in two dimensions, with the
     distribution 1 - 1 / sqrt(1 + (k d0)^2).
 
     Args:
-        seed: Of the field.
+        seed: Seed of the field.
         sigma_db: Standard deviation.
-        decorrelation_m: d0, over which correlation falls to 1/e.
+        decorrelation_m: d0, the distance over which correlation falls to 1/e.
     """
 
     def __init__(self, seed: int, sigma_db: float, decorrelation_m: float) -> None:
@@ -190,7 +198,7 @@ class Shadowing:
         self._sigma_db = sigma_db
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return the extra loss, which may be below 0, of paths between points of shape (n, 3), in dB."""
+        """Return the extra loss, which may be negative, of paths between points of shape (n, 3), in dB."""
         loss_db: Floats = self._sigma_db * (self._field(start_m) + self._field(end_m)) / math.sqrt(2)
         return loss_db
 

@@ -1,7 +1,7 @@
-"""Links that do the same wherever stations stand: each a queue, a rate, a delay and a loss.
+"""Links that behave the same wherever the stations are: each with a queue, a rate, a delay and a loss.
 
-The model knows no clock and no socket. The caller brings the time, in integer nanoseconds that never decrease: the
-medium reads it from the monotonic clock, a test or a co-simulation makes it up.
+The model uses no clock and no socket. The caller passes the time, in integer nanoseconds that never decrease: the
+medium reads it from the monotonic clock; tests and co-simulations use virtual time.
 """
 
 import heapq
@@ -25,13 +25,13 @@ from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 class FixedLink:
     """The state of one directed link.
 
-    Packets wait in a bounded first-in-first-out queue, go on the air one after the other at the link's rate, and
-    arrive after the link's delay. They never overtake each other, jitter or not, because an 802.11 receiver hands
-    frames up in order (IEEE 802.11-2020, 5.1.3): one that drew less jitter than its predecessor waits for it.
+    Packets wait in a bounded first-in-first-out queue, are sent one after the other at the link's rate, and arrive
+    after the link's delay. They never overtake each other in spite of jitter, because an 802.11 receiver delivers
+    frames in order (IEEE 802.11-2020, 5.1.3): a packet that drew less jitter than its predecessor waits for it.
 
     Args:
-        transmitter: Who sends.
-        receiver: Who receives.
+        transmitter: Name of the sending station.
+        receiver: Name of the receiving station.
         seed: Seed of the random streams, which are named by transmitter, receiver and purpose.
     """
 
@@ -50,24 +50,25 @@ class FixedLink:
         self.use(LinkParameters())
 
     def use(self, parameters: LinkParameters) -> None:
-        """Treat packets from now on as `parameters` say; those on their way keep their fate."""
+        """Use `parameters` for packets from now on; packets in flight are not affected."""
         self._parameters = parameters
-        # Few lengths occur, and computing these per packet costs more than looking them up.
+        # Few lengths occur, and computing these values per packet costs more than a look-up.
         self._by_size: dict[int, tuple[int, Delay]] = {}
 
     def offer(self, now_ns: int, size_bytes: int, packet: PacketIdentity) -> tuple[int, Delay] | str:
-        """Take a packet at `now_ns`, which never decreases.
+        """Accept a packet at `now_ns`, which never decreases.
 
         Args:
-            now_ns: Now.
-            size_bytes: Its size.
-            packet: What its draws are keyed by.
+            now_ns: Current time.
+            size_bytes: Size of the packet.
+            packet: Identity that keys its random draws.
 
         Returns:
-            When it arrives, and its delay, whose parts sum up to the time until then; why, when it never arrives.
+            Arrival time and delay, whose parts add up to the time until the arrival; or the reason if it never
+            arrives.
         """
         parameters = self._parameters
-        transmission_ns, delayed = self._by_size.get(size_bytes) or self._look_up(size_bytes)
+        transmission_ns, delay_sum = self._by_size.get(size_bytes) or self._compute_size(size_bytes)
         arrival_ns = now_ns + transmission_ns + parameters.delay_ns
         if parameters.rate_bit_s is not None:
             queuing_ns = self._enqueue(now_ns, transmission_ns)
@@ -75,7 +76,7 @@ class FixedLink:
                 return QUEUE_FULL
             if queuing_ns:
                 arrival_ns += queuing_ns
-                delayed += queuing_ns * delay.QUEUING_NS
+                delay_sum += queuing_ns * delay.QUEUING_NS
         self.sent += 1
         if parameters.loss and self._loss_draw(packet) < parameters.loss:
             self._lost += 1
@@ -85,36 +86,38 @@ class FixedLink:
             extra_ns = self._last_arrival_ns - arrival_ns
         if extra_ns:
             arrival_ns += extra_ns
-            delayed += extra_ns * delay.PROPAGATION_NS
+            delay_sum += extra_ns * delay.PROPAGATION_NS
         self._last_arrival_ns = arrival_ns
-        return arrival_ns, delayed
+        return arrival_ns, delay_sum
 
-    def refuse(self) -> None:
-        """Count a packet as lost that finds the link cut."""
+    def count_cut(self) -> None:
+        """Count a packet as lost because the link is cut."""
         self.sent += 1
-        self.lose()
+        self.count_lost()
 
-    def empty(self, now_ns: int) -> None:
-        """Let nothing wait for the link any more; what has left for it arrives after its delay and jitter at most."""
+    def clear_queue(self, now_ns: int) -> None:
+        """Empty the queue; packets already sent to the receiver arrive after at most the link's delay and jitter."""
         parameters = self._parameters
         self._free_ns = now_ns
         self._starts_ns.clear()
         self._last_arrival_ns = min(self._last_arrival_ns, now_ns + parameters.delay_ns + parameters.jitter_ns)
 
-    def lose(self) -> None:
-        """Count one of the packets that were sent as lost."""
+    def count_lost(self) -> None:
+        """Count one of the sent packets as lost."""
         self._lost += 1
 
-    def _look_up(self, size_bytes: int) -> tuple[int, Delay]:
-        """Return transmission in ns and delay without waiting of packets of a size; remember them."""
+    def _compute_size(self, size_bytes: int) -> tuple[int, Delay]:
+        """Return the transmission time in ns and the delay without queueing for a packet size; cache them."""
         parameters = self._parameters
         transmission_ns = parameters.serialization_ns(size_bytes)
-        delayed = delay.PACKET + transmission_ns * delay.TRANSMISSION_NS + parameters.delay_ns * delay.PROPAGATION_NS
-        known = self._by_size[size_bytes] = transmission_ns, delayed
-        return known
+        delay_sum = (
+            delay.PACKET + transmission_ns * delay.TRANSMISSION_NS + parameters.delay_ns * delay.PROPAGATION_NS
+        )
+        entry = self._by_size[size_bytes] = transmission_ns, delay_sum
+        return entry
 
     def _enqueue(self, now_ns: int, transmission_ns: int) -> int | None:
-        """Return how long a packet waits until it goes on the air, None when the queue is full."""
+        """Return the time that a packet waits before its transmission, in ns, or None if the queue is full."""
         waiting = self._starts_ns
         while waiting and waiting[0] <= now_ns:
             waiting.popleft()
@@ -130,42 +133,43 @@ class FixedLink:
 
     @property
     def rate_bit_s(self) -> int | None:
-        """Its rate now; None is unlimited."""
+        """The current rate; None means unlimited."""
         return self._parameters.rate_bit_s
 
     @property
     def counters(self) -> LinkCounters:
-        """What happened so far."""
+        """The counters so far."""
         return LinkCounters(self.sent, self._queue_dropped, self._lost, self.delivered)
 
 
-_OnLink = tuple[FixedLink, Payload, int, bool, tuple[str, ...], str, PacketIdentity]
-"""A packet on one link: link, payload, size in bytes, whether the receiver keeps it, to whom it is sent on, who
-sent it at first, and what its draws are keyed by."""
+_LinkPacket = tuple[FixedLink, Payload, int, bool, tuple[str, ...], str, PacketIdentity]
+"""A packet on one link: link, payload, size in bytes, True if the receiver keeps it, stations to which it is
+forwarded, original source, and identity that keys its random draws.
+"""
 
 
-_UnderWay = tuple[int, int, _OnLink[Payload], Delay, Delay]
-"""When it arrives, which it is of all, the packet, and what it is delayed by on this link and was before."""
+_InFlight = tuple[int, int, _LinkPacket[Payload], Delay, Delay]
+"""Arrival time, sequence number, packet, its delay on this link, and its delay before this link."""
 
 
 class FixedLinks(Generic[Payload]):
     """Carries packets between stations over directed links.
 
-    With a relay (the master topology) a packet between two other stations goes to the relay first and from there on,
-    each hop with its own queue, rate, delay and loss; a broadcast of a station reaches the relay, which repeats it to
-    everyone else. Without one, or to and from the relay itself, packets go directly. A broadcast is one packet per
-    receiver, each with a fate of its own.
+    With a relay (the master topology) a packet between two other stations is sent to the relay first and forwarded
+    from there; each hop has its own queue, rate, delay and loss. A broadcast of a station reaches the relay, which
+    repeats it to all other stations. Without a relay, and to and from the relay itself, packets go directly. A
+    broadcast is one packet per receiver, each with its own random draws.
 
     Args:
-        seed: Seed of all random draws: equal seeds, links and packets give equal fates.
+        seed: Seed of all random draws: equal seeds, links and packets give equal results.
     """
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
         self._relay: str | None = None
-        self._known_links: dict[Pair, FixedLink] = {}
+        self._all_links: dict[Pair, FixedLink] = {}
         self._links: dict[str, dict[str, FixedLink]] = {}
-        self._under_way: list[_UnderWay[Payload]] = []
+        self._in_flight: list[_InFlight[Payload]] = []
         self._order = 0
         self._offered: dict[str, int] = {}
         self._arrived: list[Delivery[Payload]] = []
@@ -174,16 +178,16 @@ class FixedLinks(Generic[Payload]):
         self._cut: Set[Pair] = frozenset()
 
     def connect(self, links: Mapping[Pair, LinkParameters], relay: str | None = None) -> None:
-        """Use `links`, per ordered pair of stations, and `relay`, from now on; links not named are gone.
+        """Use `links`, by ordered pair of stations, and `relay` from now on; links that are not named are removed.
 
-        Packets on the air keep their fate; counters and random streams go on.
+        Packets in flight are not affected; counters and random streams continue.
         """
         self._relay = relay
         self._links = {}
         for (transmitter, receiver), parameters in links.items():
-            link = self._known_links.get((transmitter, receiver)) or FixedLink(transmitter, receiver, self._seed)
+            link = self._all_links.get((transmitter, receiver)) or FixedLink(transmitter, receiver, self._seed)
             link.use(parameters)
-            self._known_links[transmitter, receiver] = link
+            self._all_links[transmitter, receiver] = link
             self._links.setdefault(transmitter, {})[receiver] = link
 
     def send(
@@ -197,8 +201,8 @@ class FixedLinks(Generic[Payload]):
         packet: PacketIdentity | None = None,
         before: Delay = 0,
     ) -> None:
-        """See `RadioModel.send`."""
-        if self._under_way and self._under_way[0][0] <= now_ns:
+        """Implement `RadioModel.send`."""
+        if self._in_flight and self._in_flight[0][0] <= now_ns:
             self._advance(now_ns)
         links = self._links[source]
         if packet is None:
@@ -220,109 +224,110 @@ class FixedLinks(Generic[Payload]):
             self._transmit(now_ns, (links[relay], payload, size_bytes, False, (destination,), source, packet), before)
 
     def next_event_ns(self) -> int | None:
-        """Return when `deliveries` has something to do next, None when nothing is under way."""
-        return self._under_way[0][0] if self._under_way else None
+        """Return the time of the next event for `deliveries`, or None if no packet is in flight."""
+        return self._in_flight[0][0] if self._in_flight else None
 
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
-        """Return what arrived up to `now_ns` and was not returned before, in order of arrival."""
-        if self._under_way and self._under_way[0][0] <= now_ns:
+        """Return the packets that arrived up to `now_ns` and were not returned before, in order of arrival."""
+        if self._in_flight and self._in_flight[0][0] <= now_ns:
             self._advance(now_ns)
         arrived, self._arrived = self._arrived, []
         return arrived
 
     def log_losses(self, log: LossLog | None) -> None:
-        """Hand `log` every loss from now on, or nobody."""
+        """Pass every loss from now on to `log`; None stops logging."""
         self._log_loss = log
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
-        """See `RadioModel.disturb`; what has left its transmitter keeps its fate."""
+        """Implement `RadioModel.disturb`; packets that have left their transmitter are not affected."""
         self._advance(now_ns)
         newly_off = off - self._off
-        self._off, self._cut = off, cut | {(other, one) for one, other in cut}
+        self._off, self._cut = off, cut | {(receiver, transmitter) for transmitter, receiver in cut}
         if not newly_off:
             return
-        for link in self._known_links.values():
+        for link in self._all_links.values():
             if link.transmitter in newly_off:
-                link.empty(now_ns)
-        under_way, self._under_way = sorted(self._under_way), []
-        for waiting in under_way:
-            at_ns, _, packet, delayed, _ = waiting
+                link.clear_queue(now_ns)
+        in_flight, self._in_flight = sorted(self._in_flight), []
+        for entry in in_flight:
+            at_ns, _, packet, delay_sum, _ = entry
             link = packet[0]
-            if link.transmitter in newly_off and at_ns - delay.parts(delayed).propagation_ns > now_ns:
-                link.lose()
+            if link.transmitter in newly_off and at_ns - delay.parts(delay_sum).propagation_ns > now_ns:
+                link.count_lost()
                 self._lose(now_ns, packet, RADIO_OFF)
             else:
-                self._under_way.append(waiting)
+                self._in_flight.append(entry)
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Return what happened on each link so far."""
-        return {pair: link.counters for pair, link in self._known_links.items()}
+        """Return the counters of each link so far."""
+        return {pair: link.counters for pair, link in self._all_links.items()}
 
     def use_meter(self) -> None:
-        """See `RadioModel.use_meter`; these links count without being told."""
+        """Implement `RadioModel.use_meter`; fixed links always count."""
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
-        """See `RadioModel.sample`; there are no powers, no attempts, and no channel that could be busy."""
+        """Implement `RadioModel.sample`; there are no powers, no attempts and no channel busy time."""
         self._advance(now_ns)
         return {
-            name: LinkSample(utc_ns, tuple(self._known(name, link) for link in links.values()))
+            name: LinkSample(utc_ns, tuple(self._station_sample(name, link) for link in links.values()))
             for name, links in self._links.items()
         }
 
-    def _known(self, name: str, link: FixedLink) -> StationSample:
-        other = link.receiver
-        back = self._known_links.get((other, name))
+    def _station_sample(self, name: str, link: FixedLink) -> StationSample:
+        peer = link.receiver
+        reverse = self._all_links.get((peer, name))
         return StationSample(
-            station=other,
+            station=peer,
             tx_rate_bit_s=link.rate_bit_s,
-            rx_rate_bit_s=None if back is None else back.rate_bit_s,
+            rx_rate_bit_s=None if reverse is None else reverse.rate_bit_s,
             tx_packets=link.sent,
-            rx_packets=0 if back is None else back.delivered,
+            rx_packets=0 if reverse is None else reverse.delivered,
         )
 
     def _advance(self, now_ns: int) -> None:
-        under_way = self._under_way
-        while under_way and under_way[0][0] <= now_ns:
-            at_ns, _, packet, delayed, before = heapq.heappop(under_way)
-            self._arrive(at_ns, packet, delayed + before)
+        in_flight = self._in_flight
+        while in_flight and in_flight[0][0] <= now_ns:
+            at_ns, _, packet, delay_sum, before = heapq.heappop(in_flight)
+            self._arrive(at_ns, packet, delay_sum + before)
 
-    def _transmit(self, now_ns: int, packet: _OnLink[Payload], before: Delay) -> None:
+    def _transmit(self, now_ns: int, packet: _LinkPacket[Payload], before: Delay) -> None:
         link, _, size_bytes, _, _, _, identity = packet
         if self._off or self._cut:
             ends = link.transmitter, link.receiver
             if ends in self._cut or not self._off.isdisjoint(ends):
-                link.refuse()
+                link.count_cut()
                 self._lose(now_ns, packet, OUT_OF_RANGE)
                 return
-        passage = link.offer(now_ns, size_bytes, identity)
-        if isinstance(passage, str):
-            self._lose(now_ns, packet, passage)
+        result = link.offer(now_ns, size_bytes, identity)
+        if isinstance(result, str):
+            self._lose(now_ns, packet, result)
             return
-        at_ns, delayed = passage
+        at_ns, delay_sum = result
         if before:
             before -= delay.PACKET
         if at_ns <= now_ns:
-            self._arrive(at_ns, packet, delayed + before)
+            self._arrive(at_ns, packet, delay_sum + before)
             return
         self._order += 1
-        heapq.heappush(self._under_way, (at_ns, self._order, packet, delayed, before))
+        heapq.heappush(self._in_flight, (at_ns, self._order, packet, delay_sum, before))
 
-    def _arrive(self, at_ns: int, packet: _OnLink[Payload], delayed: Delay) -> None:
+    def _arrive(self, at_ns: int, packet: _LinkPacket[Payload], delay_sum: Delay) -> None:
         link, payload, size_bytes, keep, onward, source, identity = packet
         link.delivered += 1
         if keep:
-            self._arrived.append((at_ns, link.receiver, payload, source, delayed))
+            self._arrived.append((at_ns, link.receiver, payload, source, delay_sum))
         if onward:
             links = self._links.get(link.receiver, {})
             for name in onward:
-                # The relay has no link to itself, and others may have left while the packet was on its way to it.
+                # The relay has no link to itself, and a station may have left while the packet was in flight to the
+                # relay.
                 if name in links:
-                    self._transmit(at_ns, (links[name], payload, size_bytes, True, (), source, identity), delayed)
+                    self._transmit(at_ns, (links[name], payload, size_bytes, True, (), source, identity), delay_sum)
                 elif self._log_loss is not None and name != link.receiver:
                     self._log_loss(at_ns, payload, name, OUT_OF_RANGE)
 
-    def _lose(self, now_ns: int, packet: _OnLink[Payload], reason: str) -> None:
-        """Tell that a packet does not pass its link, for everyone whom it would have reached."""
+    def _lose(self, now_ns: int, packet: _LinkPacket[Payload], reason: str) -> None:
+        """Log that a packet does not pass its link, for each station that it would have reached."""
         if self._log_loss is None:
             return
         link, payload, _, keep, onward, _, _ = packet
@@ -331,22 +336,22 @@ class FixedLinks(Generic[Payload]):
 
 
 def mesh(options: RadioOptions, names: Iterable[str]) -> dict[Pair, LinkParameters]:
-    """Return the fixed links between all stations `names`, in both directions."""
+    """Return fixed links between all stations in `names`, in both directions."""
     return dict.fromkeys(permutations(names, 2), options.link())
 
 
 class UniformLinks(FixedLinks[Payload]):
-    """Links that do the same wherever stations stand.
+    """Links between all stations that behave the same wherever the stations are.
 
     Args:
-        seed: Of all random draws.
-        options: What every link does.
+        seed: Seed of all random draws.
+        options: Parameters of every link.
     """
 
     def __init__(self, seed: int, options: RadioOptions) -> None:
         super().__init__(seed)
         self._options = options
-        self._placed: tuple[frozenset[str], str | None] | None = None
+        self._stations: tuple[frozenset[str], str | None] | None = None
 
     def place(
         self,
@@ -355,14 +360,14 @@ class UniformLinks(FixedLinks[Payload]):
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
     ) -> None:
-        """See `RadioModel.place`."""
-        placed = frozenset(places_m), relay
-        if placed != self._placed:
-            self._placed = placed
+        """Implement `RadioModel.place`; only the set of stations matters."""
+        stations = frozenset(places_m), relay
+        if stations != self._stations:
+            self._stations = stations
             self.connect(mesh(self._options, places_m), relay)
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:  # noqa: ARG002 (see RadioModel)
-        """See `RadioModel.jam`."""
+        """Implement `RadioModel.jam`; fixed links support no jammers."""
         if emitters:
             raise ConfigurationError(
                 "fixed links hear no jammer",

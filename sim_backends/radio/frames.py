@@ -1,4 +1,4 @@
-"""Frames: packets on one hop, their transmissions, what a receiver makes of one, and the log of attempts."""
+"""Frames: packets on one hop, their transmissions, the probability of decoding them, and the log of attempts."""
 
 import itertools
 import math
@@ -13,7 +13,7 @@ from sim_backends.radio.packet_error import log_success
 from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0
-"""Below it a preamble is not detected: the default of ns-3's threshold model, after 802.11 implementations."""
+"""SNR below which a preamble is not detected: the default of ns-3's threshold model, after 802.11 implementations."""
 
 HEADER_BYTES: Final = 24 + 8 + 4
 """MAC header with three addresses, LLC and SNAP, FCS: IEEE 802.11-2020, 9.3.2.1; RFC 1042."""
@@ -23,12 +23,12 @@ _NEVER_NS: Final = 1 << 63
 
 @dataclass(eq=False, slots=True)
 class Emission:
-    """Noise that somebody sends in the whole channel.
+    """Noise that a jammer sends in the whole channel.
 
     Attributes:
-        start_ns: When it begins.
-        powers_mw: How strong it arrives at each station, by index, where they are now.
-        end_ns: When it ended, if it has.
+        start_ns: Start time.
+        powers_mw: Current received power at each station, by index.
+        end_ns: End time, in the distant future while the noise continues.
     """
 
     start_ns: int
@@ -41,17 +41,17 @@ class Transmission:
     """A frame on the air.
 
     Attributes:
-        transmitter: Index of who sends it.
-        start_ns: When its preamble begins.
-        end_ns: When its last symbol ends.
-        mode: How its bits are sent.
-        size_bytes: Its size, MAC header and FCS included.
-        packet: The packet that it carries, or acknowledges.
-        attempt: 1 for the first attempt at it on this hop.
-        powers_mw: How strong it arrives at each station, by index; 0 at the transmitter.
-        heard_by: Indices of the stations that hear it, whether they can receive it or not.
-        others: Frames, and noise of jammers, that are on the air at the same time for a while.
-        followed_by: Indices of the stations that receive it, not another frame or nothing.
+        transmitter: Index of the sending station.
+        start_ns: Start of its preamble.
+        end_ns: End of its last symbol.
+        mode: Modulation and coding.
+        size_bytes: Size with MAC header and FCS.
+        packet: The packet that it carries or acknowledges.
+        attempt: Number of the transmission attempt on this hop, from 1.
+        powers_mw: Received power at each station, by index; 0 at the transmitter.
+        heard_by: Indices of the stations that detect it, whether or not they can receive it.
+        others: Frames and jammer noise that overlap it in time.
+        receivers: Indices of the stations that are synchronized to it, and so receive it.
     """
 
     transmitter: int
@@ -64,14 +64,14 @@ class Transmission:
     powers_mw: list[float] = field(default_factory=list)
     heard_by: Sequence[int] = ()
     others: list["Transmission | Emission"] = field(default_factory=list)
-    followed_by: set[int] = field(default_factory=set)
+    receivers: set[int] = field(default_factory=set)
 
 
 def success(frame: Transmission, receiver: int, noise_mw: float) -> float:
-    """Return the probability that `receiver`, which follows a frame, decodes it.
+    """Return the probability that `receiver`, which is synchronized to the frame, decodes it.
 
-    Its bits are spread evenly over its time; each stretch between two changes of interference has its own ratio of
-    signal to interference and noise, and all bits must be right.
+    The bits are spread evenly over the frame's duration. Each interval between two changes of interference has its
+    own ratio of signal to interference and noise, and all bits must be correct.
     """
     signal_mw = frame.powers_mw[receiver]
     bits = 8.0 * frame.size_bytes
@@ -93,7 +93,7 @@ def success(frame: Transmission, receiver: int, noise_mw: float) -> float:
 
 
 def decibel(ratio: float) -> float:
-    """Return a ratio of powers in dB, a very low number for 0."""
+    """Return a power ratio in dB; -1e9 for a ratio of 0."""
     return 10 * math.log10(ratio) if ratio > 0 else -1e9
 
 
@@ -102,17 +102,17 @@ class Frame(Generic[Payload]):
     """A packet on one hop.
 
     Attributes:
-        payload: What it carries.
+        payload: Its content.
         size_bytes: Size of the packet, without MAC header.
-        source: Who sent the packet at first.
-        receiver: Index of the station at the end of this hop; None is everyone.
-        onward: To whom the relay passes it on.
-        keep: Whether the receiver of this hop keeps the packet.
-        packet: What its draws are keyed by.
-        queued_ns: When it came to wait at the transmitter.
-        before: What the packet was delayed by before this hop, 0 for nothing.
-        begun_ns: When its first attempt began.
-        attempts: How many there were.
+        source: Name of the original sender.
+        receiver: Index of the station at the end of this hop; None for a broadcast.
+        onward: Indices of the stations to which the relay forwards it; None for a broadcast.
+        keep: True if the receiver of this hop keeps the packet.
+        packet: Identity that keys its random draws.
+        queued_ns: Time at which it entered the transmitter's queue.
+        before: Delay of the packet before this hop, 0 for none.
+        first_attempt_ns: Start of its first attempt.
+        attempts: Number of attempts so far.
     """
 
     payload: Payload
@@ -124,17 +124,17 @@ class Frame(Generic[Payload]):
     packet: PacketIdentity
     queued_ns: int
     before: Delay = 0
-    begun_ns: int = 0
+    first_attempt_ns: int = 0
     attempts: int = 0
 
-    def delayed(self, now_ns: int, wave_ns: int) -> Delay:
-        """Return what the packet was delayed by on all its hops, if it is decoded at `now_ns` after `wave_ns`."""
-        waited_ns, sent_ns = self.begun_ns - self.queued_ns, now_ns - self.begun_ns
+    def total_delay(self, now_ns: int, wave_ns: int) -> Delay:
+        """Return the delay over all hops so far, for a frame decoded at `now_ns` after `wave_ns` of propagation."""
+        waited_ns, sent_ns = self.first_attempt_ns - self.queued_ns, now_ns - self.first_attempt_ns
         parts = delay.QUEUING_NS * waited_ns + delay.TRANSMISSION_NS * sent_ns + delay.PROPAGATION_NS * wave_ns
         return parts + (self.before or delay.PACKET)
 
-    def passed_on(self, now_ns: int, receiver: int | None, before: Delay) -> "Frame[Payload]":
-        """Return the packet on its second hop, which the relay queues at `now_ns`."""
+    def for_second_hop(self, now_ns: int, receiver: int | None, before: Delay) -> "Frame[Payload]":
+        """Return the packet as a frame of its second hop, which the relay queues at `now_ns`."""
         return Frame(self.payload, self.size_bytes, self.source, receiver, (), True, self.packet, now_ns, before)
 
 
@@ -143,15 +143,15 @@ class TransmissionAttempt:
     """One transmission attempt, for a log.
 
     Attributes:
-        start_ns: When it began.
-        end_ns: When it ended.
-        transmitter: Who sent.
-        receiver: To whom; None is everyone.
-        mode: In which mode.
-        size_bytes: MAC header and FCS included.
-        number: 1 for the first attempt at a frame; 0 for an ACK.
-        received: Who decoded it of those it was for.
-        payload: What it carried; None for an ACK.
+        start_ns: Start time.
+        end_ns: End time.
+        transmitter: Name of the sender.
+        receiver: Name of the receiver; None for a broadcast.
+        mode: Modulation and coding.
+        size_bytes: Size with MAC header and FCS.
+        number: Number of the attempt for this frame, from 1; 0 for an ACK.
+        received: Names of the addressed stations that decoded it.
+        payload: Its content; None for an ACK.
     """
 
     start_ns: int
@@ -165,10 +165,10 @@ class TransmissionAttempt:
     payload: Any
 
 
-def attempt(
+def attempt_record(
     names: Sequence[str], transmission: Transmission, frame: Frame[Any], received: Iterable[int]
 ) -> TransmissionAttempt:
-    """Return the attempt at `frame` that was `transmission`, decoded by those of index `received`."""
+    """Return the log entry of an attempt at `frame`, decoded by the stations with the indices `received`."""
     return TransmissionAttempt(
         transmission.start_ns,
         transmission.end_ns,
@@ -182,10 +182,10 @@ def attempt(
     )
 
 
-def acknowledgement(
+def ack_record(
     names: Sequence[str], transmission: Transmission, receiver: int, *, decoded: bool
 ) -> TransmissionAttempt:
-    """Return the ACK that was `transmission`, for `receiver`, as an attempt."""
+    """Return the log entry of an ACK for `receiver`."""
     name = names[receiver]
     received = (name,) if decoded else ()
     return TransmissionAttempt(

@@ -1,4 +1,4 @@
-"""Jammers as a radio model is told of them."""
+"""Jammers, as a radio model receives them."""
 
 from dataclasses import dataclass
 
@@ -7,12 +7,12 @@ from fieldkit.core.model import Vector
 
 @dataclass(frozen=True, slots=True)
 class Emitter:
-    """Who sends noise in the whole channel now.
+    """A transmitter of noise in the whole channel.
 
     Attributes:
-        name: Which, the same as long as it sends without a pause.
-        place_m: Where it is now, metres east, north, up.
-        power_dbm: Power that it sends with.
+        name: Name that stays the same while it sends without a pause.
+        place_m: Current position, metres east, north, up.
+        power_dbm: Transmit power.
     """
 
     name: str

@@ -11,11 +11,11 @@ class LinkParameters:
     """Parameters of one directed link.
 
     Attributes:
-        rate_bit_s: Serialization rate in bit/s; None is unlimited.
-        delay_ns: Delay beside waiting and serialization, in ns.
+        rate_bit_s: Serialization rate in bit/s; None means unlimited.
+        delay_ns: Delay in addition to queueing and serialization, in ns.
         jitter_ns: Width of the uniform extra delay, in ns.
-        loss: Share of packets lost whatever their length.
-        queue_packets: Packets that wait beside the one on the air.
+        loss: Share of packets lost, independent of their length.
+        queue_packets: Maximum number of queued packets, without the one on the air.
     """
 
     rate_bit_s: int | None = None
@@ -25,7 +25,7 @@ class LinkParameters:
     queue_packets: int = 1000
 
     def serialization_ns(self, size_bytes: int) -> int:
-        """Return how long a packet of `size_bytes` occupies the link, in ns rounded up."""
+        """Return the time for which a packet of `size_bytes` occupies the link, in ns, rounded up."""
         return 0 if self.rate_bit_s is None else -(-8 * size_bytes * 1_000_000_000 // self.rate_bit_s)
 
 
@@ -33,11 +33,11 @@ class LinkParameters:
 class LinkCounters:
     """Counters of one directed link, so far.
 
-    A packet offered to the link is sent or dropped by its queue; one sent is lost, delivered or still under way.
+    A packet offered to the link is sent or dropped by its queue; a sent packet is lost, delivered or still in flight.
 
     Attributes:
         sent: Packets that went on the air.
-        queue_dropped: Packets that found the queue full.
+        queue_dropped: Packets dropped because the queue was full.
         lost: Packets that went on the air and did not arrive.
         delivered: Packets that arrived.
     """

@@ -1,12 +1,12 @@
-"""Reasons for which packets never arrive, told as it happens."""
+"""Reasons for the loss of packets, which models report when a loss happens."""
 
 from collections.abc import Callable
 from typing import Any, Final
 
 LossLog = Callable[[int, Any, str, str], None]
-"""Is called with when a packet was lost, in ns, what it carried, who will not get it, and why.
+"""Called with the time of the loss in ns, the payload, the station that will not receive it, and the reason.
 
-Of each packet that a model was given, each station that it was for is told once: here, or as a delivery.
+For each packet passed to a model, each addressed station is reported exactly once: here, or as a delivery.
 """
 
 OUT_OF_RANGE: Final = "out of range"

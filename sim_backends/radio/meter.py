@@ -1,4 +1,4 @@
-"""Counters of stations' drivers: the time that their channel was busy, frames, retries, failures, rates."""
+"""Counters of the stations' drivers: channel busy time, frames, retries, failures, rates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,13 +8,13 @@ from sim_backends.radio.frames import Transmission
 
 @dataclass(slots=True)
 class LinkMeter:
-    """Counts of one directed link.
+    """Counters of one directed link.
 
     Attributes:
-        frames: Packets whose first attempt began.
+        frames: Packets whose first attempt has started.
         retries: Attempts after the first.
-        failures: Packets given up after the last.
-        rate_bit_s: Rate of the last attempt; None before any.
+        failures: Packets given up after the last attempt.
+        rate_bit_s: Rate of the last attempt; None before the first.
     """
 
     frames: int = 0
@@ -24,10 +24,10 @@ class LinkMeter:
 
 
 class RadioMeter:
-    """Counts for stations that share one channel.
+    """Counters for stations that share one channel.
 
     Args:
-        stations: How many there are.
+        stations: Number of stations.
     """
 
     def __init__(self, stations: int) -> None:
@@ -35,8 +35,8 @@ class RadioMeter:
         self._busy_ns = [0] * stations
         self._busy_until_ns = [0] * stations
 
-    def begun(self, transmission: Transmission, receiver: int | None) -> None:
-        """Take in a frame whose first symbol goes on the air now; None is everyone, or an ACK's receiver."""
+    def on_start(self, transmission: Transmission, receiver: int | None) -> None:
+        """Record a frame that starts now; `receiver` is None for broadcasts and ACKs."""
         start_ns, end_ns = transmission.start_ns, transmission.end_ns
         busy_ns, busy_until_ns = self._busy_ns, self._busy_until_ns
         for index in (transmission.transmitter, *transmission.heard_by):
@@ -52,14 +52,14 @@ class RadioMeter:
                 link.retries += 1
             link.rate_bit_s = transmission.mode.rate_bit_s
 
-    def failed(self, transmitter: int, receiver: int) -> None:
-        """Take in that a packet was given up."""
+    def on_failure(self, transmitter: int, receiver: int) -> None:
+        """Record that a packet was given up."""
         self.link(transmitter, receiver).failures += 1
 
     def link(self, transmitter: int, receiver: int) -> LinkMeter:
-        """Return the counts of a link, which go on."""
+        """Return the counters of a link, which continue to change."""
         return self._links.setdefault((transmitter, receiver), LinkMeter())
 
     def busy_ns(self, now_ns: int) -> Sequence[int]:
-        """Return for how long each station found its channel busy until now, by index."""
+        """Return the time for which each station found its channel busy until now, by index."""
         return [busy - max(0, until - now_ns) for busy, until in zip(self._busy_ns, self._busy_until_ns, strict=True)]

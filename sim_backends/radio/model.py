@@ -1,4 +1,4 @@
-"""Radio models behind one interface: packets in, packets out, at the nanosecond that the model says."""
+"""Radio models behind one interface."""
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from itertools import product
@@ -18,7 +18,7 @@ from sim_backends.world.world import World
 
 
 class RadioModel(Protocol[Payload]):
-    """Packets in, packets out, at the nanosecond the models say; the caller brings the time, and never an earlier."""
+    """A radio model: it delivers packets at computed times, in ns; the caller passes non-decreasing times."""
 
     def place(
         self,
@@ -27,13 +27,13 @@ class RadioModel(Protocol[Payload]):
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,
     ) -> None:
-        """Let stations be where they are now; those without a place are out of everybody's range.
+        """Set the current positions of the stations; stations without a position are out of range.
 
         Args:
-            now_ns: Now.
-            places_m: Metres east, north, up.
-            relay: Whose access point relays between the others; None for direct links.
-            velocities_m_s: How they move; None for standing.
+            now_ns: Current time.
+            places_m: Positions in metres east, north, up.
+            relay: Station whose access point relays between the others; None for direct links.
+            velocities_m_s: Velocities; None if all stations are at rest.
         """
         ...
 
@@ -51,63 +51,63 @@ class RadioModel(Protocol[Payload]):
         """Send a packet at `now_ns`.
 
         Args:
-            now_ns: Now.
-            source: Who sends it.
-            payload: What it carries.
+            now_ns: Current time.
+            source: Name of the sender.
+            payload: Content of the packet.
             size_bytes: Its size, without MAC header.
-            destination: To whom; None is everyone.
-            packet: What the draws that decide over it are keyed by; None for the packets of a source as they come.
-            before: What it was delayed by until now.
+            destination: Name of the receiver; None for a broadcast.
+            packet: Identity that keys its random draws; None to number the packets of the source in order.
+            before: Delay of the packet until now.
 
         Raises:
-            KeyError: There is no way from `source` towards `destination`.
+            KeyError: There is no link from `source` towards `destination`.
         """
         ...
 
     def next_event_ns(self) -> int | None:
-        """Return when `deliveries` has something to do next, None when nothing is under way."""
+        """Return the time of the next event for `deliveries`, or None if no packet is in flight."""
         ...
 
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
-        """Return what arrived up to `now_ns` and was not returned before, in order of arrival."""
+        """Return the packets that arrived up to `now_ns` and were not returned before, in order of arrival."""
         ...
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Return what happened on each link so far."""
+        """Return the counters of each link so far."""
         ...
 
     def use_meter(self) -> None:
-        """Count from now on what drivers of radios count, for `sample`."""
+        """Start the counters of the radio drivers, for `sample`."""
         ...
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
-        """Return what each station's driver tells at `now_ns` of its links since `use_meter`; `utc_ns` is noted."""
+        """Return each station's driver statistics of its links since `use_meter`, with the timestamp `utc_ns`."""
         ...
 
     def log_losses(self, log: LossLog | None) -> None:
-        """Hand `log` every loss from now on, or nobody."""
+        """Pass every loss from now on to `log`; None stops logging."""
         ...
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
-        """Let the radios of these stations be off from now on, and these links be cut, but no others.
+        """Set the stations whose radios are off and the links that are cut, replacing earlier ones.
 
         Args:
-            now_ns: Now.
-            off: Whose radio is off. What waits at one that was on is lost.
-            cut: Who is out of each other's range wherever they are; a pair stands for both directions.
+            now_ns: Current time.
+            off: Stations whose radio is off. Packets queued at a station that is switched off are lost.
+            cut: Pairs of stations that cannot receive each other at any distance; a pair means both directions.
         """
         ...
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
-        """Let nobody but these send noise from now on.
+        """Set the jammers that send noise from now on, replacing earlier ones.
 
         Raises:
-            ConfigurationError: There are some, and the model knows no noise.
+            ConfigurationError: There are jammers, and the model does not support noise.
         """
         ...
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Hand `log` every transmission attempt that ends from now on, or nobody; fixed links make none."""
+        """Pass every transmission attempt that ends from now on to `log`; None stops it; fixed links report none."""
         ...
 
 
@@ -115,10 +115,10 @@ class WifiInWorld(Wifi[Payload]):
     """Wi-Fi stations in a world.
 
     Args:
-        seed: Of all random draws.
-        options: What the air does.
+        seed: Seed of all random draws.
+        options: Radio options.
         antennas: The stations.
-        world: What stands between them; None for open ground.
+        world: Obstacles between the stations; None for open ground.
     """
 
     def __init__(
@@ -135,20 +135,20 @@ class WifiInWorld(Wifi[Payload]):
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,
     ) -> None:
-        """See `RadioModel.place`."""
+        """Implement `RadioModel.place`."""
         self.advance(now_ns)
         self._world_channel.move(now_ns, places_m, velocities_m_s)
         self.relay(relay)
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
-        """See `RadioModel.disturb`."""
+        """Implement `RadioModel.disturb`."""
         self.switch_off(now_ns, off)
         self._world_channel.cut([*cut, *product(off, self._names)])
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
-        """See `RadioModel.jam`."""
-        heard_mw = self._world_channel.heard_mw
-        self.hear(
+        """Implement `RadioModel.jam`."""
+        received_mw = self._world_channel.received_mw
+        self.set_emissions(
             now_ns,
-            {emitter.name: Emission(now_ns, heard_mw(emitter.place_m, emitter.power_dbm)) for emitter in emitters},
+            {emitter.name: Emission(now_ns, received_mw(emitter.place_m, emitter.power_dbm)) for emitter in emitters},
         )

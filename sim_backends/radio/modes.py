@@ -1,6 +1,6 @@
-"""Modulation and coding of 802.11g and of 802.11n with one stream in 20 MHz, and how long frames take on the air.
+"""Modulation and coding of 802.11g and of 802.11n with one stream in 20 MHz, and the airtime of frames.
 
-Clauses are of IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n).
+Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n).
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ Modulation = Literal["BPSK", "QPSK", "16-QAM", "64-QAM"]
 SIFS_NS: Final = 10_000
 SLOT_NS: Final = 9_000
 DIFS_NS: Final = SIFS_NS + 2 * SLOT_NS
-"""Table 18-5, short slot: no station of 802.11b is near. DIFS by 10.3.7."""
+"""Table 18-5, short slot: there is no 802.11b station. DIFS by 10.3.7."""
 
 CW_MIN: Final = 15
 CW_MAX: Final = 1023
@@ -26,7 +26,7 @@ SHORT_RETRY_LIMIT: Final = 7
 """CW of table 18-5; dot11ShortRetryLimit by annex C."""
 
 ENERGY_DETECTION_DBM: Final = -62.0
-"""What arrives with this keeps a station from sending, whatever it is: 17.3.10.6, 20 dB above -82 dBm."""
+"""Any signal of at least this power keeps a station from sending: 17.3.10.6, 20 dB above -82 dBm."""
 
 ACK_BYTES: Final = 14
 _SYMBOL_NS: Final = 4_000
@@ -38,14 +38,14 @@ _HT_PREAMBLE_NS: Final = 36_000
 
 @dataclass(frozen=True, eq=False)
 class WifiMode:
-    """One way to put bits on the air; there is one object of each, so that comparing and hashing them cost nothing.
+    """A combination of modulation and coding; one object exists for each, so comparing and hashing use the identity.
 
     Attributes:
         name: `g54` or `n7`.
-        modulation: Of each subcarrier.
-        code_rate: Of the convolutional code.
+        modulation: Modulation of each subcarrier.
+        code_rate: Rate of the convolutional code.
         bits_per_symbol: Data bits in an OFDM symbol of 4 us, N_DBPS.
-        ht: Whether it is a mode of 802.11n.
+        ht: True for a mode of 802.11n.
     """
 
     name: str
@@ -63,17 +63,18 @@ class WifiMode:
         return self.bits_per_symbol * 1_000_000_000 // _SYMBOL_NS
 
     def airtime_ns(self, size_bytes: int) -> int:
-        """Return how long a frame of `size_bytes`, MAC header and FCS included, occupies the channel.
+        """Return the time for which a frame of `size_bytes`, with MAC header and FCS, occupies the channel.
 
-        TXTIME of 17.4.3 with the signal extension of 18.5.3.2 for ERP-OFDM; of 19.4.3 for HT in mixed format with
-        one stream (legacy preamble 20 us, HT-SIG 8 us, one HT-STF and one HT-LTF of 4 us each), extended alike.
+        TXTIME of 17.4.3 with the signal extension of 18.5.3.2 for ERP-OFDM; TXTIME of 19.4.3 for HT in mixed format
+        with one stream (legacy preamble 20 us, HT-SIG 8 us, one HT-STF and one HT-LTF of 4 us each), with the same
+        extension.
         """
         symbols = -(-(_SERVICE_AND_TAIL_BITS + 8 * size_bytes) // self.bits_per_symbol)
         return self.preamble_ns + symbols * _SYMBOL_NS + _SIGNAL_EXTENSION_NS
 
     @property
     def preamble_ns(self) -> int:
-        """Length of what precedes the data."""
+        """Duration of the preamble and headers before the data."""
         return _HT_PREAMBLE_NS if self.ht else _OFDM_PREAMBLE_NS
 
 
@@ -121,28 +122,28 @@ _CONTROL: Final = (G_MODES[4], G_MODES[2], G_MODES[0])
 
 
 def standard_of(radio: Radio) -> Standard:
-    """Return what a robot's radio speaks; what is not 802.11n speaks 802.11g."""
+    """Return the standard of a robot's radio; any standard other than 802.11n is treated as 802.11g."""
     return "802.11n" if radio.standard.startswith("802.11n") else "802.11g"
 
 
 def fixed_mode(name: str | None, standards: Mapping[str, Standard]) -> WifiMode | None:
-    """Return the mode that all stations are to send in; those of 802.11g every station of 802.11n has too.
+    """Return the mode in which all stations must send; stations of 802.11n also support the modes of 802.11g.
 
     Args:
-        name: Of the mode; None where each chooses its own.
-        standards: What the stations speak, by name.
+        name: Name of the mode; None if each station chooses its mode.
+        standards: Standards of the stations, by name.
 
     Raises:
-        ConfigurationError: A station does not have it.
+        ConfigurationError: A station does not support the mode.
     """
     if name is None:
         return None
-    mode = next(one for one in (*G_MODES, *N_MODES) if one.name == name)
+    mode = next(mode for mode in (*G_MODES, *N_MODES) if mode.name == name)
     for station, standard in standards.items():
         if mode.ht and standard != "802.11n":
             raise ConfigurationError(
-                f"radio.mode {name} is of 802.11n, and {station} has {standard}",
-                remedy=f"a mode that all have: {', '.join(one.name for one in G_MODES)}",
+                f"radio.mode {name} is a mode of 802.11n, but {station} supports only {standard}",
+                remedy=f"use a mode that all stations support: {', '.join(mode.name for mode in G_MODES)}",
             )
     return mode
 
@@ -155,9 +156,11 @@ def control_mode(mode: WifiMode) -> WifiMode:
     """
     reference = mode
     if mode.ht:
-        alike = [one for one in G_MODES if (one.modulation, one.code_rate) == (mode.modulation, mode.code_rate)]
-        reference = alike[0] if alike else G_MODES[-1]
-    return next(one for one in _CONTROL if one.bits_per_symbol <= reference.bits_per_symbol)
+        matches = [
+            g_mode for g_mode in G_MODES if (g_mode.modulation, g_mode.code_rate) == (mode.modulation, mode.code_rate)
+        ]
+        reference = matches[0] if matches else G_MODES[-1]
+    return next(control for control in _CONTROL if control.bits_per_symbol <= reference.bits_per_symbol)
 
 
 @cache

@@ -26,10 +26,10 @@ _HOP_S: Final = 0.0002
 
 
 def _checked_mode(name: str) -> str:
-    known = [mode.name for mode in (*G_MODES, *N_MODES)]
-    if name not in known:
+    names = [mode.name for mode in (*G_MODES, *N_MODES)]
+    if name not in names:
         raise schema.validation_error(
-            f"there is no mode {name!r}; {did_you_mean(name, known, 'modes: ' + ', '.join(known))}"
+            f"there is no mode {name!r}; {did_you_mean(name, names, 'modes: ' + ', '.join(names))}"
         )
     return name
 
@@ -49,11 +49,11 @@ def _checked_rate(text: str) -> str:
 
 
 class RadioOptions(Strict):
-    """The radio of an emulated lab: Wi-Fi in its world, or links that do the same everywhere.
+    """The radio of an emulated lab: Wi-Fi in its world, or links that behave the same everywhere.
 
-    With `loss`, `delay`, `rate` or `jitter` every link is fixed, wherever the robots stand: none is out of range,
-    robots do not contend for the channel, and nothing else below but `queue_packets` counts. In a master topology a
-    packet between two stations crosses two links and meets each of them twice.
+    With `loss`, `delay`, `rate` or `jitter` every link is fixed, wherever the robots are: no robot is out of range,
+    robots do not contend for the channel, and of the other options only `queue_packets` applies. In a master topology
+    a packet between two stations crosses two links, and each of the four applies twice.
 
     Attributes:
         propagation: Mean path loss in the open: `log-distance`, `free-space`, or `two-ray` over flat ground.
@@ -102,11 +102,11 @@ class RadioOptions(Strict):
 
     @property
     def fixed(self) -> bool:
-        """Whether every link is fixed."""
+        """True if every link is fixed."""
         return any(option is not None for option in (self.loss, self.delay, self.rate, self.jitter))
 
     def link(self) -> LinkParameters:
-        """Return what every fixed link does."""
+        """Return the parameters of every fixed link."""
         return LinkParameters(
             rate_bit_s=self._rate_bit_s(),
             delay_ns=round((_HOP_S if self.delay is None else self.delay) * 1e9),

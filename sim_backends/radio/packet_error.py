@@ -1,8 +1,8 @@
-"""Packet errors by noise: the bit error of each modulation, then the convolutional code.
+"""Packet errors by noise: the bit error rate of each modulation, then of the convolutional code.
 
 The model is that of Pei and Henderson, "Validation of OFDM error rate model in ns-3" (2010), after Miller,
 "Validation of 802.11a/UWB coexistence simulation" (NIST, 2003): hard decisions on a channel with additive white
-Gaussian noise, the code's error probability by the union bound over its weight spectrum.
+Gaussian noise; the code's error probability by the union bound over its weight spectrum.
 """
 
 import math
@@ -13,9 +13,9 @@ from typing import Final
 
 from sim_backends.radio.modes import WifiMode
 
-# Input bits per step, free distance, and the sum of bit errors over the paths of each weight from there on, for the
-# generators 133, 171 and its punctured codes: Haccoun and Begin, IEEE Trans. Commun. 37:1113 (1989); Frenger, Orten
-# and Ottosson, IEEE Commun. Lett. 3:317 (1999).
+# Input bits per step, free distance, and the sum of bit errors over the paths of each weight from the free distance
+# upwards, for the generators 133, 171 and the punctured codes: Haccoun and Begin, IEEE Trans. Commun. 37:1113 (1989);
+# Frenger, Orten and Ottosson, IEEE Commun. Lett. 3:317 (1999).
 _SPECTRA: Final[Mapping[Fraction, tuple[int, int, tuple[int, ...]]]] = {
     Fraction(1, 2): (
         1,
@@ -37,7 +37,7 @@ _HIGHEST_DB: Final = 40.0
 
 
 def bit_error(mode: WifiMode, snr: float) -> float:
-    """Return the share of coded bits in error at a signal-to-noise ratio `snr`, as a ratio, in the signal's band.
+    """Return the share of coded bits in error at the signal-to-noise power ratio `snr` in the signal's bandwidth.
 
     Proakis, Digital Communications, 4th ed., 5.2: Gray-coded, per subcarrier.
     """
@@ -53,7 +53,7 @@ def bit_error(mode: WifiMode, snr: float) -> float:
 
 
 def decoded_bit_error(mode: WifiMode, snr: float) -> float:
-    """Return an upper bound of the share of data bits in error after decoding, at most 1: the union bound."""
+    """Return an upper bound (the union bound) of the share of data bits in error after decoding, at most 1."""
     raw = bit_error(mode, snr)
     bhattacharyya = math.sqrt(4 * raw * (1 - raw))
     inputs, free_distance, weights = _SPECTRA[mode.code_rate]
@@ -63,17 +63,18 @@ def decoded_bit_error(mode: WifiMode, snr: float) -> float:
 
 @cache
 def _log_success_per_bit(mode: WifiMode) -> tuple[float, ...]:
-    """Return ln(1 - p) of a decoded bit at each step of the table, -inf where p is 1."""
+    """Return ln(1 - p) of a decoded bit at each step of the table, -inf if p is 1."""
     steps = round((_HIGHEST_DB - _LOWEST_DB) / _STEP_DB)
     errors = (decoded_bit_error(mode, 10 ** ((_LOWEST_DB + n * _STEP_DB) / 10)) for n in range(steps + 1))
     return tuple(math.log1p(-error) if error < 1 else -math.inf for error in errors)
 
 
 def log_success(mode: WifiMode, snr_db: float, bits: float) -> float:
-    """Return ln of the probability that `bits` data bits arrive whole at `snr_db`; -inf where none does.
+    """Return ln of the probability that `bits` data bits arrive without error at `snr_db`; -inf if it is 0.
 
-    Read from a table in steps of 0.05 dB, between which it goes straight: that is the formula within 0.002 dB.
-    Rounded to steps it would be off by up to 0.05 dB, which at a link's edge spoils a tenth more of the frames.
+    The value is interpolated linearly in a table with steps of 0.05 dB, which is within 0.002 dB of the formula.
+    Without interpolation the error would be up to 0.05 dB, which corrupts a tenth more of the frames at the edge of a
+    link's range.
     """
     steps = (snr_db - _LOWEST_DB) / _STEP_DB
     if steps <= 0:
@@ -89,5 +90,5 @@ def log_success(mode: WifiMode, snr_db: float, bits: float) -> float:
 
 
 def packet_error(mode: WifiMode, snr_db: float, size_bytes: int) -> float:
-    """Return the probability that a frame of `size_bytes` is spoilt at `snr_db`."""
+    """Return the probability that a frame of `size_bytes` is corrupted at `snr_db`."""
     return -math.expm1(log_success(mode, snr_db, 8 * size_bytes))

@@ -1,4 +1,4 @@
-"""Mean path loss in the open, for many paths at once."""
+"""Mean path loss in the open, for many paths together."""
 
 import math
 from typing import Final
@@ -10,7 +10,9 @@ from sim_backends.world.materials import GROUND, SPEED_OF_LIGHT_M_S
 from sim_backends.world.shapes import Floats
 
 NEAREST_M: Final = 1.0
-"""Nearer than this the loss stays what it is here: antennas have a size, and far-field formulas none."""
+"""Minimum distance; the loss does not fall further below it, because antennas have a size and far-field formulas do
+not.
+"""
 
 
 def free_space_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
@@ -19,30 +21,30 @@ def free_space_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats
 
 
 def log_distance_db(start_m: Floats, end_m: Floats, frequency_hz: float, exponent: float) -> Floats:
-    """Return free-space loss at 1 m and 10 n log10(d / 1 m) from there: Rappaport, Wireless Communications, 4.9.1."""
+    """Return free-space loss at 1 m plus 10 n log10(d / 1 m): Rappaport, Wireless Communications, 4.9.1."""
     loss_db: Floats = 10 * exponent * np.log10(_length_m(start_m, end_m)) + _friis_db(np.ones(1), frequency_hz)
     return loss_db
 
 
 def two_ray_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
-    """Return the loss where the ground reflects: the direct wave and its image, with their phases.
+    """Return the loss with ground reflection: the sum of the direct and the reflected wave, with their phases.
 
     Heights are over flat ground at 0. The reflection is Fresnel's for vertical polarization on medium dry ground
-    (ITU-R P.2040-1, eq. 31b and table 3); see Rappaport, Wireless Communications, 4.5 and 4.6. The loss is at most 40
-    dB more than the direct wave's, where the two cancel: no ground is that flat.
+    (ITU-R P.2040-1, eq. 31b and table 3); see Rappaport, Wireless Communications, 4.5 and 4.6. The loss exceeds that
+    of the direct wave by at most 40 dB when the two cancel: no real ground is flat enough for more.
     """
     direct_m = _length_m(start_m, end_m)
     image_m = end_m * np.array((1.0, 1.0, -1.0))
-    bounced_m = _length_m(start_m, image_m)
-    sine = np.minimum((start_m[:, 2] + end_m[:, 2]) / bounced_m, 1.0)
-    phase = 2 * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * (bounced_m - direct_m)
-    ratio = 1 + _reflection(sine, frequency_hz) * direct_m / bounced_m * np.exp(-1j * phase)
+    reflected_m = _length_m(start_m, image_m)
+    sine = np.minimum((start_m[:, 2] + end_m[:, 2]) / reflected_m, 1.0)
+    phase = 2 * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * (reflected_m - direct_m)
+    ratio = 1 + _reflection(sine, frequency_hz) * direct_m / reflected_m * np.exp(-1j * phase)
     loss_db: Floats = _friis_db(direct_m, frequency_hz) - 20 * np.log10(np.maximum(np.abs(ratio), 0.01))
     return loss_db
 
 
 def _reflection(sine: Floats, frequency_hz: float) -> NDArray[np.complex128]:
-    """Return what the ground makes of a wave that meets it at an angle with this sine."""
+    """Return the reflection coefficient of the ground for a wave that arrives at an angle with this sine."""
     permittivity = GROUND.permittivity(frequency_hz)
     root = np.sqrt(permittivity - (1 - sine**2))
     reflected: NDArray[np.complex128] = (permittivity * sine - root) / (permittivity * sine + root)

@@ -1,7 +1,8 @@
-"""Counter-based random streams: equal names give equal draws, whatever is drawn before, after or in between.
+"""Counter-based random streams: equal names give equal draws, regardless of other draws before or in between.
 
-Draws that decide over packets are keyed by what a packet is, never by how many draws came before: so one packet or
-one attempt more shifts no other's fate, and two runs that differ a little can be compared packet by packet.
+Draws that decide the result of a packet are keyed by the packet's identity, not by the number of draws before. An
+additional packet or attempt therefore changes no other packet's result, and two slightly different runs can be
+compared packet by packet.
 """
 
 import hashlib
@@ -10,46 +11,46 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.random import Philox  # which numpy itself would import at the first draw, while a packet waits
+from numpy.random import Philox  # numpy would import it at the first draw, and delay a packet
 from numpy.typing import NDArray
 
-# Most streams are asked for a few draws only: one per flow, attempt and purpose.
+# Most streams are used for a few draws only: there is one per flow, attempt and purpose.
 _BLOCK: Final = 64
-# Philox-4x64 turns one step of its counter into four 64-bit words.
+# Philox-4x64 generates four 64-bit words per step of its counter.
 _STEPS_PER_BLOCK: Final = _BLOCK // 4
 
 
 PacketIdentity = tuple[str, int]
-"""A flow, and which of its packets it is: what all random draws for a packet are keyed by."""
+"""A flow and the number of the packet in it: the key of all random draws for a packet."""
 
 
 class RandomStream:
     """Uniform draws on [0, 1), one per packet number, for one purpose.
 
     The draw for number n is the n-th word of Philox-4x64 (Salmon et al., "Parallel random numbers: as easy as 1, 2,
-    3", SC 2011) under a key hashed from the name. Words come in blocks and the last block is kept, so numbers
-    in rising order cost a list look-up each.
+    3", SC 2011) with a key hashed from the name. Words are generated in blocks and the last block is kept, so numbers
+    in ascending order cost one list look-up each.
 
     Args:
-        seed: The trial's seed.
+        seed: Seed of the trial.
         name: Words that name the stream, for example transmitter, receiver and purpose.
     """
 
     def __init__(self, seed: int, *name: str) -> None:
         self._key = int.from_bytes(_key(seed, name), "little")
-        self._number_of_block = -1
+        self._block_number = -1
         self._block: list[float] = []
 
     def draw(self, number: int) -> float:
         """Return the draw for packet `number`, counted from 0."""
         block, offset = divmod(number, _BLOCK)
-        if block != self._number_of_block:
+        if block != self._block_number:
             self._block = self._generate(block)
-            self._number_of_block = block
+            self._block_number = block
         return self._block[offset]
 
     def first(self, count: int) -> NDArray[np.float64]:
-        """Return the draws for the numbers below `count`."""
+        """Return the draws for the numbers 0 to `count` - 1."""
         return self._uniforms(0, count)
 
     def _generate(self, block: int) -> list[float]:
@@ -57,12 +58,13 @@ class RandomStream:
         return uniforms
 
     def _uniforms(self, counter: int, count: int) -> NDArray[np.float64]:
-        # Raw words, because numpy promises their values across versions and those of its distributions not.
+        # Raw words are used, because numpy guarantees their values across versions, but not those of its
+        # distributions.
         return _uniforms(Philox(key=self._key, counter=counter).random_raw(count))
 
 
 def first_draws(seed: int, names: Sequence[Sequence[str]], count: int) -> NDArray[np.float64]:
-    """Return the first draws of `RandomStream(seed, *name)` by name, in a third of the time. Shape (names, count)."""
+    """Return the first draws of `RandomStream(seed, *name)` by name, 3 times faster. Shape (names, count)."""
     generator = Philox(key=0)
     unused = generator.state
     words = np.empty((len(names), count), dtype=np.uint64)
@@ -86,18 +88,18 @@ class PacketDraws:
     """Draws for packets, for one purpose at one station or on one link.
 
     Args:
-        seed: As of `RandomStream`.
-        name: As of `RandomStream`.
+        seed: As for `RandomStream`.
+        name: As for `RandomStream`.
     """
 
     def __init__(self, seed: int, *name: str) -> None:
         self._seed = seed
         self._name = name
-        # By flow and occasion, so that the numbers of a stream follow each other.
+        # One stream per flow and occasion, so that the numbers within a stream are consecutive.
         self._streams: dict[tuple[str, int], RandomStream] = {}
 
     def draw(self, packet: PacketIdentity, occasion: int = 0) -> float:
-        """Return the draw on [0, 1) for a packet on one of several occasions, for example an attempt at it."""
+        """Return the draw on [0, 1) for a packet on one of several occasions, for example an attempt to send it."""
         flow, number = packet
         stream = self._streams.get((flow, occasion))
         if stream is None:

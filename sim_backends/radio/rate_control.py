@@ -1,4 +1,4 @@
-"""Rate control: the mode of a station's next frame, fixed or chosen by what arrived."""
+"""Rate control: the mode of a station's next frame, fixed or adapted to acknowledgements."""
 
 from typing import Protocol
 
@@ -7,25 +7,25 @@ from sim_backends.radio.random_streams import PacketIdentity
 
 
 class RateControl(Protocol):
-    """Chooses the mode of each attempt on one directed link."""
+    """Selects the mode of each attempt on one directed link."""
 
     def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:
-        """Return the mode of an attempt that begins at `now_ns`.
+        """Return the mode of an attempt that starts at `now_ns`.
 
         Args:
-            now_ns: When it begins.
-            packet: At which packet.
-            attempt: 1 for the first at it.
+            now_ns: Start time.
+            packet: Identity of the packet.
+            attempt: Number of the attempt for this packet, from 1.
         """
         ...
 
-    def tell(self, mode: WifiMode, *, acknowledged: bool) -> None:
-        """Take in what became of an attempt."""
+    def report(self, mode: WifiMode, *, acknowledged: bool) -> None:
+        """Record the result of an attempt."""
         ...
 
 
 class FixedRate:
-    """Always one mode.
+    """Always uses one mode.
 
     Args:
         mode: The mode.
@@ -35,8 +35,8 @@ class FixedRate:
         self._mode = mode
 
     def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:  # noqa: ARG002 (see RateControl)
-        """See `RateControl.choose`."""
+        """Implement `RateControl.choose`."""
         return self._mode
 
-    def tell(self, mode: WifiMode, *, acknowledged: bool) -> None:
-        """See `RateControl.tell`."""
+    def report(self, mode: WifiMode, *, acknowledged: bool) -> None:
+        """Implement `RateControl.report`."""

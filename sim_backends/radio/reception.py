@@ -1,4 +1,4 @@
-"""Reception of transmissions: carrier sense, the preamble that a station follows, what it decodes."""
+"""Reception of transmissions: carrier sense, synchronization to a preamble, and decoding."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,11 +21,11 @@ _ENERGY_DETECTION_MW: Final = 10 ** (ENERGY_DETECTION_DBM / 10)
 
 @dataclass(frozen=True, slots=True)
 class _Reach:
-    """How far a transmitter reaches, as long as its powers hold.
+    """The stations that a transmitter reaches, valid while its received powers do not change.
 
     Attributes:
-        powers_mw: As `RadioChannel.powers_mw` returned them.
-        heard_by: Indices of the stations that a frame of it keeps from sending.
+        powers_mw: The list returned by `RadioChannel.powers_mw`.
+        heard_by: Indices of the stations that detect its frames and therefore do not send.
     """
 
     powers_mw: list[float]
@@ -33,13 +33,13 @@ class _Reach:
 
 
 class Reception(Generic[Payload]):
-    """The frames on one channel, and the ears of all stations.
+    """The frames on one channel, and their reception at all stations.
 
     Args:
-        channel: How they hear each other.
-        seed: Of the draws that decide what is decoded.
-        stations: By index.
-        events: When stations that wait to send begin to; they begin later when they hear a frame.
+        channel: Received powers between the stations.
+        seed: Seed of the draws that decide which frames are decoded.
+        stations: Stations by index.
+        events: Scheduled starts of waiting stations, which are postponed when they detect a frame.
     """
 
     def __init__(
@@ -58,108 +58,108 @@ class Reception(Generic[Payload]):
         self._draws: dict[tuple[int, int, str], PacketDraws] = {}
         self._reaches: dict[int, _Reach] = {}
 
-    def begin(self, transmission: Transmission, reserved_ns: int) -> None:
-        """Put a frame on the air; who hears it keeps silent until `reserved_ns`."""
+    def start(self, transmission: Transmission, reserved_ns: int) -> None:
+        """Put a frame on the air; stations that detect it do not send until `reserved_ns`."""
         station, now_ns, end_ns = self._stations[transmission.transmitter], transmission.start_ns, transmission.end_ns
         reach = self._reach(transmission.transmitter, now_ns)
         transmission.powers_mw, transmission.heard_by = reach.powers_mw, reach.heard_by
-        before = self._on_air
-        for other in before:
+        on_air = self._on_air
+        for other in on_air:
             other.others.append(transmission)
-        transmission.others.extend(before)
+        transmission.others.extend(on_air)
         transmission.others.extend(self._emissions.values())
-        if station.following is not None:
-            station.following.followed_by.discard(station.index)
-            station.following = None
+        if station.receiving is not None:
+            station.receiving.receivers.discard(station.index)
+            station.receiving = None
         station.sending_until_ns = end_ns
-        station.contention.sent(end_ns)
-        stations, events, beginnings = self._stations, self._events, self._events.beginnings
+        station.contention.set_busy_until(end_ns)
+        stations, events, starts = self._stations, self._events, self._events.starts
         alone, powers_mw, noise_mw = not transmission.others, reach.powers_mw, self._channel.noise_mw
-        follow = transmission.followed_by.add
+        add_receiver = transmission.receivers.add
         sensed_ns = now_ns + BLIND_NS
         for index in reach.heard_by:
             hearer = stations[index]
-            if hearer.following is None and hearer.sending_until_ns <= now_ns:
+            if hearer.receiving is None and hearer.sending_until_ns <= now_ns:
                 others_mw = 0.0 if alone else sum([other.powers_mw[index] for other in transmission.others])
                 if powers_mw[index] >= (noise_mw[index] + others_mw) * _DETECTABLE_RATIO:
-                    hearer.following = transmission
-                    follow(index)
-            beginning = beginnings.get(index)
-            if beginning is None:
-                hearer.contention.sensed(now_ns, reserved_ns)
-            elif beginning[0] > sensed_ns:
-                events.begin(hearer.contention.postponed(now_ns, reserved_ns), index)
-        before.append(transmission)
+                    hearer.receiving = transmission
+                    add_receiver(index)
+            scheduled = starts.get(index)
+            if scheduled is None:
+                hearer.contention.on_busy(now_ns, reserved_ns)
+            elif scheduled[0] > sensed_ns:
+                events.schedule_start(hearer.contention.postpone(now_ns, reserved_ns), index)
+        on_air.append(transmission)
 
     def end(self, now_ns: int, transmission: Transmission) -> None:
-        """Take a frame off the air; who heard it without understanding it waits for an ACK that it could not see."""
+        """Take a frame off the air; stations that detected it without receiving it defer (EIFS)."""
         self._on_air.remove(transmission)
-        for index in transmission.followed_by:
-            self._stations[index].following = None
+        for index in transmission.receivers:
+            self._stations[index].receiving = None
         if transmission.others:
             until_ns = now_ns + _EIFS_EXTRA_NS + DIFS_NS
             for index in transmission.heard_by:
                 hearer = self._stations[index]
-                if index not in transmission.followed_by and hearer.sending_until_ns < now_ns:
-                    hearer.contention.deferred(until_ns)
-                    if index in self._events.beginnings:
-                        self._events.begin(hearer.contention.wanted(now_ns), index)
+                if index not in transmission.receivers and hearer.sending_until_ns < now_ns:
+                    hearer.contention.defer_until(until_ns)
+                    if index in self._events.starts:
+                        self._events.schedule_start(hearer.contention.earliest_start_ns(now_ns), index)
             transmission.others.clear()
 
-    def silence(self, index: int, now_ns: int) -> None:
-        """Break off what a station sends, so that nobody decodes it, and what it receives."""
+    def abort(self, index: int, now_ns: int) -> None:
+        """Abort the transmission of a station, so that no station decodes it, and its reception."""
         station = self._stations[index]
-        if station.following is not None:
-            station.following.followed_by.discard(index)
-            station.following = None
+        if station.receiving is not None:
+            station.receiving.receivers.discard(index)
+            station.receiving = None
         for transmission in self._on_air:
             if transmission.transmitter == index:
-                for follower in transmission.followed_by:
-                    self._stations[follower].following = None
-                transmission.followed_by.clear()
+                for receiver in transmission.receivers:
+                    self._stations[receiver].receiving = None
+                transmission.receivers.clear()
         station.sending_until_ns = min(station.sending_until_ns, now_ns)
 
-    def jam(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
-        """Let nothing but this noise be on the air from now on, by who sends it; the same noise may change."""
+    def set_emissions(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
+        """Set the noise that is on the air from now on, by jammer name; its received powers may change."""
         for name, emission in self._emissions.items():
             if name not in emissions:
                 emission.end_ns = now_ns
-        kept = {name: self._emissions.get(name, emission) for name, emission in emissions.items()}
-        for name, emission in kept.items():
+        current = {name: self._emissions.get(name, emission) for name, emission in emissions.items()}
+        for name, emission in current.items():
             if name not in self._emissions:
                 for transmission in self._on_air:
                     transmission.others.append(emission)
             emission.powers_mw = emissions[name].powers_mw
-        self._emissions = kept
+        self._emissions = current
 
-    def jammed(self, index: int) -> bool:
-        """Return whether a station finds so much noise of jammers that it does not send."""
+    def is_jammed(self, index: int) -> bool:
+        """Return True if the jammer noise at a station is so strong that it does not send."""
         emissions = self._emissions.values()
         return bool(emissions) and sum(emission.powers_mw[index] for emission in emissions) >= _ENERGY_DETECTION_MW
 
     def decodes(self, index: int, transmission: Transmission, purpose: str) -> bool:
-        """Return whether a station decodes a frame whose end has come; to be asked once, before `end`.
+        """Return True if a station decodes a frame that ends now; call it once per station, before `end`.
 
         Args:
-            index: Of the station.
-            transmission: Of the frame.
-            purpose: Names the stream of draws: frames of data and ACKs have fates of their own.
+            index: Index of the station.
+            transmission: The frame.
+            purpose: Name of the stream of draws: data frames and ACKs have separate draws.
         """
-        if index not in transmission.followed_by:
+        if index not in transmission.receivers:
             return False
-        return self._fate(transmission, index, purpose) < success(transmission, index, self._channel.noise_mw[index])
+        return self._draw(transmission, index, purpose) < success(transmission, index, self._channel.noise_mw[index])
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
-        known = self._reaches.get(transmitter)
-        if known is not None and known.powers_mw is powers_mw:
-            return known
+        reach = self._reaches.get(transmitter)
+        if reach is not None and reach.powers_mw is powers_mw:
+            return reach
         heard = map(ge, powers_mw, self._channel.sensitivity_mw)
         heard_by = [index for index, hears in enumerate(heard) if hears and index != transmitter]
-        known = self._reaches[transmitter] = _Reach(powers_mw, heard_by)
-        return known
+        reach = self._reaches[transmitter] = _Reach(powers_mw, heard_by)
+        return reach
 
-    def _fate(self, transmission: Transmission, receiver: int, purpose: str) -> float:
+    def _draw(self, transmission: Transmission, receiver: int, purpose: str) -> float:
         key = transmission.transmitter, receiver, purpose
         draws = self._draws.get(key)
         if draws is None:

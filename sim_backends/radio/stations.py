@@ -1,4 +1,4 @@
-"""Stations at work, and their knowledge of the peers that they send to."""
+"""State of the stations, and of their links to the peers to which they send."""
 
 from collections import deque
 from typing import Generic
@@ -13,64 +13,65 @@ from sim_backends.radio.rate_control import RateControl
 
 
 class Station(Generic[Payload]):
-    """A station at work.
+    """The state of a station.
 
     Args:
-        index: Which it is of the channel's.
-        draws: Of its backoff.
+        index: Its index in the channel's list of stations.
+        draws: Random draws of its backoff.
 
     Attributes:
         contention: Its carrier sense and backoff.
-        queue: What it has to send; the first is being sent, or waits for the channel.
-        following: The frame that it receives.
-        sending_until_ns: When its own last frame ends, or ended.
-        exchange: Counts exchanges of a frame and its ACK; odd while one is under way.
-        offered: Counts the packets that it was given to send.
+        queue: Frames to send; the first is being sent, or waits for the channel.
+        receiving: The frame that it is receiving.
+        sending_until_ns: End of its last or current frame.
+        exchange_id: Number that increases at the start and the end of each exchange of a frame and its ACK; odd
+            during an exchange.
+        offered: Number of packets that it was given to send.
     """
 
     __slots__ = (
-        "_drawn",
-        "_drawn_for",
         "_draws",
+        "_redraws",
+        "_redraws_of",
         "contention",
-        "exchange",
-        "following",
+        "exchange_id",
         "index",
         "offered",
         "queue",
+        "receiving",
         "sending_until_ns",
     )
 
     def __init__(self, index: int, draws: PacketDraws) -> None:
         self.index = index
         self._draws = draws
-        self._drawn_for: tuple[PacketIdentity, int] | None = None
-        self._drawn = 0
+        self._redraws_of: tuple[PacketIdentity, int] | None = None
+        self._redraws = 0
         self.contention = Contention(self._backoff)
         self.queue: deque[Frame[Payload]] = deque()
-        self.following: Transmission | None = None
+        self.receiving: Transmission | None = None
         self.sending_until_ns = 0
-        self.exchange = self.offered = 0
+        self.exchange_id = self.offered = 0
 
     def _backoff(self) -> float:
-        """Return the next draw for the frame that it sends, of those after so many attempts."""
+        """Return the next random draw for the first frame in the queue after its current number of attempts."""
         frame = self.queue[0]
-        drawn_for = frame.packet, frame.attempts
-        # Who drew no slot and finds the channel taken draws again.
-        self._drawn = self._drawn + 1 if drawn_for == self._drawn_for else 0
-        self._drawn_for = drawn_for
-        return self._draws.draw(frame.packet, self._drawn * (SHORT_RETRY_LIMIT + 1) + frame.attempts)
+        attempt = frame.packet, frame.attempts
+        # A station that drew 0 slots and finds the channel busy draws again.
+        self._redraws = self._redraws + 1 if attempt == self._redraws_of else 0
+        self._redraws_of = attempt
+        return self._draws.draw(frame.packet, self._redraws * (SHORT_RETRY_LIMIT + 1) + frame.attempts)
 
 
 class Peer(Generic[Payload]):
-    """What a station knows of another that it sends to, and what became of that.
+    """The state of a link from a station to a peer, and its counters.
 
     Args:
-        receiver: Index of the other.
-        rate: What chooses modes.
+        receiver: Index of the peer.
+        rate: Rate control of the link.
 
     Attributes:
-        last: The frame that came last: a retry whose ACK was lost comes twice.
+        last: The last frame that the peer received; a retry after a lost ACK is a duplicate of it.
     """
 
     __slots__ = ("delivered", "last", "lost", "queue_dropped", "rate", "receiver", "sent")
@@ -82,7 +83,7 @@ class Peer(Generic[Payload]):
         self.last: Frame[Payload] | None = None
 
     def count(self, *, delivered: bool) -> None:
-        """Take in what became of a frame in the end."""
+        """Count the final result of a frame."""
         self.sent += 1
         self.delivered += delivered
         self.lost += not delivered

@@ -1,8 +1,8 @@
-"""Stations of 802.11 on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
+"""802.11 stations on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
 
-An event-driven engine on integer nanoseconds that knows no clock and no socket; its contract is that of
-`model.RadioModel`. It leaves out RTS/CTS (drivers switch it off below 2347 bytes), A-MPDU aggregation,
-frames sent by the access point as beacons, power save, fragmentation.
+An event-driven engine on integer nanoseconds that uses no clock and no socket; its interface is `model.RadioModel`.
+It does not model RTS/CTS (drivers switch it off below 2347 bytes), A-MPDU aggregation, beacons of the access point,
+power save and fragmentation.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Set
@@ -19,8 +19,8 @@ from sim_backends.radio.frames import (
     Frame,
     Transmission,
     TransmissionAttempt,
-    acknowledgement,
-    attempt,
+    ack_record,
+    attempt_record,
     decibel,
 )
 from sim_backends.radio.links import LinkCounters, Pair
@@ -40,10 +40,10 @@ from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.reception import Reception
 from sim_backends.radio.stations import Peer, Station
 
-# 10.3.2.11: an ACK that has not begun by then does not come; aRxPHYStartDelay of table 17-21 is 20 us.
+# 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
 _ACK_TIMEOUT_NS: Final = SIFS_NS + SLOT_NS + 20_000
 
-# Who finds the channel jammed looks again so often; a robot hardly moves meanwhile.
+# Retry interval of a station that finds the channel jammed; a robot hardly moves in this time.
 _JAMMED_NS: Final = 1_000_000
 
 
@@ -51,9 +51,9 @@ class Wifi(Generic[Payload]):
     """Stations that share one channel.
 
     Args:
-        channel: How they hear each other.
-        seed: Of all random draws.
-        queue_packets: Packets that wait per station.
+        channel: Received powers between the stations.
+        seed: Seed of all random draws.
+        queue_packets: Maximum number of queued packets per station.
     """
 
     def __init__(self, channel: RadioChannel, seed: int, *, queue_packets: int = 1000) -> None:
@@ -74,19 +74,19 @@ class Wifi(Generic[Payload]):
         self._arrived: list[Delivery[Payload]] = []
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Hand `log` every transmission attempt that ends from now on, or nobody."""
+        """Pass every transmission attempt that ends from now on to `log`; None stops logging."""
         self._log = log
 
     def log_losses(self, log: LossLog | None) -> None:
-        """Hand `log` every loss from now on, or nobody."""
+        """Pass every loss from now on to `log`; None stops logging."""
         self._log_loss = log
 
     def use_meter(self) -> None:
-        """Count from now on what drivers count, for `sample`."""
+        """Start the counters of the radio drivers, for `sample`."""
         self._meter = RadioMeter(len(self._stations))
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
-        """See `RadioModel.sample`."""
+        """Implement `RadioModel.sample`."""
         self.advance(now_ns)
         if self._meter is None:
             return {}
@@ -94,7 +94,7 @@ class Wifi(Generic[Payload]):
         return {
             name: LinkSample(
                 utc_ns,
-                tuple(self._known(now_ns, self._meter, index, other) for other in self._associated(index)),
+                tuple(self._station_sample(now_ns, self._meter, index, other) for other in self._associated(index)),
                 noise_dbm=decibel(self._channel.noise_mw[index]),
                 active_ns=now_ns,
                 busy_ns=busy_ns[index],
@@ -103,58 +103,61 @@ class Wifi(Generic[Payload]):
         }
 
     def _associated(self, index: int) -> list[int]:
-        """Return whom a station sends frames to: all others, or its access point."""
+        """Return the indices of the stations to which a station sends frames: all others, or its access point."""
         others = range(len(self._stations)) if self._relay in {None, index} else (self._relay,)
         return [other for other in others if other is not None and other != index]
 
-    def _known(self, now_ns: int, meter: RadioMeter, index: int, other: int) -> StationSample:
-        name, heard = self._channel.names[other], self._channel.linked(other, index)
-        sent, back, came = meter.link(index, other), meter.link(other, index), self._peers.get((other, index))
+    def _station_sample(self, now_ns: int, meter: RadioMeter, index: int, other: int) -> StationSample:
+        name, linked = self._channel.names[other], self._channel.linked(other, index)
+        sent, reverse, peer = meter.link(index, other), meter.link(other, index), self._peers.get((other, index))
         return StationSample(
             station=name,
-            signal_dbm=decibel(self._channel.powers_mw(other, now_ns)[index]) if heard else None,
+            signal_dbm=decibel(self._channel.powers_mw(other, now_ns)[index]) if linked else None,
             tx_rate_bit_s=sent.rate_bit_s,
-            rx_rate_bit_s=back.rate_bit_s,
+            rx_rate_bit_s=reverse.rate_bit_s,
             tx_packets=sent.frames,
-            rx_packets=0 if came is None else came.delivered,
+            rx_packets=0 if peer is None else peer.delivered,
             tx_retries=sent.retries,
             tx_failures=sent.failures,
         )
 
     def switch_off(self, now_ns: int, names: Set[str]) -> None:
-        """Let the radios of these stations be off, and no others; who is off is to be out of everybody's range.
+        """Set the stations whose radios are off; the caller must also put them out of range of all others.
 
-        What waits at a station that was on is lost, and what it sends is broken off.
+        Frames queued at a station that is switched off are lost, and its current transmission is aborted.
         """
         self.advance(now_ns)
         for name in sorted(names - self._off):
             station = self._stations[self._index[name]]
-            self._reception.silence(station.index, now_ns)
-            self._events.forget(station.index)
-            station.exchange += station.exchange & 1
+            self._reception.abort(station.index, now_ns)
+            self._events.cancel_start(station.index)
+            station.exchange_id += station.exchange_id & 1
             while station.queue:
                 frame = station.queue.popleft()
                 if frame.receiver is None or self._peer(station.index, frame.receiver).last is not frame:
                     self._lose(now_ns, station.index, frame, RADIO_OFF)
         self._off = frozenset(names)
 
-    def hear(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
-        """Let nothing but this noise be on the air from now on, by who sends it."""
+    def set_emissions(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
+        """Set the jammer noise that is on the air from now on, by jammer name."""
         self.advance(now_ns)
-        self._reception.jam(now_ns, emissions)
+        self._reception.set_emissions(now_ns, emissions)
         if not emissions:
             for station in self._stations:
-                self._look_again(now_ns, station)
+                self._retry_when_idle(now_ns, station)
 
     def relay(self, name: str | None) -> None:
-        """Let this station be the access point from now on, or none."""
+        """Set the station that is the access point from now on; None for direct links."""
         self._relay = None if name is None else self._index[name]
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Return what became of the frames on each hop so far; a broadcast is one per station in range."""
+        """Return the counters of each hop so far; a broadcast counts as one frame per station in range."""
         names = self._channel.names
-        none = dict.fromkeys(permutations(names, 2), LinkCounters(0, 0, 0, 0))
-        return none | {(names[one], names[other]): peer.counters for (one, other), peer in self._peers.items()}
+        zeros = dict.fromkeys(permutations(names, 2), LinkCounters(0, 0, 0, 0))
+        return zeros | {
+            (names[transmitter], names[receiver]): peer.counters
+            for (transmitter, receiver), peer in self._peers.items()
+        }
 
     def send(
         self,
@@ -167,7 +170,7 @@ class Wifi(Generic[Payload]):
         packet: PacketIdentity | None = None,
         before: Delay = 0,
     ) -> None:
-        """See `RadioModel.send`."""
+        """Implement `RadioModel.send`."""
         self.advance(now_ns)
         station = self._stations[self._index[source]]
         receiver = None if destination is None else self._index[destination]
@@ -182,17 +185,17 @@ class Wifi(Generic[Payload]):
         self._enqueue(now_ns, station, frame)
 
     def next_event_ns(self) -> int | None:
-        """Return when `deliveries` has something to do next, None when nothing is under way."""
+        """Return the time of the next event for `deliveries`, or None if no packet is in flight."""
         return self._events.next_ns()
 
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
-        """Return what arrived up to `now_ns` and was not returned before, in order of arrival."""
+        """Return the packets that arrived up to `now_ns` and were not returned before, in order of arrival."""
         self.advance(now_ns)
         arrived, self._arrived = self._arrived, []
         return arrived
 
     def advance(self, now_ns: int) -> None:
-        """Let everything happen up to `now_ns`."""
+        """Run all events up to `now_ns`."""
         self._events.advance(now_ns)
 
     def _enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
@@ -208,22 +211,22 @@ class Wifi(Generic[Payload]):
             self._lose(now_ns, station.index, frame, QUEUE_FULL)
             return
         queue.append(frame)
-        if len(queue) == 1 and not station.exchange & 1:
+        if len(queue) == 1 and not station.exchange_id & 1:
             self._contend(now_ns, station)
 
     def _contend(self, now_ns: int, station: Station[Payload]) -> None:
-        self._events.begin(station.contention.wanted(now_ns), station.index)
+        self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def _begin(self, now_ns: int, index: int) -> None:
         station = self._stations[index]
-        station.contention.wanted(now_ns)
-        if self._reception.jammed(index):
-            self._events.at(now_ns + _JAMMED_NS, self._look_again, station)
+        station.contention.earliest_start_ns(now_ns)
+        if self._reception.is_jammed(index):
+            self._events.at(now_ns + _JAMMED_NS, self._retry_when_idle, station)
             return
-        station.exchange += 1
+        station.exchange_id += 1
         frame = station.queue[0]
         if not frame.attempts:
-            frame.begun_ns = now_ns
+            frame.first_attempt_ns = now_ns
         frame.attempts += 1
         receiver, packet, number = frame.receiver, frame.packet, frame.attempts
         mode = BASIC if receiver is None else self._peer(station.index, receiver).rate.choose(now_ns, packet, number)
@@ -231,43 +234,45 @@ class Wifi(Generic[Payload]):
         end_ns = now_ns + mode.airtime_ns(size_bytes)
         reserved_ns = end_ns if receiver is None else end_ns + SIFS_NS + ack_ns(mode)
         transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, packet, number)
-        self._reception.begin(transmission, reserved_ns)
+        self._reception.start(transmission, reserved_ns)
         if self._meter is not None:
-            self._meter.begun(transmission, receiver)
-        self._events.at(end_ns, self._sent, station, frame, transmission)
+            self._meter.on_start(transmission, receiver)
+        self._events.at(end_ns, self._end_transmission, station, frame, transmission)
 
-    def _look_again(self, now_ns: int, station: Station[Payload]) -> None:
-        if not station.queue or station.exchange & 1 or station.index in self._events.beginnings:
+    def _retry_when_idle(self, now_ns: int, station: Station[Payload]) -> None:
+        if not station.queue or station.exchange_id & 1 or station.index in self._events.starts:
             return
-        if self._reception.jammed(station.index):
-            self._events.at(now_ns + _JAMMED_NS, self._look_again, station)
+        if self._reception.is_jammed(station.index):
+            self._events.at(now_ns + _JAMMED_NS, self._retry_when_idle, station)
         else:
-            station.contention.sent(now_ns)
+            station.contention.set_busy_until(now_ns)
             self._contend(now_ns, station)
 
-    def _sent(
+    def _end_transmission(
         self, now_ns: int, station: Station[Payload], frame: Frame[Payload], transmission: Transmission
     ) -> None:
         receiver = frame.receiver
-        aimed_at = sorted(transmission.followed_by) if receiver is None else [receiver]
-        received = [index for index in aimed_at if self._reception.decodes(index, transmission, "data")]
+        addressed = sorted(transmission.receivers) if receiver is None else [receiver]
+        received = [index for index in addressed if self._reception.decodes(index, transmission, "data")]
         self._reception.end(now_ns, transmission)
         if self._log is not None:
-            self._log(attempt(self._channel.names, transmission, frame, received))
+            self._log(attempt_record(self._channel.names, transmission, frame, received))
         if not station.queue or station.queue[0] is not frame:
-            return  # broken off: its radio was switched off
+            return  # aborted: its radio was switched off
         for index in received:
             self._receive(now_ns, station.index, index, frame)
         if receiver is None:
             self._broadcast(now_ns, station.index, frame, received)
-            self._end(now_ns, station, done=True)
+            self._end_exchange(now_ns, station, done=True)
         else:
             if received:
-                answering = self._stations[receiver]
+                acknowledging = self._stations[receiver]
                 self._events.at(
-                    now_ns + SIFS_NS, self._acknowledge, answering, station, transmission, station.exchange
+                    now_ns + SIFS_NS, self._acknowledge, acknowledging, station, transmission, station.exchange_id
                 )
-            self._events.at(now_ns + _ACK_TIMEOUT_NS, self._unanswered, station, station.exchange, transmission.mode)
+            self._events.at(
+                now_ns + _ACK_TIMEOUT_NS, self._ack_timeout, station, station.exchange_id, transmission.mode
+            )
 
     def _broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
         for index, name in enumerate(self._channel.names):
@@ -283,7 +288,7 @@ class Wifi(Generic[Payload]):
         receiver: Station[Payload],
         station: Station[Payload],
         transmission: Transmission,
-        exchange: int,
+        exchange_id: int,
     ) -> None:
         if receiver.sending_until_ns > now_ns:
             return
@@ -291,51 +296,51 @@ class Wifi(Generic[Payload]):
         end_ns = now_ns + ack_ns(mode)
         packet, number = transmission.packet, transmission.attempt
         ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES, packet, number)
-        self._reception.begin(ack, end_ns)
+        self._reception.start(ack, end_ns)
         if self._meter is not None:
-            self._meter.begun(ack, None)
-        answered = 0
-        if station.following is ack and station.exchange == exchange:
-            answered = station.exchange = exchange + 2  # so that it no longer counts as unanswered
-        self._events.at(end_ns, self._acknowledged, station, ack, mode, answered)
+            self._meter.on_start(ack, None)
+        ack_exchange_id = 0
+        if station.receiving is ack and station.exchange_id == exchange_id:
+            ack_exchange_id = station.exchange_id = exchange_id + 2  # so that the ACK timeout is ignored
+        self._events.at(end_ns, self._end_ack, station, ack, mode, ack_exchange_id)
 
-    def _acknowledged(
-        self, now_ns: int, station: Station[Payload], ack: Transmission, mode: WifiMode, exchange: int
+    def _end_ack(
+        self, now_ns: int, station: Station[Payload], ack: Transmission, mode: WifiMode, exchange_id: int
     ) -> None:
-        decoded = station.following is ack and self._reception.decodes(station.index, ack, "ack")
+        decoded = station.receiving is ack and self._reception.decodes(station.index, ack, "ack")
         self._reception.end(now_ns, ack)
         if self._log is not None:
-            self._log(acknowledgement(self._channel.names, ack, station.index, decoded=decoded))
-        if exchange == station.exchange:
-            self._answer(now_ns, station, mode, acknowledged=decoded)
+            self._log(ack_record(self._channel.names, ack, station.index, decoded=decoded))
+        if exchange_id == station.exchange_id:
+            self._finish_attempt(now_ns, station, mode, acknowledged=decoded)
 
-    def _unanswered(self, now_ns: int, station: Station[Payload], exchange: int, mode: WifiMode) -> None:
-        if exchange == station.exchange:
-            self._answer(now_ns, station, mode, acknowledged=False)
+    def _ack_timeout(self, now_ns: int, station: Station[Payload], exchange_id: int, mode: WifiMode) -> None:
+        if exchange_id == station.exchange_id:
+            self._finish_attempt(now_ns, station, mode, acknowledged=False)
 
-    def _answer(self, now_ns: int, station: Station[Payload], mode: WifiMode, *, acknowledged: bool) -> None:
+    def _finish_attempt(self, now_ns: int, station: Station[Payload], mode: WifiMode, *, acknowledged: bool) -> None:
         frame = station.queue[0]
         assert frame.receiver is not None
         peer = self._peer(station.index, frame.receiver)
-        peer.rate.tell(mode, acknowledged=acknowledged)
+        peer.rate.report(mode, acknowledged=acknowledged)
         if not acknowledged:
-            station.contention.sent(now_ns)
+            station.contention.set_busy_until(now_ns)
         done = acknowledged or frame.attempts >= SHORT_RETRY_LIMIT
         if done:
             peer.count(delivered=peer.last is frame)
             if self._meter is not None and not acknowledged:
-                self._meter.failed(station.index, frame.receiver)
+                self._meter.on_failure(station.index, frame.receiver)
             if peer.last is not frame:
                 self._lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
-        self._end(now_ns, station, done=done)
+        self._end_exchange(now_ns, station, done=done)
 
-    def _end(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
-        station.exchange += 1
+    def _end_exchange(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
+        station.exchange_id += 1
         if done:
-            station.contention.succeeded()
+            station.contention.on_success()
             station.queue.popleft()
         else:
-            station.contention.failed()
+            station.contention.on_failure()
         if station.queue:
             self._contend(now_ns, station)
 
@@ -345,25 +350,25 @@ class Wifi(Generic[Payload]):
             return
         peer.last = frame
         wave_ns = self._channel.delay_ns(transmitter, receiver)
-        passed = frame.delayed(now_ns, wave_ns)
+        delay_so_far = frame.total_delay(now_ns, wave_ns)
         if frame.keep:
-            self._events.at(now_ns + wave_ns, self._deliver, receiver, frame.payload, frame.source, passed)
+            self._events.at(now_ns + wave_ns, self._deliver, receiver, frame.payload, frame.source, delay_so_far)
         for onward in frame.onward:
-            self._enqueue(now_ns, self._stations[receiver], frame.passed_on(now_ns, onward, passed))
+            self._enqueue(now_ns, self._stations[receiver], frame.for_second_hop(now_ns, onward, delay_so_far))
 
-    def _deliver(self, now_ns: int, receiver: int, payload: Payload, source: str, passed: Delay) -> None:
+    def _deliver(self, now_ns: int, receiver: int, payload: Payload, source: str, delay_so_far: Delay) -> None:
         name = self._channel.names[receiver]
-        if name != source:  # an access point repeats a broadcast to who sent it, too
-            self._arrived.append((now_ns, name, payload, source, passed))
+        if name != source:  # an access point also repeats a broadcast to its sender
+            self._arrived.append((now_ns, name, payload, source, delay_so_far))
 
     def _lose(self, now_ns: int, transmitter: int, frame: Frame[Payload], reason: str) -> None:
-        """Tell that a frame got no further than `transmitter`, for everyone whom it would have reached."""
+        """Log that a frame was not delivered beyond `transmitter`, for each station that it would have reached."""
         if self._log_loss is None:
             return
-        for name in self._missed_by(transmitter, frame):
+        for name in self._intended_receivers(transmitter, frame):
             self._log_loss(now_ns, frame.payload, name, reason)
 
-    def _missed_by(self, transmitter: int, frame: Frame[Payload]) -> Iterable[str]:
+    def _intended_receivers(self, transmitter: int, frame: Frame[Payload]) -> Iterable[str]:
         names = self._channel.names
         ends = frame.onward or (frame.receiver,)
         if ends == (None,):

@@ -1,4 +1,4 @@
-"""The channel between stations that stand or move in a world: path loss, obstacles, fading."""
+"""The channel between stations that are placed or move in a world: path loss, obstacles, fading."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -29,21 +29,22 @@ from sim_backends.world.world import World
 
 CHANNEL_6_HZ: Final = 2.437e9
 
-# A gain is used for this share of the time in which the echoes turn once.
-_KEPT_TURN: Final = 0.02
+# A gain is used for this share of the shortest period of an echo's phase.
+_GAIN_VALID_PERIODS: Final = 0.02
 _SLOWEST_M_S: Final = 1e-6
 
-# So many links cost little more than one, about 0.3 ms among trees; whoever sends next may ask for them.
-_TOGETHER: Final = 100
+# Computing this number of links costs little more than one, about 0.3 ms among trees, and the next sender may need
+# them.
+_BATCH_LINKS: Final = 100
 
 
 @dataclass(frozen=True)
 class Antenna:
-    """A station as the air sees it.
+    """The radio properties of a station.
 
     Attributes:
-        standard: What its radio speaks.
-        tx_power_dbm: Power that it sends with.
+        standard: Standard of its radio.
+        tx_power_dbm: Transmit power.
         sensitivity_dbm: Weakest frame that it detects.
     """
 
@@ -53,79 +54,80 @@ class Antenna:
 
 
 def antenna_of(radio: Radio) -> Antenna:
-    """Return the antenna of a robot's radio; what is not 802.11n speaks 802.11g."""
+    """Return the antenna of a robot's radio; any standard other than 802.11n is treated as 802.11g."""
     return Antenna(standard_of(radio), float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
 
 
 class _Row:
-    """One station's links to all, by index, as they are until somebody moves.
+    """The links of one station to all others, by index, valid until a station moves.
 
     Args:
-        moves: How often somebody had moved when it was worked out.
-        mean_mw: How strong the station arrives at each, without fading, in mW.
+        revision: Revision of the positions for which it was computed.
+        mean_mw: Received power of the station at each other, without fading, in mW.
 
     Attributes:
-        linked: Whether each hears it and is heard by it, without fading; None before anybody asked.
-        slot: The time for which `powers_mw` were worked out, counted in times that a gain is kept.
-        powers_mw: How strong the station arrives at each in that time, without fading before any time.
+        linked: True for each station that receives it and is received by it, without fading; None before the first
+            use.
+        slot: Number of the time slot (of the validity of a gain) for which `powers_mw` was computed; -1 for none.
+        powers_mw: Received power of the station at each other in that slot; without fading if the slot is -1.
     """
 
-    __slots__ = ("linked", "mean_mw", "moves", "powers_mw", "slot")
+    __slots__ = ("linked", "mean_mw", "powers_mw", "revision", "slot")
 
-    def __init__(self, moves: int, mean_mw: Floats) -> None:
-        self.moves = moves
+    def __init__(self, revision: int, mean_mw: Floats) -> None:
+        self.revision = revision
         self.mean_mw = mean_mw
         self.linked: list[bool] | None = None
         self.slot = -1
         self.powers_mw: list[float] = mean_mw.tolist()
 
 
-class _Faded:
-    """The gains of some links, as they are until somebody moves and as long as a gain is kept.
+class _GainCache:
+    """The gains of some links, valid until a station moves or the time slot ends.
 
     Args:
-        links: Their indices.
-        ends: Indices of their first ends, and of their second.
-        echoes: How their echoes go.
+        links: Indices of the links.
+        ends: Indices of their first ends, and of their second ends.
+        echoes: Their echoes.
 
     Attributes:
-        moves: How often somebody had moved when `fades` was worked out.
-        fades: How they fade since then.
-        slot: The time for which `gains` were worked out.
-        gains: What they are in that time, by place among `links`.
+        revision: Revision of the positions for which `fades` was computed.
+        fades: Gains over time since then.
+        slot: Time slot for which `gains` was computed.
+        gains: Gains in that slot, in the order of `links`.
     """
 
-    __slots__ = ("echoes", "ends", "fades", "gains", "links", "moves", "slot")
+    __slots__ = ("echoes", "ends", "fades", "gains", "links", "revision", "slot")
 
     def __init__(self, links: NDArray[np.int64], ends: NDArray[np.int64], echoes: Echoes) -> None:
         self.links = links
         self.ends = ends
         self.echoes = echoes
-        self.moves = self.slot = -1
+        self.revision = self.slot = -1
         self.fades: Fades | None = None
         self.gains = np.empty(0)
 
 
 class WorldChannel(RadioChannel):
-    """The channel between stations that stand, or move, in a world.
+    """The channel between stations that are placed or move in a world.
 
-    A move costs little: the links of a station are worked out when a frame, or anybody, asks for them. What they are
-    then depends on nothing but the time and what was told of places and velocities last.
+    A move is cheap: the links of a station are computed when a frame, or another caller, needs them. The result
+    depends only on the time and the last positions and velocities.
 
     Args:
-        seed: Of shadowing and fading.
+        seed: Seed of shadowing and fading.
         antennas: The stations.
-        options: What the air does.
-        world: What stands between them; None for open ground.
+        options: Radio options.
+        world: Obstacles between the stations; None for open ground.
 
     Raises:
-        ConfigurationError: All frames are to be of a mode that a station does not have.
+        ConfigurationError: `options.mode` is a mode that a station does not support.
     """
 
     def __init__(
         self, seed: int, antennas: Mapping[str, Antenna], options: RadioOptions, world: World | None = None
     ) -> None:
-        # The tables of errors are made now, not while the first frames wait for them.
+        # The error tables are computed now, not when the first frames wait for them.
         for mode in (*MODES["802.11g"], *MODES["802.11n"]):
             packet_error(mode, 0.0, 1)
         self.names = tuple(antennas)
@@ -133,7 +135,7 @@ class WorldChannel(RadioChannel):
         self.sensitivity_mw = [milliwatt(antenna.sensitivity_dbm) for antenna in antennas.values()]
         self._seed = seed
         self._antennas = tuple(antennas.values())
-        self._sent_dbm = np.array([antenna.tx_power_dbm for antenna in self._antennas])
+        self._tx_powers_dbm = np.array([antenna.tx_power_dbm for antenna in self._antennas])
         self._options = options
         self._fixed_mode = fixed_mode(options.mode, {name: antenna.standard for name, antenna in antennas.items()})
         self._world = world
@@ -141,14 +143,14 @@ class WorldChannel(RadioChannel):
             Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
         )
         count = len(self.names)
-        # A link begins at the end whose name sorts first, whatever the order of the stations.
+        # The first end of a link is the one whose name sorts first, whatever the order of the stations.
         by_name = np.array(sorted(range(count), key=self.names.__getitem__), dtype=np.int64)
         self._ends = by_name[np.stack(np.triu_indices(count, 1))]
         self._link_of = np.zeros((count, count), dtype=np.int64)
         self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(self._ends.shape[1])
         self._own_links = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
         self._others = [np.delete(np.arange(count), station) for station in range(count)]
-        self._faded: list[_Faded | None] = [None] * count
+        self._gain_caches: list[_GainCache | None] = [None] * count
         self._fading = Fading(
             seed,
             self.names,
@@ -162,17 +164,17 @@ class WorldChannel(RadioChannel):
         self._cut = np.zeros((count, count), dtype=bool)
         self._present = np.zeros(count, dtype=bool)
         self._places_m, self._velocities_m_s = np.zeros((2, count, 3))
-        self._told_ns, self._kept_ns = 0, self._gain_kept_ns()
-        self._moves = 0
+        self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
+        self._revision = 0
         self.use_losses(np.full((count, count), np.inf))
 
     def move(
         self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
     ) -> None:
-        """Take it that the stations are at `places_m` now and move with `velocities_m_s`, or stand.
+        """Set the current positions and velocities of the stations.
 
-        Who has no place is out of everybody's range. Until something else is told, mean powers stay as they are, and
-        stations go on with their velocities as far as fading is concerned, which turns within a wavelength.
+        Stations without a position are out of range of all others. Until the next call, mean powers do not change;
+        only fading, which changes within a wavelength, extrapolates with the velocities.
         """
         moving = velocities_m_s or {}
         places = list(map(places_m.get, self.names))
@@ -186,13 +188,13 @@ class WorldChannel(RadioChannel):
         if velocities is not self._velocities:
             self._velocities_m_s = np.array(velocities, dtype=np.float64).reshape(-1, 3)
             self._in_motion = bool(self._velocities_m_s.any())
-            self._kept_ns = self._gain_kept_ns()
+            self._gain_valid_ns = self._compute_gain_valid_ns()
         self._places, self._velocities = places, velocities
         self._present = np.array([place is not None for place in places])
         self._places_m = np.array([place or STILL for place in places], dtype=np.float64).reshape(-1, 3)
-        # Where nobody moves it does not matter since when, and must not, not even by a rounding.
-        self._told_ns = now_ns if self._in_motion else 0
-        self._moves += 1
+        # If no station moves, the time must not matter, not even through rounding.
+        self._moved_ns = now_ns if self._in_motion else 0
+        self._revision += 1
         if moved.all():
             self._stale[:] = True
         else:
@@ -200,97 +202,97 @@ class WorldChannel(RadioChannel):
             self._stale |= moved[first] | moved[second]
 
     def cut(self, pairs: Iterable[tuple[str, str]]) -> None:
-        """Let these pairs be out of each other's range from now on, and no others but by where they are."""
+        """Set the pairs of stations that are out of range of each other regardless of their positions."""
         index = {name: number for number, name in enumerate(self.names)}
         cut = np.zeros_like(self._cut)
-        for one, other in pairs:
-            cut[index[one], index[other]] = cut[index[other], index[one]] = True
-        self._moves += 1
+        for first, second in pairs:
+            cut[index[first], index[second]] = cut[index[second], index[first]] = True
+        self._revision += 1
         self._stale |= (cut != self._cut)[tuple(self._ends)]
         self._cut = cut
 
-    def heard_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
-        """Return how strong somebody else who sends from a place is on average at each station, by index."""
+    def received_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
+        """Return the mean received power at each station, by index, of another transmitter at a position."""
         to_m = self._places_m
         loss_db = self.loss_db(np.broadcast_to(place_m, to_m.shape), to_m)
         loss_db[~self._present] = np.inf
-        heard_mw: list[float] = _milliwatts(power_dbm - loss_db).tolist()
-        return heard_mw
+        received_mw: list[float] = _milliwatts(power_dbm - loss_db).tolist()
+        return received_mw
 
-    def _gain_kept_ns(self) -> int:
-        """Return how long a gain is used: while the echoes between the two fastest hardly turn."""
-        both_m_s = float(np.sort(np.linalg.norm(self._velocities_m_s, axis=1))[-2:].sum())
-        turn_s = SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ / max(both_m_s + self._options.stir_m_s, _SLOWEST_M_S)
-        return round(_KEPT_TURN * turn_s * 1e9)
+    def _compute_gain_valid_ns(self) -> int:
+        """Return the time for which a gain is used: 2 % of an echo's period between the two fastest stations."""
+        closing_m_s = float(np.sort(np.linalg.norm(self._velocities_m_s, axis=1))[-2:].sum())
+        period_s = SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ / max(closing_m_s + self._options.stir_m_s, _SLOWEST_M_S)
+        return round(_GAIN_VALID_PERIODS * period_s * 1e9)
 
     def use_losses(self, loss_db: Floats) -> None:
-        """Let paths lose this, from row to column, in dB, until an end of theirs moves; infinity is out of range."""
-        self._moves += 1
+        """Use these losses from row to column, in dB, until an end of the path moves; infinity is out of range."""
+        self._revision += 1
         self._loss_db = loss_db
         self._k = np.zeros(loss_db.shape)
         self._stale = np.zeros(self._ends.shape[1], dtype=bool)
         self._rows: list[_Row | None] = [None] * len(loss_db)
 
     def _row(self, station: int) -> _Row:
-        """Return the links of a station, worked out now if an end of them moved since they were."""
+        """Return the links of a station, computed again if one of their ends has moved."""
         row = self._rows[station]
-        if row is not None and row.moves == self._moves:
+        if row is not None and row.revision == self._revision:
             return row
-        self._work_out(station)
-        row = _Row(self._moves, _milliwatts(self._sent_dbm[station] - self._loss_db[station]))
+        self._update_links(station)
+        row = _Row(self._revision, _milliwatts(self._tx_powers_dbm[station] - self._loss_db[station]))
         self._rows[station] = row
         return row
 
     def _gains(self, station: int, slot: int) -> Floats:
-        """Return the gains of a station's links in a time, 0 to itself; its row is to be worked out before."""
-        faded, own = self._faded_of(station), self._own_links[station]
-        if faded.fades is None or faded.moves != self._moves:
-            first, second = faded.ends
+        """Return the gains of a station's links in a time slot, 0 to itself; `_row` must have been called before."""
+        cache, own = self._gain_cache(station), self._own_links[station]
+        if cache.fades is None or cache.revision != self._revision:
+            first, second = cache.ends
             start_m, end_m = self._places_m[first], self._places_m[second]
             velocities_m_s = (self._velocities_m_s[first], self._velocities_m_s[second]) if self._in_motion else None
-            faded.fades = faded.echoes.fades(start_m, end_m, velocities_m_s, self._k[first, second], self._told_ns)
-            faded.moves, faded.slot = self._moves, -1
-        if faded.slot != slot:
-            faded.gains = faded.fades.gains((slot * self._kept_ns - self._told_ns) * 1e-9)
-            faded.slot = slot
+            cache.fades = cache.echoes.fades(start_m, end_m, velocities_m_s, self._k[first, second], self._moved_ns)
+            cache.revision, cache.slot = self._revision, -1
+        if cache.slot != slot:
+            cache.gains = cache.fades.gains((slot * self._gain_valid_ns - self._moved_ns) * 1e-9)
+            cache.slot = slot
         gains = np.zeros(len(self.names))
-        gains[self._others[station]] = faded.gains if faded.links is own else faded.gains[own]
+        gains[self._others[station]] = cache.gains if cache.links is own else cache.gains[own]
         return gains
 
-    def _faded_of(self, station: int) -> _Faded:
-        faded = self._faded[station]
-        if faded is None:
-            # An answer needs the same gain as what it answers, so that few links are worked out together.
-            together = self._ends.shape[1] <= _TOGETHER
-            links = np.arange(self._ends.shape[1]) if together else self._own_links[station]
-            faded = _Faded(links, self._ends[:, links], self._fading.echoes(links))
-            if together:
-                self._faded = [faded] * len(self.names)
+    def _gain_cache(self, station: int) -> _GainCache:
+        cache = self._gain_caches[station]
+        if cache is None:
+            # An ACK needs the same gain as its data frame, so if there are few links they are computed together.
+            all_links = self._ends.shape[1] <= _BATCH_LINKS
+            links = np.arange(self._ends.shape[1]) if all_links else self._own_links[station]
+            cache = _GainCache(links, self._ends[:, links], self._fading.echoes(links))
+            if all_links:
+                self._gain_caches = [cache] * len(self.names)
             else:
-                self._faded[station] = faded
-        return faded
+                self._gain_caches[station] = cache
+        return cache
 
-    def _work_out(self, station: int) -> None:
-        """Work out the links of a station that are stale, and all others with them while they are few."""
+    def _update_links(self, station: int) -> None:
+        """Compute the stale links of a station, and all other stale links too if there are few."""
         own = self._own_links[station]
         stale = own[self._stale[own]]
         if not len(stale):
             return
-        if np.count_nonzero(self._stale) <= _TOGETHER:
+        if np.count_nonzero(self._stale) <= _BATCH_LINKS:
             stale = np.flatnonzero(self._stale)
         first, second = self._ends[:, stale]
         start, end = self._places_m[first], self._places_m[second]
         obstacles_db = self._obstacles_db(start, end)
         loss_db = self._open_db(start, end) + obstacles_db
         loss_db[~(self._present[first] & self._present[second]) | self._cut[first, second]] = np.inf
-        # Whatever stands in the way takes something, and the steady wave.
+        # Any obstacle on the path adds loss and removes the constant component.
         k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
         for table, values in ((self._loss_db, loss_db), (self._k, k)):
             table[first, second] = table[second, first] = values
         self._stale[stale] = False
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return the mean loss of paths between points of shape (n, 3), shadowing and obstacles included, in dB."""
+        """Return the mean loss of paths between points of shape (n, 3), with shadowing and obstacles, in dB."""
         return self._open_db(start_m, end_m) + self._obstacles_db(start_m, end_m)
 
     def _open_db(self, start_m: Floats, end_m: Floats) -> Floats:
@@ -317,7 +319,7 @@ class WorldChannel(RadioChannel):
         row = self._row(transmitter)
         if not self._options.fading:
             return row.powers_mw
-        slot = now_ns // self._kept_ns
+        slot = now_ns // self._gain_valid_ns
         if slot != row.slot:
             row.powers_mw = (row.mean_mw * self._gains(transmitter, slot)).tolist()
             row.slot = slot
@@ -325,18 +327,18 @@ class WorldChannel(RadioChannel):
 
     @override
     def linked(self, transmitter: int, receiver: int) -> bool:
-        """By mean powers, so that a deep fade breaks no association."""
+        """Use mean powers, so that a deep fade breaks no association."""
         row = self._row(transmitter)
         if row.linked is None:
-            back_mw = _milliwatts(self._sent_dbm - self._loss_db[transmitter])
-            hears_mw = self.sensitivity_mw[transmitter]
-            row.linked = ((row.mean_mw >= self.sensitivity_mw) & (back_mw >= hears_mw)).tolist()
+            reverse_mw = _milliwatts(self._tx_powers_dbm - self._loss_db[transmitter])
+            sensitivity_mw = self.sensitivity_mw[transmitter]
+            row.linked = ((row.mean_mw >= self.sensitivity_mw) & (reverse_mw >= sensitivity_mw)).tolist()
         return row.linked[receiver]
 
     @override
     def delay_ns(self, transmitter: int, receiver: int) -> int:
-        one, other = self._places[transmitter], self._places[receiver]
-        return round(math.dist(one or STILL, other or STILL) / SPEED_OF_LIGHT_M_S * 1e9)
+        first, second = self._places[transmitter], self._places[receiver]
+        return round(math.dist(first or STILL, second or STILL) / SPEED_OF_LIGHT_M_S * 1e9)
 
     @override
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
@@ -355,7 +357,7 @@ class WorldChannel(RadioChannel):
 
 
 def milliwatt(dbm: float) -> float:
-    """Return a power in mW, which is 0 below what a float can tell."""
+    """Return a power in mW; 0 below the range of a float."""
     return float(10 ** (max(dbm, -3000.0) / 10))
 
 

@@ -1,1 +1,1 @@
-"""The world that robots stand in: obstacles with materials, shared by radio and physics."""
+"""The world of the robots: obstacles with materials, shared by radio and physics."""

@@ -1,4 +1,4 @@
-"""Dead reckoning: where somebody is later who keeps their velocity (IEEE Std 1278.1-2012, annex E, DRM FPW)."""
+"""Dead reckoning: extrapolation with constant velocity (IEEE Std 1278.1-2012, annex E, DRM FPW)."""
 
 from collections.abc import Iterator, Mapping
 
@@ -6,13 +6,13 @@ from sim_backends.world.motion import State
 
 
 def moved_on(state: State, seconds: float) -> State:
-    """Return a state that many seconds later, at its velocity."""
+    """Return the state after this time, at constant velocity."""
     (e, n, u), (v_e, v_n, v_u) = state.position_m, state.velocity_m_s
     return state._replace(position_m=(e + seconds * v_e, n + seconds * v_n, u + seconds * v_u))
 
 
-class _MovedOn(Mapping[str, State]):
-    """States some seconds later, each worked out when it is asked for."""
+class _Extrapolated(Mapping[str, State]):
+    """States extrapolated by some seconds, each computed on request."""
 
     def __init__(self, states: Mapping[str, State], seconds: float) -> None:
         self._states = states
@@ -29,12 +29,12 @@ class _MovedOn(Mapping[str, State]):
 
 
 class DeadReckoned(Mapping[str, State]):
-    """States that are known at a time, and by dead reckoning later: as a mapping, those of that time.
+    """States known at a time, and extrapolated later; as a mapping, it contains those of that time.
 
     Args:
         states: The states.
         since_ns: Their time.
-        step_ns: They move on by whole steps of this length, counted from `since_ns`.
+        step_ns: The extrapolation moves in whole steps of this length, counted from `since_ns`.
     """
 
     def __init__(self, states: Mapping[str, State], since_ns: int, step_ns: int) -> None:
@@ -45,11 +45,11 @@ class DeadReckoned(Mapping[str, State]):
         self._now = states
 
     def at(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states at a time not before theirs; the same object for a whole step."""
+        """Return the states at a time that is not before theirs; the same object for a whole step."""
         steps = (now_ns - self._since_ns) // self._step_ns
         if steps != self._steps:
             self._steps = steps
-            self._now = _MovedOn(self._states, steps * self._step_ns / 1e9) if steps else self._states
+            self._now = _Extrapolated(self._states, steps * self._step_ns / 1e9) if steps else self._states
         return self._now
 
     def __getitem__(self, name: str) -> State:

@@ -1,4 +1,4 @@
-"""Materials, and their losses to a radio wave that crosses them."""
+"""Materials, and the losses of a radio wave that crosses them."""
 
 import cmath
 import math
@@ -42,7 +42,7 @@ class Solid:
         return -_DB_PER_NEPER * wave_number * cmath.sqrt(self.permittivity(frequency_hz)).imag
 
     def face_loss_db(self, frequency_hz: float) -> float:
-        """Return what one face reflects of a wave that meets it squarely, in dB: ITU-R P.2040-1, eq. 31, theta 0."""
+        """Return the reflection loss of one face at normal incidence, in dB: ITU-R P.2040-1, eq. 31, theta 0."""
         root = cmath.sqrt(self.permittivity(frequency_hz))
         reflected = abs((1 - root) / (1 + root)) ** 2
         return -10 * math.log10(1 - reflected)
@@ -50,10 +50,10 @@ class Solid:
 
 @dataclass(frozen=True)
 class Foliage:
-    """Leaves and branches, by the depth of them that a path crosses in all.
+    """Leaves and branches; the loss depends on their total depth along a path.
 
     Weissberger's modified exponential decay (1982, ESD-TR-81-101), for 0.23 to 95 GHz, trees in leaf: with f in GHz
-    and d in m, 0.45 f^0.284 d below 14 m, 1.33 f^0.284 d^0.588 above. Beyond the 400 m it was fitted to, it goes on.
+    and d in m, 0.45 f^0.284 d below 14 m, 1.33 f^0.284 d^0.588 above. It is also used beyond its range of 400 m.
     """
 
     def loss_db(self, depth_m: float, frequency_hz: float) -> float:

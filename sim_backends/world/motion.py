@@ -12,12 +12,12 @@ STILL: Final[Vector] = (0.0, 0.0, 0.0)
 
 
 class State(NamedTuple):
-    """Place and velocity of a robot; many are made, which a tuple is quicker at than a frozen dataclass.
+    """Position and velocity of a robot; a tuple, which is faster to create than a frozen dataclass.
 
     Attributes:
         position_m: Metres east, north, up.
         velocity_m_s: Metres per second east, north, up.
-        heading_rad: Where it heads, from east towards north; None where its motion tells none.
+        heading_rad: Heading, from east towards north; None if its motion does not define one.
     """
 
     position_m: Vector
@@ -26,28 +26,28 @@ class State(NamedTuple):
 
 
 class Motion(Protocol):
-    """Robots that move. Time is in integer nanoseconds since the motion began."""
+    """Robots that move. Time is in integer nanoseconds since the start of the motion."""
 
     @property
     def end_ns(self) -> int | None:
-        """Time from which on all of them stand for good, nanoseconds; None where nobody knows."""
+        """Time after which all of them stay at rest, nanoseconds; None if it is unknown."""
         ...
 
     def at(self, time_ns: int) -> Mapping[str, State]:
-        """Return the state of each robot that it moves, by name; asked with times that never go back."""
+        """Return the state of each robot that it moves, by name; times must not decrease between calls."""
         ...
 
 
 class WayPoints:
-    """One robot goes straight from point to point at one speed, and stands at the last.
+    """One robot moves straight from point to point at one speed, and stops at the last.
 
-    It is pure: the same time gives the same state, whatever was asked before. A corner is passed at the nanosecond
-    that its distance along the way gives, so that rounding does not add up.
+    It has no mutable state: a state depends only on the time. Corners are passed at times rounded from their distance
+    along the path, so that rounding errors do not add up.
 
     Args:
         name: The robot.
-        points_m: Where it goes, the first being where it is at time 0.
-        speed_m_s: How fast.
+        points_m: Its points; the first is its position at time 0.
+        speed_m_s: Its speed.
 
     Raises:
         ValueError: There is no point, or the speed is not above 0.
@@ -55,12 +55,12 @@ class WayPoints:
 
     def __init__(self, name: str, points_m: Sequence[Vector], speed_m_s: float) -> None:
         if not points_m or not speed_m_s > 0:
-            raise ValueError(f"no way: {len(points_m)} points at {speed_m_s} m/s")
+            raise ValueError(f"not a path: {len(points_m)} points at {speed_m_s} m/s")
         self.name = name
         self._speed_m_s = speed_m_s
         self._points_m = tuple(points_m)
-        so_far_m = accumulate((math.dist(*leg) for leg in pairwise(points_m)), initial=0.0)
-        self._times_ns = tuple(round(metres / speed_m_s * 1e9) for metres in so_far_m)
+        distances_m = accumulate((math.dist(*leg) for leg in pairwise(points_m)), initial=0.0)
+        self._times_ns = tuple(round(metres / speed_m_s * 1e9) for metres in distances_m)
         self._legs = [
             _leg(*ends, *times_ns)
             for ends, times_ns in zip(pairwise(points_m), pairwise(self._times_ns), strict=True)
@@ -68,49 +68,49 @@ class WayPoints:
 
     @property
     def end_ns(self) -> int:
-        """See `Motion.end_ns`."""
+        """Implement `Motion.end_ns`."""
         return self._times_ns[-1]
 
     def at(self, time_ns: int) -> Mapping[str, State]:
-        """See `Motion.at`."""
+        """Implement `Motion.at`."""
         return {self.name: self._state(time_ns)}
 
     def limit_m_s2(self, time_ns: int) -> float:
-        """Return an acceleration a such that who moves on at the velocity of now is off by at most a t^2 / 2.
+        """Return an acceleration a such that extrapolation at the current velocity is wrong by at most a t^2 / 2.
 
-        Up to the next corner, c from now, there is no error; behind it two velocities of speed v differ by at most
-        2 v. So the error is at most 2 v (t - c), which is never more than (v / c) t^2 / 2.
+        Up to the next corner, c from now, there is no error; after it two velocities of speed v differ by at most 2
+        v. So the error is at most 2 v (t - c), which is at most (v / c) t^2 / 2.
         """
-        passed = bisect_right(self._times_ns, time_ns)
-        if passed == len(self._times_ns):
+        corner = bisect_right(self._times_ns, time_ns)
+        if corner == len(self._times_ns):
             return 0.0
-        return self._speed_m_s * 1e9 / (self._times_ns[passed] - time_ns)
+        return self._speed_m_s * 1e9 / (self._times_ns[corner] - time_ns)
 
     def _state(self, time_ns: int) -> State:
         if time_ns < 0:
             return State(self._points_m[0])
-        passed = bisect_right(self._times_ns, time_ns)
-        if passed == len(self._times_ns):
+        corner = bisect_right(self._times_ns, time_ns)
+        if corner == len(self._times_ns):
             return State(self._points_m[-1])
-        began_ns, takes_ns, (east_m, north_m, up_m), (e, n, u), velocity_m_s = self._legs[passed - 1]
-        share = (time_ns - began_ns) / takes_ns
+        start_ns, duration_ns, (east_m, north_m, up_m), (e, n, u), velocity_m_s = self._legs[corner - 1]
+        share = (time_ns - start_ns) / duration_ns
         return State((east_m + share * e, north_m + share * n, up_m + share * u), velocity_m_s)
 
 
-def _leg(begin: Vector, end: Vector, begins_ns: int, ends_ns: int) -> tuple[int, int, Vector, Vector, Vector]:
-    """Return when a leg begins, how long it takes, where it begins, how far it goes, and the velocity on it."""
-    e, n, u = (there - here for here, there in zip(begin, end, strict=True))
-    takes_ns = ends_ns - begins_ns
-    per_s = 1e9 / max(takes_ns, 1)  # of no length: never on the way
-    return begins_ns, takes_ns, begin, (e, n, u), (per_s * e, per_s * n, per_s * u)
+def _leg(start: Vector, end: Vector, start_ns: int, end_ns: int) -> tuple[int, int, Vector, Vector, Vector]:
+    """Return start time, duration, start, displacement and velocity of a leg."""
+    e, n, u = (last - first for first, last in zip(start, end, strict=True))
+    duration_ns = end_ns - start_ns
+    per_s = 1e9 / max(duration_ns, 1)  # a leg without length is never used
+    return start_ns, duration_ns, start, (e, n, u), (per_s * e, per_s * n, per_s * u)
 
 
 class OnGround:
-    """A motion whose robots stay on the ground, whatever height it gives them.
+    """A motion whose robots stay on the ground, whatever heights it has.
 
     Args:
         motion: The motion.
-        up_m: Height of an antenna at a place, metres east and north.
+        up_m: Returns the height of an antenna at a position, metres east and north.
     """
 
     def __init__(self, motion: Motion, up_m: Callable[[tuple[float, float]], float]) -> None:
@@ -119,11 +119,11 @@ class OnGround:
 
     @property
     def end_ns(self) -> int | None:
-        """See `Motion.end_ns`."""
+        """Implement `Motion.end_ns`."""
         return self._motion.end_ns
 
     def at(self, time_ns: int) -> Mapping[str, State]:
-        """See `Motion.at`."""
+        """Implement `Motion.at`."""
         return {name: self._on_ground(state) for name, state in self._motion.at(time_ns).items()}
 
     def _on_ground(self, state: State) -> State:

@@ -1,4 +1,4 @@
-"""Obstacles of a world file, and the shapes that each is made of."""
+"""Obstacles of a world file, and their shapes."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,26 +16,26 @@ from sim_backends.world.materials import MATERIALS
 from sim_backends.world.shapes import Box, Cylinder, Shape
 
 Real = Number | Int
-"""A number as people write it, `2` or `2.5`: metres or degrees, as the key says."""
+"""A number as in a YAML file, `2` or `2.5`: metres or degrees, depending on the key."""
 Coordinate = Annotated[Real, Field(ge=-1e6, le=1e6)]
-"""Metres from the origin. The flat ground of a world means nothing beyond, and squares of distances stay finite."""
+"""Metres from the origin. The limits keep squares of distances finite; a flat ground makes no sense beyond them."""
 Place = tuple[Coordinate, Coordinate]
 """Metres east and north."""
 Size = tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)]]
 Dimension = Annotated[Length, Field(gt=0)]
 
 _STEPS: Final = 8
-"""Of which a ramp is made where waves and whoever flies meet it."""
+"""Number of steps of a ramp, for radio waves and for flying robots."""
 
 
-def _known(name: str) -> str:
+def _checked_material(name: str) -> str:
     if name not in MATERIALS:
         hint = did_you_mean(name, MATERIALS, f"materials: {', '.join(MATERIALS)}")
         raise schema.validation_error(f"there is no material {name!r}; {hint}")
     return name
 
 
-MaterialName = Annotated[str, AfterValidator(_known)]
+MaterialName = Annotated[str, AfterValidator(_checked_material)]
 
 
 @dataclass(frozen=True)
@@ -43,9 +43,9 @@ class Part:
     """A shape of one material.
 
     Attributes:
-        obstacle: Name of the obstacle that it is of.
+        obstacle: Name of its obstacle.
         material: Name of its material.
-        shape: Where it is.
+        shape: Its shape and position.
     """
 
     obstacle: str
@@ -54,26 +54,26 @@ class Part:
 
 
 class _Obstacle(Strict, ABC):
-    """Something that stands in a world.
+    """An obstacle in a world.
 
     Attributes:
-        name: What it is called.
+        name: Its name.
     """
 
     name: str
 
     @abstractmethod
     def parts(self) -> Iterator[Part]:
-        """Yield the shapes that it is made of."""
+        """Yield its shapes."""
 
 
 class _Rectangular(_Obstacle):
-    """An obstacle with a rectangle as its base.
+    """An obstacle with a rectangular base.
 
     Attributes:
         centre_m: Centre of its base, metres east and north.
         size_m: Its outer edges, in metres.
-        yaw_deg: How far its first edge is turned from east towards north.
+        yaw_deg: Rotation of its first edge from east towards north.
     """
 
     centre_m: Place
@@ -81,7 +81,7 @@ class _Rectangular(_Obstacle):
     yaw_deg: Real = 0
 
     def _box(self, size_m: Vector, *, along_m: float = 0.0, across_m: float = 0.0, base_m: float = 0.0) -> Box:
-        """Return a box with edges along its own, away from its centre by so much, its underside at `base_m`."""
+        """Return a box with parallel edges, shifted from the centre along them, its underside at `base_m`."""
         yaw = math.radians(self.yaw_deg)
         east_m = self.centre_m[0] + along_m * math.cos(yaw) - across_m * math.sin(yaw)
         north_m = self.centre_m[1] + along_m * math.sin(yaw) + across_m * math.cos(yaw)
@@ -94,7 +94,7 @@ class BoxObstacle(_Rectangular):
     Attributes:
         kind: `box`.
         base: Height of its underside.
-        material: Of what it is.
+        material: Its material.
     """
 
     kind: Literal["box"]
@@ -112,10 +112,10 @@ class Wall(_Obstacle):
     Attributes:
         kind: `wall`.
         from_m: One end of its centre line, metres east and north.
-        to_m: The other.
+        to_m: The other end.
         height: Its height.
         thickness: Its thickness.
-        material: Of what it is.
+        material: Its material.
     """
 
     kind: Literal["wall"]
@@ -138,8 +138,8 @@ class Building(_Rectangular):
 
     Attributes:
         kind: `building`.
-        thickness: Of walls and roof.
-        material: Of what they are.
+        thickness: Thickness of walls and roof.
+        material: Their material.
     """
 
     kind: Literal["building"]
@@ -149,12 +149,15 @@ class Building(_Rectangular):
     @override
     def parts(self) -> Iterator[Part]:
         long_m, wide_m, high_m = self.size_m
-        off = self.thickness
-        under_m = high_m - off
+        thickness = self.thickness
+        under_m = high_m - thickness
         boxes = (
-            *(self._box((long_m, off, under_m), across_m=side * (wide_m - off) / 2) for side in (1, -1)),
-            *(self._box((off, wide_m - 2 * off, under_m), along_m=side * (long_m - off) / 2) for side in (1, -1)),
-            self._box((long_m, wide_m, off), base_m=under_m),
+            *(self._box((long_m, thickness, under_m), across_m=side * (wide_m - thickness) / 2) for side in (1, -1)),
+            *(
+                self._box((thickness, wide_m - 2 * thickness, under_m), along_m=side * (long_m - thickness) / 2)
+                for side in (1, -1)
+            ),
+            self._box((long_m, wide_m, thickness), base_m=under_m),
         )
         yield from (Part(self.name, self.material, box) for box in boxes)
 
@@ -164,9 +167,9 @@ class Tree(_Obstacle):
 
     Attributes:
         kind: `tree`.
-        at_m: Where it stands, metres east and north.
-        height: To the top of its crown.
-        crown_base: Height at which the crown begins.
+        at_m: Its position, metres east and north.
+        height: Height of the top of its crown.
+        crown_base: Height of the lower end of its crown.
         crown_radius: Radius of the crown.
         trunk_radius: Radius of the trunk.
     """
@@ -187,27 +190,27 @@ class Tree(_Obstacle):
 
 
 class _HigherGround(_Rectangular):
-    """Ground that is higher than around it: robots stand on it, and paths through it meet earth."""
+    """Ground that is higher than its surroundings: robots drive on it, and radio paths cross its material."""
 
     @property
     @abstractmethod
     def grade(self) -> tuple[float, float]:
-        """How much it rises per metre east and north."""
+        """Its rise per metre east and north."""
 
     @property
     @abstractmethod
     def middle_m(self) -> float:
-        """Its height in its middle."""
+        """Its height at its centre."""
 
     def covers(self, place_m: tuple[float, float]) -> bool:
-        """Return whether a place, metres east and north, is on it; its edge is."""
+        """Return True if a point, metres east and north, is on it or on its edge."""
         east_m, north_m = place_m[0] - self.centre_m[0], place_m[1] - self.centre_m[1]
         cos, sin = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
         along_m, across_m = east_m * cos + north_m * sin, north_m * cos - east_m * sin
         return abs(along_m) <= self.size_m[0] / 2 and abs(across_m) <= self.size_m[1] / 2
 
     def height_m(self, place_m: tuple[float, float]) -> float:
-        """Return how high it is at a place on it."""
+        """Return its height at a point on it."""
         east, north = self.grade
         return self.middle_m + east * (place_m[0] - self.centre_m[0]) + north * (place_m[1] - self.centre_m[1])
 
@@ -237,7 +240,7 @@ class Raised(_HigherGround):
 
 
 class Ramp(_HigherGround):
-    """Ground that rises evenly along its first edge, from nothing to its height, with upright sides.
+    """Ground that rises evenly along its first edge, from 0 to its height, with upright sides.
 
     Attributes:
         kind: `ramp`.
@@ -258,7 +261,7 @@ class Ramp(_HigherGround):
 
     @override
     def parts(self) -> Iterator[Part]:
-        """A flight of steps, each as high as the ramp is in its middle."""
+        """Yield steps, each as high as the ramp at the middle of the step."""
         long_m, wide_m, high_m = self.size_m
         for number in range(_STEPS):
             share = (number + 0.5) / _STEPS

@@ -1,4 +1,4 @@
-"""Solid shapes that a straight path may cross, all paths against all shapes at once."""
+"""Solid shapes that straight paths may cross; all paths and shapes are processed together."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -15,18 +15,18 @@ Floats = NDArray[np.float64]
 
 _CIRCLE_CORNERS: Final = 32
 
-# Who stays this far from a shape does not meet it by a rounding.
+# Margin against rounding errors: a path at this distance does not touch a shape.
 _NEAR_M: Final = 0.001
 
 
 @dataclass(frozen=True)
 class Box:
-    """An upright box, turned about the vertical.
+    """An upright box, rotated about the vertical.
 
     Attributes:
         centre_m: Its centre.
-        size_m: Its edges along its own axes, in metres.
-        yaw_rad: How far its first axis is turned from east towards north.
+        size_m: Its edges along its axes, in metres.
+        yaw_rad: Rotation of its first axis from east towards north.
     """
 
     centre_m: Vector
@@ -80,7 +80,7 @@ Shape = Box | Cylinder
 
 
 class Solids:
-    """Shapes that many paths are asked about.
+    """Shapes, for the intersection with many paths.
 
     Args:
         shapes: m shapes.
@@ -97,34 +97,34 @@ class Solids:
         ]
 
     def depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return how much of each straight path lies inside each shape.
+        """Return the length of each straight path inside each shape.
 
         Args:
-            start_m: Where the paths begin, shape (n, 3).
-            end_m: Where they end, shape (n, 3).
+            start_m: Starts of the paths, shape (n, 3).
+            end_m: Ends of the paths, shape (n, 3).
 
         Returns:
-            Lengths in metres, shape (n, m); 0 where a path misses or only touches.
+            Lengths in metres, shape (n, m); 0 if a path misses or only touches a shape.
         """
         inside = np.zeros((self._count, len(start_m)))
         below_m, above_m = np.minimum(start_m, end_m), np.maximum(start_m, end_m)
         for numbers, share, (low_m, high_m, *arrays) in self._kinds:
-            # Most paths pass most shapes at a distance, which is quicker to see.
-            near = ((above_m >= low_m) & (below_m <= high_m)).all(axis=-1).any(axis=-1)
-            if near.any():
-                inside[numbers[near]] = share(start_m, end_m, *(array[near] for array in arrays))
+            # Most paths are far from most shapes, which is faster to check with bounding boxes.
+            candidates = ((above_m >= low_m) & (below_m <= high_m)).all(axis=-1).any(axis=-1)
+            if candidates.any():
+                inside[numbers[candidates]] = share(start_m, end_m, *(array[candidates] for array in arrays))
         depths: Floats = inside.T * np.linalg.norm(end_m - start_m, axis=1)[:, None]
         return depths
 
 
 def _reach(shapes: Sequence[Shape]) -> tuple[Floats, Floats]:
-    """Return the lowest and the highest coordinates that each shape has, and a little more, shape (m, 1, 3)."""
+    """Return the lowest and the highest coordinates of each shape, with a small margin, shape (m, 1, 3)."""
     centre, half = _vectors(shape.centre_m for shape in shapes), _vectors(_half_m(shape) for shape in shapes)
     return centre - half - _NEAR_M, centre + half + _NEAR_M
 
 
 def _half_m(shape: Shape) -> Vector:
-    """Return how far a shape reaches east, north and up from its centre."""
+    """Return the extent of a shape east, north and up from its centre."""
     if isinstance(shape, Cylinder):
         return shape.radius_m, shape.radius_m, shape.height_m / 2
     (long_m, wide_m, high_m), cos, sin = shape.size_m, abs(math.cos(shape.yaw_rad)), abs(math.sin(shape.yaw_rad))
@@ -132,14 +132,14 @@ def _half_m(shape: Shape) -> Vector:
 
 
 def _in_boxes(start_m: Floats, end_m: Floats, centre: Floats, half: Floats, turn: Floats) -> Floats:
-    """Return the share of each path that is inside each box, of shape (m, n)."""
-    enters, leaves = _slab((start_m - centre) @ turn, (end_m - centre) @ turn, half)
-    inside: Floats = np.maximum(leaves.min(axis=-1) - enters.max(axis=-1), 0.0)
+    """Return the share of each path that is inside each box, shape (m, n)."""
+    entry, exit_ = _slab((start_m - centre) @ turn, (end_m - centre) @ turn, half)
+    inside: Floats = np.maximum(exit_.min(axis=-1) - entry.max(axis=-1), 0.0)
     return inside
 
 
 def _in_cylinders(start_m: Floats, end_m: Floats, centre: Floats, radius: Floats, height: Floats) -> Floats:
-    """Return the share of each path that is inside each cylinder, of shape (m, n)."""
+    """Return the share of each path that is inside each cylinder, shape (m, n)."""
     start, end = start_m - centre, end_m - centre
     first, last = _disc(start[..., :2], end[..., :2], radius)
     below, above = _slab(start[..., 2], end[..., 2], height / 2)
@@ -148,7 +148,7 @@ def _in_cylinders(start_m: Floats, end_m: Floats, centre: Floats, radius: Floats
 
 
 def _box_arrays(boxes: Iterable[Box]) -> tuple[Floats, Floats, Floats]:
-    """Return centres and half sizes, shape (m, 1, 3), and what turns row vectors into the axes of each box."""
+    """Return centres and half sizes, shape (m, 1, 3), and the rotations of row vectors into the axes of each box."""
     turns = [(math.cos(box.yaw_rad), math.sin(box.yaw_rad)) for box in boxes]
     turn = np.array([((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)) for cos, sin in turns]).reshape(-1, 3, 3)
     return _vectors(box.centre_m for box in boxes), _vectors(box.size_m for box in boxes) / 2, turn
@@ -162,35 +162,35 @@ def _cylinder_arrays(cylinders: Iterable[Cylinder]) -> tuple[Floats, Floats, Flo
 
 
 def _vectors(points: Iterable[Vector]) -> Floats:
-    """Return m points as shape (m, 1, 3), to meet n paths."""
+    """Return m points as shape (m, 1, 3), for broadcasting with n paths."""
     vectors: Floats = np.array(list(points), dtype=np.float64).reshape(-1, 1, 3)
     return vectors
 
 
 def _slab(start: Floats, end: Floats, half: Floats) -> tuple[Floats, Floats]:
-    """Return where along each path it enters and leaves -half..half, within 0..1; 1 and 0 for one that never does."""
+    """Return the positions, within 0..1, where each path enters and leaves -half..half; 1 and 0 if it never does."""
     step = end - start
     level = step == 0
     step = np.where(level, 1.0, step)
-    with np.errstate(over="ignore"):  # a path that hardly rises meets the planes infinitely far away
-        one, other = (-half - start) / step, (half - start) / step
-    enters, leaves = np.clip(np.minimum(one, other), 0, 1), np.clip(np.maximum(one, other), 0, 1)
+    with np.errstate(over="ignore"):  # an almost level path intersects the planes infinitely far away
+        first, second = (-half - start) / step, (half - start) / step
+    entry, exit_ = np.clip(np.minimum(first, second), 0, 1), np.clip(np.maximum(first, second), 0, 1)
     within = np.abs(start) < half
-    return np.where(level, np.where(within, 0.0, 1.0), enters), np.where(level, np.where(within, 1.0, 0.0), leaves)
+    return np.where(level, np.where(within, 0.0, 1.0), entry), np.where(level, np.where(within, 1.0, 0.0), exit_)
 
 
 def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
-    """Return the same for discs around the origin, paths of shape (m, n, 2)."""
+    """Return the same as `_slab` for discs around the origin, paths of shape (m, n, 2)."""
     step = end - start
     a = (step * step).sum(axis=-1)
     half_b = (start * step).sum(axis=-1)
     c = (start * start).sum(axis=-1) - radius**2
     root = half_b**2 - a * c
     level = a == 0
-    meets = (root > 0) & ~level
-    square = np.sqrt(np.where(meets, root, 0.0))
+    crosses = (root > 0) & ~level
+    square = np.sqrt(np.where(crosses, root, 0.0))
     divisor = np.where(level, 1.0, a)
-    enters = np.clip((-half_b - square) / divisor, 0, 1)
-    leaves = np.clip((-half_b + square) / divisor, 0, 1)
+    entry = np.clip((-half_b - square) / divisor, 0, 1)
+    exit_ = np.clip((-half_b + square) / divisor, 0, 1)
     always = level & (c < 0)
-    return np.where(meets, enters, np.where(always, 0.0, 1.0)), np.where(meets, leaves, np.where(always, 1.0, 0.0))
+    return np.where(crosses, entry, np.where(always, 0.0, 1.0)), np.where(crosses, exit_, np.where(always, 1.0, 0.0))

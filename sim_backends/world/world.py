@@ -1,4 +1,4 @@
-"""World files: obstacles, ground and lines to stand along; and the loss of radio paths through them."""
+"""World files: obstacles, ground and lines for the robots; and the loss of radio paths through them."""
 
 import math
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ _SHIPPED: Final = Path(__file__).parent / "worlds"
 
 @dataclass(frozen=True)
 class ObstacleCrossing:
-    """The stretch of a path that is inside one part of an obstacle.
+    """The part of a path that is inside one part of an obstacle.
 
     Attributes:
-        obstacle: Its name.
+        obstacle: Name of the obstacle.
         material: Name of the material.
-        length_m: How long the stretch is.
+        length_m: Length of the part.
     """
 
     obstacle: str
@@ -36,30 +36,30 @@ class ObstacleCrossing:
 
 
 class Line(Strict):
-    """Line along which the robots of a trial stand, from the sender on.
+    """Line on which the robots of a trial are placed, starting at the sender.
 
     Attributes:
-        from_m: The sender's place, metres east and north.
-        bearing_deg: Direction of the others from north over east, as a compass shows it.
+        from_m: The sender's position, metres east and north.
+        bearing_deg: Direction of the others, clockwise from north.
     """
 
     from_m: Place
     bearing_deg: Real
 
     def at(self, distance_m: float, left_m: float = 0.0) -> tuple[float, float]:
-        """Return the place at a distance from the sender and to the left of the line, metres east and north."""
+        """Return the point at a distance from the sender and to the left of the line, metres east and north."""
         bearing = math.radians(self.bearing_deg)
         sin, cos = math.sin(bearing), math.cos(bearing)
         return self.from_m[0] + distance_m * sin - left_m * cos, self.from_m[1] + distance_m * cos + left_m * sin
 
 
 class World(Named):
-    """What stands around the robots. The ground is flat at height 0 but where it is raised, or rises.
+    """The surroundings of the robots. The ground is flat at height 0, except for raised ground and ramps.
 
     Attributes:
-        area_m: Extent of the area that is drawn, metres east and north from the origin.
-        obstacles: What stands in it.
-        lines: Where the robots of a trial stand, by scenario.
+        area_m: Extent of the drawn area, metres east and north from the origin.
+        obstacles: Its obstacles.
+        lines: Lines for the robots of a trial, by scenario.
     """
 
     area_m: tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)]]
@@ -67,15 +67,15 @@ class World(Named):
     lines: dict[Scenario, Line] = Field(default_factory=dict)
 
     def __deepcopy__(self, memo: dict[int, Any] | None = None) -> "World":
-        return self  # it never changes, so a run and its forks may share it
+        return self  # it is immutable, so a run and its forks may share it
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:
-        """Every shape of every obstacle."""
+        """All shapes of all obstacles."""
         return tuple(part for obstacle in self.obstacles for part in obstacle.parts())
 
     def crossings(self, start_m: Floats, end_m: Floats) -> list[tuple[ObstacleCrossing, ...]]:
-        """Return what each of the straight paths between points of shape (n, 3) crosses, in the order of the file."""
+        """Return the parts crossed by each straight path between points of shape (n, 3), in the order of the file."""
         return [
             tuple(
                 ObstacleCrossing(part.obstacle, part.material, length_m)
@@ -86,29 +86,29 @@ class World(Named):
         ]
 
     def penetration_loss_db(self, start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
-        """Return what obstacles take from waves along straight paths, in dB, shape (n,).
+        """Return the loss by obstacles along straight paths, in dB, shape (n,).
 
-        A solid takes its loss per metre and what two faces reflect, as if met squarely and without echoes inside;
-        foliage counts by its depth in all. What bends around an obstacle is left out, so that a thick one shadows
-        more than in the open.
+        A solid causes its loss per metre and the reflection loss of two faces, at normal incidence and without
+        multiple reflections inside; for foliage the total depth counts. Diffraction is not modelled, so that a thick
+        obstacle casts a deeper shadow than a real one.
 
         Args:
-            start_m: Where the paths begin, shape (n, 3).
-            end_m: Where they end, shape (n, 3).
-            frequency_hz: Of the wave.
+            start_m: Starts of the paths, shape (n, 3).
+            end_m: Ends of the paths, shape (n, 3).
+            frequency_hz: Frequency of the wave.
         """
         depths = self._solids.depths_m(start_m, end_m)
         if not depths.any():
             return np.zeros(len(start_m))
-        db_per_m, faces_db, leafy = _of_materials(self._materials, frequency_hz)
+        db_per_m, faces_db, is_foliage = _material_losses(self._materials, frequency_hz)
         loss_db: Floats = depths @ db_per_m + (depths > 0) @ faces_db
-        loss_db += [FOLIAGE.loss_db(depth_m, frequency_hz) for depth_m in (depths @ leafy).tolist()]
+        loss_db += [FOLIAGE.loss_db(depth_m, frequency_hz) for depth_m in (depths @ is_foliage).tolist()]
         return loss_db
 
     def ground_m(self, place_m: tuple[float, float]) -> float:
-        """Return the height of the ground at a place, metres east and north."""
-        higher = [obstacle for obstacle in self.obstacles if isinstance(obstacle, Raised | Ramp)]
-        return max((obstacle.height_m(place_m) for obstacle in higher if obstacle.covers(place_m)), default=0.0)
+        """Return the height of the ground at a point, metres east and north."""
+        raised = [obstacle for obstacle in self.obstacles if isinstance(obstacle, Raised | Ramp)]
+        return max((obstacle.height_m(place_m) for obstacle in raised if obstacle.covers(place_m)), default=0.0)
 
     @cached_property
     def _solids(self) -> Solids:
@@ -120,8 +120,8 @@ class World(Named):
 
 
 @cache
-def _of_materials(names: tuple[str, ...], frequency_hz: float) -> tuple[Floats, Floats, Floats]:
-    """Return what each material takes per metre and by two faces, in dB, if it is solid, and 1 for foliage."""
+def _material_losses(names: tuple[str, ...], frequency_hz: float) -> tuple[Floats, Floats, Floats]:
+    """Return, per material, the loss per metre and by two faces in dB, 0 for foliage, and 1 for foliage, else 0."""
     materials = [MATERIALS[name] for name in names]
     solids = [material if isinstance(material, Solid) else None for material in materials]
     return (
@@ -132,14 +132,14 @@ def _of_materials(names: tuple[str, ...], frequency_hz: float) -> tuple[Floats, 
 
 
 def load_world(name: str) -> World:
-    """Return a world by name: of the lab's own folder `worlds/`, or one that ships with fieldkit.
+    """Return a world by name: from the lab's folder `worlds/`, or one that ships with fieldkit.
 
     Raises:
-        ConfigurationError: There is none, or it is wrong; says where.
+        ConfigurationError: The world does not exist or is invalid; the error names the location.
     """
-    known = {path.stem: path for folder in (_SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
-    if name not in known:
+    paths = {path.stem: path for folder in (_SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
+    if name not in paths:
         raise ConfigurationError(
-            f"there is no world {name!r}", remedy=did_you_mean(name, known, f"worlds: {', '.join(known)}")
+            f"there is no world {name!r}", remedy=did_you_mean(name, paths, f"worlds: {', '.join(paths)}")
         )
-    return schema.load(known[name], World)
+    return schema.load(paths[name], World)

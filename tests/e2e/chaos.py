@@ -1,4 +1,4 @@
-"""Trials in the midst of faults: links cut, sshd killed, robots rebooted, fieldkit killed and resumed, by a seed.
+"""Trials during faults: links cut, sshd killed, robots rebooted, fieldkit killed and resumed, by a seed.
 
 `python -m tests.e2e.chaos --faults 200` is the soak test of `make soak`; tests/e2e/test_chaos.py runs short ones.
 """
@@ -25,13 +25,13 @@ from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit, only_trial, rows, start
 
 MAX_STARTS: Final = 60
-AFTERMATH_NS: Final = 5 * 10**9
-"""What a fault may still do when it is over: a server that was killed is up again a while later."""
+RECOVERY_NS: Final = 5 * 10**9
+"""Time for which a fault may have effects after its end; for example a killed server restarts only later."""
 
 VOIDS_PER_FAULT: Final = 2
-"""The attempt that it met, and the one that began before it was over."""
+"""The attempt during the fault, and one that started before the fault ended."""
 
-LOOK_EACH_S: Final = 5.0
+POLL_S: Final = 5.0
 
 PROCEDURE: Final = """\
 name: chaos
@@ -51,13 +51,13 @@ steps:
 
 
 @dataclass(frozen=True)
-class Befell:
-    """A fault that befell a trial.
+class InjectedFault:
+    """A fault injected into a trial.
 
     Attributes:
-        kind: What.
-        began_ns: When it began, in nanoseconds since 1970 UTC.
-        over_ns: When it was over.
+        kind: Kind of the fault.
+        began_ns: Start time, in nanoseconds since 1970 UTC.
+        over_ns: End time.
     """
 
     kind: str
@@ -67,13 +67,13 @@ class Befell:
 
 @dataclass(frozen=True)
 class Void:
-    """An attempt that is void.
+    """A void attempt.
 
     Attributes:
-        name: Of its folder.
-        reason: Why.
-        began_ns: When it began, in nanoseconds since 1970 UTC.
-        ended_ns: When its word came into the journal.
+        name: Name of its folder.
+        reason: Reason in the journal.
+        began_ns: Start time, in nanoseconds since 1970 UTC.
+        ended_ns: Time of its entry in the journal.
     """
 
     name: str
@@ -82,55 +82,59 @@ class Void:
     ended_ns: int
 
 
-def unexplained(voids: Sequence[Void], faults: Sequence[Befell]) -> list[Void]:
-    """Return the void attempts that no fault explains, by being there during the attempt.
+def unexplained(voids: Sequence[Void], faults: Sequence[InjectedFault]) -> list[Void]:
+    """Return the void attempts that no fault during the attempt explains.
 
     Args:
         voids: The void attempts.
-        faults: What befell the trial, one after the other.
+        faults: The injected faults, which do not overlap.
     """
-    left = sorted([*faults] * VOIDS_PER_FAULT, key=lambda fault: fault.began_ns)
-    found = []
-    # Faults do not overlap, so each attempt met some that follow each other, and the first is the one to take.
+    remaining = sorted([*faults] * VOIDS_PER_FAULT, key=lambda fault: fault.began_ns)
+    unexplained_voids = []
+    # Faults do not overlap, so each attempt matches consecutive faults, and the first one is assigned to it.
     for void in sorted(voids, key=lambda void: void.ended_ns):
-        met = (one for one in left if one.began_ns <= void.ended_ns and void.began_ns <= one.over_ns + AFTERMATH_NS)
-        if cause := next(met, None):
-            left.remove(cause)
+        matching = (
+            fault
+            for fault in remaining
+            if fault.began_ns <= void.ended_ns and void.began_ns <= fault.over_ns + RECOVERY_NS
+        )
+        if cause := next(matching, None):
+            remaining.remove(cause)
         else:
-            found.append(void)
-    return found
+            unexplained_voids.append(void)
+    return unexplained_voids
 
 
 @dataclass
 class Tally:
-    """What a chaotic trial came to.
+    """Results of a trial with faults.
 
     Attributes:
-        planned: Repeats planned.
-        valid: Repeats with exactly one valid attempt.
-        voids: Attempts that are void.
-        starts: How often fieldkit was started.
-        faults: Faults injected.
-        problems: What must not be.
-        stops: What fieldkit said each time it stopped before the end.
+        planned: Number of planned repeats.
+        valid: Number of repeats with exactly one valid attempt.
+        voids: The void attempts.
+        starts: Number of starts of fieldkit.
+        faults: The injected faults.
+        problems: Violations of the requirements.
+        stops: Error output each time fieldkit stopped before the end.
     """
 
     planned: int
     valid: int = 0
     starts: int = 0
     voids: list[Void] = field(default_factory=list)
-    faults: list[Befell] = field(default_factory=list)
+    faults: list[InjectedFault] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     stops: list[str] = field(default_factory=list)
 
     @property
     def lost(self) -> int:
-        """Repeats planned that did not end up valid."""
+        """Number of planned repeats that are not valid."""
         return self.planned - self.valid
 
     def __str__(self) -> str:
         kinds = ", ".join(
-            f"{count} {kind}" for kind, count in sorted(Counter(one.kind for one in self.faults).items())
+            f"{count} {kind}" for kind, count in sorted(Counter(fault.kind for fault in self.faults).items())
         )
         return (
             f"{len(self.faults)} faults injected ({kinds}); {self.starts} starts of fieldkit; "
@@ -140,13 +144,13 @@ class Tally:
 
 
 class Chaos:
-    """One trial, and what befalls it.
+    """One trial with injected faults.
 
     Args:
         outside: The robots.
-        seed: Of the faults, their times and their victims.
-        repeats: Per protocol.
-        faults: How many to inject; the trial may end before the last.
+        seed: Seed of the faults, their times and robots.
+        repeats: Repeats per protocol.
+        faults: Maximum number of faults; the trial may end before the last.
     """
 
     def __init__(self, outside: Outside, *, seed: int, repeats: int, faults: int) -> None:
@@ -168,20 +172,21 @@ class Chaos:
             if ended.code not in {3, -9}:
                 self.tally.problems.append(f"exit code {ended.code}: {ended.err}")
             self.tally.stops.append(ended.err.strip())
-            if "holds it since" in ended.err and not self._begun():
-                # Killed between taking the robots and making its folder, so that nothing can be gone on with.
+            if "holds it since" in ended.err and not self._trial_exists():
+                # fieldkit was killed after locking the robots and before creating its folder, so there is nothing to
+                # resume.
                 fieldkit(lab, "abort", "--yes")
-            if self._begun():
+            if self._trial_exists():
                 words = ("resume", str(only_trial(lab)), "--yes", "--json")
         self._judge()
         return self.tally
 
-    def _begun(self) -> bool:
-        """Whether there is a trial to go on with."""
+    def _trial_exists(self) -> bool:
+        """Return True if there is a trial to resume."""
         return any((self._outside.folder / "trials").glob("*/trial.yaml"))
 
     def _run_once(self, *words: str) -> Run:
-        """Start fieldkit and let faults befall it until it ends."""
+        """Start fieldkit and inject faults until it ends."""
         self.tally.starts += 1
         self._process = start(self._outside.folder, *words)
         while self._process.poll() is None and self._budget > 0:
@@ -192,11 +197,11 @@ class Chaos:
         return self._finish(self._process)
 
     def _finish(self, process: subprocess.Popen[str]) -> Run:
-        """Wait until fieldkit ends, or end it where it voids attempts for no reason, as it might for hours."""
+        """Wait for the end of fieldkit; kill it if attempts become void without a reason, which could last hours."""
         deadline = Deadline.after(LIMIT_S)
         while True:
             try:
-                out, err = process.communicate(timeout=LOOK_EACH_S)
+                out, err = process.communicate(timeout=POLL_S)
                 return Run(process.returncode, out, err)
             except subprocess.TimeoutExpired:
                 if deadline.expired or self._unexplained():
@@ -204,7 +209,9 @@ class Chaos:
 
     def _unexplained(self) -> list[Void]:
         """Return the void attempts so far that no fault explains."""
-        return unexplained(_voids(only_trial(self._outside.folder)), self.tally.faults) if self._begun() else []
+        return (
+            unexplained(_voids(only_trial(self._outside.folder)), self.tally.faults) if self._trial_exists() else []
+        )
 
     def _inject(self) -> None:
         inject = self._outside.testbed.inject
@@ -216,21 +223,21 @@ class Chaos:
             "robot rebooted": lambda role: inject(Fault(FaultKind.REBOOT, role)),
             "fieldkit killed": self._kill,
         }
-        if not self._deck:  # each kind comes once before one comes again
+        if not self._deck:  # each kind is used once before any is repeated
             self._deck = self._random.sample(list(faults), k=len(faults))
         kind = self._deck.pop()
         role = self._random.choice((Role.SENDER, Role.RECEIVER))
         self._budget -= 1
         began_ns = time.time_ns()
         faults[kind](role)
-        self.tally.faults.append(Befell(kind, began_ns, time.time_ns()))
+        self.tally.faults.append(InjectedFault(kind, began_ns, time.time_ns()))
 
     def _cut(self, role: Role) -> None:
         self._outside.links.cut(role)
-        with_patience_s = self._random.uniform(0.2, 12.0)
+        duration_s = self._random.uniform(0.2, 12.0)
         assert self._process is not None
         try:
-            self._process.wait(with_patience_s)
+            self._process.wait(duration_s)
         except subprocess.TimeoutExpired:
             pass
         finally:
@@ -241,7 +248,7 @@ class Chaos:
         self._process.kill()
 
     def _judge(self) -> None:
-        """Look at the folder as its reader would, and at the robots as the next operator would."""
+        """Check the folder of the trial, and that nothing is left on the robots."""
         lab, tally = self._outside.folder, self.tally
         trial = only_trial(lab)
         table = rows(trial)
@@ -269,16 +276,21 @@ class Chaos:
 def _voids(trial: Path) -> list[Void]:
     """Return the void attempts of a trial."""
     entries = journal.read(trial)
-    told_ns = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries}
+    ended_ns_by_attempt = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries}
     return [
-        Void(one.folder, one.reason, one.started_utc_ns, told_ns[one.repeat, one.number])
-        for one in journal.ended(entries)
-        if one.status is Status.VOID
+        Void(
+            attempt.folder,
+            attempt.reason,
+            attempt.started_utc_ns,
+            ended_ns_by_attempt[attempt.repeat, attempt.number],
+        )
+        for attempt in journal.ended(entries)
+        if attempt.status is Status.VOID
     ]
 
 
 def chaos(folder: Path, *, seed: int, repeats: int, faults: int, debian: bool = True) -> Tally:
-    """Run one trial of `repeats` per protocol among `faults` faults, in the empty folder `folder`.
+    """Run one trial of `repeats` per protocol with `faults` faults, in the empty folder `folder`.
 
     The robots have Debian's ROS, or the built-in one.
     """
@@ -287,7 +299,7 @@ def chaos(folder: Path, *, seed: int, repeats: int, faults: int, debian: bool = 
 
 
 def main() -> int:
-    """Run trials until so many faults were injected; print the tally."""
+    """Run trials until the given number of faults was injected; print the results."""
     parser = argparse.ArgumentParser(description="soak test")
     parser.add_argument("--faults", type=int, default=200)
     parser.add_argument("--repeats", type=int, default=10, help="per protocol and trial")

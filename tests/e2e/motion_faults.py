@@ -1,8 +1,8 @@
 """The fault matrix of moving robots: part of `make soak`; tests/e2e/test_motion_faults.py runs a few of its cells.
 
 `python -m tests.e2e.motion_faults --runs 10 --cells 'rover/*' --jobs 2` prints an outcome per line, then the tables
-of `docs/stopping.md`; `--write docs/stopping.md` puts them there. With `--results FILE` outcomes are added to a
-file, trials that it has are not repeated, and the tables are of all that it has.
+of `docs/stopping.md`; `--write docs/stopping.md` writes them there. With `--results FILE` outcomes are appended to a
+file, trials in the file are not repeated, and the tables contain all outcomes of the file.
 """
 
 import argparse
@@ -24,62 +24,62 @@ from tests.helpers.motion_lab import motion_lab
 from tests.helpers.motion_outcomes import MotionOutcome
 from tests.helpers.motion_trials import MotionTrial
 
-_RENEWED_AFTER: Final = 50
-"""Trials after which a lab is set up anew."""
+_TRIALS_PER_LAB: Final = 50
+"""Number of trials after which a lab is replaced by a new one."""
 
 _Task = tuple[str, int]
 """Name of a cell, and seed."""
 
 
 def observe(cells: Iterable[tuple[MotionCell, int]]) -> Iterator[MotionOutcome]:
-    """Yield the outcome of one trial after the other, each of a cell with its seed, in one lab."""
+    """Yield the outcomes of trials in order, each of a cell with its seed, in one lab."""
     with tempfile.TemporaryDirectory(prefix="fieldkit-motion-") as folder, motion_lab(Path(folder)) as lab:
         for number, (cell, seed) in enumerate(cells):
-            own = Path(folder, f"trial-{number}")
-            own.mkdir()
-            yield MotionTrial(lab, cell, own, seed).run()
+            trial_folder = Path(folder, f"trial-{number}")
+            trial_folder.mkdir()
+            yield MotionTrial(lab, cell, trial_folder, seed).run()
 
 
 def _work(tasks: "Queue[_Task | None]", outcomes: "Queue[str | None]") -> None:
-    """Run trials until there are none left; the end is None."""
+    """Run trials until none are left; None marks the end."""
     by_name = {cell.name: cell for cell in CELLS}
 
-    def some() -> Iterator[tuple[MotionCell, int]]:
-        for _ in range(_RENEWED_AFTER):
+    def next_tasks() -> Iterator[tuple[MotionCell, int]]:
+        for _ in range(_TRIALS_PER_LAB):
             task = tasks.get()
             if task is None:
-                tasks.put(None)  # for the others, and for the next lab
+                tasks.put(None)  # for the other workers, and for the next lab
                 return
             yield by_name[task[0]], task[1]
 
-    ended = False
+    is_finished = False
     try:
-        while not ended:
+        while not is_finished:
             count = 0
-            for outcome in observe(some()):
+            for outcome in observe(next_tasks()):
                 count += 1
                 outcomes.put(outcome.line())
-            ended = count < _RENEWED_AFTER
+            is_finished = count < _TRIALS_PER_LAB
     finally:
         outcomes.put(None)
 
 
 def all_outcomes(tasks: Sequence[_Task], jobs: int) -> Iterator[MotionOutcome]:
-    """Yield the outcomes of trials, as they end, `jobs` at the same time, each in a lab of its own process."""
+    """Yield the outcomes of trials as they end; `jobs` run in parallel, each in a lab of its process."""
     context = multiprocessing.get_context("spawn")
-    waiting: Queue[_Task | None] = context.Queue()
-    ended: Queue[str | None] = context.Queue()
+    task_queue: Queue[_Task | None] = context.Queue()
+    outcome_queue: Queue[str | None] = context.Queue()
     for task in (*tasks, None):
-        waiting.put(task)
-    workers = [context.Process(target=_work, args=(waiting, ended)) for _ in range(jobs)]
+        task_queue.put(task)
+    workers = [context.Process(target=_work, args=(task_queue, outcome_queue)) for _ in range(jobs)]
     for worker in workers:
         worker.start()
-    left = jobs
+    running_workers = jobs
     try:
-        while left:
-            line = ended.get()
+        while running_workers:
+            line = outcome_queue.get()
             if line is None:
-                left -= 1
+                running_workers -= 1
             else:
                 yield MotionOutcome.of(line)
     finally:
@@ -105,8 +105,8 @@ def main() -> int:
     if arguments.list:
         print("\n".join(cell.name for cell in cells))
         return 0
-    known = _read(arguments.results)
-    done = {(outcome.cell, outcome.seed) for outcome in known}
+    stored_outcomes = _read(arguments.results)
+    done = {(outcome.cell, outcome.seed) for outcome in stored_outcomes}
     tasks = [
         (cell.name, seed)
         for seed in range(arguments.seed, arguments.seed + arguments.runs)
@@ -115,7 +115,7 @@ def main() -> int:
     ]
     random.Random(arguments.seed).shuffle(tasks)
     tasks = tasks[: arguments.sample] if arguments.sample else tasks
-    outcomes, began_s = list(known), time.monotonic()
+    outcomes, start_s = list(stored_outcomes), time.monotonic()
     for outcome in all_outcomes(tasks, arguments.jobs) if tasks else ():
         outcomes.append(outcome)
         if arguments.results:
@@ -134,15 +134,17 @@ def main() -> int:
         print(f"{outcome.cell}: {times or 'went on'} {'; '.join(outcome.problems) and 'BEYOND: '}", end="")
         print("; ".join(outcome.problems), flush=True)
     load = max((outcome.load for outcome in outcomes), default=0.0)
-    made = f"{datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} cores, load up to {load:.1f}, {arguments.jobs} at a time"
-    text = motion_table.tables(outcomes, made)
+    conditions = (
+        f"{datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} cores, load up to {load:.1f}, {arguments.jobs} at a time"
+    )
+    text = motion_table.tables(outcomes, conditions)
     print(text)
     if arguments.write:
         motion_table.write(arguments.write, text)
     beyond = sum(bool(outcome.problems) for outcome in outcomes)
-    if missing := len(known) + len(tasks) - len(outcomes):
+    if missing := len(stored_outcomes) + len(tasks) - len(outcomes):
         sys.exit(f"{missing} trials did not end: see the errors above")
-    print(f"trials: {len(outcomes)}, beyond their bounds: {beyond}; {time.monotonic() - began_s:.0f} s")
+    print(f"trials: {len(outcomes)}, beyond their bounds: {beyond}; {time.monotonic() - start_s:.0f} s")
     return int(beyond > 0)
 
 

@@ -1,4 +1,4 @@
-"""Power cuts at random moments, one after the other, on each file system in turn: part of `make soak`.
+"""Power cuts at random moments, in sequence, on each file system in turn: part of `make soak`.
 
 tests/trial/test_power_cuts.py cuts at every sync, and a few times at random.
 """
@@ -19,12 +19,12 @@ IN_A_ROW: Final = 6
 
 
 def main() -> int:
-    """Cut so often; print how often on which file system, and the first thing that was lost."""
+    """Cut the power the given number of times; print the counts per file system, and the first loss."""
     parser = argparse.ArgumentParser(description="power cuts")
     parser.add_argument("--cuts", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    draw, cuts = random.Random(arguments.seed), Counter[str]()
+    generator, cuts = random.Random(arguments.seed), Counter[str]()
     with (
         tempfile.TemporaryDirectory(prefix="fieldkit-power-") as folder,
         namespaces_of_our_own(),
@@ -35,7 +35,7 @@ def main() -> int:
         calls = calls_of_a_trial(place)
         while cuts.total() < arguments.cuts:
             for file_system in FILE_SYSTEMS:
-                cuts[file_system.name] += cuts_in_a_row(file_system, place, draw, calls=calls, most=IN_A_ROW)
+                cuts[file_system.name] += cuts_in_a_row(file_system, place, generator, calls=calls, most=IN_A_ROW)
     kinds = ", ".join(f"{count} on {name}" for name, count in sorted(cuts.items()))
     print(f"power cuts: {cuts.total()} ({kinds}); lost: 0")
     return 0

@@ -1,4 +1,4 @@
-"""`fieldkit abort` on robots that outlive fieldkit: it ends what runs there, whoever is out of reach."""
+"""`fieldkit abort` on robots that outlive fieldkit: it ends their jobs even if another robot cannot be reached."""
 
 import re
 from pathlib import Path
@@ -32,9 +32,9 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
                 jobs.start(shells[role], CAPTURE)
 
             site = tmp_path / SITE_FILE
-            whole = site.read_text(encoding="utf-8")
+            complete_site = site.read_text(encoding="utf-8")
             port = outside.links.port(Role.RECEIVER)
-            site.write_text(whole.replace(f"port: {port},", f"port: {free_port()},"), encoding="utf-8")
+            site.write_text(complete_site.replace(f"port: {port},", f"port: {free_port()},"), encoding="utf-8")
             run = fieldkit(tmp_path, "abort", "--yes")
             assert run.code == 3
             assert f"{sender}: lock broken, 1 job ended\n  {FOLDER}/capture " in run.out
@@ -42,7 +42,7 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
             assert jobs.list_running(shells[Role.SENDER], Deadline.after(30)) == ()
             assert len(jobs.list_running(shells[Role.RECEIVER], Deadline.after(30))) == 1
 
-            site.write_text(whole, encoding="utf-8")
+            site.write_text(complete_site, encoding="utf-8")
             run = fieldkit(tmp_path, "abort", "--yes")
             assert run.code == 0
             assert f"{sender}: not locked, 0 jobs ended\n{receiver}: lock broken, 1 job ended\n" in run.out
@@ -51,7 +51,7 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
             assert re.search(r"by \w+@", caught.value.what)
 
 
-def test_abort_asks_first(tmp_path: Path) -> None:
+def test_abort_needs_a_confirmation(tmp_path: Path) -> None:
     key = " ".join(make_key(tmp_path / "key").split()[:2])
     robot = f"{{profile: duckiedrone, host: localhost, user: nobody, host_key: {key}}}"
     site = f"backend: field\nrobots:\n  a: {robot}\nroles: {{}}\n"

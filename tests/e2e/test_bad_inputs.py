@@ -1,4 +1,4 @@
-"""Every bad input of docs/errors.md, produced for real: one clear message with a remedy, and the right exit code."""
+"""Every bad input of docs/errors.md, reproduced: one clear message with a remedy, and the right exit code."""
 
 import re
 from collections.abc import Callable
@@ -53,7 +53,7 @@ Setup = Callable[[Path], str]
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table in docs/errors.md; `...` stands for what differs from lab to lab."""
+    """A row of the table in docs/errors.md; `...` stands for parts that differ from lab to lab."""
 
     situation: str
     code: int
@@ -64,16 +64,16 @@ class Row:
 def table(section: str) -> dict[str, Row]:
     body = re.search(rf"^## {re.escape(section)}$(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
     assert body, section
-    found = {}
+    rows_by_situation = {}
     for line in body[1].splitlines():
         if re.match(r"\| (?!what is wrong|---)", line):
             situation, code, message, remedy = (_bare(cell) for cell in line.strip("| ").split(" | "))
-            found[situation] = Row(situation, int(code), message, remedy)
-    return found
+            rows_by_situation[situation] = Row(situation, int(code), message, remedy)
+    return rows_by_situation
 
 
 def _bare(cell: str) -> str:
-    """Return a cell without the back quotes that mark code."""
+    """Return a cell without the backticks that mark code."""
     bare = cell.strip()
     marks = len(bare) - len(bare.lstrip("`"))
     return bare[marks:-marks].strip() if marks else bare
@@ -95,12 +95,12 @@ def own(kind: Kind, name: str, *changes: str, command: str = DRY) -> Setup:
     return setup
 
 
-def campaign(*changes: str, begun: bool = False) -> Setup:
+def campaign(*changes: str, started: bool = False) -> Setup:
     def setup(lab: Path) -> str:
         text = CAMPAIGN
         path = lab / "lawn.yaml"
         path.write_text(text, encoding="utf-8")
-        if begun:
+        if started:
             asked, _ = plan.make_plan(path, "emulated")
             with CampaignJournal(lab / "trials" / "campaign_lawn").claimed(asked):
                 pass
@@ -118,7 +118,7 @@ def typed(command: str) -> Setup:
 
 
 def two_runs(command: str, **changes: Any) -> Setup:  # noqa: ANN401 (as replace)
-    """Two runs in the folders `a` and `b`, the second with `changes`."""
+    """Write two runs in the folders `a` and `b`, the second with `changes`."""
 
     def setup(lab: Path) -> str:
         rows = tables.bursty(tables.COMPARABLE, 3, seed=1)
@@ -169,7 +169,7 @@ TYPED: dict[str, Setup] = {
     "a threshold of nothing": two_runs("compare a b --threshold ip_loss=0%"),
     "a lab that is not up": typed("lab ps"),
     "a lab of no robots": typed("lab up --robots 0"),
-    "a lab of a backend that brings up none": site(FIELD, command="lab up --backend field"),
+    "a lab of a backend that cannot start robots": site(FIELD, command="lab up --backend field"),
     "a figure of no known kind": typed("lab plot -o lab.gif"),
 }
 
@@ -240,12 +240,12 @@ WRITTEN: dict[str, Setup] = {
     "one distance twice": campaign("20ft", "3.048m"),
     "a trial left out that there is not": campaign("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]"),
     "a walk that is too short": campaign("seed: 7", "seed: 7\nwalk: 12m"),
-    "a campaign file that changed": campaign("seed: 7", "seed: 8", begun=True),
+    "a campaign file that changed": campaign("seed: 7", "seed: 8", started=True),
 }
 
 
 def read(*rows: RepeatRow, options: str = "", other: RepeatRow | None = None, cut: int | None = None) -> Setup:
-    """Write the table of a trial, perhaps another of the same trial, perhaps with its last line cut."""
+    """Write the table of a trial, optionally a second one of the same trial, optionally with its last line cut."""
 
     def setup(lab: Path) -> str:
         path = tables.write(lab / "trials" / "a", rows)
@@ -258,8 +258,8 @@ def read(*rows: RepeatRow, options: str = "", other: RepeatRow | None = None, cu
     return setup
 
 
-def begun(command: str, *, with_table: bool = True) -> Setup:
-    """Write a trial that has a plan and not one repeat."""
+def with_empty_trial(command: str, *, with_table: bool = True) -> Setup:
+    """Write a trial that has a plan and no repeat."""
 
     def setup(lab: Path) -> str:
         path = tables.write(lab / "trials" / "a", [])
@@ -271,28 +271,28 @@ def begun(command: str, *, with_table: bool = True) -> Setup:
     return setup
 
 
-def colleague_s(command: str, befalls: Callable[[Path], object]) -> Setup:
-    """Write a whole trial, to which something befalls."""
+def with_changed_trial(command: str, change: Callable[[Path], object]) -> Setup:
+    """Write a complete trial and apply a change to it."""
 
     def setup(lab: Path) -> str:
         folder = recorded.make(lab / "made").rename(lab / "a")
         Ledger(store.read_plan(folder), folder, Stop()).summarize()
-        befalls(folder)
+        change(folder)
         return command
 
     return setup
 
 
-def a_link(trial: Path) -> None:
+def replace_table_by_link(trial: Path) -> None:
     (trial / "trial.csv").unlink()
     (trial / "trial.csv").symlink_to("/etc/passwd")
 
 
-def more_evidence(trial: Path) -> None:
+def add_evidence(trial: Path) -> None:
     (trial / "repeats" / "udp-01" / "medium.txt").touch()
 
 
-def one_more_line(trial: Path) -> None:
+def add_journal_entry(trial: Path) -> None:
     repeat = RepeatId(Protocol.UDP, 7)
     journal.append(trial, JournalEntry(1, repeat.protocol, repeat.number, 1, Status.RUNNING))
 
@@ -305,8 +305,8 @@ READ: dict[str, Setup] = {
     "a cell that is no number": read(replace(tables.ROW, distance_m="near")),
     "a table of a newer fieldkit": read(replace(tables.ROW, schema_version=99)),
     "two copies of a trial that differ": read(tables.ROW, other=replace(tables.ROW, transfer_s=2.0)),
-    "trials in which no repeat has ended": begun("aggregate trials"),
-    "trials whose tables are gone": begun("aggregate trials", with_table=False),
+    "trials in which no repeat has ended": with_empty_trial("aggregate trials"),
+    "trials whose tables are gone": with_empty_trial("aggregate trials", with_table=False),
     "a table without a line": lambda lab: (read()(lab), "aggregate trials/a/trial.csv")[1],
     "a table alone to rebuild from": read(tables.ROW, options="--rebuild"),
     "a column that tells no conditions": read(tables.ROW, options="--by distanse"),
@@ -314,10 +314,10 @@ READ: dict[str, Setup] = {
     "a width without a unit": read(tables.ROW, options="--width 2"),
     "a width for none of the quantities": read(tables.ROW, options="--width 1ms --quantity ip_loss"),
     "a paper's table of what nobody measured": read(tables.ROW, options="--format latex --quantity jitter_s"),
-    "a link in the folder of a trial": colleague_s("rebuild a", a_link),
-    "evidence that is not what was measured": colleague_s("rebuild a", more_evidence),
-    "a journal of what cannot have happened": colleague_s("rebuild a", one_more_line),
-    "a manifest that is none": colleague_s(
+    "a link in the folder of a trial": with_changed_trial("rebuild a", replace_table_by_link),
+    "evidence that is not what was measured": with_changed_trial("rebuild a", add_evidence),
+    "a journal of what cannot have happened": with_changed_trial("rebuild a", add_journal_entry),
+    "a manifest that is none": with_changed_trial(
         "verify a", lambda trial: (trial / store.MANIFEST_FILE).write_text("x\n", encoding="utf-8")
     ),
 }
@@ -326,7 +326,7 @@ SECTIONS: dict[str, dict[str, Setup]] = {"Typed": TYPED, "Written in YAML": WRIT
 
 
 @pytest.mark.parametrize(("section", "cases"), SECTIONS.items())
-def test_the_page_lists_what_is_tested(section: str, cases: dict[str, Setup]) -> None:
+def test_the_page_lists_the_tested_inputs(section: str, cases: dict[str, Setup]) -> None:
     assert list(table(section)) == list(cases)
 
 
@@ -335,7 +335,7 @@ def test_the_page_lists_what_is_tested(section: str, cases: dict[str, Setup]) ->
     [(row, cases[name]) for section, cases in SECTIONS.items() for name, row in table(section).items()],
     ids=lambda value: value.situation if isinstance(value, Row) else "",
 )
-def test_a_bad_input_is_one_message_with_a_remedy(
+def test_a_bad_input_gives_one_message_with_a_remedy(
     row: Row, setup: Setup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)

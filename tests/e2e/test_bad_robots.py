@@ -1,4 +1,4 @@
-"""What is wrong with robots and the ways to them, produced on real ones: the last section of docs/errors.md."""
+"""Errors of robots and of connections to them, reproduced on emulated robots: the last section of docs/errors.md."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -24,7 +24,7 @@ BEGIN = "mkdir -p .fieldkit/other/one/.jobs"
 
 
 class Testbed:
-    """A lab's folder with the site file of robots that are up, and whatever a case changes."""
+    """A lab's folder with the site file of running robots, and the changes of a case."""
 
     def __init__(self, folder: Path, outside: Outside) -> None:
         self.folder = folder
@@ -120,7 +120,7 @@ def full_robot(lab: Testbed) -> str:
     return TRIAL
 
 
-def nobody_there(lab: Testbed) -> str:
+def unused_address(lab: Testbed) -> str:
     return TRIAL.removesuffix(" --yes")
 
 
@@ -141,7 +141,7 @@ ON_ROBOTS: dict[str, Setup] = {
     "a job left by another trial": leftover,
     "a robot whose disk is full": full_robot,
     "a topic that is silent": procedure("[/scan]", "[/nothing]"),
-    "nobody to place the robots": nobody_there,
+    "nobody to place the robots": unused_address,
 }
 
 
@@ -158,12 +158,12 @@ def prepared(folder: Path, outside: Outside) -> Iterator[Testbed]:
         yield lab
 
 
-def test_the_page_lists_what_is_tested() -> None:
+def test_the_page_lists_the_tested_errors() -> None:
     assert list(table("On the robots")) == list(ON_ROBOTS)
 
 
 @pytest.mark.parametrize("row", table("On the robots").values(), ids=lambda row: row.situation)
-def test_what_is_wrong_with_robots_is_one_message_with_a_remedy(row: Row, outside: Outside, tmp_path: Path) -> None:
+def test_an_error_of_a_robot_gives_one_message_with_a_remedy(row: Row, outside: Outside, tmp_path: Path) -> None:
     with prepared(tmp_path, outside) as lab:
         run = fieldkit(tmp_path, *ON_ROBOTS[row.situation](lab).split())
     check(row, run.code, run.err)

@@ -1,4 +1,4 @@
-"""A campaign from the outside: killed and run again on emulated robots; skipped and noted on the field backend."""
+"""A campaign, end to end: killed and run again on emulated robots; skipped trials and notes on the field backend."""
 
 import json
 import subprocess
@@ -39,7 +39,7 @@ def journal(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "journal.jsonl").read_text(encoding="utf-8").splitlines()]
 
 
-def what(folder: Path) -> Counter[tuple[str, str]]:
+def count_events(folder: Path) -> Counter[tuple[str, str]]:
     return Counter((entry["turn"], entry["what"]) for entry in journal(folder))
 
 
@@ -47,7 +47,7 @@ def trials(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir())
 
 
-def test_a_campaign_killed_in_a_trial_goes_on_and_has_each_trial_once(tmp_path: Path) -> None:
+def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path: Path) -> None:
     folder = begin(tmp_path, "10ft, 20ft")
     process = start(tmp_path, "campaign", "lawn.yaml", "--json")
     wait_for_line(process, '"campaign_went"')
@@ -71,9 +71,9 @@ def test_a_campaign_killed_in_a_trial_goes_on_and_has_each_trial_once(tmp_path: 
     assert len(trials(folder)) == 4
     assert "recover" in {event["name"] for event in run.events("phase_started")}
     order = [f"los {distance} {topology}" for topology in Topology for distance in ("10ft", "20ft")]
-    assert what(folder) == Counter({(turn, event): 1 for turn in order for event in ("started", "ended")}) + Counter(
-        {(turn, "placed"): 2 if turn == planned["trials"][0] else 1 for turn in order}
-    )
+    assert count_events(folder) == Counter(
+        {(turn, event): 1 for turn in order for event in ("started", "ended")}
+    ) + Counter({(turn, "placed"): 2 if turn == planned["trials"][0] else 1 for turn in order})
     for trial in trials(folder):
         assert [row["status"] for row in rows(trial) if row["status"] != "void"] == ["valid"]
     assert fieldkit(tmp_path, "verify", str(before[1])).code == 0
@@ -102,7 +102,7 @@ def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> 
         nothing = answered(tmp_path, "s", "", "s", "", "s", "", "s")
         assert nothing.code == 1, nothing.err
         assert "run the same command again" in nothing.err
-        assert trials(folder) == [], "what is skipped leaves no folder"
+        assert trials(folder) == [], "skipped trials leave no folder"
 
         first, second = nothing.events("campaign_planned")[0]["trials"]
         run = answered(tmp_path, "s", "n rigged by Ann", "n wet grass", "", "")
@@ -125,11 +125,11 @@ def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> 
     assert "notes: campaign lawn; rigged by Ann; wet grass\n" in noted
     assert "notes: campaign lawn\n" in plain
     assert [entry["note"] for entry in journal(folder) if entry["what"] == "placed"] == ["wet grass", ""]
-    assert what(folder)[first, "skipped"] == 3
-    assert what(folder)[first, "ended"] == what(folder)[second, "ended"] == 1
+    assert count_events(folder)[first, "skipped"] == 3
+    assert count_events(folder)[first, "ended"] == count_events(folder)[second, "ended"] == 1
 
 
-def test_a_program_answers_through_a_pipe(tmp_path: Path) -> None:
+def test_a_program_can_answer_through_a_pipe(tmp_path: Path) -> None:
     folder = begin(tmp_path, "10ft")
     with robots_outside(tmp_path, topology=Topology.MASTERLESS):
         text = (tmp_path / "lawn.yaml").read_text(encoding="utf-8").replace("[master, masterless]", "[masterless]")

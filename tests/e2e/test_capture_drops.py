@@ -1,4 +1,4 @@
-"""Packets that tcpdump lost: a topic withholds what depends on its captures, and a transfer is void."""
+"""Packets lost by tcpdump: values of a topic that depend on its captures are withheld, and a transfer is void."""
 
 import re
 from pathlib import Path
@@ -53,7 +53,7 @@ def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journ
 
 
 def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tuple[tuple[str, ...], Measured]:
-    """Return the problems and the columns of an attempt whose tcpdump reports that the kernel dropped 12 packets."""
+    """Return the problems and columns of an attempt in which tcpdump reports 12 packets dropped by the kernel."""
     plan, folder, ended = attempt
     log = folder / f"{capture}-capture.log"
     whole = log.read_text(encoding="utf-8")
@@ -68,7 +68,7 @@ def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tup
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_a_topic_keeps_what_its_logs_say(attempt: tuple[Plan, Path, journal.Attempt], role: str) -> None:
+def test_a_topic_keeps_the_values_from_its_logs(attempt: tuple[Plan, Path, journal.Attempt], role: str) -> None:
     problems, measured = with_drops(attempt, f"topic.{role}")
     assert problems == ()
     assert measured.values.keys() >= NEEDS_NO_CAPTURE

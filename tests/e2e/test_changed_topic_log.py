@@ -1,4 +1,4 @@
-"""A topic between emulated robots: its repeat is valid, and not when its subscriber's log is changed afterwards."""
+"""A topic between emulated robots: its repeat is valid, and invalid after a change of its subscriber's log."""
 
 import struct
 import zlib
@@ -32,7 +32,7 @@ steps:
 
 
 def shifted(content: bytes, by_ns: int) -> bytes:
-    """Return a log whose samples came later by so much, with the checksum of its new content."""
+    """Return a log whose samples arrived later by this time, with a matching checksum."""
     head, size = len(records.MAGIC), records.RECORD.size
     rows = [list(records.RECORD.unpack_from(content, at)) for at in range(head, len(content), size)]
     for row in rows:
@@ -42,7 +42,7 @@ def shifted(content: bytes, by_ns: int) -> bytes:
     return records.MAGIC + b"".join(records.RECORD.pack(*row) for row in rows)
 
 
-def test_a_changed_log_of_a_real_stream_is_noticed(tmp_path: Path) -> None:
+def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
     (tmp_path / "procedures").mkdir()
     (tmp_path / "procedures" / "stream.yaml").write_text(STREAM, encoding="utf-8")
     run = fieldkit(tmp_path, "trial", "stream", "5m", "--yes")

@@ -1,4 +1,4 @@
-"""`fieldkit check` from the outside: a lab that is ready, and labs with a fault planted in each."""
+"""`fieldkit check`, end to end: a ready lab, and labs with one injected fault each."""
 
 import subprocess
 import sys
@@ -23,29 +23,29 @@ pytestmark = pytest.mark.emulated
 CHECK = ("check", "los", "--topology", "masterless", "--json")
 
 
-def told(run: Run) -> dict[tuple[str, str], dict[str, str]]:
-    return {(one["robot"], one["check"]): one for one in run.events("finding")}
+def findings_by_check(run: Run) -> dict[tuple[str, str], dict[str, str]]:
+    return {(finding["robot"], finding["check"]): finding for finding in run.events("finding")}
 
 
 def failed(run: Run) -> set[tuple[str, str]]:
-    return {where for where, finding in told(run).items() if finding["status"] == "fail"}
+    return {where for where, finding in findings_by_check(run).items() if finding["status"] == "fail"}
 
 
 @pytest.fixture(scope="module")
 def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
-    """Debian's ROS, as its programs are what is checked."""
+    """Robots with Debian's ROS, whose programs are checked."""
     with robots_outside(tmp_path_factory.mktemp("lab"), site=DEFAULT_SITE) as robots:
         yield robots
 
 
 @pytest.fixture
 def lab(outside: Outside, tmp_path: Path) -> Path:
-    """Return a folder of its own with the site file of the robots outside."""
+    """Return a separate folder with the site file of the robots."""
     (tmp_path / "fieldkit.yaml").write_bytes((outside.folder / "fieldkit.yaml").read_bytes())
     return tmp_path
 
 
-def test_a_lab_that_is_ready_is_ok_in_every_line(tmp_path: Path) -> None:
+def test_a_ready_lab_is_ok_in_every_line(tmp_path: Path) -> None:
     run = fieldkit(tmp_path, "check")
     assert run.code == 0, run.out + run.err
     assert list(tmp_path.iterdir()) == []
@@ -66,17 +66,17 @@ def test_a_lab_that_is_ready_is_ok_in_every_line(tmp_path: Path) -> None:
     assert "\x1b" not in run.out, "no terminal codes off a terminal"
 
 
-def test_the_field_backend_is_ok_too_and_nothing_is_left_on_the_robots(outside: Outside, lab: Path) -> None:
+def test_the_field_backend_is_ok_and_leaves_nothing_on_the_robots(outside: Outside, lab: Path) -> None:
     run = fieldkit(lab, *CHECK)
     assert run.code == 0, run.out + run.err
-    scan = told(run)["turtlebot-1", "topic /scan"]
+    scan = findings_by_check(run)["turtlebot-1", "topic /scan"]
     assert scan["status"] == "ok"
     for shell in outside.testbed.shells.values():
         left = shell.run(("ls", jobs.HOME), deadline=Deadline.after(30)).stdout.decode().split()
         assert [name for name in left if not name.startswith("job-")] == []
 
 
-def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside: Outside, lab: Path) -> None:
+def test_each_fault_is_reported_with_its_remedy_and_the_rest_is_checked(outside: Outside, lab: Path) -> None:
     copy_shipped(lab, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
     copy_shipped(lab, "robots", "duckiedrone", "capture_right: direct", "capture_right: sudo")
     receiver = outside.testbed.shells[Role.RECEIVER]
@@ -92,7 +92,7 @@ def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside
         jobs.stop(receiver, leftover)
         receiver.run(("rm", "-r", folder), deadline=Deadline.after(30))
     assert run.code == 3
-    findings = told(run)
+    findings = findings_by_check(run)
     assert failed(run) == {
         ("turtlebot-1", "nc.imaginary"),
         ("duckiedrone-1", "port 1234"),
@@ -104,27 +104,27 @@ def test_each_fault_is_a_failure_with_its_remedy_and_the_rest_is_checked(outside
     assert findings["turtlebot-1", "topic /scan"]["status"] == "ok"
 
 
-def test_a_silent_topic_is_found_before_the_trial(lab: Path) -> None:
+def test_a_silent_topic_is_detected_before_the_trial(lab: Path) -> None:
     copy_shipped(lab, "procedures", "los", "[/scan]", "[/scan, /nothing]")
     run = fieldkit(lab, *CHECK)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "topic /nothing")}
-    assert told(run)["turtlebot-1", "topic /scan"]["status"] == "ok"
+    assert findings_by_check(run)["turtlebot-1", "topic /scan"]["status"] == "ok"
 
 
-def test_a_robot_that_cannot_be_reached_does_not_hide_the_others(outside: Outside, lab: Path) -> None:
+def test_an_unreachable_robot_does_not_prevent_checks_of_the_others(outside: Outside, lab: Path) -> None:
     site = (lab / "fieldkit.yaml").read_text(encoding="utf-8")
-    # 192.0.2.0/24 is for documentation (RFC 5737): nobody is there. The other robot's radio has another address.
+    # 192.0.2.0/24 is for documentation (RFC 5737) and not in use. The other robot's radio has another address.
     address = outside.cast[Role.RECEIVER].address
     site = site.replace(f"port: {outside.links.port(Role.SENDER)}", "port: 1").replace(address, "192.0.2.1")
     (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
     run = fieldkit(lab, *CHECK)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "connection"), ("duckiedrone-1", "interface wlan0")}
-    assert [check for robot, check in told(run) if robot == "turtlebot-1"] == ["connection"]
+    assert [check for robot, check in findings_by_check(run) if robot == "turtlebot-1"] == ["connection"]
 
 
-def test_a_robot_that_somebody_else_holds_is_named_and_not_disturbed(outside: Outside, lab: Path) -> None:
+def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(outside: Outside, lab: Path) -> None:
     sender = {Role.SENDER: outside.testbed.shells[Role.SENDER]}
     with locks.locked(sender, Holder("token", "anna@one", "trial-a"), sink=lambda _: None):
         job = Job(
@@ -135,11 +135,11 @@ def test_a_robot_that_somebody_else_holds_is_named_and_not_disturbed(outside: Ou
         run = fieldkit(lab, *CHECK)
         evidence.end_jobs(sender[Role.SENDER], job.folder)
     assert run.code == 3
-    assert failed(run) == {("turtlebot-1", "lock")}, "what anna runs is no leftover"
-    lock = told(run)["turtlebot-1", "lock"]
+    assert failed(run) == {("turtlebot-1", "lock")}, "a process of anna is no leftover"
+    lock = findings_by_check(run)["turtlebot-1", "lock"]
     assert "anna@one holds the robot for trial-a" in lock["detail"]
     assert lock["remedy"].endswith(": fieldkit abort")
-    assert ("turtlebot-1", "topic /scan") not in told(run)
+    assert ("turtlebot-1", "topic /scan") not in findings_by_check(run)
 
 
 def test_a_changed_host_key_names_both_fingerprints(outside: Outside, lab: Path) -> None:
@@ -150,10 +150,10 @@ def test_a_changed_host_key_names_both_fingerprints(outside: Outside, lab: Path)
     run = fieldkit(lab, *CHECK)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "connection")}
-    assert told(run)["turtlebot-1", "connection"]["detail"].count("SHA256:") == 2
+    assert findings_by_check(run)["turtlebot-1", "connection"]["detail"].count("SHA256:") == 2
 
 
-def test_a_home_without_room_fails(outside: Outside, lab: Path) -> None:
+def test_a_full_home_directory_fails(outside: Outside, lab: Path) -> None:
     shell = outside.testbed.shells[Role.SENDER]
     resize = "mount -o remount,size=$1 /root && df -Pk /root"
     before = shell.run(("df", "-Pk", "/root"), deadline=Deadline.after(30)).stdout.split()[-5].decode()
@@ -167,7 +167,7 @@ def test_a_home_without_room_fails(outside: Outside, lab: Path) -> None:
     assert {robot for robot, _ in failed(run)} == {"turtlebot-1"}
 
 
-def test_a_trial_tells_warnings_and_stops_at_failures(lab: Path) -> None:
+def test_a_trial_reports_warnings_and_stops_at_failures(lab: Path) -> None:
     copy_shipped(
         lab,
         "robots",
@@ -184,8 +184,8 @@ def test_a_trial_tells_warnings_and_stops_at_failures(lab: Path) -> None:
     assert "correct its name in profile turtlebot3_burger" in run.err
 
 
-def test_a_machine_without_a_hosts_file_is_enough(tmp_path: Path) -> None:
-    """As a bare Debian is; its `/etc` stands in a mount namespace of its own."""
+def test_a_machine_without_a_hosts_file_is_sufficient(tmp_path: Path) -> None:
+    """Like a minimal Debian; its `/etc` is in a separate mount namespace."""
     script = 'cp -a /etc "$0" && rm -f "$0/hosts" && mount --bind "$0" /etc && test ! -e /etc/hosts && exec "$@"'
     argv = ("unshare", "--mount", "sh", "-c", script, str(tmp_path / "etc"), sys.executable, "-m", "fieldkit", *CHECK)
     done = subprocess.run(argv, check=False, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT_S)

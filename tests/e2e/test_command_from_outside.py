@@ -1,4 +1,4 @@
-"""A command from another package: the one of docs/add-a-command.md, found by its entry point, beside broken ones."""
+"""A command of another package: the example of docs/add-a-command.md, loaded by its entry point, and broken ones."""
 
 import os
 import re
@@ -29,7 +29,7 @@ def install(folder: Path, package: str, group: str, points: dict[str, str]) -> N
 
 @pytest.fixture
 def fieldkit(tmp_path: Path) -> Fieldkit:
-    """fieldkit beside installed packages: the page's example, and others that are broken."""
+    """Return a function that runs fieldkit with installed packages: the page's example, and broken ones."""
     page = PAGE.read_text(encoding="utf-8")
     (source,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (entry,) = re.findall(r'^    \[project\.entry-points\."(.*)"\]\n    (\w+) = "(.*)"$', page, re.MULTILINE)
@@ -62,14 +62,14 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
     return run
 
 
-def test_it_runs_with_the_options_that_it_declares(fieldkit: Fieldkit) -> None:
+def test_the_command_runs_with_its_declared_options(fieldkit: Fieldkit) -> None:
     done = fieldkit("worst", str(TRIAL))
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[2].split() == ["udp-1", "0.125"]
     assert fieldkit("worst", str(TRIAL), "--by", "rtt_loss").stdout.splitlines()[2].split() == ["udp-2", "0.9"]
 
 
-def test_its_help_and_errors_are_told_as_those_of_other_commands(fieldkit: Fieldkit, tmp_path: Path) -> None:
+def test_its_help_and_errors_look_like_those_of_other_commands(fieldkit: Fieldkit, tmp_path: Path) -> None:
     assert "Name the repeats of a trial that lost most." in fieldkit("worst", "--help").stdout
     refused = fieldkit("worst", str(TRIAL), "--by", "rtt_los")
     assert (refused.returncode, refused.stderr.count("did you mean 'rtt_loss'?")) == (2, 1), refused.stderr
@@ -89,7 +89,7 @@ def test_the_help_lists_it_and_the_tab_key_completes_it(fieldkit: Fieldkit, tmp_
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "message"),
     [
         ("absent", "entry point absent = no_such_package:add: it cannot be loaded: ModuleNotFoundError"),
         ("failing", "entry point failing = failing:add: its arguments cannot be declared: RuntimeError: not today"),
@@ -97,15 +97,13 @@ def test_the_help_lists_it_and_the_tab_key_completes_it(fieldkit: Fieldkit, tmp_
         ("twice", "several packages add a command 'twice': "),
     ],
 )
-def test_a_package_that_cannot_be_used_is_named_when_its_command_is(
-    fieldkit: Fieldkit, command: str, said: str
-) -> None:
+def test_a_broken_package_is_named_when_its_command_is_used(fieldkit: Fieldkit, command: str, message: str) -> None:
     refused = fieldkit(command)
     assert refused.returncode == 2
-    assert refused.stderr.startswith(f"error: {said}")
+    assert refused.stderr.startswith(f"error: {message}")
     assert "\n  remedy: " in refused.stderr
 
 
-def test_the_others_go_on_beside_broken_ones_and_keep_their_names(fieldkit: Fieldkit) -> None:
+def test_other_commands_work_and_keep_their_names_despite_broken_packages(fieldkit: Fieldkit) -> None:
     assert "usage: fieldkit trial" in fieldkit("trial", "--help").stdout
     assert fieldkit("columns", "show", "ip_loss").returncode == 0

@@ -1,4 +1,4 @@
-"""The conformance suite over every way that fieldkit has to a robot."""
+"""The conformance suite for every connection from fieldkit to a robot."""
 
 import subprocess
 from collections.abc import Callable, Iterator
@@ -77,7 +77,7 @@ def rebooting(testbed: Testbed) -> Callable[[], object]:
 
 
 class OfTestbed(ShellConformance, BackendConformance, RebootConformance):
-    """All suites on the testbed that the fixture `opened` gives."""
+    """All suites, on the testbed of the fixture `opened`."""
 
     @pytest.fixture(scope="class")
     @classmethod

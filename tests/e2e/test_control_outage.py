@@ -1,4 +1,4 @@
-"""`control: radio`, and the sender leaves everybody's range for a while: jobs go on, nothing is measured twice."""
+"""`control: radio` with the sender out of range for a while: jobs continue, and nothing is measured twice."""
 
 import subprocess
 import threading
@@ -32,38 +32,38 @@ pytestmark = pytest.mark.emulated
 
 UnderWay = Callable[[EmulatedTestbed], bool]
 
-# Longer than it takes to notice, so that the connection is given up, and made again when the sender is back.
+# Longer than the time for noticing it, so that the connection is given up, and opened again when the sender is back.
 OUTAGE_S = 8.0
-# So slow that a transfer is under way for about a second.
+# So slow that a transfer takes about a second.
 RADIO = "{rate: 500kbit/s}"
 RECORD_S = 2.0
 
 
 def inside(testbed: EmulatedTestbed) -> Path:
-    """Return where /proc tells of a process of the sender's own namespaces."""
+    """Return the /proc folder of a process in the sender's namespaces."""
     outermost = testbed.robots[Role.SENDER].pid
     first = Path(f"/proc/{outermost}/task/{outermost}/children").read_text(encoding="ascii").strip()
     return Path(f"/proc/{first}")
 
 
 def jobs_of(testbed: EmulatedTestbed) -> dict[str, str]:
-    """Return the identity of each job that the sender has or had, read past SSH."""
-    found = (inside(testbed) / "root/root/.fieldkit").glob("*/*/.jobs/*/pid")
-    return {path.parent.name: path.read_text(encoding="ascii") for path in found}
+    """Return the identity of each current or former job of the sender, read without SSH."""
+    pid_files = (inside(testbed) / "root/root/.fieldkit").glob("*/*/.jobs/*/pid")
+    return {path.parent.name: path.read_text(encoding="ascii") for path in pid_files}
 
 
-def it_records(testbed: EmulatedTestbed) -> bool:
+def is_recording(testbed: EmulatedTestbed) -> bool:
     return jobs_of(testbed).get("record", "") != ""
 
 
-def it_sends(testbed: EmulatedTestbed) -> bool:
+def is_sending(testbed: EmulatedTestbed) -> bool:
     sender, receiver = (testbed.robots[role].name for role in (Role.SENDER, Role.RECEIVER))
     return testbed.medium.stats().links[sender, receiver].sent > 5
 
 
 @dataclass
 class Observed:
-    """What a trial told, and which jobs its sender had at a moment."""
+    """Notes of a trial, and the jobs of its sender before and after a moment."""
 
     notes: list[str] = field(default_factory=list)
     before: dict[str, str] = field(default_factory=dict)
@@ -72,7 +72,7 @@ class Observed:
 
 @contextmanager
 def captured(testbed: EmulatedTestbed, path: Path) -> Iterator[None]:
-    """Capture what the sender's radio carries of the transfer and of SSH."""
+    """Capture the packets of the transfer and of SSH on the sender's radio."""
     enter = ("nsenter", f"--net={inside(testbed)}/ns/net")
     options = ("-n", "-U", "--immediate-mode", "-s", "128", "-B", "4096", "-Z", "root", "-w", str(path))
     argv = (*enter, "tcpdump", "-i", "wlan0", *options, "tcp port 22 or port 1234")
@@ -85,32 +85,40 @@ def captured(testbed: EmulatedTestbed, path: Path) -> Iterator[None]:
             process.terminate()
 
 
-def said_during_the_transfer(path: Path) -> list[str]:
-    """Return what fieldkit or a robot said by SSH over the radio during the transfer.
+def control_packets_during_transfer(path: Path) -> list[str]:
+    """Return the SSH packets of fieldkit or a robot over the radio during the transfer.
 
-    Bare acknowledgements are left out, and so is what the two kernels have to settle of a connection that is no more:
-    TCP repeats what was not acknowledged until it is, at twice the interval each time, and is answered by a reset.
+    Bare acknowledgements are omitted, and so are the packets by which the kernels end a broken connection: TCP
+    retransmits unacknowledged data with exponential backoff, and receives a reset.
     """
     packets = list(rdpcap(str(path)))
-    times = [float(one.time) for one in packets if any(one[kind].dport == 1234 for kind in (TCP, UDP) if kind in one)]
-    control = [one for one in packets if TCP in one and 22 in (one[TCP].sport, one[TCP].dport)]
+    times = [
+        float(packet.time)
+        for packet in packets
+        if any(packet[kind].dport == 1234 for kind in (TCP, UDP) if kind in packet)
+    ]
+    control = [packet for packet in packets if TCP in packet and 22 in (packet[TCP].sport, packet[TCP].dport)]
     assert control
     assert times
-    newest = [one[TCP].sport for one in control if one[TCP].flags == "S"][-1]
+    newest = [packet[TCP].sport for packet in control if packet[TCP].flags == "S"][-1]
     ends: dict[tuple[int, int], int] = {}
-    said = []
-    for one in control:
-        tcp = one[TCP]
-        way, end = (tcp.sport, tcp.dport), tcp.seq + len(tcp.payload)
-        settles = newest not in way and (end <= ends.get(way, 0) or tcp.flags == "R")
-        ends[way] = max(end, ends.get(way, 0))
-        if min(times) < float(one.time) < max(times) and (len(tcp.payload) > 0 or tcp.flags != "A") and not settles:
-            said.append(one.summary())
-    return said
+    control_packets = []
+    for packet in control:
+        tcp = packet[TCP]
+        direction, end = (tcp.sport, tcp.dport), tcp.seq + len(tcp.payload)
+        is_kernel_cleanup = newest not in direction and (end <= ends.get(direction, 0) or tcp.flags == "R")
+        ends[direction] = max(end, ends.get(direction, 0))
+        if (
+            min(times) < float(packet.time) < max(times)
+            and (len(tcp.payload) > 0 or tcp.flags != "A")
+            and not is_kernel_cleanup
+        ):
+            control_packets.append(packet.summary())
+    return control_packets
 
 
-def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way: UnderWay) -> Observed:
-    """Run a trial of one repeat whose sender goes away when `under_way` holds in `phase`."""
+def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, is_under_way: UnderWay) -> Observed:
+    """Run a trial of one repeat whose sender leaves the range when `is_under_way` is True in `phase`."""
     backend = EmulatedBackend(*load_site(lab_folder / SITE_FILE))
     request = TrialRequest(
         load_procedure("quick"), parse_distance("5m"), protocols=(protocol,), repeats=1, record_s=RECORD_S
@@ -119,12 +127,12 @@ def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way:
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     observed = Observed()
 
-    def go_away() -> None:
-        wait_until(lambda: under_way(testbed), Deadline.after(60))
+    def leave_range() -> None:
+        wait_until(lambda: is_under_way(testbed), Deadline.after(60))
         observed.before = jobs_of(testbed)
         testbed.inject(Fault(FaultKind.OUT_OF_RANGE, Role.SENDER, OUTAGE_S))
 
-    outage = threading.Thread(target=go_away)
+    outage = threading.Thread(target=leave_range)
 
     def watch(event: Event) -> None:
         match event:
@@ -145,26 +153,26 @@ def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, under_way:
 
 
 @pytest.mark.parametrize(
-    ("protocol", "phase", "under_way"),
+    ("protocol", "phase", "is_under_way"),
     [
-        (Protocol.TCP, "record", it_records),
-        (Protocol.TCP, "transfer", it_sends),
-        (Protocol.UDP, "transfer", it_sends),
+        (Protocol.TCP, "record", is_recording),
+        (Protocol.TCP, "transfer", is_sending),
+        (Protocol.UDP, "transfer", is_sending),
     ],
 )
-def test_a_sender_that_was_away_is_collected_and_nothing_runs_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: Protocol, phase: str, under_way: UnderWay
+def test_evidence_of_a_sender_that_was_out_of_range_is_fetched_and_nothing_runs_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: Protocol, phase: str, is_under_way: UnderWay
 ) -> None:
     folder = make_lab(tmp_path / "lab", RADIO)
     site = folder / SITE_FILE
     site.write_text(site.read_text(encoding="utf-8") + "control: radio\n", encoding="utf-8")
     monkeypatch.chdir(folder)
-    observed = run_with_outage(folder, protocol, phase, under_way)
+    observed = run_with_outage(folder, protocol, phase, is_under_way)
     for what in ("lost", "back"):
-        told = any(f"link is {what}" in note for note in observed.notes)
-        # A TCP transfer outlasts the outage, and what is silent loses nothing by it.
-        assert told is (phase == "record" or protocol is Protocol.UDP)
-    assert said_during_the_transfer(folder / "radio.pcap") == []
+        link_was_reported = any(f"link is {what}" in note for note in observed.notes)
+        # A TCP transfer is longer than the outage, and an idle connection is not affected by it.
+        assert link_was_reported is (phase == "record" or protocol is Protocol.UDP)
+    assert control_packets_during_transfer(folder / "radio.pcap") == []
     assert observed.before.keys() == ({"record"} if phase == "record" else {"record", "capture", "send"})
     assert observed.after.keys() == {"record", "capture", "send", "ping"}
     assert observed.after.items() >= observed.before.items(), "the jobs are those that ran when the link died"
@@ -174,4 +182,4 @@ def test_a_sender_that_was_away_is_collected_and_nothing_runs_twice(
     assert 0 < int(row["bag_messages"]) <= 11, "2 s of a 5 Hz laser, less what it takes to subscribe"
     packets = rdpcap(str(trial / "repeats" / f"{protocol}-01" / "sender.pcap"))
     ports = {packet[layer].sport for packet in packets for layer in (TCP, UDP) if layer in packet}
-    assert len(ports - {1234}) == 1, "each netcat sends from a port of its own"
+    assert len(ports - {1234}) == 1, "each netcat sends from its own port"

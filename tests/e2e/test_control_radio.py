@@ -1,4 +1,4 @@
-"""`control: radio`: SSH crosses the radio under test, and what is measured there stays what it was."""
+"""`control: radio`: SSH crosses the radio under test, and the measured values stay correct."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,7 +30,7 @@ def at(distance: str, topology: Topology) -> Placement:
     return Placement(Scenario.LOS, topology, parse_distance(distance))
 
 
-def test_control_is_separate_unless_the_site_file_says_otherwise() -> None:
+def test_control_is_separate_by_default() -> None:
     text = DEFAULT_SITE.read_text(encoding="utf-8")
     assert validate(parse(text, source="f"), Site).control is Control.SEPARATE
     assert validate(parse(f"{text}control: radio\n", source="f"), Site).control is Control.RADIO
@@ -38,7 +38,7 @@ def test_control_is_separate_unless_the_site_file_says_otherwise() -> None:
         validate(parse(f"{text}control: wifi\n", source="f"), Site)
 
 
-def test_no_robot_may_be_the_laptop(tmp_path: Path) -> None:
+def test_no_robot_may_have_the_laptops_name(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
     text = DEFAULT_SITE.read_text(encoding="utf-8").replace("turtlebot-2", "laptop")
     path.write_text(f"{text}control: radio\n", encoding="utf-8")
@@ -59,7 +59,7 @@ def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
 
 
 @pytest.mark.emulated
-def test_ssh_crosses_the_medium_as_any_station_s_packets_do(up: EmulatedTestbed) -> None:
+def test_ssh_crosses_the_medium_like_the_packets_of_any_station(up: EmulatedTestbed) -> None:
     done = up.shells[Role.SENDER].run(("head", "-c", str(FETCHED_BYTES), "/dev/zero"), deadline=Deadline.after(30))
     assert len(done.stdout) == FETCHED_BYTES
     master = Role.RELAY in up.robots
@@ -67,20 +67,20 @@ def test_ssh_crosses_the_medium_as_any_station_s_packets_do(up: EmulatedTestbed)
 
     seen: list[MediumStats] = []
 
-    def at_rest() -> bool:  # no packet is on its way between the begin of a hop, its end and the laptop
+    def at_rest() -> bool:  # no packet is in flight on a hop or to the laptop
         seen.append(stats := up.medium.stats())
         hop = stats.links[last_hop, "laptop"]
         return hop.sent == hop.delivered == stats.ports["laptop"].written
 
     wait_until(at_rest, Deadline.after(30))
-    stats = seen[-1]  # the next may be of a moment with a packet on its way
+    stats = seen[-1]  # a later one may be taken while a packet is in flight
     assert stats.ports["laptop"].written > FETCHED_BYTES / 1500
     assert stats.links["turtlebot-1", "laptop"].sent == (0 if master else stats.ports["laptop"].written)
     assert stats.links["turtlebot-1", up.robots[Role.RECEIVER].name].sent == 0
 
 
 @pytest.mark.emulated
-def test_a_robot_out_of_range_is_out_of_reach_until_it_comes_back(up: EmulatedTestbed) -> None:
+def test_a_robot_out_of_range_is_unreachable_until_it_returns(up: EmulatedTestbed) -> None:
     topology = Topology.MASTER if Role.RELAY in up.robots else Topology.MASTERLESS
     up.place(at("1km", topology))
     with pytest.raises(LinkError):
@@ -91,7 +91,7 @@ def test_a_robot_out_of_range_is_out_of_reach_until_it_comes_back(up: EmulatedTe
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("radio", ["{fading: false}", "{loss: 10%}"])
-def test_a_trial_ends_valid_and_captures_nothing_of_ssh(tmp_path: Path, radio: str) -> None:
+def test_a_trial_ends_valid_and_captures_no_ssh_packets(tmp_path: Path, radio: str) -> None:
     folder = make_lab(tmp_path / "lab", radio)
     site = folder / "fieldkit.yaml"
     site.write_text(site.read_text(encoding="utf-8") + "control: radio\n", encoding="utf-8")
@@ -105,14 +105,14 @@ def test_a_trial_ends_valid_and_captures_nothing_of_ssh(tmp_path: Path, radio: s
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(("control", "word"), [("separate", "arrives at 127.0.0.1"), ("radio", "shares the radio")])
-def test_check_sees_which_way_ssh_takes(tmp_path: Path, control: str, word: str) -> None:
+def test_check_reports_the_network_of_ssh(tmp_path: Path, control: str, word: str) -> None:
     folder = make_lab(tmp_path / "lab", "{}")
     site = folder / "fieldkit.yaml"
     site.write_text(site.read_text(encoding="utf-8") + f"control: {control}\n", encoding="utf-8")
     run = fieldkit(folder, "check", "quick", "--json")
     assert run.code == 0, run.err + run.out
-    found = {one["robot"]: one for one in run.events("finding") if one["check"] == "control"}
-    assert found.keys() == {"turtlebot-1", "turtlebot-2"}
-    for one in found.values():
-        assert one["status"] == "ok"
-        assert word in one["detail"]
+    findings = {finding["robot"]: finding for finding in run.events("finding") if finding["check"] == "control"}
+    assert findings.keys() == {"turtlebot-1", "turtlebot-2"}
+    for finding in findings.values():
+        assert finding["status"] == "ok"
+        assert word in finding["detail"]

@@ -1,4 +1,4 @@
-"""`fieldkit cosim run` as a user types it: what it prints and keeps, bad inputs, Ctrl-C, pipes."""
+"""`fieldkit cosim run` on the command line: output, recordings, bad inputs, Ctrl-C, pipes."""
 
 import csv
 import io
@@ -52,7 +52,7 @@ def lab(tmp_path: Path) -> Path:
 
 
 def cosim(lab: Path, *words: str) -> Run:
-    """Run `fieldkit cosim` in this process, where most of what it imports is imported already."""
+    """Run `fieldkit cosim` in this process, which has already imported most of its modules."""
     return here(lab, "cosim", *words)
 
 
@@ -73,14 +73,14 @@ def event_hash(run: Run) -> str:
     return line
 
 
-def test_it_prints_each_flow_in_every_form(lab: Path) -> None:
+def test_it_prints_each_flow_in_every_format(lab: Path) -> None:
     table = cosim(lab, "run", "pass.yaml")
     assert table.code == 0, table.err
     assert "state/bob" in table.out
     assert max(map(len, table.out.splitlines())) <= 100
     (row,) = rows(cosim(lab, "run", "pass.yaml", "--format", "csv").out)
-    (same,) = json.loads(cosim(lab, "run", "pass.yaml", "--format", "json").out)["flows"]
-    assert (row["flow"], row["sent"]) == (same["flow"], str(same["sent"])) == ("state/bob", "100")
+    (flow,) = json.loads(cosim(lab, "run", "pass.yaml", "--format", "json").out)["flows"]
+    assert (row["flow"], row["sent"]) == (flow["flow"], str(flow["sent"])) == ("state/bob", "100")
     assert cosim(lab, "run", "pass.yaml", "--format", "markdown").out.startswith("| ")
 
 
@@ -93,28 +93,28 @@ def test_options_change_the_scenario(lab: Path) -> None:
     assert event_hash(cosim(lab, "run", "pass.yaml", "--seed", "1")) == event_hash(cosim(lab, "run", "pass.yaml"))
 
 
-def test_all_seeds_of_the_scenario_are_run_unless_an_option_says_otherwise(lab: Path) -> None:
+def test_all_seeds_of_the_scenario_are_run_by_default(lab: Path) -> None:
     path = lab / "pass.yaml"
     path.write_text(path.read_text(encoding="utf-8") + "seeds: [7, 3]\n", encoding="utf-8")
 
     def seeds(*words: str) -> list[str]:
-        done = cosim(lab, *words, "pass.yaml", "--duration", "100ms", "--format", "csv")
-        return [row.get("seed", row.get("seeds", "")) for row in rows(done.out)]
+        run = cosim(lab, *words, "pass.yaml", "--duration", "100ms", "--format", "csv")
+        return [row.get("seed", row.get("seeds", "")) for row in rows(run.out)]
 
     assert seeds("run") == ["7", "3"]
     assert seeds("run", "--seed", "5") == ["5"]
     assert seeds("run", "--seeds", "3") == ["1", "2", "3"]
     assert seeds("shootout", "--policy", "scheduled") == ["2"]
     cosim(lab, "run", "pass.yaml", "--duration", "100ms", "--out", "sim")
-    assert sorted(one.parent.name for one in (lab / "sim").glob("*/run.json")) == ["seed-3", "seed-7"]
-    refused = cosim(lab, "run", "pass.yaml", "--set", "seeds=[1, 1]")
-    assert (refused.code, "a seed is named twice" in refused.err) == (2, True)
+    assert sorted(path.parent.name for path in (lab / "sim").glob("*/run.json")) == ["seed-3", "seed-7"]
+    rejected = cosim(lab, "run", "pass.yaml", "--set", "seeds=[1, 1]")
+    assert (rejected.code, "a seed is named twice" in rejected.err) == (2, True)
 
 
 def test_a_folder_has_a_recording_for_each_seed_and_equal_runs_are_equal(lab: Path) -> None:
     for name in ("one", "two"):
-        done = cosim(lab, "run", "pass.yaml", "--seeds", "2", "--out", f"{name}/sim")
-        assert done.code == 0, done.err
+        run = cosim(lab, "run", "pass.yaml", "--seeds", "2", "--out", f"{name}/sim")
+        assert run.code == 0, run.err
     for seed in (1, 2):
         table = (lab / "one" / "sim" / f"seed-{seed}" / "trial.csv").read_text(encoding="utf-8")
         assert table == (lab / "two" / "sim" / f"seed-{seed}" / "trial.csv").read_text(encoding="utf-8")
@@ -124,40 +124,42 @@ def test_a_folder_has_a_recording_for_each_seed_and_equal_runs_are_equal(lab: Pa
         declared: dict[str, Column] = {column.name: column for column in trial_columns()}
         assert row.keys() <= declared.keys()
         assert not [name for name, text in row.items() if declared[name].invalid_value_reason(text)]
-    assert cosim(lab, "run", "one/sim/pass.yaml", "--format", "csv").out.count("\n") == 2, "it runs again"
+    assert cosim(lab, "run", "one/sim/pass.yaml", "--format", "csv").out.count("\n") == 2, (
+        "the stored scenario can be run"
+    )
 
 
-def test_a_recording_gives_the_same_numbers_again_and_can_be_drawn(lab: Path) -> None:
-    ran = cosim(lab, "run", "pass.yaml", "--out", "sim")
+def test_a_recording_reproduces_the_numbers_and_can_be_plotted(lab: Path) -> None:
+    original = cosim(lab, "run", "pass.yaml", "--out", "sim")
     replayed = cosim(lab, "replay", "sim")
     assert replayed.code == 0, replayed.err
-    assert event_hash(replayed) == event_hash(ran)
-    assert replayed.out.splitlines()[1:4] == ran.out.splitlines()[1:4]
+    assert event_hash(replayed) == event_hash(original)
+    assert replayed.out.splitlines()[1:4] == original.out.splitlines()[1:4]
     assert cosim(lab, "plot", "sim", "--out", "run.svg").code == 0
     assert "state/bob" in (lab / "run.svg").read_text(encoding="utf-8")
 
 
-def test_replay_and_plot_tell_what_is_no_recording(lab: Path) -> None:
+def test_replay_and_plot_reject_invalid_recordings(lab: Path) -> None:
     cosim(lab, "run", "pass.yaml", "--seeds", "2", "--duration", "100ms", "--out", "sim")
     for words in (("replay", "sim"), ("plot", "sim")):
-        refused = cosim(lab, *words)
-        assert (refused.code, "name one of them: sim/seed-1" in refused.err) == (4, True), refused.err
+        rejected = cosim(lab, *words)
+        assert (rejected.code, "name one of them: sim/seed-1" in rejected.err) == (4, True), rejected.err
     assert "there is no recording" in cosim(lab, "replay", ".").err
     damaged = next((lab / "sim" / "seed-1" / "packets").iterdir())
     damaged.write_bytes(damaged.read_bytes()[:-1])
-    refused = cosim(lab, "replay", "sim/seed-1")
-    assert (refused.code, "was changed after the run" in refused.err) == (4, True), refused.err
+    rejected = cosim(lab, "replay", "sim/seed-1")
+    assert (rejected.code, "was changed after the run" in rejected.err) == (4, True), rejected.err
     assert "use the suffix .svg, .pdf, .png" in cosim(lab, "plot", "sim/seed-2", "--out", "run.txt").err
     manifest = read_manifest(lab / "sim" / "seed-2")
     about = replace(manifest.about, scenario="- of another version")
     write_manifest(lab / "sim" / "seed-2", replace(manifest, about=about, scenario_hash=about.scenario_hash))
     for command in ("replay", "plot"):
-        refused = cosim(lab, command, "sim/seed-2")
-        assert (refused.code, "its scenario cannot be read" in refused.err) == (4, True), refused.err
+        rejected = cosim(lab, command, "sim/seed-2")
+        assert (rejected.code, "its scenario cannot be read" in rejected.err) == (4, True), rejected.err
 
 
 @pytest.mark.parametrize(
-    ("words", "said", "remedy"),
+    ("words", "message", "remedy"),
     [
         (("run", "pas"), "there is no scenario 'pas'", "baylands"),
         (("run", "none.yaml"), "none.yaml: cannot be read: No such file", "ls -l none.yaml"),
@@ -177,165 +179,169 @@ def test_replay_and_plot_tell_what_is_no_recording(lab: Path) -> None:
         (("run", "pass.yaml", "--polcy", "x"), "has no option or argument '--polcy'", "--policy"),
     ],
 )
-def test_bad_input_is_told_with_a_remedy(lab: Path, words: tuple[str, ...], said: str, remedy: str) -> None:
+def test_bad_input_is_reported_with_a_remedy(lab: Path, words: tuple[str, ...], message: str, remedy: str) -> None:
     (lab / "taken").mkdir()
     (lab / "taken" / "file").touch()
-    refused = cosim(lab, *words)
-    assert refused.code == 2, refused.out + refused.err
-    assert refused.err.startswith("error: ")
-    assert said in refused.err
-    assert remedy in refused.err
-    assert not refused.out
-    assert "Traceback" not in refused.err
+    rejected = cosim(lab, *words)
+    assert rejected.code == 2, rejected.out + rejected.err
+    assert rejected.err.startswith("error: ")
+    assert message in rejected.err
+    assert remedy in rejected.err
+    assert not rejected.out
+    assert "Traceback" not in rejected.err
 
 
-def test_ctrl_c_keeps_what_was_recorded(lab: Path) -> None:
+def test_ctrl_c_keeps_the_recording(lab: Path) -> None:
     process = start(lab, "cosim", "run", "pass.yaml", "--duration", "10min", "--out", "sim")
     while not list((lab / "sim").glob("windows/*.parquet")):
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    done = finish(process)
-    assert done.code == 130, done.err
-    assert "seed 1: interrupted at" in done.err
-    assert "Traceback" not in done.err
+    run = finish(process)
+    assert run.code == 130, run.err
+    assert "seed 1: interrupted at" in run.err
+    assert "Traceback" not in run.err
     (row,) = rows((lab / "sim" / "trial.csv").read_text(encoding="utf-8"))
     assert (row["status"], row["reason"].partition(" at ")[0]) == ("failed", "interrupted")
     replayed = cosim(lab, "replay", "sim")
     assert "(interrupted)" in replayed.err
-    assert event_hash(replayed) == event_hash(done), "what was recorded is what was printed"
+    assert event_hash(replayed) == event_hash(run), "the recording equals the output"
 
 
-def test_ctrl_c_ends_many_seeds_and_keeps_those_that_had_ended(lab: Path) -> None:
+def test_ctrl_c_stops_a_run_of_many_seeds_and_keeps_finished_ones(lab: Path) -> None:
     process = start(lab, "cosim", "run", "pass.yaml", "--seeds", "10000", "--out", "sim")
-    # Who gets another seed has told of the one before.
+    # When a process starts another seed, it has reported the previous one.
     while len(list((lab / "sim").glob("seed-*/trial.csv"))) <= len(os.sched_getaffinity(0)):
         assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    done = finish(process)
-    assert done.code == 130, done.err
-    assert "Traceback" not in done.err
-    ended = sorted(int(path.parent.name.removeprefix("seed-")) for path in (lab / "sim").glob("seed-*/trial.csv"))
-    printed = [int(line.split()[0]) for line in done.out.splitlines() if " state/bob " in line]
+    run = finish(process)
+    assert run.code == 130, run.err
+    assert "Traceback" not in run.err
+    finished_seeds = sorted(
+        int(path.parent.name.removeprefix("seed-")) for path in (lab / "sim").glob("seed-*/trial.csv")
+    )
+    printed = [int(line.split()[0]) for line in run.out.splitlines() if " state/bob " in line]
     assert printed
-    # One may have ended after the last that was told.
-    assert set(printed) <= set(ended)
-    assert f"interrupted: {len(printed)} of 10000 seeds had finished" in done.err
+    # One more seed may have finished after the last report.
+    assert set(printed) <= set(finished_seeds)
+    assert f"interrupted: {len(printed)} of 10000 seeds had finished" in run.err
     aggregated = fieldkit(lab, "aggregate", "sim", "--format", "csv")
     assert aggregated.code == 0, aggregated.err
 
 
-def test_a_policy_that_has_no_window_ends_the_run_and_what_was_before_is_kept(lab: Path) -> None:
-    # The publisher stands, and the subscriber comes to 0.9 m/s: 0.5 ms less 0.9 ms.
+def test_a_policy_without_a_window_ends_the_run_and_keeps_the_recording(lab: Path) -> None:
+    # The publisher is at rest, and the subscriber reaches 0.9 m/s: 0.5 ms minus 0.9 ms.
     raw = ("--policy", "velocity_aware_raw", "--window", "0.5ms", "--set", "physics.step=0.1ms")
-    done = cosim(lab, "run", "pass.yaml", *raw, "--out", "sim")
-    assert done.code == 2
-    assert "w + (Vp - Vs)/1000" in done.err
+    run = cosim(lab, "run", "pass.yaml", *raw, "--out", "sim")
+    assert run.code == 2
+    assert "w + (Vp - Vs)/1000" in run.err
     replayed = cosim(lab, "replay", "sim", "--format", "csv")
     assert 0 < int(rows(replayed.out)[0]["sent"]) < 100
 
 
-def test_faults_are_told_with_what_came_back_and_when(lab: Path) -> None:
+def test_faults_are_reported_with_recovered_flows_and_times(lab: Path) -> None:
     path = lab / "pass.yaml"
     path.write_text(path.read_text(encoding="utf-8") + PINGS, encoding="utf-8")
     cut = ("--set", "faults=[{kind: link-cut, between: [ann, bob], from: 200ms, to: 600ms}]")
-    done = cosim(lab, "run", "pass.yaml", "--duration", "1s", *cut, "--out", "sim")
-    assert done.code == 0, done.err
-    found = dict(re.findall(r"^ link-cut +(\S+) +0\.6 +(\d+) +\d", done.out, re.MULTILINE))
-    assert found == {"state/bob": "20", "ping/ann": "4", "ping/ann/reply": "0"}
-    assert recovery(done.out) == recovery(cosim(lab, "replay", "sim").out)
-    told = json.loads(cosim(lab, "replay", "sim", "--format", "json").out)["recoveries"]
-    assert [(one["fault"], one["flow"], one["end_s"], one["lost"]) for one in told] == [
-        ("link-cut", flow, 0.6, int(lost)) for flow, lost in sorted(found.items())
-    ]
-    assert all(0 < one["recovered_s"] < 0.2 for one in told)
-    pinged = {row["trial"]: row for row in rows((lab / "sim" / "trial.csv").read_text(encoding="utf-8"))}
-    row = pinged["sim/ping/ann"]
+    run = cosim(lab, "run", "pass.yaml", "--duration", "1s", *cut, "--out", "sim")
+    assert run.code == 0, run.err
+    lost_by_flow = dict(re.findall(r"^ link-cut +(\S+) +0\.6 +(\d+) +\d", run.out, re.MULTILINE))
+    assert lost_by_flow == {"state/bob": "20", "ping/ann": "4", "ping/ann/reply": "0"}
+    assert recovery(run.out) == recovery(cosim(lab, "replay", "sim").out)
+    recoveries = json.loads(cosim(lab, "replay", "sim", "--format", "json").out)["recoveries"]
+    assert [
+        (recovery_row["fault"], recovery_row["flow"], recovery_row["end_s"], recovery_row["lost"])
+        for recovery_row in recoveries
+    ] == [("link-cut", flow, 0.6, int(lost)) for flow, lost in sorted(lost_by_flow.items())]
+    assert all(0 < recovery_row["recovered_s"] < 0.2 for recovery_row in recoveries)
+    rows_by_trial = {row["trial"]: row for row in rows((lab / "sim" / "trial.csv").read_text(encoding="utf-8"))}
+    row = rows_by_trial["sim/ping/ann"]
     assert (row["rtt_sent"], row["rtt_received"], row["rtt_payload_bytes"]) == ("10", "6", "56")
     assert float(row["rtt_loss"]) == pytest.approx(0.4)
-    # Both ways take some 0.1 ms; the policy holds nothing, but who answers wakes at a window's end only.
+    # Both directions take some 0.1 ms; the policy delays nothing, but a responder resumes only at the end of a
+    # window.
     assert 0 < float(row["rtt_min_s"]) <= float(row["rtt_median_s"]) <= float(row["rtt_max_s"]) < 0.01
-    assert not pinged["sim/state/bob"]["rtt_sent"]
+    assert not rows_by_trial["sim/state/bob"]["rtt_sent"]
 
 
 def recovery(printed: str) -> str:
     return printed.partition("recovery\n")[2].partition("ended at:")[0]
 
 
-def test_who_does_not_answer_is_named_and_what_was_before_is_kept(lab: Path) -> None:
+def test_an_unresponsive_federate_is_named_and_the_recording_is_kept(lab: Path) -> None:
     stall = "faults=[{kind: stalled-federate, federate: network, from: 200ms, stall: 1min}]"
-    done = cosim(lab, "run", "pass.yaml", "--set", stall, "--deadline", "200ms", "--out", "sim")
-    assert done.code == 3
-    assert "network has not answered for 0.2 s: asked to advance from 0.19" in done.err
+    run = cosim(lab, "run", "pass.yaml", "--set", stall, "--deadline", "200ms", "--out", "sim")
+    assert run.code == 3
+    assert "network has not answered for 0.2 s: asked to advance from 0.19" in run.err
     replayed = cosim(lab, "replay", "sim")
     assert "(failed): UnansweredError: network has not answered" in replayed.err
-    assert event_hash(replayed) == event_hash(done)
+    assert event_hash(replayed) == event_hash(run)
     assert "--deadline 30s" in cosim(lab, "run", "pass.yaml", "--deadline", "0s").err
 
 
-def test_a_recording_has_a_capture_per_robot_and_becomes_mcap(lab: Path) -> None:
+def test_a_recording_has_a_capture_per_robot_and_can_be_converted_to_mcap(lab: Path) -> None:
     cosim(lab, "run", "pass.yaml", "--duration", "200ms", "--out", "sim")
     assert [path.name for path in sorted((lab / "sim" / "captures").iterdir())] == ["ann.pcap", "bob.pcap"]
-    done = cosim(lab, "replay", "sim", "--mcap", "sim.mcap")
-    assert done.code == 0, done.err
-    assert "written: sim.mcap" in done.err
+    run = cosim(lab, "replay", "sim", "--mcap", "sim.mcap")
+    assert run.code == 0, run.err
+    assert "written: sim.mcap" in run.err
     with (lab / "sim.mcap").open("rb") as file:
         topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
     assert topics == {"/tf", "/states/ann", "/states/bob", "/packets/state/bob"}
-    refused = cosim(lab, "replay", "sim", "--mcap", "none/sim.mcap")
-    assert (refused.code, "choose another --mcap" in refused.err) == (2, True), refused.err
+    rejected = cosim(lab, "replay", "sim", "--mcap", "none/sim.mcap")
+    assert (rejected.code, "choose another --mcap" in rejected.err) == (2, True), rejected.err
 
 
-def test_equal_seeds_give_equal_hashes_whatever_the_load(lab: Path) -> None:
-    """Once alone, and once while another process takes what it can get of each processor."""
+def test_equal_seeds_give_equal_hashes_under_any_load(lab: Path) -> None:
+    """Run alone, and while other processes use all processors."""
     alone = cosim(lab, "run", "pass.yaml", "--seed", "7")
     with ExitStack() as busy:
         for _ in os.sched_getaffinity(0):
             process = busy.enter_context(subprocess.Popen((sys.executable, "-c", "while True: pass")))
             busy.callback(process.kill)
-        beside = cosim(lab, "run", "pass.yaml", "--seed", "7")
-    assert (alone.code, beside.code) == (0, 0), alone.err + beside.err
-    assert event_hash(alone) == event_hash(beside)
+        under_load = cosim(lab, "run", "pass.yaml", "--seed", "7")
+    assert (alone.code, under_load.code) == (0, 0), alone.err + under_load.err
+    assert event_hash(alone) == event_hash(under_load)
     assert event_hash(alone) != event_hash(cosim(lab, "run", "pass.yaml", "--seed", "8"))
 
 
-def test_fieldkit_reads_simulations_beside_trials(lab: Path) -> None:
-    """Robots 30 ft apart, as in the stored trial that they are compared with."""
+def test_fieldkit_reads_simulations_like_trials(lab: Path) -> None:
+    """Robots 30 ft apart, as in the stored trial with which they are compared."""
     options = ("--set", "agents.bob.along=9.144m", "--duration", "500ms", "--seeds", "2")
     for policy in ("sliding_window", "scheduled"):
         assert cosim(lab, "run", "pass.yaml", *options, "--policy", policy, "--out", policy).code == 0
-    (cell,) = [one for one in rows(here(lab, "aggregate", "scheduled", "--format", "csv").out) if of_loss(one)]
+    (cell,) = [row for row in rows(here(lab, "aggregate", "scheduled", "--format", "csv").out) if is_loss_row(row)]
     assert (cell["n_valid"], cell["backend"], cell["distance_m"]) == ("2", "cosim", "9.144")
     assert cell["procedure"] == "pass state/bob (scheduled 10 ms)"
     both = here(lab, "compare", "scheduled", "sliding_window", "--format", "csv")
-    assert [one["n_b"] for one in rows(both.out) if of_loss(one)] == ["2"], both.err
+    assert [row["n_b"] for row in rows(both.out) if is_loss_row(row)] == ["2"], both.err
     trial = here(
         lab, "compare", str(TRIAL), "scheduled", "--by", "scenario,distance_m,protocol", "--force", "--format", "csv"
     )
-    assert [one["n_b"] for one in rows(trial.out) if of_loss(one)] == ["2"], trial.err
+    assert [row["n_b"] for row in rows(trial.out) if is_loss_row(row)] == ["2"], trial.err
     page = here(lab, "report", "scheduled", str(TRIAL), "-o", "page.html")
     assert page.code == 0, page.err
     assert "pass state/bob (scheduled 10 ms)" in (lab / "page.html").read_text(encoding="utf-8")
     for form in ("csv", "parquet"):
         assert here(lab, "export", "scheduled", "--format", form, "-o", f"all.{form}").code == 0
     assert len(rows((lab / "all.csv").read_text(encoding="utf-8"))) == 2
-    refused = here(lab, "export", "scheduled/seed-1", "--format", "mcap", "-o", "one.mcap")
-    assert refused.code == 2, "a simulation has no time line of a trial"
-    assert "Traceback" not in refused.err
+    rejected = here(lab, "export", "scheduled/seed-1", "--format", "mcap", "-o", "one.mcap")
+    assert rejected.code == 2, "a simulation has no timeline of a trial"
+    assert "Traceback" not in rejected.err
 
 
-def of_loss(row: dict[str, str]) -> bool:
+def is_loss_row(row: dict[str, str]) -> bool:
     return row["quantity"] == "datagram_loss"
 
 
-def test_a_reader_that_goes_away_ends_it_in_silence(lab: Path) -> None:
+def test_a_closed_pipe_ends_the_run_silently(lab: Path) -> None:
     command = f"set -o pipefail; '{sys.executable}' -m fieldkit cosim run pass.yaml --window 11ms | true"
-    done = subprocess.run(
+    run = subprocess.run(
         ("bash", "-c", command), cwd=lab, capture_output=True, text=True, check=False, timeout=LIMIT_S
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (run.returncode, run.stderr) == (0, "")
 
 
-def test_without_a_terminal_nothing_is_coloured_and_nothing_redraws(lab: Path) -> None:
-    done = cosim(lab, "run", "pass.yaml", "--window", "11ms")
-    assert "\x1b" not in done.out
-    assert not done.err
+def test_without_a_terminal_there_are_no_colours_and_no_progress_bar(lab: Path) -> None:
+    run = cosim(lab, "run", "pass.yaml", "--window", "11ms")
+    assert "\x1b" not in run.out
+    assert not run.err

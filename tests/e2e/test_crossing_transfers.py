@@ -1,4 +1,4 @@
-"""Transfers and pings that cross at the same time, on emulated robots: each is measured as if it were alone."""
+"""Simultaneous transfers and pings on emulated robots: each is measured as if it were alone."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -34,7 +34,7 @@ emulated:
 """
 PROCEDURE = """\
 name: cross
-summary: both ways at once with a competing flow from a third robot, and pings meanwhile
+summary: both directions at once with a competing flow from a third robot, and pings meanwhile
 scenario: los
 topology: master
 protocols: [tcp, udp]
@@ -72,62 +72,66 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def attempts(trial: Path, protocol: Protocol) -> list[tuple[Plan, Path, Values]]:
-    """Return what each valid attempt left, and what is measured of it."""
-    plan, found = store.read_plan(trial), []
+    """Return the plan, folder and measured values of each valid attempt."""
+    plan, results = store.read_plan(trial), []
     for row in rows(trial):
         if row["protocol"] != protocol or row["status"] != "valid":
             continue
         repeat = RepeatId(protocol, int(row["repeat"]))
         folder = trial / "repeats" / str(repeat)
-        judged = gates.judge(plan, repeat, AttemptEvidence(folder))
-        assert not judged.problems
-        found.append((plan, folder, judged.measured.values))
-    assert len(found) == 2
-    return found
+        verdict = gates.judge(plan, repeat, AttemptEvidence(folder))
+        assert not verdict.problems
+        results.append((plan, folder, verdict.measured.values))
+    assert len(results) == 2
+    return results
 
 
-def keys(capture: list[Row], transfer: Transfer, protocol: int) -> Iterator[tuple[bool, Row]]:
-    """Yield of each packet between the ends of a transfer whether it names its port, and its id and place."""
-    ends = tuple(0xFFFF << 32 | int(IPv4Address(one)) for one in (transfer.sender_address, transfer.receiver_address))
+def packet_keys(capture: list[Row], transfer: Transfer, protocol: int) -> Iterator[tuple[bool, Row]]:
+    """Yield, for each packet between the ends of a transfer, True if it has the port, and its id and fragment
+    position.
+    """
+    ends = tuple(
+        0xFFFF << 32 | int(IPv4Address(address)) for address in (transfer.sender_address, transfer.receiver_address)
+    )
     for row in capture:
         if row[2:5] == (*ends, protocol):
             yield row[11] == transfer.port, (row[5], row[6], row[9])
 
 
-def test_the_losses_of_each_udp_transfer_are_those_that_another_dissector_counts(trial: Path) -> None:
-    """Scapy tells a transfer's datagrams by port, and their other fragments by the id of the first."""
+def test_the_losses_of_each_udp_transfer_equal_those_counted_by_scapy(trial: Path) -> None:
+    """Scapy identifies a transfer's datagrams by port, and their other fragments by the id of the first."""
     lost = 0
     for plan, folder, values in attempts(trial, Protocol.UDP):
-        seen = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
+        captures = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
         for transfer in plan.transfers(Protocol.UDP):
-            near = list(keys(seen[transfer.source], transfer, UDP))
-            ids = {key[0] for is_first, key in near if is_first}
-            left = Counter(key for _, key in near if key[0] in ids)
-            came = Counter(key for _, key in keys(seen[transfer.destination], transfer, UDP))
-            arrived = sum((left & came).values())
+            sent_keys = list(packet_keys(captures[transfer.source], transfer, UDP))
+            ids = {key[0] for is_first, key in sent_keys if is_first}
+            sent_packets = Counter(key for _, key in sent_keys if key[0] in ids)
+            received_packets = Counter(key for _, key in packet_keys(captures[transfer.destination], transfer, UDP))
+            arrived = sum((sent_packets & received_packets).values())
             name = transfer.name
-            assert values[f"{name}.ip_packets_sent"] == left.total()
+            assert values[f"{name}.ip_packets_sent"] == sent_packets.total()
             assert values[f"{name}.ip_packets_received"] == arrived == values[f"{name}.delay_packets"]
             assert values[f"{name}.datagrams_sent"] == len(ids) == values[f"{name}.paper_packets"]
-            lost += left.total() - arrived
+            lost += sent_packets.total() - arrived
             sent, received = ((folder / file).read_bytes() for file in (transfer.sent_file, transfer.received_file))
             assert values[f"{name}.file_loss"] == 1 - len(received) / len(sent)
     assert lost, "the radio loses one packet in twenty"
 
 
-def test_each_tcp_transfer_is_whole_and_of_its_own_frames(trial: Path) -> None:
+def test_each_tcp_transfer_is_complete_and_counts_only_its_frames(trial: Path) -> None:
     for plan, folder, values in attempts(trial, Protocol.TCP):
-        seen = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
+        captures = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
         for transfer in plan.transfers(Protocol.TCP):
             name = transfer.name
-            frames = sum(is_own for is_own, _ in keys(seen[transfer.source], transfer, TCP))
+            frames = sum(is_own for is_own, _ in packet_keys(captures[transfer.source], transfer, TCP))
             assert values[f"{name}.ip_packets_sent"] == frames
             assert values[f"{name}.tcp_unique_bytes"] == (folder / transfer.sent_file).stat().st_size
             assert (values[f"{name}.byte_loss"], values[f"{name}.hash_match"]) == (0, True)
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_each_ping_counts_its_own_answers_and_the_captures_theirs(trial: Path, protocol: Protocol) -> None:
+def test_each_ping_and_each_capture_counts_only_its_packets(trial: Path, protocol: Protocol) -> None:
     for _, folder, values in attempts(trial, protocol):
         assert (values["load.rtt_sent"], values["rtt_sent"]) == (20, 10)
         assert (values["load.rtt_payload_bytes"], values["rtt_payload_bytes"]) == (4000, 100)
@@ -136,8 +140,8 @@ def test_each_ping_counts_its_own_answers_and_the_captures_theirs(trial: Path, p
         assert values["load.rtt_received"] == answers
 
 
-def test_the_delays_of_transfers_that_cross_are_told(trial: Path) -> None:
-    """Clocks of emulated robots are one: what goes the other way meanwhile shows it."""
+def test_the_delays_of_simultaneous_transfers_are_measured(trial: Path) -> None:
+    """Emulated robots share one clock; traffic in the other direction is used to measure the offset."""
     for _, _, values in attempts(trial, Protocol.UDP):
         for name in ("up", "down"):
             offset_s, error_s = (values[f"{name}.clock_offset{what}_s"] for what in ("", "_error"))

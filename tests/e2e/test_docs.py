@@ -1,4 +1,4 @@
-"""What the documentation says is so: its commands run, its keys, options, codes and links exist."""
+"""The documentation is correct: its commands run, its keys, options, codes and links exist."""
 
 import ast
 import inspect
@@ -27,8 +27,8 @@ COMMAND_S = 600.0
 TOPIC = re.compile(r"fieldkit docs ([a-z][a-z0-9_-]*)")
 MARKDOWN_FILE = re.compile(r"[\w/-]+\.md\b")
 
-MEASURES_NOTHING = re.compile(r"^ls |--dry-run| show | verify ")
-"""Commands whose output has the same lines each time, numbers apart."""
+REPRODUCIBLE = re.compile(r"^ls |--dry-run| show | verify ")
+"""Commands whose output has the same lines each time, except for numbers."""
 
 BLOCK = re.compile(r"^```(?P<language>\w+)\n(?P<body>.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?P<target>[^)\s#]+)")
@@ -46,7 +46,7 @@ def blocks(page: Path, language: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Command:
-    """A command as a reader types it, here-document included, and the exit code and output that the page shows."""
+    """A command with its here-document, and the exit code and output shown on the page."""
 
     text: str
     exit_code: int
@@ -54,7 +54,7 @@ class Command:
 
 
 def shape(output: str) -> list[str]:
-    """Return the lines of an output without what differs from run to run: numbers, widths of columns, order."""
+    """Return the sorted lines of an output without run-dependent parts: numbers and column widths."""
     return sorted(re.sub(r"[ ─]+", " ", re.sub(r"[0-9a-f]{12,}|[0-9][0-9.T]*Z?", "N", output)).splitlines())
 
 
@@ -92,7 +92,7 @@ def test_every_command_of_a_page_runs(page: Path, tmp_path: Path) -> None:
         if target := re.fullmatch(r"make ([a-z]+)", command.text):
             assert target[1] in make_targets()
             continue
-        done = subprocess.run(
+        process = subprocess.run(
             ("bash", "-euc", command.text),
             cwd=tmp_path,
             env=environment,
@@ -103,9 +103,9 @@ def test_every_command_of_a_page_runs(page: Path, tmp_path: Path) -> None:
             timeout=COMMAND_S,
             check=False,
         )
-        assert done.returncode == command.exit_code, f"$ {command.text}\n{done.stdout}"
-        if command.shown and MEASURES_NOTHING.search(command.text):
-            assert shape(command.shown) == shape(done.stdout), f"$ {command.text}\n{done.stdout}"
+        assert process.returncode == command.exit_code, f"$ {command.text}\n{process.stdout}"
+        if command.shown and REPRODUCIBLE.search(command.text):
+            assert shape(command.shown) == shape(process.stdout), f"$ {command.text}\n{process.stdout}"
 
 
 def test_a_command_keeps_its_here_document_and_its_exit_code(tmp_path: Path) -> None:
@@ -133,14 +133,16 @@ def test_python_examples_import_and_are_complete(page: Path, monkeypatch: pytest
     for source in blocks(page, "python"):
         names: dict[str, Any] = {"__name__": "example"}
         exec(compile(source, page.name, "exec"), names)
-        own = [value for value in names.values() if inspect.isclass(value) and value.__module__ == "example"]
-        assert not [kind for kind in own if issubclass(kind, Step) and inspect.isabstract(kind)]
+        example_classes = [
+            value for value in names.values() if inspect.isclass(value) and value.__module__ == "example"
+        ]
+        assert not [kind for kind in example_classes if issubclass(kind, Step) and inspect.isabstract(kind)]
 
 
-def test_the_reference_is_what_the_code_says() -> None:
-    written = reference.pages()
-    assert {path.name for path in reference.FOLDER.glob("*.md")} == set(written)
-    differing = [name for name, text in written.items() if (reference.FOLDER / name).read_text("utf-8") != text]
+def test_the_reference_is_up_to_date() -> None:
+    generated = reference.pages()
+    assert {path.name for path in reference.FOLDER.glob("*.md")} == set(generated)
+    differing = [name for name, text in generated.items() if (reference.FOLDER / name).read_text("utf-8") != text]
     assert not differing, "write them again: .venv/bin/python -m docs.generator"
 
 
@@ -157,13 +159,13 @@ def test_every_page_has_a_place_in_the_sidebar() -> None:
     assert sorted(listed) == sorted(pages)
 
 
-def test_every_guide_that_a_command_names_exists() -> None:
+def test_every_guide_named_by_a_command_exists() -> None:
     assert not [guide for guide in GUIDES.values() if not (ROOT / "docs" / guide).is_file()]
     assert not set(GUIDES) - set(cli.parser().subcommands())
 
 
 def texts() -> Iterator[tuple[str, str]]:
-    """Yield every text that a user can read, and its place: strings in code, and shipped YAML with its comments."""
+    """Yield every user-visible text and its location: strings in code, and shipped YAML with its comments."""
     for path in chain((ROOT / "fieldkit").rglob("*.py"), (ROOT / "sim_backends").rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
@@ -175,9 +177,9 @@ def texts() -> Iterator[tuple[str, str]]:
             yield str(path.relative_to(ROOT)), path.read_text(encoding="utf-8")
 
 
-def test_messages_refer_to_installed_pages_alone() -> None:
-    named = [(place, topic) for place, text in texts() for topic in TOPIC.findall(text)]
-    assert len(named) > 10
-    wrong = [(place, topic) for place, topic in named if topic not in documentation.topics()]
+def test_messages_refer_only_to_installed_pages() -> None:
+    topics = [(place, topic) for place, text in texts() for topic in TOPIC.findall(text)]
+    assert len(topics) > 10
+    wrong = [(place, topic) for place, topic in topics if topic not in documentation.topics()]
     files = [(place, name) for place, text in texts() for name in MARKDOWN_FILE.findall(text)]
     assert (wrong, files) == ([], [])

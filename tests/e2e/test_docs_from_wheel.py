@@ -1,4 +1,4 @@
-"""The documentation as a wheel installs it: `fieldkit docs` finds its pages, and it needs no network."""
+"""The documentation installed by a wheel: `fieldkit docs` finds its pages, and needs no network."""
 
 import subprocess
 from pathlib import Path
@@ -17,10 +17,10 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def page(python: Path, topic: str) -> Path:
-    """Return what `fieldkit docs TOPIC --path` prints."""
+    """Return the path printed by `fieldkit docs TOPIC --path`."""
     command = (python.with_name("fieldkit"), "docs", topic, "--path")
-    done = subprocess.run(command, cwd=python.parent, capture_output=True, text=True, check=True)
-    return Path(done.stdout.strip())
+    process = subprocess.run(command, cwd=python.parent, capture_output=True, text=True, check=True)
+    return Path(process.stdout.strip())
 
 
 @pytest.mark.parametrize(
@@ -45,13 +45,13 @@ def test_every_link_leads_to_an_installed_page(python: Path) -> None:
 def test_search_works_from_files(python: Path) -> None:
     requested: list[str] = []
 
-    def note(request: Request) -> None:
+    def record_request(request: Request) -> None:
         requested.append(request.url)
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
         tab = browser.new_context(offline=True, viewport={"width": 1300, "height": 900}).new_page()
-        tab.on("request", note)
+        tab.on("request", record_request)
         tab.goto(page(python, "index").as_uri())
         tab.click(".md-search__input")
         tab.keyboard.type("netcat")

@@ -1,4 +1,4 @@
-"""Robots that drive by themselves, from the outside: by ROS 1, DDS and Zenoh, and a laptop with the field backend."""
+"""Robots that drive, end to end: over ROS 1, DDS and Zenoh, with the field backend on the laptop."""
 
 import json
 import math
@@ -98,7 +98,7 @@ RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
 
 @pytest.fixture(scope="module")
 def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
-    """Robots that outlive fieldkit, one of them quick, so that the tests take less time."""
+    """Robots that outlive fieldkit; one of them is fast, so that the tests take less time."""
     folder = tmp_path_factory.mktemp("rovers")
     profile = rover_profile(fence_m=30.0)
     for name in ("robots", "procedures"):
@@ -116,11 +116,11 @@ def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
 
 @pytest.fixture
 def outside(rovers: Outside, monkeypatch: pytest.MonkeyPatch) -> Outside:
-    """The same robots at their places, reachable, without what an earlier trial left on them."""
+    """The same robots at their initial positions, reachable, without remains of an earlier trial."""
     monkeypatch.chdir(rovers.folder)
     for role, shell in rovers.testbed.shells.items():
         rovers.links.restore(role)
-        jobs.abort(shell, "test", Deadline.after(60))  # a fieldkit that was killed leaves its jobs to their limits
+        jobs.abort(shell, "test", Deadline.after(60))  # jobs of a killed fieldkit run until their limits
         shell.run(("sh", "-c", "rm -rf ~/.fieldkit/*"), deadline=Deadline.after(30))
     shutil.rmtree(rovers.folder / "trials", ignore_errors=True)
     rovers.testbed.place(PLACEMENT)
@@ -128,12 +128,12 @@ def outside(rovers: Outside, monkeypatch: pytest.MonkeyPatch) -> Outside:
 
 
 def track_of(outside: Outside, role: Role) -> list[TrackPoint]:
-    return [one for one in outside.testbed.oracle.track(0) if one.role is role]
+    return [point for point in outside.testbed.oracle.track(0) if point.role is role]
 
 
 def place_at(track: list[TrackPoint], utc_ns: int) -> Vector:
-    """Where the oracle had the robot, on a straight line between what it says."""
-    after = bisect_left(track, utc_ns, key=lambda one: one.utc_ns)
+    """Return the position of the robot by the oracle, interpolated linearly."""
+    after = bisect_left(track, utc_ns, key=lambda point: point.utc_ns)
     before, now = track[max(after - 1, 0)], track[min(after, len(track) - 1)]
     assert before.position_m is not None
     assert now.position_m is not None
@@ -142,7 +142,7 @@ def place_at(track: list[TrackPoint], utc_ns: int) -> Vector:
     return x, y, z
 
 
-def test_they_drive_there_and_back_and_the_world_agrees_with_their_odometry(outside: Outside) -> None:
+def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(BOTH, encoding="utf-8")
     starts_m = {role: track_of(outside, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
     run = fieldkit(outside.folder, *RUN)
@@ -150,7 +150,7 @@ def test_they_drive_there_and_back_and_the_world_agrees_with_their_odometry(outs
     trial = only_trial(outside.folder)
     (repeat,) = (trial / "repeats").iterdir()
     (row,) = rows(trial)
-    # By ROS 1, and as it looks from the sender; by ROS 2 over DDS, and facing the other way; over Zenoh.
+    # Over ROS 1, with positions relative to the sender; over ROS 2 with DDS, facing the other way; over Zenoh.
     for role, name, sign, way_m in (
         (Role.RECEIVER, "", 1, (0.4, 0.0)),
         (Role.SENDER, "outer.", -1, (0.3, 0.3)),
@@ -158,24 +158,24 @@ def test_they_drive_there_and_back_and_the_world_agrees_with_their_odometry(outs
     ):
         log = [json.loads(line) for line in (repeat / f"{name}drive.jsonl").read_text(encoding="ascii").splitlines()]
         assert (log[-1]["ended"], log[-1]["phase"]) == ("home", "home")
-        assert max(one["x_m"] for one in log) == pytest.approx(way_m[0], abs=0.1)
-        assert max(one["y_m"] for one in log) == pytest.approx(way_m[1], abs=0.1)
+        assert max(entry["x_m"] for entry in log) == pytest.approx(way_m[0], abs=0.1)
+        assert max(entry["y_m"] for entry in log) == pytest.approx(way_m[1], abs=0.1)
         start_m, track = starts_m[role], track_of(outside, role)
         assert start_m is not None
-        for one in log:
-            east_m, north_m, _ = place_at(track, one["utc_ns"])
-            off_m = east_m - start_m[0] - sign * one["x_m"], north_m - start_m[1] - sign * one["y_m"]
-            assert max(map(abs, off_m)) < 0.25, one  # a quarter of a second at 0.6 m/s, on a busy machine
-        # What it says last is of a robot that stands.
+        for entry in log:
+            east_m, north_m, _ = place_at(track, entry["utc_ns"])
+            off_m = east_m - start_m[0] - sign * entry["x_m"], north_m - start_m[1] - sign * entry["y_m"]
+            assert max(map(abs, off_m)) < 0.25, entry  # a quarter of a second at 0.6 m/s, on a busy machine
+        # The last entry is of a robot at rest.
         end_m = track[-1].position_m
         assert end_m is not None
         assert sign * (end_m[0] - start_m[0]) == pytest.approx(log[-1]["x_m"], abs=0.01)
         assert sign * (end_m[1] - start_m[1]) == pytest.approx(log[-1]["y_m"], abs=0.01)
-        speeds = [math.hypot(*one.velocity_m_s) for one in track]
+        speeds = [math.hypot(*point.velocity_m_s) for point in track]
         assert max(speeds) <= (1.0 if name else SPEED_M_S) + 1e-6
         assert max(speeds) > SPEED_M_S / 2
-        # Columns of the drive against what the world saw of it.
-        farthest_m = max(math.dist(one.position_m or start_m, start_m) for one in track)
+        # Columns of the drive, compared with the true track.
+        farthest_m = max(math.dist(point.position_m or start_m, start_m) for point in track)
         assert row[f"{name}drive_ended"] == "home"
         assert float(row[f"{name}drive_farthest_m"]) == pytest.approx(farthest_m, abs=0.02)
         assert float(row[f"{name}drive_out_m"]) == pytest.approx(math.hypot(*way_m), abs=0.1)
@@ -184,7 +184,7 @@ def test_they_drive_there_and_back_and_the_world_agrees_with_their_odometry(outs
         assert float(row[f"{name}drive_speed_max_m_s"]) == pytest.approx(max(speeds), abs=0.25)
 
 
-def test_a_robot_of_a_lab_to_play_with_goes_where_it_is_driven(tmp_path: Path) -> None:
+def test_a_robot_of_an_interactive_lab_can_be_driven(tmp_path: Path) -> None:
     (tmp_path / "fieldkit.yaml").write_text(LAB, encoding="utf-8")
     backend = EmulatedBackend(*load_site(tmp_path / "fieldkit.yaml"))
     with backend.open_lab(seed=1, sink=lambda _: None) as lab:
@@ -208,11 +208,11 @@ def test_a_robot_of_a_lab_to_play_with_goes_where_it_is_driven(tmp_path: Path) -
         assert lab.place_m("robot-1") == pytest.approx(place_m)
 
 
-def said(outside: Outside) -> Steered | None:
+def receiver_motion(outside: Outside) -> Steered | None:
     return outside.testbed.robots[Role.RECEIVER].steered()
 
 
-def test_a_fieldkit_that_is_killed_stops_it(outside: Outside) -> None:
+def test_killing_fieldkit_stops_the_robot(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
     process = start(outside.folder, *RUN)
     try:
@@ -221,7 +221,7 @@ def test_a_fieldkit_that_is_killed_stops_it(outside: Outside) -> None:
         process.kill()
         process.communicate(timeout=60)
     wait_for_end({process.pid}, within_s=60.0)
-    wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
+    wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
     shell = outside.testbed.shells[Role.RECEIVER]
     text = ("sh", "-c", "cat .fieldkit/*/*/drive.status")
     wait_until(
@@ -234,7 +234,7 @@ def test_a_fieldkit_that_is_killed_stops_it(outside: Outside) -> None:
 
 @contextmanager
 def driving(outside: Outside, procedure: str = DRIVE) -> "Iterator[subprocess.Popen[str]]":
-    """Run a trial until its robot drives; killed at the end where it still runs."""
+    """Run a trial until its robot drives; kill it at the end if it still runs."""
     (outside.folder / "procedures" / "drive.yaml").write_text(procedure, encoding="utf-8")
     process = start(outside.folder, *RUN)
     try:
@@ -248,15 +248,15 @@ def driving(outside: Outside, procedure: str = DRIVE) -> "Iterator[subprocess.Po
 
 
 def standstill_s(outside: Outside, since_ns: int) -> float:
-    """Return how long after a time the world saw the receiver stop, and that it did not move afterwards."""
-    wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
-    moments = [one for one in track_of(outside, Role.RECEIVER) if one.utc_ns >= since_ns]
-    moving = [one.utc_ns for one in moments if math.hypot(*one.velocity_m_s) > 0]
+    """Return the time from `since_ns` until the receiver stopped by the true track; it must not move afterwards."""
+    wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
+    moments = [point for point in track_of(outside, Role.RECEIVER) if point.utc_ns >= since_ns]
+    moving = [point.utc_ns for point in moments if math.hypot(*point.velocity_m_s) > 0]
     return (max(moving, default=since_ns) - since_ns) / 1e9
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_stops_it_at_once(outside: Outside, number: signal.Signals) -> None:
+def test_the_first_signal_stops_the_robot_immediately(outside: Outside, number: signal.Signals) -> None:
     with driving(outside) as process:
         sent_ns = time.time_ns()
         process.send_signal(number)
@@ -271,7 +271,7 @@ def test_the_first_signal_stops_it_at_once(outside: Outside, number: signal.Sign
 
 
 def assert_held(outside: Outside, reason: str) -> None:
-    """Assert that the stopped motion is held, and that its repeat is void, with the same reason."""
+    """Assert that the stopped motion is held, and that its repeat is void for the same reason."""
     trial = only_trial(outside.folder)
     assert motions(trial) == ["origin", "begun", "held"]
     held = json.loads((trial / "motion.jsonl").read_text(encoding="utf-8").splitlines()[-1])
@@ -284,7 +284,7 @@ def assert_held(outside: Outside, reason: str) -> None:
     assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
 
 
-def test_ctrl_c_at_a_terminal_stops_it_at_once(outside: Outside) -> None:
+def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
     master, terminal = pty.openpty()
     words = ("setsid", "--ctty", sys.executable, "-m", "fieldkit", *RUN)
@@ -315,13 +315,13 @@ def test_ctrl_c_at_a_terminal_stops_it_at_once(outside: Outside) -> None:
     assert text.index("stopping: rover-1") < text.index("rover-1: stopped (standing)")
 
 
-def test_ctrl_c_while_it_drives_back_stops_it_on_its_way(outside: Outside) -> None:
+def test_ctrl_c_while_the_robot_drives_back_stops_it(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(SHORT, encoding="utf-8")
     home_m = place_m(outside)
     process = start(outside.folder, *RUN)
     try:
         wait_during(process, lambda: drives(outside))
-        wait_during(process, lambda: (now := said(outside)) is not None and now.velocity_m_s[0] < -0.3)
+        wait_during(process, lambda: (now := receiver_motion(outside)) is not None and now.velocity_m_s[0] < -0.3)
         sent_ns = time.time_ns()
         process.send_signal(signal.SIGINT)
         took_s = standstill_s(outside, sent_ns)
@@ -363,7 +363,7 @@ def test_a_robot_outside_its_fence_does_not_start(outside: Outside) -> None:
         profile.write_text(text, encoding="utf-8")
 
 
-def test_stop_from_another_terminal_also_while_fieldkit_is_suspended(outside: Outside) -> None:
+def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(outside: Outside) -> None:
     with driving(outside) as process:
         process.send_signal(signal.SIGSTOP)
         sent_ns = time.time_ns()
@@ -389,7 +389,7 @@ def test_stop_from_another_terminal_also_while_fieldkit_is_suspended(outside: Ou
     assert "rover-1: nothing of fieldkit moves it" in partly.out
 
 
-def test_ctrl_c_while_its_program_starts_lets_no_robot_move(outside: Outside) -> None:
+def test_ctrl_c_while_the_program_starts_prevents_motion(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
     began_ns = time.time_ns()
     process = start(outside.folder, *RUN, "--json")
@@ -398,26 +398,28 @@ def test_ctrl_c_while_its_program_starts_lets_no_robot_move(outside: Outside) ->
     run = finish(process)
     assert run.code == 130
     assert "stopping: " in run.err
-    speeds = [math.hypot(*one.velocity_m_s) for one in track_of(outside, Role.RECEIVER) if one.utc_ns > began_ns]
+    speeds = [
+        math.hypot(*point.velocity_m_s) for point in track_of(outside, Role.RECEIVER) if point.utc_ns > began_ns
+    ]
     assert max(speeds, default=0.0) == 0.0
     assert not [name for name in only_trial(outside.folder).rglob("drive.jsonl") if name.read_text(encoding="ascii")]
 
 
-def test_ctrl_c_of_a_robot_out_of_reach_says_that_its_lease_stops_it(outside: Outside) -> None:
+def test_ctrl_c_with_an_unreachable_robot_reports_that_its_lease_stops_it(outside: Outside) -> None:
     with driving(outside) as process:
         outside.links.cut(Role.RECEIVER)
         process.send_signal(signal.SIGINT)
-        wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
+        wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
         run = finish(process)
     assert run.code == 130
     assert f"no answer from rover-1: it stops automatically within {LEASE_S:g} s" in run.err
 
 
-def test_stop_of_a_suspended_agent_lets_it_send_no_other_velocity(outside: Outside) -> None:
+def test_stop_of_a_suspended_agent_prevents_further_velocities(outside: Outside) -> None:
     with driving(outside) as process:
         (agent,) = [pid for pid in descendants(os.getpid()) if b"drive" in command_line(pid)]
         os.kill(agent, signal.SIGSTOP)
-        wait_until(lambda: (now := said(outside)) is not None and not now.moves, Deadline.after(60))
+        wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
         stands_ns = time.time_ns()
         stopped = fieldkit(outside.folder, "stop", "rover-1")
         assert (stopped.code, stopped.out) == (0, "rover-1: stopped (standing)\n")
@@ -434,7 +436,7 @@ def test_stop_of_a_suspended_agent_lets_it_send_no_other_velocity(outside: Outsi
 
 
 def command_line(pid: int) -> list[bytes]:
-    """Return the words of an agent's process; none where it is another process, or has ended."""
+    """Return the command line of an agent's process; empty if it is another process, or has ended."""
     with suppress(OSError):
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
         return words if b"python" in words[0] and any(b"/agent-" in word for word in words) else []
@@ -453,11 +455,11 @@ def place_m(outside: Outside) -> Vector:
 
 
 def drives(outside: Outside) -> bool:
-    return (now := said(outside)) is not None and now.velocity_m_s[0] > SPEED_M_S / 2
+    return (now := receiver_motion(outside)) is not None and now.velocity_m_s[0] > SPEED_M_S / 2
 
 
 def stationary(outside: Outside) -> bool:
-    return (now := said(outside)) is not None and not now.moves
+    return (now := receiver_motion(outside)) is not None and not now.moves
 
 
 def motions(trial: Path) -> list[str]:
@@ -482,23 +484,23 @@ def test_after_a_fault_nothing_moves_before_it_is_confirmed(outside: Outside) ->
     assert 0.1 < math.dist(stopped_m, home_m) < FAR_M
     trial = only_trial(outside.folder)
     assert motions(trial) == ["origin", "begun", "held"]
-    # --yes is no confirmation, in no run.
+    # --yes is no confirmation, in any run.
     again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert "the laptop was silent for 2 s" in again.err
     assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
-    # A person who only presses Enter does not confirm either: the default is to stop.
+    # Pressing Enter does not confirm either: the default is to stop.
     answers = outside.folder / "answers"
     answers.write_text("\n\n", encoding="utf-8")
     enter = fieldkit(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
     assert enter.code == 5, enter.err
     assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
-    # The option: it drives back along its path first, and then as in the beginning.
+    # With the option the robot first drives back along its path, and then as at the start.
     begun_ns = track_of(outside, Role.RECEIVER)[-1].utc_ns
     option = fieldkit(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
     assert option.code == 0, option.err
-    track = [one for one in track_of(outside, Role.RECEIVER) if one.utc_ns > begun_ns and one.position_m]
-    off_m = [math.dist(one.position_m or home_m, home_m) for one in track]
+    track = [point for point in track_of(outside, Role.RECEIVER) if point.utc_ns > begun_ns and point.position_m]
+    off_m = [math.dist(point.position_m or home_m, home_m) for point in track]
     assert max(off_m) == pytest.approx(FAR_M, abs=0.3), "not as far again from where it stopped"
     assert place_m(outside) == pytest.approx(home_m, abs=0.3)
     assert motions(trial)[3:] == ["allowed", *("begun", "ended") * 2]
@@ -513,7 +515,7 @@ done
 """
 
 
-def test_a_suspended_driver_does_not_go_on_and_a_person_lets_it_move_again(outside: Outside) -> None:
+def test_a_suspended_driver_does_not_continue_until_a_person_confirms(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
     shell = outside.testbed.shells[Role.RECEIVER]
 

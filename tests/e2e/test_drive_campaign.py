@@ -1,4 +1,4 @@
-"""A robot that drives by itself: held after a fault, with one fence for all trials of a campaign; and stopped."""
+"""A driving robot: held after a fault, with one fence for all trials of a campaign; and stopped."""
 
 import json
 import math
@@ -19,9 +19,11 @@ pytestmark = pytest.mark.emulated
 FENCE_M = 2.5
 WAY_M = 1.0
 BEYOND_M = 0.3
-"""Braking from 0.6 m/s at 2 m/s² takes 0.09 m, two turns of the loop 0.06 m; the rest is for a busy machine."""
+"""Braking from 0.6 m/s at 2 m/s² takes 0.09 m, two cycles of the loop 0.06 m; the rest is a margin for a busy
+machine.
+"""
 LEASE_S = 30.0
-"""Longer than a test: no robot of these tests is stopped by its lease."""
+"""Longer than a test, so that no robot of these tests is stopped by its lease."""
 CAMPAIGN = """\
 name: lawn
 procedures: [drive]
@@ -62,14 +64,14 @@ def answers(lab: RoverLab, *lines: str) -> tuple[str, str]:
 
 
 def assert_unmoved(lab: RoverLab, run: Run, reason: str, since_ns: int) -> None:
-    """Assert that a run ended for a reason that needs a person, and that the rover stayed where it was."""
+    """Assert that a run ended for a reason that needs a person, and that the rover did not move."""
     assert run.code == 5, run.err
     assert reason in run.err
     track = lab.track_m(since_ns)
     assert all(math.dist(place_m, lab.place_m) < 0.01 for place_m in track)
 
 
-def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_holds_over_all_trials(lab: RoverLab) -> None:
+def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_applies_to_all_trials(lab: RoverLab) -> None:
     out, site = "held", ("--site", RECEIVER_SITE)
     lab.write_procedure(Role.RECEIVER, WAY_M)
     lab.place_at("5m")
@@ -90,13 +92,14 @@ def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_holds_over_all_tria
     assert_unmoved(lab, campaign(lab, out, *site, *UNASKED), "rover-1: stopped by the operator", since_ns)
     assert len(trials(lab, out)) == 1, "no other trial began"
 
-    # The option: back along its path first, then out again from its origin, and the next trial from there, too.
+    # With the option: first back along its path, then out again from its origin, which also applies to the next
+    # trial.
     option = campaign(lab, out, *site, *UNASKED, OPTION)
     assert option.code == 0, option.err
     assert motions(lab, out) == ["origin", "begun", "held", "allowed", *("begun", "ended") * 2], "one origin"
     assert [row["status"] for trial in trials(lab, out) for row in rows(trial)] == ["void", "valid", "valid"]
     farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(begun_ns))
-    assert farthest_m == pytest.approx(WAY_M, abs=BEYOND_M), "not as far again from where it was stopped"
+    assert farthest_m == pytest.approx(WAY_M, abs=BEYOND_M), "not the whole distance again from the point of the stop"
     assert lab.place_m == pytest.approx(home_m, abs=0.1)
 
 
@@ -118,7 +121,7 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
     refused = campaign(lab, out, *site, *UNASKED, OPTION)
     assert_unmoved(lab, refused, f"outside its fence of {FENCE_M:g} m", since_ns)
 
-    # A person puts it back and confirms it: a new origin, which holds for both trials.
+    # A person puts it back and confirms this: a new origin, which applies to both trials.
     lab.place_at("5m")
     run = campaign(lab, out, *site, *MOTION, *answers(lab, "", "confirm", ""))
     assert run.code == 0, run.err
@@ -126,7 +129,7 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
     assert lab.place_m == pytest.approx(home_m, abs=0.1)
 
 
-def test_with_yes_a_robot_does_not_start_at_a_place_where_no_person_put_it(lab: RoverLab) -> None:
+def test_with_yes_a_robot_does_not_start_at_an_unconfirmed_position(lab: RoverLab) -> None:
     out = "places"
     lab.write_procedure(Role.SENDER, 0.4)
     lab.place_at("5m")
@@ -142,7 +145,7 @@ def test_with_yes_a_robot_does_not_start_at_a_place_where_no_person_put_it(lab: 
     assert motions(lab, out) == ["origin", "begun", "ended"]
     assert [[row["status"] for row in rows(trial)] for trial in trials(lab, out)] == [["valid"], []]
 
-    # A person who answers that it is there: its origin, and with it its fence, is the new place.
+    # A person confirms the position: its origin, and so its fence, is at the new position.
     (distance,) = (name for name in ("5m", "10m") if name in trials(lab, out)[1].name)
     lab.place_at(distance)
     home_m, begun_ns = lab.place_m, time.time_ns()
@@ -153,7 +156,7 @@ def test_with_yes_a_robot_does_not_start_at_a_place_where_no_person_put_it(lab: 
     assert farthest_m == pytest.approx(0.4, abs=BEYOND_M)
 
 
-def test_stop_stops_a_robot_whose_fieldkit_was_killed(lab: RoverLab) -> None:
+def test_stop_stops_a_robot_after_fieldkit_was_killed(lab: RoverLab) -> None:
     lab.write_procedure(Role.SENDER, FENCE_M - BEYOND_M)
     lab.place_at("5m")
     process = start(lab.folder, "trial", "drive", "5m", "--out", "killed", *UNASKED)
@@ -162,7 +165,7 @@ def test_stop_stops_a_robot_whose_fieldkit_was_killed(lab: RoverLab) -> None:
     finally:
         process.kill()
         process.communicate()
-    # An error of the site file that does not concern the robots is no reason not to stop them.
+    # An error of the site file that does not concern the robots must not prevent stopping them.
     (lab.folder / "broken.yaml").write_text(
         (lab.folder / "fieldkit.yaml").read_text(encoding="utf-8") + "no such key: 1\n", encoding="utf-8"
     )

@@ -1,4 +1,4 @@
-"""A robot that drives away, from the outside: where it was, what reached it, and what its rows then say."""
+"""A robot that drives away, end to end: its positions, the packets that reached it, and its rows."""
 
 import csv
 import signal
@@ -37,7 +37,7 @@ RATES = {mode.name: mode.rate_bit_s for mode in N_MODES}
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
-    """A lab with a drone faster than the one that ships, and a driveaway for it, so that nobody waits long."""
+    """Return a lab with a drone faster than the shipped one, and a driveaway for it, which saves time."""
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     for folder, old, new, changes in (
         ("robots", "duckiedrone", "quick", {"max_speed_m_s: 3.0": "max_speed_m_s: 4.0"}),
@@ -53,7 +53,7 @@ def lab(tmp_path: Path) -> Path:
 
 
 def range_m() -> float:
-    """How far the model lets these two hear each other, on open ground."""
+    """Return the range of these two robots in the model, on open ground."""
     antennas = {name: antenna_of(load_profile(name).radio) for name in ("turtlebot3_burger", "duckiedrone")}
     channel = WorldChannel(1, antennas, RadioOptions(fading=False, shadowing_db=0.0))
     near_m, far_m = 1.0, 1000.0
@@ -65,20 +65,20 @@ def range_m() -> float:
 
 
 def frames(folder: Path, where: tuple[TrackPoint, ...]) -> list[tuple[float, str, bool]]:
-    """Return each attempt to reach the receiver: how far it was as the medium was told before, mode, and success."""
+    """Return the distance, mode and success of each attempt to reach the receiver."""
     changes = track.distances_m(where, Role.SENDER, Role.RECEIVER)
     distances = [(utc_ns, metres) for utc_ns, metres in changes if metres is not None]
     with (folder / "air.csv").open(encoding="ascii", newline="") as file:
         lines = [line for line in csv.DictReader(file) if line["receiver"] == "duckiedrone-1"]
-    attempts = [line for line in lines if line["attempt"] != "0"]  # those are ACKs
-    found = []
+    attempts = [line for line in lines if line["attempt"] != "0"]  # 0 marks ACKs
+    frame_results = []
     for line in attempts:
         metres = [metres for utc_ns, metres in distances if utc_ns <= int(line["start_ns"])][-1]
-        found.append((metres, line["mode"], "duckiedrone-1" in line["received"].split()))
-    return found
+        frame_results.append((metres, line["mode"], "duckiedrone-1" in line["received"].split()))
+    return frame_results
 
 
-def test_the_link_gets_slower_and_ends_where_the_model_says(lab: Path) -> None:
+def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) -> None:
     run = fieldkit(lab, "trial", "rush", "40m", "--repeats", "1", "--protocol", "udp", "--record", "1s")
     assert run.code == 0, run.err
     trial = only_trial(lab)
@@ -86,21 +86,21 @@ def test_the_link_gets_slower_and_ends_where_the_model_says(lab: Path) -> None:
     (folder,) = (trial / "repeats").glob("udp-01")
 
     where = track.read(folder / "track.csv")
-    went = [one for one in where if one.role is Role.RECEIVER]
-    assert {one.position_m for one in where if one.role is Role.SENDER} == {(3.0, 6.0, 0.2)}
-    east_m = [one.position_m[0] for one in went if one.position_m is not None]
+    receiver_track = [point for point in where if point.role is Role.RECEIVER]
+    assert {point.position_m for point in where if point.role is Role.SENDER} == {(3.0, 6.0, 0.2)}
+    east_m = [point.position_m[0] for point in receiver_track if point.position_m is not None]
     assert (east_m[0], max(east_m), east_m[-1]) == (43.0, 43.0 + WAY_M, 43.0), "there, and back at its place"
     assert all(here < there for here, there in pairwise(east_m[:-1]))
-    assert len(east_m) > WAY_M / 2, "told all along the way"
-    assert {one.velocity_m_s for one in went[1:-2]} == {(SPEED_M_S, 0.0, 0.0)}
-    assert went[-2].velocity_m_s == went[-1].velocity_m_s == (0.0, 0.0, 0.0)
+    assert len(east_m) > WAY_M / 2, "positions along the whole path"
+    assert {point.velocity_m_s for point in receiver_track[1:-2]} == {(SPEED_M_S, 0.0, 0.0)}
+    assert receiver_track[-2].velocity_m_s == receiver_track[-1].velocity_m_s == (0.0, 0.0, 0.0)
 
     end_m = range_m()
-    assert 60 < end_m < 40 + WAY_M, "the way leads out of range"
+    assert 60 < end_m < 40 + WAY_M, "the route leads out of range"
     sent = frames(folder, where)
     heard = [metres for metres, _, received in sent if received]
     assert end_m - 10 < max(heard) <= end_m
-    nearest_m = min(metres for metres, _, _ in sent)  # it drives while the programs start
+    nearest_m = min(metres for metres, _, _ in sent)  # the robot already drives while the programs start
     near, far = ([RATES[m] for metres, m, _ in sent if 0 <= metres - low <= 10] for low in (nearest_m, end_m - 10))
     assert sum(near) / len(near) > 1.2 * sum(far) / len(far)
 
@@ -119,7 +119,7 @@ def test_the_link_gets_slower_and_ends_where_the_model_says(lab: Path) -> None:
     assert fieldkit(lab, "verify", str(trial)).code == 0
 
 
-def test_a_trial_that_is_ended_on_the_way_saves_its_state(lab: Path) -> None:
+def test_a_trial_that_is_stopped_during_the_move_saves_its_state(lab: Path) -> None:
     process = start(lab, "trial", "rush", "10m", "--repeats", "1", "--protocol", "tcp", "--record", "1s", "--json")
     wait_for_line(process, '"ping"')
     process.send_signal(signal.SIGTERM)
@@ -129,7 +129,7 @@ def test_a_trial_that_is_ended_on_the_way_saves_its_state(lab: Path) -> None:
     assert (row["status"], row["reason"]) == ("void", "interrupted")
 
 
-def test_who_is_too_slow_is_refused_before_anything_moves(lab: Path) -> None:
+def test_a_robot_that_is_too_slow_is_rejected_before_anything_moves(lab: Path) -> None:
     (lab / "fieldkit.yaml").write_text(SITE.replace("profile: quick", "profile: turtlebot3_burger"))
     path = lab / "procedures" / "rush.yaml"
     path.write_text(path.read_text().replace("      within_limits: true\n", ""))

@@ -22,7 +22,7 @@ from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
 
-# Where the drone stays it is heard, and 20 m farther it is not.
+# The drone is in range where it hovers, and out of range 20 m farther.
 SITE = """\
 backend: emulated
 robots:
@@ -69,7 +69,7 @@ def lab(folder: Path, during: str) -> Path:
     return folder
 
 
-def test_a_drone_flies_away_and_the_row_says_so(tmp_path: Path) -> None:
+def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
     (lab(tmp_path, TRANSFER) / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     run = fieldkit(tmp_path, "trial", "flyaway", "3m")
     assert run.code == 0, run.err
@@ -82,15 +82,15 @@ def test_a_drone_flies_away_and_the_row_says_so(tmp_path: Path) -> None:
     assert float(row["rtt_distance_max_m"]) > 8.0
     assert float(row["rtt_loss"]) > 0.1
     where = track.read(trial / "repeats/tcp-01/track.csv")
-    flown_m = [one.position_m for one in where if one.role is Role.RECEIVER and one.position_m is not None]
+    flown_m = [point.position_m for point in where if point.role is Role.RECEIVER and point.position_m is not None]
     ground_m = flown_m[0][2]
     assert max(up_m for _, _, up_m in flown_m) == pytest.approx(ground_m + 1.0, abs=0.4)
     assert flown_m[-1][2] == pytest.approx(ground_m, abs=1e-6), "it landed"
-    assert flown_m[-1][0] - flown_m[0][0] > 8.0, "where it was"
+    assert flown_m[-1][0] - flown_m[0][0] > 8.0, "the drone has flown from its start"
     log = (trial / "repeats/tcp-01/fly.log").read_text(encoding="utf-8").split("\n")
-    said = [line.partition(" ")[2] for line in log if line]
+    log_texts = [line.partition(" ")[2] for line in log if line]
     phases = "ready", "standing", "climbing", "up", "flying", "coming down", "landed"
-    assert [text for text in said if text in phases] == list(phases)
+    assert [text for text in log_texts if text in phases] == list(phases)
     assert float(row["fly_height_median_m"]) == pytest.approx(1.0, abs=0.3)
     assert float(row["fly_farthest_m"]) == pytest.approx(flown_m[-1][0] - flown_m[0][0], abs=0.5)
     assert 1.0 < float(row["fly_speed_median_m_s"]) < 4.0
@@ -98,7 +98,7 @@ def test_a_drone_flies_away_and_the_row_says_so(tmp_path: Path) -> None:
     assert "flew " in run.out
 
 
-# A drone of each family; both are real robots to fieldkit. What it brings down by itself it does soon.
+# A drone of each family; both are real robots for fieldkit. Landings by their programs start soon.
 DRONES = """\
 backend: emulated
 robots:
@@ -143,7 +143,7 @@ while beat is None or beat.base_mode & 128:
     beat = drone.recv_match(type="HEARTBEAT", blocking=True, timeout=0.5) or beat
 """
 NEAR_M = 0.6
-"""To home; it flew three times as far."""
+"""Distance to home; it flew three times as far."""
 NEWEST = 'cat "$(ls -t .fieldkit/*/*/fly.log | head -n 1)"'
 
 
@@ -159,7 +159,7 @@ def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
     (folder / "drones.yaml").write_text(DRONES, encoding="utf-8")
     with ExitStack() as stack:
         with pytest.MonkeyPatch.context() as patch:
-            patch.chdir(folder)  # where profiles are looked for
+            patch.chdir(folder)  # profiles are searched there
             outside = stack.enter_context(robots_outside(folder, site=folder / "drones.yaml"))
         yield outside
 
@@ -182,13 +182,13 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(out
     )
     assert stops < comes < ground
     assert height_m(outside, Role.SENDER) < 1e-3, "confirmed when it is there"
-    landed(outside, Role.SENDER, "return: the job was ended")
+    assert_landed(outside, Role.SENDER, "return: the job was ended")
     assert far_m(outside, Role.SENDER) < NEAR_M
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def test_a_drone_flies_on_without_its_laptop_until_somebody_says_abort(outside: Outside) -> None:
-    """Killed, the laptop leaves it to its lease; `fieldkit abort` ends the job that flies it before."""
+def test_a_drone_flies_on_without_its_laptop_until_abort(outside: Outside) -> None:
+    """If fieldkit is killed, the drone lands when its lease ends; `fieldkit abort` ends its job before that."""
     process = flying(outside, Role.RECEIVER, how="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
@@ -198,7 +198,7 @@ def test_a_drone_flies_on_without_its_laptop_until_somebody_says_abort(outside: 
     aborted = fieldkit(outside.folder, "abort", "--yes")
     assert aborted.code == 0
     assert "/fly " in aborted.out, aborted.err
-    landed(outside, Role.RECEIVER, "land: the job was ended")
+    assert_landed(outside, Role.RECEIVER, "land: the job was ended")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
@@ -211,11 +211,11 @@ def test_a_second_ctrl_c_does_not_wait_for_the_landing(outside: Outside) -> None
     stopped = finish(process)
     assert stopped.code == 130
     assert "the order to stop was sent" in stopped.err
-    landed(outside, Role.RECEIVER, "land: the job was ended")
+    assert_landed(outside, Role.RECEIVER, "land: the job was ended")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def test_stop_brings_a_drone_down_whose_fieldkit_is_dead(outside: Outside) -> None:
+def test_stop_lands_a_drone_after_fieldkit_was_killed(outside: Outside) -> None:
     process = flying(outside, Role.RECEIVER, how="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
@@ -225,18 +225,20 @@ def test_stop_brings_a_drone_down_whose_fieldkit_is_dead(outside: Outside) -> No
         "copter-1: nothing of fieldkit moves it; nothing was sent to it",
         "duckiedrone-1: coming down (land)",
     ]
-    landed(outside, Role.RECEIVER, "land: the job was ended")
+    assert_landed(outside, Role.RECEIVER, "land: the job was ended")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
 def set_parameter(outside: Outside, role: Role, name: str, value: float) -> None:
-    """Set a parameter of an autopilot: how high it returns at least, how near home it begins to land."""
+    """Set a parameter of an autopilot, for example the minimum return height or the distance at which it starts to
+    land.
+    """
     program = SET_PARAMETER.format(name=name, value=value)
     outside.testbed.shells[role].run((sys.executable, "-c", program), deadline=Deadline.after(60))
 
 
 def flying(outside: Outside, role: Role, *, how: str, lease: str) -> "subprocess.Popen[str]":
-    """Let the motors of one that has just landed stand; start a trial, and return when its drone is in the air."""
+    """Wait for stopped motors after a landing; start a trial, and return when its drone is in the air."""
     outside.testbed.shells[role].run((sys.executable, "-c", STANDS), deadline=Deadline.after(60))
     (outside.folder / "procedures").mkdir(exist_ok=True)
     text = GIVEN_UP
@@ -249,19 +251,21 @@ def flying(outside: Outside, role: Role, *, how: str, lease: str) -> "subprocess
     return process
 
 
-def landed(outside: Outside, role: Role, why: str) -> None:
-    """Wait until the drone stands, and see that its own program says why it brought it down."""
+def assert_landed(outside: Outside, role: Role, why: str) -> None:
+    """Wait until the drone is on the ground, and check the reason that its program reports for the landing."""
     wait_until(lambda: height_m(outside, role) < 1e-3, Deadline.after(60))
     shell = outside.testbed.shells[role]
     assert why in shell.run(("sh", "-c", NEWEST), deadline=Deadline.after(30)).stdout.decode()
 
 
 def moved_m(outside: Outside, role: Role) -> Vector:
-    """Return how far the drone is from where it was put, as the lab knows it."""
-    (*_, now), (put, *_) = 2 * [[one.position_m for one in outside.testbed.oracle.track(0) if one.role is role]]
+    """Return the distance of the drone from its initial position, by the lab."""
+    (*_, now), (start, *_) = 2 * [
+        [point.position_m for point in outside.testbed.oracle.track(0) if point.role is role]
+    ]
     assert now is not None
-    assert put is not None
-    return now[0] - put[0], now[1] - put[1], now[2] - put[2]
+    assert start is not None
+    return now[0] - start[0], now[1] - start[1], now[2] - start[2]
 
 
 def far_m(outside: Outside, role: Role) -> float:
@@ -273,10 +277,10 @@ def height_m(outside: Outside, role: Role) -> float:
 
 
 def agents() -> list[str]:
-    """Return the command lines of agents of fieldkit that run on our robots."""
-    found = []
+    """Return the command lines of fieldkit's agents on our robots."""
+    command_lines = []
     for pid in descendants(os.getpid()):
-        with suppress(OSError):  # it has ended meanwhile
+        with suppress(OSError):  # the process has ended
             words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-            found += [" ".join(map(os.fsdecode, words))] if any(b"/agent-" in word for word in words) else []
-    return found
+            command_lines += [" ".join(map(os.fsdecode, words))] if any(b"/agent-" in word for word in words) else []
+    return command_lines

@@ -1,6 +1,7 @@
-"""Ten repeats of a flight in a row fly the same way: an emulated ArduCopter in the field backend, by the lab's truth.
+"""Ten consecutive repeats of a flight fly the same path: an emulated ArduCopter in the field backend, by true
+positions.
 
-The field backend leaves the drone where and as it landed: an ArduCopter has turned its nose along its way back.
+The field backend leaves the drone as it landed: an ArduCopter has turned its nose towards home.
 """
 
 import math
@@ -52,7 +53,7 @@ steps:
 
 
 def flights(places_m: Sequence[Vector]) -> Iterator[list[Vector]]:
-    """Yield the places of each flight, from the last one on the ground to the first one there."""
+    """Yield the positions of each flight, from the last one on the ground before it to the first one after it."""
     ground_m, flight = places_m[0][2], [places_m[0]]
     for place_m in places_m:
         if place_m[2] > ground_m + AIRBORNE_M:
@@ -65,12 +66,12 @@ def flights(places_m: Sequence[Vector]) -> Iterator[list[Vector]]:
 
 
 def farthest_m(flight: Sequence[Vector], start_m: Vector) -> tuple[float, float]:
-    """Return the farthest place of a flight relative to a start, east and north."""
+    """Return the farthest position of a flight relative to a start, east and north."""
     east_m, north_m, _ = max(flight, key=lambda place_m: math.dist(place_m[:2], start_m[:2]))
     return east_m - start_m[0], north_m - start_m[1]
 
 
-def test_ten_repeats_in_a_row_fly_the_same_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ten_consecutive_repeats_fly_the_same_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "robots").mkdir()
     (tmp_path / "procedures").mkdir()
     profile = (ROOT / "robots/duckiedrone.yaml").read_text(encoding="utf-8")
@@ -95,7 +96,7 @@ def test_ten_repeats_in_a_row_fly_the_same_way(tmp_path: Path, monkeypatch: pyte
     assert [row["status"] for row in results] == ["valid"] * REPEATS
     attempts = sum(int(row["attempt"]) for row in results)
     assert len(flown) <= attempts
-    if attempts == REPEATS:  # a busy machine suspends the pilot, which lands the drone then
+    if attempts == REPEATS:  # on a busy machine the pilot is suspended, and then lands the drone
         assert len(flown) == REPEATS
         for row, flight in zip(results, flown, strict=True):
             assert math.dist(flight[-1][:2], home_m[:2]) < 0.5, "it came back"

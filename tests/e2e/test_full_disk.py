@@ -1,4 +1,4 @@
-"""The laptop's disk fills up in mid-trial: it stops cleanly, and goes on when there is room again."""
+"""The laptop's disk fills up during a trial: the trial stops cleanly, and continues when there is space again."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ from tests.helpers.runs import LIMIT_S, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
 
-# The lab is a small file system of its own, which this shell and its children alone see.
+# The lab is on a separate small file system, visible only to this shell and its children.
 SCRIPT = """\
 set -e
 out=$1 python=$2 lab=$3
@@ -39,7 +39,7 @@ echo "exit code $code" >>"$out/small"
 """
 
 
-def test_a_full_disk_stops_the_trial_and_resume_goes_on_when_there_is_room(tmp_path: Path) -> None:
+def test_a_full_disk_stops_the_trial_and_resume_continues_after_cleaning_up(tmp_path: Path) -> None:
     out, lab = tmp_path / "out", tmp_path / "lab"
     out.mkdir()
     lab.mkdir()
@@ -52,13 +52,13 @@ def test_a_full_disk_stops_the_trial_and_resume_goes_on_when_there_is_room(tmp_p
         check=False,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )
-    said = {name: (out / name).read_text(encoding="utf-8") for name in ("first", "full", "second", "small")}
-    assert done.returncode == 0, (done.stderr, said)
+    outputs = {name: (out / name).read_text(encoding="utf-8") for name in ("first", "full", "second", "small")}
+    assert done.returncode == 0, (done.stderr, outputs)
     for name in ("first", "full"):
-        assert "free some space, then: fieldkit resume trials/" in said[name]
-        assert said[name].endswith("exit code 2\n")
-    assert f"du -sh {lab}/small/* # delete what is not needed, or choose another --out" in said["small"]
-    assert said["small"].endswith("exit code 3\n")
+        assert "free some space, then: fieldkit resume trials/" in outputs[name]
+        assert outputs[name].endswith("exit code 2\n")
+    assert f"du -sh {lab}/small/* # delete what is not needed, or choose another --out" in outputs["small"]
+    assert outputs["small"].endswith("exit code 3\n")
     table = rows(only_trial(out))
     assert [row["repeat"] for row in table if row["status"] == "valid"] == ["1", "2"]
     assert all(row["reason"] for row in table if row["status"] != "valid")

@@ -1,4 +1,4 @@
-"""The pictures of docs/gallery.md are those that benchmarks.gallery makes."""
+"""The pictures of docs/gallery.md are those that benchmarks.gallery generates."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def test_pictures_are_small() -> None:
 
 
 @pytest.mark.emulated
-def test_the_pictures_can_be_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_pictures_can_be_generated_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     assert gallery.main(["--out", str(tmp_path)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in PICTURES.iterdir())

@@ -1,4 +1,4 @@
-"""Each tool on a robot hangs in turn, in its work or when asked for its version: the trial ends all the same."""
+"""Each tool on a robot hangs in turn, during its work or when queried for its version: the trial still ends."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,7 +29,7 @@ steps:
   - ping: {from: sender, to: receiver, count: 2, interval: 200ms}
 """
 
-# Answers for its version as the real one does, and hangs when it is to work.
+# Responds to version queries like the real tool, and hangs during its work.
 HANGS_AT_WORK = """\
 #!/bin/sh
 case "$*" in -V | -h | --help | -L* | *127.0.0.1*) exec {program} "$@" ;; esac
@@ -52,7 +52,7 @@ def lab(outside: Outside, tmp_path: Path) -> Path:
 
 
 def replace_tool(outside: Outside, lab: Path, tool: str, program: str, script: str) -> None:
-    """Let the sender's profile name a program of the robot's own in place of a tool."""
+    """Set a program of the robot in place of a tool in the sender's profile."""
     place_program(outside, tool, script.format(program=program))
     copy_shipped(lab, "robots", "turtlebot3_burger", f"  {tool}: {program}\n", f"  {tool}: /root/{tool}\n")
 
@@ -64,31 +64,31 @@ def place_program(outside: Outside, name: str, script: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tool", "program", "said"),
+    ("tool", "program", "message"),
     [
         ("netcat", "nc.traditional", "recv.bag"),
         ("capture", "tcpdump", "capture"),
         ("ping", "ping", "ping"),
     ],
 )
-def test_a_tool_that_hangs_at_work_ends_at_its_limit(
-    outside: Outside, lab: Path, tool: str, program: str, said: str
+def test_a_hanging_tool_is_ended_at_its_limit(
+    outside: Outside, lab: Path, tool: str, program: str, message: str
 ) -> None:
     replace_tool(outside, lab, tool, program, HANGS_AT_WORK)
     run = fieldkit(lab, "trial", "short", "5m", "--yes")
     assert run.code in {0, 4}, run.err
     (row,) = rows(only_trial(lab))
-    if tool == "netcat":  # a transfer that does not come to its end is a measurement
+    if tool == "netcat":  # an incomplete transfer is a measurement
         assert (row["status"], row["received_bytes"]) == ("valid", "0"), row["reason"]
     else:
         assert row["status"] == "failed"
-        assert said in row["reason"]
+        assert message in row["reason"]
     for shell in outside.testbed.shells.values():
         assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 @pytest.mark.parametrize(("tool", "program"), [("netcat", "nc.traditional"), ("ping", "ping")])
-def test_a_tool_that_hangs_when_asked_is_refused_before_repeat_1(
+def test_a_tool_that_hangs_on_version_queries_is_rejected_before_repeat_1(
     outside: Outside, lab: Path, tool: str, program: str
 ) -> None:
     replace_tool(outside, lab, tool, program, HANGS)
@@ -98,7 +98,7 @@ def test_a_tool_that_hangs_when_asked_is_refused_before_repeat_1(
     assert "remedy" in run.err
 
 
-def test_a_recorder_that_hangs_is_ended_at_its_limit(outside: Outside, lab: Path) -> None:
+def test_a_hanging_recorder_is_ended_at_its_limit(outside: Outside, lab: Path) -> None:
     copy_shipped(
         lab, "robots", "turtlebot3_burger", '[rosbag, record, "--duration', '[/root/rosbag, record, "--duration'
     )

@@ -1,4 +1,4 @@
-"""Text of robots and operators in every output: no output passes control characters on to whatever shows it."""
+"""Texts of robots and operators in every output: no output passes control characters on to a terminal or viewer."""
 
 import csv
 import io
@@ -25,11 +25,11 @@ HOSTILE = "=a\x1b[31mb\x07\x7f\x9b5m\u202ec\u2066\u200fd\u2028e"
 TEXTS = ("procedure", "scenario", "backend", "distance", "sender", "reason")
 WRITTEN_TO_FILES = "export"
 BARE_PRINT = {"fieldkit/cli/display.py", "fieldkit/cli/terminal.py", "fieldkit/cli/commands/completion.py"}
-"""Modules that may print: the one that makes texts harmless, prompts of our own, and a shell's own script."""
+"""Modules that may print: the one that escapes texts, fieldkit's prompts, and the script of a shell."""
 
 
 def formats() -> Iterator[tuple[str, str]]:
-    """Yield every command with a choice of formats, and each: one that is added later is here without a change."""
+    """Yield every command that has a choice of formats, with each format, including commands added later."""
     for command in ("aggregate", "compare", "export"):
         known = parser().command(command)
         assert known is not None
@@ -88,7 +88,7 @@ def words(command: str, form: str, hostile: Path, out: Path) -> Sequence[str]:
 
 
 @pytest.mark.parametrize(("command", "form"), [*formats(), ("report", "html")])
-def test_no_output_holds_a_control_character(
+def test_no_output_contains_control_characters(
     hostile: Path, tmp_path: Path, command: str, form: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / f"out.{form}"
@@ -96,21 +96,21 @@ def test_no_output_holds_a_control_character(
         assert main(["report", str(hostile), "-o", str(out)]) == 0
     else:
         assert main([*words(command, form, hostile, out)]) == 0
-    said = capsys.readouterr()
-    assert_shown(said.out)
-    assert_shown(said.err)
-    written = list(texts_in(form, out)) if out.exists() else [said.out]
+    captured = capsys.readouterr()
+    assert_shown(captured.out)
+    assert_shown(captured.err)
+    written = list(texts_in(form, out)) if out.exists() else [captured.out]
     assert out.exists() is (command in {"export", "report"})
     for text in written:
         assert_shown(text)
     if form != "mcap":
-        assert any("?[31mb" in text or "\\u001b[31mb" in text for text in written), "the test sees what is hostile"
+        assert any("?[31mb" in text or "\\u001b[31mb" in text for text in written), "the texts contain the sequence"
     if form == "csv":
         cells = [cell for line in csv.reader(io.StringIO(written[0])) for cell in line]
         assert not [cell for cell in cells if cell.startswith("=")]
 
 
-def test_no_command_prints_past_the_one_border() -> None:
+def test_only_listed_modules_print() -> None:
     modules = [*(ROOT / "fieldkit" / "cli").rglob("*.py"), *(ROOT / "sim_backends/cosim/commands").rglob("*.py")]
     printing = {
         str(path.relative_to(ROOT))
@@ -120,27 +120,27 @@ def test_no_command_prints_past_the_one_border() -> None:
     assert printing <= BARE_PRINT
 
 
-def kept(row: RepeatRow) -> dict[str, object]:
-    """Return the texts of a row that was written as a table and read from there."""
+def round_trip(row: RepeatRow) -> dict[str, object]:
+    """Return the texts of a row after writing and reading its table."""
     content = rows.to_csv([row], trial_columns()).encode()
-    found = repeats.parse(content, trial_columns())
-    return {name: found.texts[name][0] for name in ("distance", "reason", "sender")}
+    table = repeats.parse(content, trial_columns())
+    return {name: table.texts[name][0] for name in ("distance", "reason", "sender")}
 
 
 @given(st.tuples(*[st.text(st.characters(exclude_categories=["C", "Z"]), max_size=12)] * 3))
-def test_a_table_that_is_read_again_has_the_same_texts(texts: tuple[str, str, str]) -> None:
+def test_a_table_that_is_read_again_has_equal_texts(texts: tuple[str, str, str]) -> None:
     own = dict(zip(("distance", "reason", "sender"), texts, strict=True))
     own = {name: "" if text in {"nan", "NaN"} else text for name, text in own.items()}
-    assert kept(replace(ROW, **own)) == own
+    assert round_trip(replace(ROW, **own)) == own
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
 @given(text=st.text(min_size=1, max_size=20), form=st.sampled_from(["table", "csv", "json", "markdown", "latex"]))
-def test_any_text_of_a_condition_is_shown_in_any_format(
+def test_any_text_of_a_condition_is_printable_in_any_format(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, form: str
 ) -> None:
     table = write(tmp_path, [replace(ROW, distance=text, distance_m=None, tcp_byte_loss=0.1)])
     code = main(["aggregate", str(table), "--by", "distance,protocol", "--format", form])
-    said = capsys.readouterr()
-    assert code == 0, said.err
-    assert_shown(said.out + said.err)
+    captured = capsys.readouterr()
+    assert code == 0, captured.err
+    assert_shown(captured.out + captured.err)

@@ -1,4 +1,4 @@
-"""Ctrl-C while steps run at the same time: all of them end, and the repeat is told as interrupted."""
+"""Ctrl-C during simultaneous steps: all of them end, and the repeat is reported as interrupted."""
 
 import json
 import signal
@@ -23,7 +23,7 @@ roles:
 """
 PROCEDURE = """\
 name: beside
-summary: Four things at once, none of which ends by itself in time
+summary: Four concurrent activities, none of which ends by itself in time
 scenario: los
 topology: masterless
 protocols: [tcp]
@@ -39,7 +39,7 @@ steps:
 
 
 def wait_for_all(process: "subprocess.Popen[str]", names: list[str]) -> None:
-    """Return when all of these steps have begun, in any order."""
+    """Return when all of these steps have started, in any order."""
     assert process.stdout is not None
     left = list(names)
     for line in process.stdout:
@@ -50,7 +50,7 @@ def wait_for_all(process: "subprocess.Popen[str]", names: list[str]) -> None:
     raise AssertionError(f"never began: {left}")
 
 
-def test_ctrl_c_ends_all_that_runs_at_the_same_time(tmp_path: Path, untouched: Untouched) -> None:
+def test_ctrl_c_ends_all_simultaneous_steps(tmp_path: Path, untouched: Untouched) -> None:
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")

@@ -1,6 +1,6 @@
-"""A radio with known delay, measured by whole trials.
+"""A radio with known delay, measured by complete trials.
 
-What this machine itself takes is known from a radio without delay in the same run.
+The delay of this machine itself is known from a radio without delay in the same run.
 """
 
 import pytest
@@ -22,18 +22,18 @@ def delayed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str
 
 @pytest.mark.parametrize("delay_ms", [5, 20])
 def test_rtt_is_twice_the_delay_of_the_link(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
-    """A busy machine adds to a median and, of 50 pings, hardly to the least."""
+    """A busy machine increases the median but, with 50 pings, hardly the minimum."""
     table = delayed[str(delay_ms)]
     assert [row["rtt_payload_bytes"] for row in table] == ["502", "8192"]
     for row, own in zip(table, delayed["0"], strict=True):
-        least_ms, own_ms = (1e3 * float(one["rtt_min_s"]) for one in (row, own))
-        assert least_ms - own_ms == pytest.approx(2 * delay_ms, abs=0.5)
+        least_ms, baseline_ms = (1e3 * float(pings["rtt_min_s"]) for pings in (row, own))
+        assert least_ms - baseline_ms == pytest.approx(2 * delay_ms, abs=0.5)
         assert 2 * delay_ms <= least_ms <= 1e3 * float(row["rtt_median_s"]) <= 2 * delay_ms + 5
 
 
 @pytest.mark.parametrize("delay_ms", [5, 20])
-def test_the_offset_of_one_clock_to_itself_is_none(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
-    """Both robots have this machine's clock, so the truth is known; half a round trip is the delay of the link."""
+def test_the_offset_of_a_clock_to_itself_is_zero(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
+    """Both robots use this machine's clock, so the true offset is 0; half a round trip is the delay of the link."""
     own_s = most(delayed["0"], "rtt_median_s")
     for row in delayed[str(delay_ms)]:
         offset_s, error_s = float(row["clock_offset_s"]), float(row["clock_offset_error_s"])
@@ -57,7 +57,7 @@ def test_the_delay_on_the_air_is_that_of_the_link(delayed: dict[str, list[dict[s
         assert (row["delay_transmission_s"], row["delay_queuing_s"]) == ("0", "0"), "the rate has no limit"
         assert 0 < processing_s < 5e-3, "no medium is never late"
         assert whole_s == pytest.approx(propagation_s + processing_s, rel=1e-8)
-        # TCP's last acknowledgment may still be on the air when both programs have ended, and ROS may say a word.
+        # TCP's last acknowledgment may still be in flight when both programs have ended, and ROS may send a packet.
         assert int(row["delay_packets"]) == pytest.approx(int(row["ip_packets_received"]), abs=2)
 
 

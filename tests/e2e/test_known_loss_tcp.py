@@ -1,4 +1,4 @@
-"""A radio with known loss, measured by whole trials over TCP: every byte arrives, and what was repaired counts."""
+"""A radio with known loss, measured by complete trials over TCP: every byte arrives; retransmissions count."""
 
 import pytest
 
@@ -7,8 +7,9 @@ from tests.helpers.runs import total
 
 pytestmark = pytest.mark.emulated
 
-# With 30 % lost in each direction every other round trip fails and TCP doubles its timer each time: one transfer in
-# ten waits for a minute or more, so 20 took up to 450 s. What is asserted of each, and of their sum, needs fewer.
+# With a loss of 30 % in each direction every second round trip fails and TCP doubles its timer each time: one
+# transfer in ten takes a minute or more, so 20 took up to 450 s. The assertions on each transfer and on their sum
+# need fewer.
 SHARE_AT = dict.fromkeys(LOSSES_PERCENT, 1.0) | {30: 0.4}
 
 
@@ -17,7 +18,7 @@ def lossy_tcp(
     tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 ) -> dict[str, list[dict[str, str]]]:
     base = tmp_path_factory.mktemp("tcp")
-    # At 30 % a small bag, too, bounds the waiting.
+    # At 30 % a small bag also limits the duration.
     topics = dict.fromkeys(LOSSES_PERCENT, "/imu") | {30: "/battery_state"}
     radios = {loss: f"{{loss: {loss}%, rate: 50Mbit/s}}" for loss in LOSSES_PERCENT}
     repeats = {loss: int(share * request.param) for loss, share in SHARE_AT.items()}
@@ -30,7 +31,7 @@ def lossy_tcp(
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)
-def test_tcp_delivers_every_byte_and_counts_what_it_repaired(
+def test_tcp_delivers_every_byte_and_retransmissions_are_counted(
     lossy_tcp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
     table = lossy_tcp[str(percent)]
@@ -45,10 +46,10 @@ def test_tcp_delivers_every_byte_and_counts_what_it_repaired(
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)
-def test_what_the_receiver_saw_twice_is_what_tcp_sent_twice(
+def test_packets_received_twice_are_those_that_tcp_sent_twice(
     lossy_tcp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
-    """The radio is a queue that copies nothing, and TUN devices let no super-frame pass."""
+    """The radio is a queue that copies nothing, and TUN devices do not aggregate packets."""
     for row in lossy_tcp[str(percent)]:
         number = {name: int(value) for name, value in row.items() if name.startswith("tcp_") and value.isdigit()}
         assert number["tcp_received_bytes"] == number["tcp_unique_bytes"] + number["tcp_duplicated_bytes"]
@@ -57,8 +58,8 @@ def test_what_the_receiver_saw_twice_is_what_tcp_sent_twice(
             assert number[name] == 0, name
 
 
-def test_tcp_repeats_mostly_what_was_lost(lossy_tcp: dict[str, list[dict[str, str]]]) -> None:
-    """Needless is what follows a lost acknowledgment that no later one makes good, or a pause of this machine."""
+def test_tcp_retransmits_mostly_lost_packets(lossy_tcp: dict[str, list[dict[str, str]]]) -> None:
+    """Needless retransmissions follow a lost acknowledgment that no later one replaces, or a pause of the machine."""
     without_loss = lossy_tcp["0"]
     for row in without_loss:
         assert row["tcp_retransmitted_segments"] == row["tcp_spurious_segments"], "nothing was lost"

@@ -1,4 +1,4 @@
-"""A radio with known loss, measured by whole trials over UDP: what comes out must be what was put in."""
+"""A radio with known loss, measured by complete trials over UDP: the measured loss must be the configured loss."""
 
 import math
 from statistics import median
@@ -12,7 +12,7 @@ from tests.helpers.runs import total
 pytestmark = pytest.mark.emulated
 
 FOUR_SIGMA = 0.99994
-"""What is captured differs from run to run, and with it which draws of the radio meet it."""
+"""The captured packets differ from run to run, and so do the radio's random draws for them."""
 FRAGMENTS = 6  # of a datagram of 8,192 bytes in packets of 1,500
 
 
@@ -38,10 +38,10 @@ def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str,
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)
-def test_losses_that_do_not_know_of_each_other_come_in_runs_as_in_closed_form(
+def test_runs_of_independent_losses_have_the_lengths_of_the_closed_form(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
-    """Starts of runs exclude each other next door, which gives their number's variance; run lengths are geometric."""
+    """Starts of runs cannot be adjacent, which determines the variance of their number; run lengths are geometric."""
     table, loss = lossy_udp[str(percent)], percent / 100
     sent, bursts = total(table, "ip_packets_sent"), total(table, "ip_loss_bursts")
     start = loss * (1 - loss)
@@ -52,7 +52,8 @@ def test_losses_that_do_not_know_of_each_other_come_in_runs_as_in_closed_form(
     if bursts:
         mean = (sent - total(table, "ip_packets_received")) / bursts
         assert abs(mean - 1 / (1 - loss)) <= 4 * math.sqrt(loss / bursts) / (1 - loss), mean
-        # A run of k or more begins at one of `sent` places by a chance of at most sent * (1 - loss) * loss**k.
+        # The probability that a run of k or more starts at one of `sent` positions is at most sent * (1 - loss) *
+        # loss**k.
         assert longest < math.log(1e4 * sent * (1 - loss), 1 / loss)
 
 
@@ -69,7 +70,7 @@ def test_datagram_loss_is_larger_as_six_fragments_predict(
     table = lossy_udp[str(percent)]
     loss, repeats = percent / 100, len(table)
     sent, received = total(table, "datagrams_sent"), total(table, "datagrams_received")
-    # Every repeat's last datagram is the rest of the file; it has fragments of its own number.
+    # The last datagram of every repeat is the rest of the file, with a different number of fragments.
     fragments_of_last = total(table, "ip_packets_sent") - FRAGMENTS * (sent - repeats)
     delivered = (sent - repeats) * (1 - loss) ** FRAGMENTS + repeats * (1 - loss) ** (fragments_of_last / repeats)
     interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
@@ -80,11 +81,11 @@ def test_datagram_loss_is_larger_as_six_fragments_predict(
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)
-def test_the_delay_on_the_air_is_of_the_packets_that_arrived(
+def test_the_air_delay_is_that_of_packets_that_arrived(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
     table = lossy_udp[str(percent)]
-    # Now and then a packet of ROS, sent again because it was lost, comes between them.
+    # Occasionally a retransmitted packet of ROS comes between them.
     others = [int(row["delay_packets"]) - int(row["ip_packets_received"]) for row in table]
     assert min(others) >= 0
     assert others.count(0) > len(table) // 2
@@ -101,11 +102,13 @@ def test_the_parts_of_the_delay_are_those_of_a_link_of_50_mbit_s(lossy_udp: dict
     queuing_s, transmission_s = (
         median(float(row[f"delay_{part}_s"]) for row in alone) for part in ("queuing", "transmission")
     )
-    assert queuing_s > transmission_s, "the six fragments of a datagram come at once"
+    assert queuing_s > transmission_s, "the six fragments of a datagram arrive together"
 
 
 @pytest.mark.parametrize("percent", LOSSES_PERCENT)
-def test_the_papers_loss_sees_first_fragments_only(lossy_udp: dict[str, list[dict[str, str]]], percent: int) -> None:
+def test_the_papers_loss_counts_first_fragments_only(
+    lossy_udp: dict[str, list[dict[str, str]]], percent: int
+) -> None:
     table = lossy_udp[str(percent)]
     for row in table:
         assert row["paper_packets"] == row["datagrams_sent"]

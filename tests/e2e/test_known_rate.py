@@ -1,4 +1,4 @@
-"""A radio of known rate: throughput must be that rate, and what the radio's own log of the air says."""
+"""A radio of known rate: throughput must be that rate, and equal to the radio's air log."""
 
 import csv
 from itertools import pairwise
@@ -16,13 +16,13 @@ pytestmark = pytest.mark.emulated
 REPEATS = 2
 TCP_HEADERS = 20 + 32
 FRAME_BYTES = 36  # MAC header, LLC/SNAP and check sequence around an IP packet
-SMALL = 200  # words of ROS, not the transfer
+CONTROL_BYTES = 200  # smaller packets belong to ROS, not to the transfer
 PAUSE_NS = 500_000_000
 PORT = 1234
 UDP_PACKETS = 5 * 1500 + 20 + 8192 + 8 - 5 * 1480  # of a datagram of 8,192 bytes
 
 
-def test_throughput_is_the_rate_of_the_link_and_goodput_what_its_headers_leave(tmp_path: Path) -> None:
+def test_throughput_is_the_rate_of_the_link_and_goodput_excludes_headers(tmp_path: Path) -> None:
     (table,) = run_all([make_lab(tmp_path / "lab", "{rate: 1Mbit/s}", topic="/imu", repeats=REPEATS)]).values()
     assert [row["protocol"] for row in table].count("udp") == REPEATS == len(table) / 2
     for row in table:
@@ -30,7 +30,7 @@ def test_throughput_is_the_rate_of_the_link_and_goodput_what_its_headers_leave(t
         share = 8192 / UDP_PACKETS if row["protocol"] == "udp" else 1448 / (1448 + TCP_HEADERS)
         completion_s = 8 * int(row["received_bytes"]) / float(row["goodput_bit_s"])
         if row["protocol"] == "tcp":
-            # The time of TCP's goodput begins at the SYN. On a busy machine nc sends its first byte some 10 ms later.
+            # The time of TCP's goodput starts at the SYN. On a busy machine nc sends its first byte some 10 ms later.
             completion_s -= before_data_s(only_trial(tmp_path / "lab") / f"repeats/tcp-{int(row['repeat']):02}")
         assert 8 * int(row["received_bytes"]) / completion_s == pytest.approx(1e6 * share, rel=0.02), row["protocol"]
 
@@ -45,8 +45,8 @@ def before_data_s(repeat: Path) -> float:
     return float(data.time) - float(syn.time)
 
 
-def test_throughput_is_what_the_radio_wrote_down_of_the_air(tmp_path: Path) -> None:
-    """Its own log has when each frame was received and how long it was; ping comes a second after a UDP transfer."""
+def test_throughput_equals_that_of_the_radios_air_log(tmp_path: Path) -> None:
+    """The radio's log has the time and length of each received frame; ping starts a second after a UDP transfer."""
     lab = make_lab(tmp_path / "air", "{fading: false}\n  record_air: true", topic="/imu", repeats=1)
     run: Run = fieldkit(lab, "trial", "quick", "5m", "--protocol", "udp", "--record", "5s")
     assert run.code == 0, run.err
@@ -58,9 +58,9 @@ def test_throughput_is_what_the_radio_wrote_down_of_the_air(tmp_path: Path) -> N
             for line in csv.DictReader(file)
             if line["transmitter"] == row["sender"] and line["received"] == row["receiver"]
         ]
-    frames = [(end_ns, size) for end_ns, size in frames if size > SMALL]
+    frames = [(end_ns, size) for end_ns, size in frames if size > CONTROL_BYTES]
     last = next(
-        (index for index, (one, after) in enumerate(pairwise(frames)) if after[0] - one[0] > PAUSE_NS),
+        (index for index, (before, after) in enumerate(pairwise(frames)) if after[0] - before[0] > PAUSE_NS),
         len(frames) - 1,
     )
     sent = frames[: last + 1]

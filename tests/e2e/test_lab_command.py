@@ -1,4 +1,4 @@
-"""`fieldkit lab` as people use it: robots stay up, plain ssh and scp reach them, and nothing is left of them."""
+"""`fieldkit lab` on the command line: robots stay up, plain ssh and scp reach them, and nothing is left behind."""
 
 import contextlib
 import json
@@ -42,23 +42,23 @@ emulated: {ros: builtin, world: open, radio: {fading: false}}
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The folder of a lab that is up, whose name a careless program would stumble over."""
-    here = tmp_path_factory.mktemp("a 100% lab")
-    (here / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    up = fieldkit(here, "lab", "up")
+    """The folder of a running lab, with a name that needs quoting."""
+    lab_folder = tmp_path_factory.mktemp("a 100% lab")
+    (lab_folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    up = fieldkit(lab_folder, "lab", "up")
     assert up.code == 0, up.err
-    (here / "ssh.conf").write_text(fieldkit(here, "lab", "ssh-config").out, encoding="utf-8")
+    (lab_folder / "ssh.conf").write_text(fieldkit(lab_folder, "lab", "ssh-config").out, encoding="utf-8")
     try:
-        yield here
+        yield lab_folder
     finally:
-        assert fieldkit(here, "lab", "down").code == 0
+        assert fieldkit(lab_folder, "lab", "down").code == 0
 
 
-def plain(here: Path, *argv: str) -> str:
-    """Run a program as a stranger would: of fieldkit's environment it has nothing."""
+def plain(lab_folder: Path, *argv: str) -> str:
+    """Run a program without any of fieldkit's environment."""
     done = subprocess.run(
         argv,
-        cwd=here,
+        cwd=lab_folder,
         env={"PATH": os.environ["PATH"]},
         stdin=subprocess.DEVNULL,
         capture_output=True,
@@ -70,21 +70,21 @@ def plain(here: Path, *argv: str) -> str:
     return done.stdout
 
 
-def process_of(here: Path) -> int:
-    return client.state(folder.of_directory(here)).pid
+def process_of(lab_folder: Path) -> int:
+    return client.state(folder.of_directory(lab_folder)).pid
 
 
-def test_ps_tells_robots_roles_addresses_places_and_what_runs(lab: Path) -> None:
+def test_ps_shows_robots_roles_addresses_positions_and_programs(lab: Path) -> None:
     assert fieldkit(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
     lines = fieldkit(lab, "lab", "ps").out.splitlines()
     ground, air = (" ".join(next(line for line in lines if name in line).split()) for name in ("ground-1", "air-1"))
     assert ground == "ground-1 turtlebot3_burger sender (masterless) 10.42.0.1 197.5, 197.5, 0.2 sshd, sensors"
     assert air == "air-1 duckiedrone receiver (masterless) 10.42.0.2 202.5, 197.5, 0.2 sshd, sensors, autopilot"
     assert lines[-1].startswith("up for ")
-    told = json.loads(fieldkit(lab, "lab", "ps", "--json").out)
-    assert told["pid"] == process_of(lab)
-    assert told["up_s"] > 0
-    ground_1, air_1 = told["robots"]
+    lab_state = json.loads(fieldkit(lab, "lab", "ps", "--json").out)
+    assert lab_state["pid"] == process_of(lab)
+    assert lab_state["up_s"] > 0
+    ground_1, air_1 = lab_state["robots"]
     assert ground_1 == {
         "name": "ground-1",
         "profile": "turtlebot3_burger",
@@ -110,7 +110,7 @@ STANDS: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :
 
 
 def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
-    """A program with the command line of the driver: `fieldkit stop` recognizes it by that, whoever started it."""
+    """The program has the driver's command line, by which `fieldkit stop` recognizes it, whoever started it."""
     attempt = jobs.work_folder("trial-a", "tcp-01-1")
     argv = ("sh", "-c", STANDS, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
     driver = Job(attempt, "drive", argv, WITHIN_S, "drive.log", ready="log:up")
@@ -138,8 +138,8 @@ def test_rsync_reaches_the_robots(lab: Path) -> None:
     assert (lab / "fetched").read_bytes() == (lab / "folder" / "data").read_bytes()
 
 
-def test_ssh_refuses_a_robot_with_another_host_key(lab: Path) -> None:
-    """Either robot's stream under the other's name: the pinned key is what tells them apart."""
+def test_ssh_rejects_a_robot_with_another_host_key(lab: Path) -> None:
+    """The robots' connections are swapped: the pinned host key must detect this."""
     text = (lab / "ssh.conf").read_text(encoding="utf-8")
     (lab / "swapped.conf").write_text(text.replace("%n", "air-1"), encoding="utf-8")
     done = subprocess.run(
@@ -149,30 +149,30 @@ def test_ssh_refuses_a_robot_with_another_host_key(lab: Path) -> None:
     assert "Host key verification failed" in done.stderr
 
 
-def test_robots_hear_each_other_over_their_radio(lab: Path) -> None:
-    said = fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "2", "-i", "0.2", "air-1").out
-    assert "2 packets transmitted, 2 received" in said
+def test_robots_reach_each_other_over_their_radio(lab: Path) -> None:
+    output = fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "2", "-i", "0.2", "air-1").out
+    assert "2 packets transmitted, 2 received" in output
 
 
-def test_a_robot_that_is_moved_away_is_heard_no_more_until_it_is_back(lab: Path) -> None:
-    """By exponent 3 and 17 dBm the weakest frame that is detected, of -82 dBm, comes from 91 m."""
-    here = folder.of_directory(lab)
+def test_a_robot_that_is_moved_away_is_unreachable_until_it_is_back(lab: Path) -> None:
+    """With exponent 3 and 17 dBm, the weakest detectable frame of -82 dBm comes from 91 m."""
+    lab_folder = folder.of_directory(lab)
     assert fieldkit(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
     moved = fieldkit(lab, "lab", "move", "air-1", "--by", "-100m", "-0.1km", "100m")
     assert moved.out == "air-1 is at 102.5, 97.5, 100.2 (m east, north, up)\n"
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "3", "-i", "0.2", "-W", "1", "air-1").code == 1
-    above = client.overview(here)
+    above = client.overview(lab_folder)
     assert above.robots == {"ground-1": (197.5, 197.5), "air-1": (102.5, 97.5)}
     assert not above.links[0].linked
     assert fieldkit(lab, "lab", "plot").out == "lab.svg\n"
     assert f">{above.links[0].snr_db:.0f} dB<" in (lab / "lab.svg").read_text(encoding="utf-8")
     assert fieldkit(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
-    assert client.state(here).robots[1].place_m == (207.5, 197.5, 0.2)
+    assert client.state(lab_folder).robots[1].place_m == (207.5, 197.5, 0.2)
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "1", "-w", "30", "-i", "0.2", "air-1").code == 0
 
 
 def ahead_m(lab: Path) -> float:
-    """Return the median range of the beam ahead of ground-1, in 2 s of its laser."""
+    """Return the median range of the beam ahead of ground-1, over 2 s of its laser."""
     record = "source /opt/ros/noetic/setup.bash && rosbag record --duration=2 -O scan /scan"
     plain(lab, "ssh", "-F", "ssh.conf", "ground-1", record)
     plain(lab, "scp", "-F", "ssh.conf", "ground-1:scan.bag", ".")
@@ -184,17 +184,17 @@ def ahead_m(lab: Path) -> float:
 
 
 def test_another_robot_reflects_the_laser_and_the_range_follows_it(lab: Path) -> None:
-    """The cylinder of a Duckiedrone has a radius of 0.2 m; beam 0 points east, as the robot does."""
+    """The cylinder of a Duckiedrone has a radius of 0.2 m; beam 0 points east, like the robot."""
     for east_m in (199.5, 200.5):
         assert fieldkit(lab, "lab", "move", "air-1", "--to", f"{east_m}m", "197.5m").code == 0
-        # Of the median of 8 scans or more with noise of 0.015 m.
+        # Standard error of the median of 8 or more scans with noise of 0.015 m.
         assert ahead_m(lab) == pytest.approx(east_m - 197.5 - 0.2, abs=0.05)
     assert fieldkit(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
     assert ahead_m(lab) == math.inf
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output"),
     [
         ("ari-1 --to 1m 1m", "there is no robot 'ari-1' in this lab\n  remedy: did you mean 'air-1'?"),
         (
@@ -211,15 +211,15 @@ def test_another_robot_reflects_the_laser_and_the_range_follows_it(lab: Path) ->
         ("air-1", "one of the arguments --to --by is required"),
     ],
 )
-def test_a_move_that_cannot_be_leaves_the_robot_where_it_is(
-    lab: Path, words: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_an_invalid_move_does_not_move_the_robot(
+    lab: Path, words: str, output: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(lab)
-    here = folder.of_directory(lab)
-    before = client.state(here).robots
+    lab_folder = folder.of_directory(lab)
+    before = client.state(lab_folder).robots
     assert main(["lab", "move", *words.split()]) == 2
-    assert said in capsys.readouterr().err
-    assert [one.place_m for one in client.state(here).robots] == [one.place_m for one in before]
+    assert output in capsys.readouterr().err
+    assert [robot.place_m for robot in client.state(lab_folder).robots] == [robot.place_m for robot in before]
 
 
 def test_a_command_in_a_shell_keeps_its_exit_code(lab: Path) -> None:
@@ -238,38 +238,38 @@ def test_a_shell_has_a_terminal(lab: Path) -> None:
     )
     os.close(theirs)
     os.write(ours, b"tty; hostname; exit\n")
-    said = b""
-    with contextlib.suppress(OSError):  # EIO: nobody is at the other end any more
+    output = b""
+    with contextlib.suppress(OSError):  # EIO: the other end is closed
         while data := os.read(ours, 4096):
-            said += data
+            output += data
     os.close(ours)
     assert shell.wait(WITHIN_S) == 0
-    assert b"/dev/pts/" in said
-    assert b"\nground-1" in said
+    assert b"/dev/pts/" in output
+    assert b"\nground-1" in output
 
 
-def test_what_reaches_the_robots_is_closed_to_others(lab: Path) -> None:
-    here = folder.of_directory(lab)
-    assert stat.S_IMODE(here.path.stat().st_mode) == 0o700
-    for path in (here.socket, here.key):
+def test_sockets_and_keys_of_the_robots_are_closed_to_other_users(lab: Path) -> None:
+    lab_folder = folder.of_directory(lab)
+    assert stat.S_IMODE(lab_folder.path.stat().st_mode) == 0o700
+    for path in (lab_folder.socket, lab_folder.key):
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
-def test_a_second_lab_in_a_directory_is_refused(lab: Path) -> None:
+def test_a_second_lab_in_a_directory_is_rejected(lab: Path) -> None:
     second = fieldkit(lab, "lab", "up")
     assert second.code == 2
     assert "this directory has a lab that is up\n  remedy: fieldkit lab down" in second.err
     assert "air-1" in fieldkit(lab, "lab", "ps").out
 
 
-def test_a_robot_that_is_not_there(lab: Path) -> None:
+def test_an_unknown_robot_is_rejected(lab: Path) -> None:
     shell = fieldkit(lab, "lab", "shell", "groud-1")
     assert shell.code == 2
     assert "there is no robot 'groud-1' in this lab\n  remedy: did you mean 'ground-1'?" in shell.err
 
 
 @pytest.mark.parametrize("request_", ["move", "move air-1", "move air-1 {}", "move air-1 []", "what", ""])
-def test_a_client_that_talks_nonsense_is_left_without_an_answer(lab: Path, request_: str) -> None:
+def test_an_invalid_request_gets_no_response(lab: Path, request_: str) -> None:
     with socket.socket(socket.AF_UNIX) as confused:
         confused.connect(str(folder.of_directory(lab).socket))
         confused.sendall(f"{request_}\n".encode())
@@ -277,7 +277,7 @@ def test_a_client_that_talks_nonsense_is_left_without_an_answer(lab: Path, reque
     assert len(client.state(folder.of_directory(lab)).robots) == 2
 
 
-def test_a_client_that_says_nothing_holds_up_nobody_for_long(lab: Path) -> None:
+def test_a_silent_client_does_not_block_others_for_long(lab: Path) -> None:
     with socket.socket(socket.AF_UNIX) as silent:
         silent.connect(str(folder.of_directory(lab).socket))
         assert "air-1" in fieldkit(lab, "lab", "ps").out
@@ -291,8 +291,8 @@ def test_down_leaves_nothing(tmp_path: Path, untouched: Untouched) -> None:
     lived = {process} | descendants(process)
     assert len(lived) > 4 * 3
     state = client.state(folder.of_directory(tmp_path))
-    assert [one.name for one in state.robots] == ["robot-1", "robot-2", "robot-3", "robot-4"]
-    assert {one.profile for one in state.robots} == {"duckiedrone"}
+    assert [robot.name for robot in state.robots] == ["robot-1", "robot-2", "robot-3", "robot-4"]
+    assert {robot.profile for robot in state.robots} == {"duckiedrone"}
     assert fieldkit(tmp_path, "lab", "down").out == "the robots are down\n"
     wait_for_end(lived, within_s=0.0)
     untouched()
@@ -325,7 +325,7 @@ def test_a_lab_in_the_foreground_ends_with_ctrl_c(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("robots", [(), ("--robots", "1")])
-def test_control_over_the_radio_is_for_trials_and_a_lab_says_so(tmp_path: Path, robots: tuple[str, ...]) -> None:
+def test_a_lab_rejects_control_over_the_radio(tmp_path: Path, robots: tuple[str, ...]) -> None:
     (tmp_path / "fieldkit.yaml").write_text(f"control: radio\n{SITE}", encoding="utf-8")
     up = fieldkit(tmp_path, "lab", "up", *robots)
     assert up.code == 0, up.err
@@ -338,7 +338,7 @@ def test_control_over_the_radio_is_for_trials_and_a_lab_says_so(tmp_path: Path, 
         assert fieldkit(tmp_path, "lab", "down").code == 0
 
 
-def test_a_lab_that_cannot_come_up_says_why_in_the_terminal(tmp_path: Path) -> None:
+def test_a_lab_that_cannot_start_reports_the_reason_in_the_terminal(tmp_path: Path) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE.replace("duckiedrone", "nodrone"), encoding="utf-8")
     up = fieldkit(tmp_path, "lab", "up")
     assert up.code == 2

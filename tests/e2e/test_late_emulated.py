@@ -1,4 +1,4 @@
-"""A repeat in which the emulator was late is no measurement."""
+"""A repeat in which the emulator was too late is not a measurement."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from tests.helpers.runs import fieldkit, only_trial, rows
 pytestmark = pytest.mark.emulated
 
 
-def test_a_repeat_later_than_the_bound_does_not_count(tmp_path: Path) -> None:
+def test_a_repeat_with_excessive_lateness_does_not_count(tmp_path: Path) -> None:
     lab = make_lab(tmp_path / "late", "{}\n  late_bound: 0.001ms")
     procedure = lab / "procedures" / "quick.yaml"
     procedure.write_text(

@@ -1,4 +1,4 @@
-"""What radios tell of their links, from the outside: beside captures, the kernel's counters and the air itself."""
+"""Link statistics of radio drivers, end to end: compared with captures, the kernel's counters and the air log."""
 
 import csv
 import re
@@ -20,14 +20,15 @@ roles:
 emulated:
   ros: builtin
   record_air: true
-  # Without fading the same 23.1 dB each time, which is too little for n7: of frames of 1,500 bytes half are lost, of
-  # 500 a fifth. That a repeat of 11 and 20 of them sends none again has a chance of one in 10,000 at most.
+  # Without fading the SNR is always 23.1 dB, too little for n7: half of the frames of 1,500 bytes are lost, and a
+  # fifth of those of 500 bytes. The probability that repeats of 11 and 20 frames need no retry is at most one in
+  # 10,000.
   radio: {mode: n7, fading: false, noise_floor_dbm: -84.2}
 """
 
 
 def kernel_packets(folder: Path, role: str) -> dict[str, int]:
-    """Return how many packets the kernel says crossed the interface during the repeat."""
+    """Return the kernel's packet counts of the interface during the repeat."""
     moments = []
     for moment in ("before", "after"):
         text = (folder / f"{role}-{moment}.txt").read_text(encoding="utf-8")
@@ -38,7 +39,7 @@ def kernel_packets(folder: Path, role: str) -> dict[str, int]:
     return {way: moments[1][way] - moments[0][way] for way in ("rx", "tx")}
 
 
-def test_radios_kernels_captures_and_the_air_count_the_same(tmp_path: Path) -> None:
+def test_radios_kernels_captures_and_the_air_log_have_equal_counts(tmp_path: Path) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     run = fieldkit(tmp_path, "trial", "los", "60ft", "--topology", "masterless", "--repeats", "1", "--record", "1s")
     assert run.code == 0, run.err + run.out
@@ -52,14 +53,16 @@ def test_radios_kernels_captures_and_the_air_count_the_same(tmp_path: Path) -> N
         assert air
         for role, other in (("sender", "receiver"), ("receiver", "sender")):
             kernel, mine = kernel_packets(folder, role), [line for line in air if line["transmitter"] == row[role]]
-            told = {
+            driver_counts = {
                 name: int(row[f"{role}_{name}"]) for name in ("radio_tx_packets", "radio_rx_packets", "tx_retries")
             }
-            assert kernel == {"tx": told["radio_tx_packets"], "rx": told["radio_rx_packets"]}
-            assert told["radio_tx_packets"] + told["radio_rx_packets"] == int(row[f"{role}_captured"])
-            assert told["radio_tx_packets"] == sum(line["attempt"] == "1" for line in mine)
-            assert told["tx_retries"] == sum(line["attempt"] != "1" for line in mine)
-            assert told["radio_tx_packets"] - int(row[f"{other}_radio_rx_packets"]) >= 0
+            assert kernel == {"tx": driver_counts["radio_tx_packets"], "rx": driver_counts["radio_rx_packets"]}
+            assert driver_counts["radio_tx_packets"] + driver_counts["radio_rx_packets"] == int(
+                row[f"{role}_captured"]
+            )
+            assert driver_counts["radio_tx_packets"] == sum(line["attempt"] == "1" for line in mine)
+            assert driver_counts["tx_retries"] == sum(line["attempt"] != "1" for line in mine)
+            assert driver_counts["radio_tx_packets"] - int(row[f"{other}_radio_rx_packets"]) >= 0
             assert float(row[f"{role}_signal_min_dbm"]) <= float(row[f"{role}_signal_median_dbm"]) < -40
             assert float(row[f"{role}_tx_rate_bit_s"]) == 65e6
             assert 0 < float(row[f"{role}_busy_share"]) < 1

@@ -1,4 +1,4 @@
-"""iperf3, soak and run on emulated robots without ROS: figures beside our captures', and what goes wrong."""
+"""iperf3, soak and run on emulated robots without ROS: results compared with captures, and errors."""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -30,7 +30,7 @@ attempts: 1
 steps:
 """
 
-# Out of the job's group, which ends with it: the job ends when that is done.
+# The program leaves the job's process group, which ends with the job.
 KILL_SOON = """  - run:
       robot: ROBOT
       argv:
@@ -56,7 +56,13 @@ def load(protocol: str, rate: str) -> str:
 
 def trials(labs: dict[str, Path]) -> dict[str, Run]:
     with ThreadPoolExecutor(4) as pool:
-        return dict(zip(labs, pool.map(lambda one: fieldkit(one, "trial", "own", "5m"), labs.values()), strict=True))
+        return dict(
+            zip(
+                labs,
+                pool.map(lambda lab_folder: fieldkit(lab_folder, "trial", "own", "5m"), labs.values()),
+                strict=True,
+            )
+        )
 
 
 FLOWS = {
@@ -80,7 +86,7 @@ def flows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]
     }
     for run in trials(labs).values():
         assert run.code == 0, run.err + run.out
-    return {name: rows(only_trial(one))[-1] for name, one in labs.items()}
+    return {name: rows(only_trial(lab_folder))[-1] for name, lab_folder in labs.items()}
 
 
 @pytest.mark.parametrize("name", FLOWS)
@@ -98,13 +104,13 @@ def test_iperf3_and_captures_agree_on_the_loss(flows: dict[str, dict[str, str]],
     row = flows[name]
     own, captured = float(row["iperf3_loss"]), float(row["iperf3_captured_loss"])
     percent = {"udp-lossy": 10, "udp-reverse": 5}[name]
-    # iperf3 learns nothing of datagrams that it loses at the very end.
+    # iperf3 does not count datagrams that are lost at the very end.
     assert abs(own - captured) <= 0.02 * percent / 100 + 1e-9
     assert abs(captured - percent / 100) < 0.04
     assert row["iperf3_retransmits"] == ""
 
 
-def test_what_the_radio_lost_of_tcp_was_sent_again(flows: dict[str, dict[str, str]]) -> None:
+def test_tcp_retransmitted_the_losses_of_the_radio(flows: dict[str, dict[str, str]]) -> None:
     assert float(flows["tcp"]["iperf3_captured_loss"]) == 0
     lossy = flows["tcp-lossy"]
     assert 0.005 < float(lossy["iperf3_captured_loss"]) < 0.05
@@ -118,7 +124,7 @@ WRONG = {
     "limit": "  - iperf3: {from: sender, to: receiver, rate: 1Mbit/s, size: 5MB, limit: 2s}\n",
     "load-killed": (
         "  - soak: {from: sender, to: receiver, during: [run: {robot: sender, "
-        # Until that is on record: a load that ends while fieldkit ends it is no fault.
+        # Until this is on record: a load that ends while fieldkit stops it is not an error.
         "command: sh -c 'kill -KILL $(pidof iperf3); until test -s .jobs/soak/exit; do sleep 0.05; done'}]}\n"
     ),
     "code": "  - run: {robot: receiver, command: sh -c 'echo no; exit 3'}\n",
@@ -143,7 +149,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Run, Path
 
 
 @pytest.mark.parametrize("name", REASONS)
-def test_what_went_wrong_is_told_and_no_repeat_is_valid(wrong: dict[str, tuple[Run, Path]], name: str) -> None:
+def test_errors_are_reported_and_no_repeat_is_valid(wrong: dict[str, tuple[Run, Path]], name: str) -> None:
     run, folder = wrong[name]
     assert run.code == 4, run.err + run.out
     (row,) = rows(only_trial(folder))
@@ -153,7 +159,7 @@ def test_what_went_wrong_is_told_and_no_repeat_is_valid(wrong: dict[str, tuple[R
     assert left.code == 0, left.err
 
 
-def test_a_program_that_is_not_there_is_found_before_the_first_repeat(wrong: dict[str, tuple[Run, Path]]) -> None:
+def test_a_missing_program_is_reported_before_the_first_repeat(wrong: dict[str, tuple[Run, Path]]) -> None:
     run, folder = wrong["missing-program"]
     assert run.code == 3, run.err
     assert "no-such-tool: not found" in run.err

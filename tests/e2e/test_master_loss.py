@@ -1,4 +1,4 @@
-"""Real ROS 1 with one master on the drone: a full repeat of `los`, and what is left when the drone is lost."""
+"""Real ROS 1 with one master on the drone: a complete repeat of `los`, and the effects of losing the drone."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +14,7 @@ from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
 
-# The drone is lost as late as in the shipped ones: on a busy machine a recorder takes 2 s to reach the master.
+# The drone is lost as late as in the shipped procedures: on a busy machine a recorder needs 2 s to reach the master.
 SHORTER = (
     *("duration: 5s, name: before", "duration: 2s, name: before"),
     *("duration: 10s, name: through", "duration: 6s, name: through"),
@@ -23,14 +23,14 @@ SHORTER = (
 
 
 def lab_with_one_master(folder: Path, ros: str = "debian") -> Path:
-    """Give a lab a site file: the paper's robots, ROS's own programs, the master on the drone."""
+    """Write the site file of a lab: the paper's robots, the programs of ROS, the master on the drone."""
     more = f"\nros_master: relay\nemulated: {{ros: {ros}, boot: 0.5s}}\n"
     (folder / "fieldkit.yaml").write_text(DEFAULT_SITE.read_text(encoding="utf-8") + more, encoding="utf-8")
     return folder
 
 
-def lost(lab: Path, procedure: str, *changes: str) -> dict[str, str]:
-    """Run one repeat of a procedure in less time than the shipped one takes; return its row."""
+def run_procedure(lab: Path, procedure: str, *changes: str) -> dict[str, str]:
+    """Run one repeat of a procedure, shorter than the shipped one; return its row."""
     copy_shipped(lab, "procedures", procedure, *SHORTER, *changes)
     run = fieldkit(lab, "trial", procedure, "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
@@ -39,17 +39,17 @@ def lost(lab: Path, procedure: str, *changes: str) -> dict[str, str]:
 
 
 def messages_in(bag: Path) -> tuple[set[str], list[int]]:
-    """Return who published what is in a bag, and when it came in nanoseconds, read with every field."""
+    """Return the publishers of a bag's messages, and their times in nanoseconds, after decoding every field."""
     with AnyReader([bag]) as reader:
-        callers = {getattr(one.ext, "callerid", "") for one in reader.connections}
+        callers = {getattr(connection.ext, "callerid", "") for connection in reader.connections}
         read: list[tuple[int, Any]] = [
-            (at_ns, reader.deserialize(data, one.msgtype)) for one, at_ns, data in reader.messages()
+            (at_ns, reader.deserialize(data, connection.msgtype)) for connection, at_ns, data in reader.messages()
         ]
     assert all(len(scan.ranges) == 360 for _, scan in read)
     return callers, [at_ns for at_ns, _ in read]
 
 
-def test_a_whole_repeat_of_los_with_ros_s_own_master_and_recorder(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_complete_repeat_of_los_with_the_master_and_recorder_of_ros(tmp_path: Path, untouched: Untouched) -> None:
     words = ("trial", "los", "5m", "--repeats", "1", "--record", "2s", "--protocol", "tcp")
     run = fieldkit(lab_with_one_master(tmp_path), *words)
     assert run.code == 0, run.err + run.out
@@ -58,14 +58,14 @@ def test_a_whole_repeat_of_los_with_ros_s_own_master_and_recorder(tmp_path: Path
     assert "turtlebot-1\tROS master\tok\tduckiedrone-1, 10.42.0.3:11311" in preflight
     evidence = only_trial(tmp_path) / "repeats" / "tcp-01"
     callers, came_ns = messages_in(evidence / "scan.bag")
-    assert callers == {"/sensors_turtlebot_1"}, "the built-in recorder knows one robot, and no master"
+    assert callers == {"/sensors_turtlebot_1"}, "the built-in recorder subscribes to one robot, without a master"
     assert 4 <= len(came_ns) <= 11, "2 s at 5 Hz"
     assert (evidence / "recv.bag").read_bytes() == (evidence / "scan.bag").read_bytes()
     untouched()
 
 
-def test_the_drone_is_lost_with_the_master_and_nobody_discovers_anything_any_more(tmp_path: Path) -> None:
-    row = lost(lab_with_one_master(tmp_path), "masterloss", "wait: {duration: 10s}", "wait: {duration: 3s}")
+def test_after_the_loss_of_drone_and_master_nothing_is_discovered(tmp_path: Path) -> None:
+    row = run_procedure(lab_with_one_master(tmp_path), "masterloss", "wait: {duration: 10s}", "wait: {duration: 3s}")
     assert {name: row[f"{name}.bag_discovered"] for name in ("before", "through", "after", "again")} == {
         "before": "true",
         "through": "true",
@@ -74,25 +74,25 @@ def test_the_drone_is_lost_with_the_master_and_nobody_discovers_anything_any_mor
     }
     assert 0 < float(row["before.bag_discovery_s"]) < 2
     assert (row["after.bag_messages"], row["after.bag_discovery_s"], row["after.bag_gap_s"]) == ("0", "", "")
-    assert float(row["drone.reboot_recovery_s"]) >= 0.5, "the drone itself is back, and its master knows nobody"
+    assert float(row["drone.reboot_recovery_s"]) >= 0.5, "the drone is back, and its master has no registrations"
     evidence = only_trial(tmp_path) / "repeats" / "tcp-01"
     _, came_ns = messages_in(evidence / "through.bag")
     assert int(row["through.bag_messages"]) == len(came_ns)
     gap_s = max(later - sooner for sooner, later in pairwise(came_ns)) / 1e9
     assert float(row["through.bag_gap_s"]) >= gap_s - 1e-6
-    assert len(came_ns) >= 10, "6 s at 5 Hz, the drone lost after 3 s: who has its publisher needs no master"
+    assert len(came_ns) >= 10, "6 s at 5 Hz, the drone lost after 3 s: a connected subscriber needs no master"
     assert "the same bytes as before" in fieldkit(tmp_path, "rebuild", str(only_trial(tmp_path))).out
 
 
-def test_without_a_master_the_loss_of_the_drone_changes_nothing(tmp_path: Path) -> None:
-    row = lost(lab_with_one_master(tmp_path), "peerloss")
+def test_without_a_shared_master_the_loss_of_the_drone_has_no_effect(tmp_path: Path) -> None:
+    row = run_procedure(lab_with_one_master(tmp_path), "peerloss")
     assert {row[f"{name}.bag_discovered"] for name in ("before", "through", "after")} == {"true"}
     assert 0 < float(row["after.bag_discovery_s"]) < 2
     assert float(row["drone.reboot_recovery_s"]) >= 0.5
 
 
 def test_a_master_out_of_range_stops_the_trial_before_its_first_repeat(tmp_path: Path) -> None:
-    """It is there when the robots start, side by side."""
+    """The master is in range when the robots start, side by side."""
     run = fieldkit(lab_with_one_master(tmp_path), "trial", "los", "900m", "--repeats", "1", "--protocol", "tcp")
     assert_refused(run, 3, "turtlebot-1: ROS master: no master answers at duckiedrone-1, 10.42.0.3:11311")
 
@@ -102,7 +102,7 @@ def test_robots_with_the_built_in_ros_cannot_share_a_master(tmp_path: Path) -> N
     assert_refused(run, 2, "with Debian's ROS alone")
 
 
-def assert_refused(run: Run, code: int, said: str) -> None:
+def assert_refused(run: Run, code: int, message: str) -> None:
     assert run.code == code, run.err + run.out
-    assert said in run.err
+    assert message in run.err
     assert "remedy: " in run.err

@@ -1,6 +1,6 @@
-"""Six robots in a row of which only neighbours hear each other, with two ways past the middle: one is lost.
+"""Six robots in a row, in which only neighbours are in range, with two routes past the middle; one route is lost.
 
-`fieldkit trial mesh_heal`, and what its row then says.
+`fieldkit trial mesh_heal`, and its row.
 """
 
 from pathlib import Path
@@ -15,8 +15,8 @@ from tests.helpers.runs import fieldkit, only_trial, rows
 pytestmark = pytest.mark.emulated
 
 HELLO_S = 0.3
-# babeld 1.12.1 (neighbour.c): a neighbour of which 12 hellos in a row are missing costs infinity; the first is
-# missing 1.7 intervals after the last one that came, and babeld looks once an interval.
+# babeld 1.12.1 (neighbour.c): the cost of a neighbour is infinite after 12 missing hellos in a row; the first is
+# missing 1.7 intervals after the last received one, and babeld checks once per interval.
 BOUND_S = (1.7 + 11 + 1) * HELLO_S
 
 SITE = f"""\
@@ -38,7 +38,7 @@ emulated:
 """
 
 
-def test_packets_go_another_way_within_babels_bound_and_the_row_says_so(tmp_path: Path) -> None:
+def test_packets_are_rerouted_within_babels_bound_and_the_row_contains_it(tmp_path: Path) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
@@ -56,14 +56,14 @@ def test_packets_go_another_way_within_babels_bound_and_the_row_says_so(tmp_path
     run = fieldkit(tmp_path, "trial", "mesh_heal", "220m", "--repeats", "1")
     assert run.code == 0, run.out + run.err
     trial = only_trial(tmp_path)
-    row = next(one for one in rows(trial) if one["status"] == "valid")
+    row = next(row for row in rows(trial) if row["status"] == "valid")
     gap_s, lost = float(row["rtt_gap_s"]), int(row["rtt_gap_lost"])
     assert HELLO_S < gap_s < BOUND_S
     assert lost == int(row["rtt_sent"]) - int(row["rtt_received"])
     assert gap_s == pytest.approx((lost + 1) * 0.1, abs=0.3)
     folder = trial / "repeats" / "udp-01"
-    # Three robots forward on either way, so nobody hears farther than its neighbours; packets of the way that was not
-    # lost are in the capture of the robot there.
+    # Three robots forward on either route, so only neighbours are in range; packets of the remaining route are in the
+    # capture of the robot there.
     assert (folder / "ping.txt").read_text(encoding="utf-8").count("ttl=61") == int(row["rtt_received"])
     packets = pcap.read(folder / "middle.pcap").packets
     assert (packets.protocol == ICMP).any()

@@ -1,4 +1,4 @@
-"""The figures of docs/studies/middleware.md say what its tables say, with the number of samples and intervals."""
+"""The figures of docs/studies/middleware.md equal its tables, including the numbers of samples and intervals."""
 
 import re
 
@@ -38,7 +38,7 @@ def test_a_bimodal_loss_is_marked_wherever_it_is_in_the_tables() -> None:
     marked = [line for line in page.splitlines() if line.startswith("|") and "*" in line]
     assert [line.split("|")[1:4] for line in marked] == [[" 1 MB ", " reliable ", " Zenoh "]]
     assert marked[0].count(" * |") == 4
-    # The same tables are written again: with the marks, and the note that explains them.
+    # The tables are written again, with the marks and the note that explains them.
     written = list(middleware.tables(MiddlewareFindings(middleware_page.cells(PAGE), "", 0.0, 0.0), ""))
     assert marked[0] in written
     assert middleware.BIMODAL_NOTE in written
@@ -56,7 +56,7 @@ def test_the_interval_counts_samples_within_half_a_second_as_one(size_bytes: int
     assert (low, high) == pytest.approx((max(centre - half, 0.0), min(centre + half, 1.0)), abs=1e-9)
 
 
-def test_the_intervals_that_the_page_quotes_are_those_of_its_table() -> None:
+def test_the_intervals_quoted_on_the_page_are_those_of_its_table() -> None:
     by_cell = {
         (cell.middleware, cell.kind, cell.size_bytes, cell.robots, cell.distance_m): cell
         for cell in middleware_page.cells(PAGE)
@@ -73,4 +73,4 @@ def test_the_intervals_that_the_page_quotes_are_those_of_its_table() -> None:
         assert cell.loss_high is not None
         assert f"{100 * cell.loss:.0f} % [{100 * cell.loss_low:.0f}, {100 * cell.loss_high:.0f}]" == quoted
         assert quoted in text
-    assert "95 % [76, 99]" not in text  # of Zenoh's images, of which two repeats give no rate
+    assert "95 % [76, 99]" not in text  # Zenoh's images, for which two repeats have no rate

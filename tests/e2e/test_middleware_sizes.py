@@ -1,4 +1,4 @@
-"""A sample of the shipped campaign of message sizes on a link of known loss, and what is recommended by it."""
+"""A sample of the shipped campaign of message sizes on a link of known loss, and the settings recommended by it."""
 
 import re
 from pathlib import Path
@@ -18,7 +18,9 @@ REPEATS = 2
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with trials of the shipped procedure, of its smallest samples, tuned, and what blocks alone."""
+    """Return a folder with trials of the shipped procedure, restricted to its smallest samples, tuned settings and
+    blocking.
+    """
     home = tmp_path_factory.mktemp("sizes")
     text = (ROOT / "procedures" / "middleware_sizes.yaml").read_text(encoding="utf-8")
     text = text.replace("name: middleware_sizes", "name: sizes_sample", 1).replace("[last, all]", "[all]")
@@ -35,7 +37,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def test_what_passed_is_written_with_its_evidence(measured: Path) -> None:
+def test_recommended_settings_are_written_with_their_evidence(measured: Path) -> None:
     out = measured / "passed"
     words = ("middleware", "recommend", "trials", "-o", str(out), "--repeats", str(REPEATS), "--max-loss", "20%")
     run = fieldkit(measured, *words)
@@ -80,7 +82,7 @@ def test_the_shipped_campaigns_can_run(tmp_path: Path, loss: int) -> None:
     assert "0 of 1 trials are done" in run.out
 
 
-def test_the_shipped_collapse_is_a_procedure_that_can_run(tmp_path: Path) -> None:
+def test_the_shipped_collapse_procedure_can_run(tmp_path: Path) -> None:
     (tmp_path / "procedures").mkdir()
     text = (EXAMPLE / "procedures" / "collapse.yaml").read_text(encoding="utf-8")
     (tmp_path / "procedures" / "collapse.yaml").write_text(text, encoding="utf-8")
@@ -93,7 +95,7 @@ def test_the_shipped_collapse_is_a_procedure_that_can_run(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("option", "value"), [("--max-loss", "101%"), ("--share", "100%"), ("--share", "0%"), ("--repeats", "1")]
 )
-def test_what_no_repeat_can_show_is_refused(tmp_path: Path, option: str, value: str) -> None:
+def test_impossible_criteria_are_rejected(tmp_path: Path, option: str, value: str) -> None:
     run = fieldkit(tmp_path, "middleware", "recommend", ".", "-o", "config", option, value)
     assert run.code == 2, run.out
     assert option in run.err

@@ -1,4 +1,6 @@
-"""Cells of the fault matrix of moving robots: each party and each fault once, within bounds (docs/stopping.md)."""
+"""Cells of the fault matrix of moving robots: each failing part and each fault once, within bounds
+(docs/stopping.md).
+"""
 
 import os
 import subprocess
@@ -36,14 +38,14 @@ IN_CI = (
     "copter/pilot+guard/suspend/there",
     "copter/operator/ctrl-c/back",
 )
-"""Cells of the sample that CI runs; the others are left to `make nightly`."""
+"""Cells of the sample in CI; `make nightly` runs the others."""
 AT_NIGHT = tuple(name for name in SAMPLE if name not in IN_CI)
 JOBS = 3
 LIMIT_S = 600
 
 
 def outcomes_of(names: Sequence[str], folder: Path) -> dict[str, MotionOutcome]:
-    """Run the command once for several cells, which mostly wait."""
+    """Run the command once for several cells, as trials mostly wait."""
     results = folder / "results.jsonl"
     words = ("--cells", ",".join(names), "--jobs", str(JOBS), "--results", str(results))
     done = subprocess.run(
@@ -73,16 +75,16 @@ def outcomes_at_night(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Mot
 @pytest.mark.emulated
 @pytest.mark.quiet  # the bounds hold on a machine that is not overloaded
 @pytest.mark.parametrize("name", IN_CI)
-def test_a_robot_stops_within_the_bounds_and_does_not_move_again(
-    name: str, outcomes: dict[str, MotionOutcome]
-) -> None:
+def test_a_robot_stops_within_the_bounds_and_stays_at_rest(name: str, outcomes: dict[str, MotionOutcome]) -> None:
     assert outcomes[name].problems == (), outcomes[name]
 
 
 @pytest.mark.emulated
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", AT_NIGHT)
-def test_so_does_a_robot_of_the_rest_of_the_sample(name: str, outcomes_at_night: dict[str, MotionOutcome]) -> None:
+def test_a_robot_of_the_nightly_sample_stops_within_the_bounds(
+    name: str, outcomes_at_night: dict[str, MotionOutcome]
+) -> None:
     assert outcomes_at_night[name].problems == (), outcomes_at_night[name]
 
 

@@ -1,4 +1,4 @@
-"""Emulated robots without root: a whole trial by an ordinary user, and each thing that this user may lack."""
+"""Emulated robots without root: a complete trial by an ordinary user, and each permission that the user may lack."""
 
 import csv
 import signal
@@ -53,7 +53,7 @@ cmp there back
 [ -z "$(find /tmp /var/tmp /dev/shm /run -user {ordinary_user.NAME})" ]
 """
 
-# As the user, in a user namespace of its own where no other may be made: the setting is one of each namespace.
+# Run as the user in a separate user namespace in which no other can be created; the setting is per namespace.
 NO_MORE = 'echo 0 > /proc/sys/user/max_user_namespaces; exec "$@"'
 IN_A_FULL_NAMESPACE = ("unshare", "--user", "--map-current-user", "--keep-caps", "--", "sh", "-c", NO_MORE, "sh")
 
@@ -94,11 +94,11 @@ def run(*words: str, change: str = "") -> Run:
     return finish(start(*words, change=change))
 
 
-def test_a_whole_trial_of_an_ordinary_user(untouched: Untouched) -> None:
+def test_a_complete_trial_of_an_ordinary_user(untouched: Untouched) -> None:
     done = run("sh", "-e", "-c", WHOLE, "sh", *FIELDKIT)
     assert done.code == 0, done.err
-    said, _, content = done.out.partition(BEFORE_THE_TABLE)
-    assert "2 valid" in said
+    output, _, content = done.out.partition(BEFORE_THE_TABLE)
+    assert "2 valid" in output
     tcp, udp = csv.DictReader(content.strip().splitlines())
     for row in (tcp, udp):
         assert row["status"] == "valid"
@@ -117,7 +117,7 @@ def test_a_lab_of_an_ordinary_user(untouched: Untouched) -> None:
     untouched()
 
 
-def test_kill_9_of_an_ordinary_user_s_trial_leaves_nothing(untouched: Untouched) -> None:
+def test_kill_9_of_an_ordinary_users_trial_leaves_nothing(untouched: Untouched) -> None:
     process = start(*FIELDKIT, *TRIAL, "--json")
     wait_for_line(process, '"transfer"')
     family = descendants(process.pid)
@@ -129,12 +129,12 @@ def test_kill_9_of_an_ordinary_user_s_trial_leaves_nothing(untouched: Untouched)
     untouched()
 
 
-def test_the_page_lists_what_is_tested() -> None:
+def test_the_page_lists_the_tested_errors() -> None:
     assert list(table("On this machine")) == list(LACKS)
 
 
 @pytest.mark.parametrize("row", table("On this machine").values(), ids=lambda row: row.situation)
-def test_what_an_ordinary_user_lacks_is_one_message_with_a_remedy(row: Row) -> None:
+def test_a_missing_permission_gives_one_message_with_a_remedy(row: Row) -> None:
     within = IN_A_FULL_NAMESPACE if "kernel that forbids" in row.situation else ()
     done = run(*within, *FIELDKIT, *TRIAL, change=LACKS[row.situation])
     check(row, done.code, done.err)

@@ -1,4 +1,6 @@
-"""Robots in roles of a procedure's own: placed, measured, told in the table; those of others are left alone."""
+"""Robots in custom roles of a procedure: placed, measured and listed in the table; robots without a role are not
+used.
+"""
 
 from pathlib import Path
 
@@ -48,7 +50,7 @@ def lab(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_robot_in_a_role_of_its_own_takes_part(lab: Path) -> None:
+def test_a_robot_in_a_custom_role_takes_part(lab: Path) -> None:
     assert fieldkit(lab, "trial", "rivals", "10m").code == 0
     trial = only_trial(lab)
     (row,) = rows(trial)
@@ -58,7 +60,7 @@ def test_a_robot_in_a_role_of_its_own_takes_part(lab: Path) -> None:
     assert row["receiver_captured"] == "10"
     attempt = trial / "repeats" / "tcp-01"
     assert {path.name for path in attempt.glob("*.pcap")} == {"receiver.pcap", "rival.pcap"}
-    places_m = {one.role: one.position_m for one in track.read(attempt / "track.csv")}
+    places_m = {point.role: point.position_m for point in track.read(attempt / "track.csv")}
     east_m, north_m, up_m = places_m[Role.RECEIVER] or (0.0, 0.0, 0.0)
     assert places_m == {
         Role.SENDER: (east_m - 10.0, north_m, up_m),
@@ -67,7 +69,7 @@ def test_a_robot_in_a_role_of_its_own_takes_part(lab: Path) -> None:
     }
 
 
-def test_a_robot_that_nobody_plays_is_named_before_anything_starts(lab: Path) -> None:
+def test_an_unassigned_role_is_reported_before_anything_starts(lab: Path) -> None:
     (lab / "fieldkit.yaml").write_text(SITE.replace("rival: turtlebot-2, ", ""), encoding="utf-8")
     done = fieldkit(lab, "trial", "rivals", "10m")
     assert done.code == 2

@@ -1,4 +1,4 @@
-"""Pages are short, use terms that they introduce, and name commands that exist."""
+"""Pages are short, introduce their terms, and name existing commands."""
 
 import ast
 import re
@@ -38,10 +38,10 @@ def untested_commands(page: Path) -> Iterator[str]:
     """Yield fieldkit commands of indented blocks and tables, which no other test runs."""
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     lines = re.sub(r"\\\n\s*", " ", text).splitlines()
-    found = [line.strip() for line in lines if re.match(r" {4,}fieldkit [a-z-]", line)]
+    commands = [line.strip() for line in lines if re.match(r" {4,}fieldkit [a-z-]", line)]
     if page.name == "cheat-sheet.md":
-        found += IN_TABLE.findall(text)
-    for command in found:
+        commands += IN_TABLE.findall(text)
+    for command in commands:
         yield END_OF_COMMAND.split(command)[0]
 
 
@@ -58,7 +58,7 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_the_parser_accepts_a_command_that_is_not_run(command: str) -> None:
+def test_the_parser_accepts_commands_that_no_test_runs(command: str) -> None:
     arguments = words(command)
     if arguments[0] in EXTERNAL:
         pytest.skip("a command of another package")
@@ -71,11 +71,11 @@ def test_the_parser_refuses_a_wrong_option() -> None:
 
 
 @pytest.mark.parametrize("page", HAND_WRITTEN, ids=page_id)
-def test_a_hand_written_page_is_short(page: Path) -> None:
+def test_a_hand_written_page_has_a_limited_length(page: Path) -> None:
     assert page.stat().st_size <= LONGEST_BYTES
 
 
-def test_all_hand_written_pages_together_are_short() -> None:
+def test_all_hand_written_pages_have_a_limited_total_length() -> None:
     assert sum(page.stat().st_size for page in HAND_WRITTEN) <= TOTAL_BYTES
 
 
@@ -91,14 +91,14 @@ def test_the_paper_is_introduced_where_it_is_first_mentioned(page: Path) -> None
     mention = re.search(r"\bthe \[?paper\b(?!'s loss \(eq)", text, re.IGNORECASE)
     if mention is None or page.name == "index.md":
         return
-    beginning, found, _ = text.partition(CITATION)
-    assert found, f"{page.name} mentions the paper and has no link to {CITATION}"
+    beginning, citation, _ = text.partition(CITATION)
+    assert citation, f"{page.name} mentions the paper and has no link to {CITATION}"
     mentions_before = re.findall(r"\bthe \[?paper\b", beginning, re.IGNORECASE)
     assert len(mentions_before) <= 2, "the link is in the same paragraph as the first mention"
 
 
 def labels() -> tuple[set[str], set[str]]:
-    """Return the labels of all figures in the code, and of labels with variable parts the longest constant part."""
+    """Return the labels of all figures in the code; for labels with variable parts the longest constant part."""
     whole, parts = set(), set()
     for path in (ROOT / "fieldkit").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -1,4 +1,6 @@
-"""Where robots really stood, from the outside: odometry and satellites beside what the lab knows, and GPX later."""
+"""True positions of robots, end to end: compared with odometry and satellite positions, and with a GPX track added
+later.
+"""
 
 import math
 from collections.abc import Mapping
@@ -49,7 +51,7 @@ steps:
 """
 SPEED_M_S = 2.0
 EARTH_M = 111_319.49, 110_574.28
-"""A degree east, and north, where the world's origin lies: on the equator."""
+"""Metres per degree east and north at the world's origin, on the equator."""
 
 
 @pytest.fixture
@@ -70,58 +72,62 @@ def lab(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def walked(lab: Path) -> Path:
+def run_walk(lab: Path) -> Path:
     """Run the procedure and return the folder of its only trial."""
     run = fieldkit(lab, "trial", "walk", "10m")
     assert run.code == 0, run.out + run.err
     return only_trial(lab)
 
 
-def as_the_lab_knows(trial: Path) -> Separation:
+def true_separation(trial: Path) -> Separation:
     folder = trial / "repeats" / "udp-01"
-    times_ns = [at for one in ping.read(folder / "ping.txt").answers if (at := one.at_utc_ns)]
-    found = track.separation_between(
+    times_ns = [at for echo in ping.read(folder / "ping.txt").answers if (at := echo.at_utc_ns)]
+    measured = track.separation_between(
         track.read(folder / "track.csv"), Role.SENDER, Role.RECEIVER, min(times_ns), max(times_ns)
     )
-    assert found is not None
-    return found
+    assert measured is not None
+    return measured
 
 
-def held_m(trial: Path) -> float:
-    """Return how far the receiver went at most until the lab told the medium again where it is; 0.1 m if in time."""
-    told = track.read(trial / "repeats" / "udp-01" / "track.csv")
-    places = [one.position_m for one in told if one.role is Role.RECEIVER and one.position_m is not None]
+def max_update_distance_m(trial: Path) -> float:
+    """Return the maximum distance moved by the receiver between two updates of the medium; 0.1 m if they were on
+    time.
+    """
+    track_points = track.read(trial / "repeats" / "udp-01" / "track.csv")
+    places = [
+        point.position_m for point in track_points if point.role is Role.RECEIVER and point.position_m is not None
+    ]
     return max(math.dist(*pair) for pair in pairwise(places[:-1])) + 1e-3
 
 
-def as_columns_say(trial: Path) -> Separation:
+def separation_by_columns(trial: Path) -> Separation:
     (row,) = rows(trial)
     assert row["status"] == "valid", row["reason"]
     names = Separation.__dataclass_fields__
     return Separation(*(float(row[f"rtt_{name}"] or "nan") for name in names))
 
 
-def assert_alike(one: Separation, other: Separation, *, within_m: float) -> None:
-    """Both say the same distances, and the same speeds but for corners and noise."""
-    assert astuple(one)[:4] == pytest.approx(astuple(other)[:4], abs=within_m)
-    assert one.relative_speed_m_s == pytest.approx(other.relative_speed_m_s, abs=0.1 * SPEED_M_S)
-    assert one.sender_speed_m_s == other.sender_speed_m_s == 0
+def assert_similar(first: Separation, second: Separation, *, within_m: float) -> None:
+    """Assert that both have the same distances, and the same speeds except for corners and noise."""
+    assert astuple(first)[:4] == pytest.approx(astuple(second)[:4], abs=within_m)
+    assert first.relative_speed_m_s == pytest.approx(second.relative_speed_m_s, abs=0.1 * SPEED_M_S)
+    assert first.sender_speed_m_s == second.sender_speed_m_s == 0
 
 
-def test_odometry_tells_what_the_lab_knows_and_moves_as_the_robot_does(lab: Path) -> None:
-    trial = walked(lab)
+def test_odometry_equals_the_true_positions_and_the_motion_of_the_robot(lab: Path) -> None:
+    trial = run_walk(lab)
     (row,) = rows(trial)
-    error_m = SPEED_M_S * float(row["positions_clock_error_s"]) + held_m(trial)
-    assert_alike(as_columns_say(trial), as_the_lab_knows(trial), within_m=error_m)
+    error_m = SPEED_M_S * float(row["positions_clock_error_s"]) + max_update_distance_m(trial)
+    assert_similar(separation_by_columns(trial), true_separation(trial), within_m=error_m)
     assert row["positions_from"] == "sender as placed, receiver /odom"
 
     folder = trial / "repeats" / "udp-01"
     samples = bag.positions(folder / "track_receiver.bag", "/odom", "")["rows"]
-    ways_m = [math.dist(one[2:4], other[2:4]) for one, other in pairwise(samples)]
-    assert sum(ways_m) == pytest.approx(6.0, abs=0.1), "4 m away and 2 m to the left, a corner cut"
+    steps_m = [math.dist(before[2:4], after[2:4]) for before, after in pairwise(samples)]
+    assert sum(steps_m) == pytest.approx(6.0, abs=0.1), "4 m away and 2 m to the left, a corner cut"
     assert samples[-1][2:4] == pytest.approx([4.0, 2.0])
     assert samples[-1][5] == pytest.approx(math.pi / 2)
-    moving = {round(one[2] + one[3], 3): one[1] for one in samples if 0 < one[2] < 4}
+    moving = {round(sample[2] + sample[3], 3): sample[1] for sample in samples if 0 < sample[2] < 4}
     (first_m, first_ns), (last_m, last_ns) = min(moving.items()), max(moving.items())
     assert (last_m - first_m) / ((last_ns - first_ns) / 1e9) == pytest.approx(SPEED_M_S, rel=0.1)
 
@@ -133,29 +139,29 @@ def test_odometry_tells_what_the_lab_knows_and_moves_as_the_robot_does(lab: Path
     assert listed.endswith(" m, sender as placed, receiver /odom\n")
 
 
-def test_satellites_tell_it_too(lab: Path) -> None:
+def test_satellite_positions_equal_the_true_positions(lab: Path) -> None:
     file = lab / "procedures" / "walk.yaml"
-    place = f"{{lat: {6 / EARTH_M[1]:.9f}, lon: {3 / EARTH_M[0]:.9f}}}"  # where the lawn has its sender
+    place = f"{{lat: {6 / EARTH_M[1]:.9f}, lon: {3 / EARTH_M[0]:.9f}}}"  # position of the sender on the lawn
     robots = f"{{receiver: {{topic: /fix}}, sender: {{at: {place}}}}}"
     file.write_text(WALK.replace("{receiver: {topic: /odom, facing: away}}", robots), encoding="utf-8")
-    trial = walked(lab)
-    known, found = as_the_lab_knows(trial), as_columns_say(trial)
-    # A fix is off by 0.1 m, its extremes by three times that.
-    assert found.distance_mean_m == pytest.approx(known.distance_mean_m, abs=0.15)
-    assert (found.distance_min_m, found.distance_max_m) == pytest.approx(
-        (known.distance_min_m, known.distance_max_m), abs=0.5
+    trial = run_walk(lab)
+    expected, measured = true_separation(trial), separation_by_columns(trial)
+    # A fix has a standard deviation of 0.1 m; extremes deviate by three times that.
+    assert measured.distance_mean_m == pytest.approx(expected.distance_mean_m, abs=0.15)
+    assert (measured.distance_min_m, measured.distance_max_m) == pytest.approx(
+        (expected.distance_min_m, expected.distance_max_m), abs=0.5
     )
 
 
 def gpx(path: Path, where: tuple[TrackPoint, ...], late_s: float) -> None:
-    """Write the way of the receiver as the telephone of somebody would who walks with it, whose clock is late."""
+    """Write the path of the receiver like the phone of an accompanying person, whose clock is late."""
     points = []
-    for one, following in pairwise(one for one in where if one.role is Role.RECEIVER):
-        assert one.position_m is not None
-        place = f'lat="{one.position_m[1] / EARTH_M[1]:.9f}" lon="{one.position_m[0] / EARTH_M[0]:.9f}"'
-        for utc_ns in (*range(one.utc_ns, following.utc_ns - 1_000_000, 200_000_000), following.utc_ns - 1_000_000):
+    for point, following in pairwise(point for point in where if point.role is Role.RECEIVER):
+        assert point.position_m is not None
+        place = f'lat="{point.position_m[1] / EARTH_M[1]:.9f}" lon="{point.position_m[0] / EARTH_M[0]:.9f}"'
+        for utc_ns in (*range(point.utc_ns, following.utc_ns - 1_000_000, 200_000_000), following.utc_ns - 1_000_000):
             at = datetime.fromtimestamp(utc_ns / 1e9 - late_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-            points.append(f"<trkpt {place}><ele>{one.position_m[2]}</ele><time>{at}</time></trkpt>")
+            points.append(f"<trkpt {place}><ele>{point.position_m[2]}</ele><time>{at}</time></trkpt>")
     text = f"<trk><trkseg>{''.join(points)}</trkseg></trk>"
     path.write_text(f'<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1">{text}</gpx>', encoding="utf-8")
 
@@ -164,13 +170,13 @@ def tables(trial: Path) -> Mapping[str, bytes]:
     return {name: (trial / name).read_bytes() for name in ("trial.csv", "summary.csv")}
 
 
-def test_gpx_of_who_walked_along_fills_the_columns_afterwards_and_can_be_forgotten(lab: Path) -> None:
+def test_gpx_of_an_accompanying_person_can_be_added_and_removed_later(lab: Path) -> None:
     without = WALK.replace("  - track:\n", "").replace("      robots: {receiver: {topic: /odom, facing: away}}\n", "")
     without = without.replace("      during:\n        - move:", "  - move:", 1)
     (lab / "procedures" / "walk.yaml").write_text(without, encoding="utf-8")
-    trial = walked(lab)
-    before, known = tables(trial), as_the_lab_knows(trial)
-    assert_alike(as_columns_say(trial), known, within_m=1e-6)
+    trial = run_walk(lab)
+    before, expected = tables(trial), true_separation(trial)
+    assert_similar(separation_by_columns(trial), expected, within_m=1e-6)
     where = track.read(trial / "repeats" / "udp-01" / "track.csv")
     sender = f"sender={6 / EARTH_M[1]:.9f},{3 / EARTH_M[0]:.9f}"
     gpx(lab / "walk.gpx", where, late_s=2.5)
@@ -179,7 +185,7 @@ def test_gpx_of_who_walked_along_fills_the_columns_afterwards_and_can_be_forgott
     assert run.code == 0, run.err
     assert run.out.startswith("changed: trial.csv")
     assert "receiver positions-receiver.gpx" in run.out
-    assert_alike(as_columns_say(trial), known, within_m=held_m(trial))
+    assert_similar(separation_by_columns(trial), expected, within_m=max_update_distance_m(trial))
     assert fieldkit(lab, "verify", str(trial)).code == 0
     assert fieldkit(lab, "positions", str(trial), "--clear").code == 0
     assert tables(trial) == before

@@ -1,4 +1,4 @@
-"""The example suite of docs/pytest.md, by the plugin as a wheel of fieldkit installs it."""
+"""The example suite of docs/pytest.md, with the plugin installed by a wheel of fieldkit."""
 
 import shutil
 import subprocess
@@ -21,7 +21,7 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def example(tmp_path: Path) -> Path:
-    """The example as somebody has it who copied it."""
+    """The example after a user has copied it."""
     return Path(shutil.copytree(EXAMPLE, tmp_path / "teleop", ignore=shutil.ignore_patterns("__pycache__")))
 
 

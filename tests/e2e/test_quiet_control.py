@@ -1,4 +1,4 @@
-"""Nothing crosses a control connection while a transfer or a ping is being measured."""
+"""Nothing crosses a control connection during the measurement of a transfer or a ping."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,7 +24,7 @@ from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.plans import steps_of
 
-# Busy robots answer the command that starts a program while that sends already.
+# Busy robots respond to the command that starts a program when the program already sends.
 pytestmark = [pytest.mark.emulated, pytest.mark.quiet]
 
 FOLDER = ".fieldkit/quiet/one"
@@ -57,7 +57,7 @@ def watch(interface: str, expression: str) -> Job:
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_the_control_connection_is_silent_while_packets_are_measured(
+def test_the_control_connection_is_silent_during_measurements(
     lab: tuple[Testbed, Scene], protocol: Protocol, tmp_path: Path
 ) -> None:
     up, scene = lab
@@ -66,8 +66,8 @@ def test_the_control_connection_is_silent_while_packets_are_measured(
     for role in ENDS:
         jobs.install(up.shells[role], Deadline.after(30))
         evidence.begin(up.shells[role], FOLDER, role, "wlan0")
-        for one in watches:
-            jobs.start(up.shells[role], one)
+        for watch_job in watches:
+            jobs.start(up.shells[role], watch_job)
     up.shells[Role.SENDER].run(
         ("sh", "-c", f"head -c 200000 /dev/zero >{FOLDER}/scan.bag"), deadline=Deadline.after(30)
     )
@@ -77,8 +77,8 @@ def test_the_control_connection_is_silent_while_packets_are_measured(
         step.run(scene, up, lambda name, expected_s: None)
 
     for role in ENDS:
-        for one in watches:
-            jobs.stop(up.shells[role], one, settle=f"{one.name.removeprefix('watch-')}.pcap")
+        for watch_job in watches:
+            jobs.stop(up.shells[role], watch_job, settle=f"{watch_job.name.removeprefix('watch-')}.pcap")
         into = tmp_path / role
         into.mkdir()
         fetching.fetch(up.shells[role], FOLDER, role, "wlan0", into)

@@ -1,4 +1,4 @@
-"""A slow control link costs a trial few round trips: what can go side by side does, and nothing is asked twice."""
+"""A slow control link costs a trial few round trips: independent work is parallel, and nothing is queried twice."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,11 +20,11 @@ from fieldkit.trial.running.runner import run_trial
 
 pytestmark = pytest.mark.emulated
 
-# Longer than threads wait for one another, so that what goes side by side is seen to.
+# Longer than threads wait for each other, so that parallel work is observable.
 ROUND_TRIP_S: Final = 0.3
 PER_REPEAT: Final = 12
 TO_OPEN: Final = 13
-"""To log in, look for the script, put it there, and take one robot after the other."""
+"""Round trips to log in, check for the script, copy it, and lock the robots in order."""
 
 PROCEDURE: Final = """\
 name: trips
@@ -44,7 +44,7 @@ steps:
 """
 
 
-def test_connecting_and_each_repeat_take_few_round_trips_in_sequence(tmp_path: Path) -> None:
+def test_connecting_and_each_repeat_take_few_sequential_round_trips(tmp_path: Path) -> None:
     procedure = schema.validate(schema.parse(PROCEDURE, source="procedure"), Procedure)
     backend = load_backend("emulated", None, None)
     cast = backend.cast(Topology.MASTERLESS)

@@ -1,4 +1,4 @@
-"""Self-healing from the outside: `fieldkit trial selfheal`, real faults, and what its rows then say."""
+"""Self-healing, end to end: `fieldkit trial selfheal`, real faults, and the resulting rows."""
 
 import re
 from pathlib import Path
@@ -14,12 +14,12 @@ from tests.helpers.runs import Run, fieldkit, only_trial, rows
 pytestmark = pytest.mark.emulated
 
 LONG_S = 300.0
-"""On a busy machine all takes longer, but not as long as this."""
+"""Upper bound of recovery times on a busy machine."""
 
-# The ping that is killed ends for ever; the sensors come back; the sender is rebooted while it records.
+# The killed ping never recovers; the sensors restart; the sender is rebooted while it records.
 NEVER = """\
 name: never
-summary: a process that nobody starts again, and steps that a fault makes fail
+summary: a process that is never restarted, and steps that a fault makes fail
 scenario: los
 topology: masterless
 protocols: [tcp]
@@ -43,7 +43,7 @@ steps:
 """
 
 CUT_S = 2.0
-# Flows of every kind: three at a rate, of which the topic starts slowly, then a file.
+# Flows of every kind: three with a rate, of which the topic starts slowly, and a file.
 FLOWS = """\
 name: flows
 summary: the radio is out of range for two seconds while flows of every kind run
@@ -85,8 +85,9 @@ steps:
 expect: [up.transfer_stall_s < 300 ms]
 """
 AGREES_S = 0.5
-"""Within it a flow at a rate has stalled as long as its radio was out of range: an exchange of the time by SSH, the
-time of a command to the testbed on a busy machine, and two sending intervals of 50 ms."""
+"""Tolerance between the stall of a flow with a rate and the time its radio was out of range: a clock query over SSH,
+the duration of a command to the testbed on a busy machine, and two sending intervals of 50 ms.
+"""
 
 HEALS = """\
 name: heals
@@ -122,7 +123,7 @@ def run_procedure(lab: Path, text: str) -> Run:
     return fieldkit(lab, "trial", write_procedure(lab, text), "5m")
 
 
-def test_a_link_and_a_robot_come_back_and_the_rows_say_when(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(tmp_path: Path, untouched: Untouched) -> None:
     run = fieldkit(tmp_path, "trial", "selfheal", "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     assert "ping recovery after link-down, median" in run.out
@@ -144,7 +145,7 @@ def test_a_link_and_a_robot_come_back_and_the_rows_say_when(tmp_path: Path, unto
     untouched()
 
 
-def test_what_never_heals_has_no_times_and_what_fails_inside_a_fault_is_a_result(tmp_path: Path) -> None:
+def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_result(tmp_path: Path) -> None:
     began = Deadline.after(LONG_S)
     run = run_procedure(tmp_path, NEVER)
     assert run.code == 0, run.err + run.out
@@ -167,7 +168,7 @@ def test_what_never_heals_has_no_times_and_what_fails_inside_a_fault_is_a_result
     assert cells["reboot_recovery_s"]["is_lower_bound"] == "false"
 
 
-def test_flows_stall_as_long_as_their_radio_was_out_of_range_and_tcp_longer(tmp_path: Path) -> None:
+def test_flows_stall_for_the_time_out_of_range_and_tcp_longer(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     run = run_procedure(tmp_path, FLOWS)
     trial = only_trial(tmp_path)
@@ -185,7 +186,8 @@ def test_flows_stall_as_long_as_their_radio_was_out_of_range_and_tcp_longer(tmp_
         assert abs(stalled["stall"] - cut_s) < AGREES_S, (paced, stalled, cut_s)
         assert 0 <= float(row[f"{paced}_out_of_range_recovery_s"]) < AGREES_S
         assert int(row[f"{paced}_stalls"]) >= 1
-    # TCP waits for its retransmission time-out, which grew meanwhile: longer than the ping that the fault is seen by.
+    # TCP waits for its retransmission timeout, which has grown during the outage: longer than the ping that measures
+    # it.
     assert float(row["up.transfer_stall_s"]) >= cut_s - AGREES_S
     assert float(row["again.up.transfer_out_of_range_recovery_s"]) > 0
     assert float(row["load.iperf3_captured_jitter_mean_s"]) > 0
@@ -193,7 +195,7 @@ def test_flows_stall_as_long_as_their_radio_was_out_of_range_and_tcp_longer(tmp_
     assert "the same bytes as before" in fieldkit(tmp_path, "rebuild", str(trial)).out
 
 
-def test_a_service_that_is_killed_comes_back(tmp_path: Path) -> None:
+def test_a_killed_service_restarts(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     run = run_procedure(tmp_path, HEALS)
     assert run.code == 0, run.err + run.out
@@ -202,7 +204,7 @@ def test_a_service_that_is_killed_comes_back(tmp_path: Path) -> None:
     assert 0.1 <= float(row["kill_outage_s"]) < LONG_S
 
 
-def test_what_fails_before_the_fault_makes_the_attempt_fail_and_there_is_no_fault(tmp_path: Path) -> None:
+def test_a_failure_before_the_fault_fails_the_attempt_without_a_fault(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     profile = locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8")
     (tmp_path / "robots").mkdir()
@@ -217,13 +219,13 @@ def test_what_fails_before_the_fault_makes_the_attempt_fail_and_there_is_no_faul
     assert not list(only_trial(tmp_path).glob("repeats/*/fault-reboot.txt"))
 
 
-def test_a_fault_that_cannot_be_made_makes_the_attempt_fail(tmp_path: Path) -> None:
+def test_a_fault_that_cannot_be_injected_fails_the_attempt(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     began = Deadline.after(LONG_S)
     recording = "during: [{record: {robot: receiver, topics: [/pidrone/imu], duration: 500s}}]"
     run = run_procedure(tmp_path, HEALS.replace("sensors, after: 0.3s", f"roscore, after: 0.3s, {recording}"))
     assert run.code == 4, run.err + run.out
-    assert not began.expired, "what ran inside was ended"
+    assert not began.expired, "the steps inside the block were ended"
     (row,) = rows(only_trial(tmp_path))
     assert "no process named roscore runs" in row["reason"]
 

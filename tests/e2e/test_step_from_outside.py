@@ -1,4 +1,4 @@
-"""A kind of step from another package: the one of docs/add-a-procedure.md, found by its entry point."""
+"""A step kind of another package: the example of docs/add-a-procedure.md, loaded by its entry point."""
 
 import json
 import os
@@ -33,7 +33,7 @@ Fieldkit = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture
 def fieldkit(tmp_path: Path) -> Fieldkit:
-    """fieldkit beside an installed package with the page's example."""
+    """Return a function that runs fieldkit with the page's example installed."""
     page = PAGE.read_text(encoding="utf-8")
     (source,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (entry,) = re.findall(r'^    \[project\.entry-points\."(.*)"\]\n    (\w+) = "(.*)"$', page, re.MULTILINE)
@@ -57,14 +57,14 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
     return run
 
 
-def test_its_columns_and_commands_are_known(fieldkit: Fieldkit) -> None:
+def test_its_columns_and_commands_are_available(fieldkit: Fieldkit) -> None:
     shown = fieldkit("columns", "show", "route_device")
     assert "Interface to the other robot" in shown.stdout, shown.stderr
     planned = fieldkit("trial", "busy", "5m", "--dry-run")
     assert "route: ip -json route get 10.42.0.1 > route.txt 2> receiver-route.log" in planned.stdout, planned.stderr
 
 
-def test_a_kind_that_is_not_there_is_refused_with_those_that_are(fieldkit: Fieldkit, tmp_path: Path) -> None:
+def test_an_unknown_kind_is_rejected_with_the_available_ones(fieldkit: Fieldkit, tmp_path: Path) -> None:
     path = tmp_path / "procedures" / "busy.yaml"
     path.write_text(PROCEDURE.replace("route:", "rout:"), encoding="utf-8")
     refused = fieldkit("trial", "busy", "5m", "--dry-run")
@@ -74,7 +74,7 @@ def test_a_kind_that_is_not_there_is_refused_with_those_that_are(fieldkit: Field
 
 
 @pytest.mark.emulated
-def test_it_runs_is_judged_measured_and_told(fieldkit: Fieldkit, tmp_path: Path) -> None:
+def test_the_step_runs_and_is_judged_measured_and_reported(fieldkit: Fieldkit, tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     done = fieldkit("trial", "busy", "5m", "--json")
     assert done.returncode == 0, done.stderr
@@ -84,7 +84,7 @@ def test_it_runs_is_judged_measured_and_told(fieldkit: Fieldkit, tmp_path: Path)
     assert (row["status"], row["route_device"]) == ("valid", route["dev"])
     assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
     (folder / "repeats" / "tcp-01" / "route.txt").write_text("[]\n", encoding="ascii")
-    assert fieldkit("rebuild", str(folder)).returncode == 4, "it is not what was summed"
+    assert fieldkit("rebuild", str(folder)).returncode == 4, "its checksum no longer matches"
     (folder / "MANIFEST.sha256").unlink()
     assert fieldkit("rebuild", str(folder)).returncode == 0
     assert rows(folder)[0]["route_device"] == "", "a figure that is not there is empty, and never guessed"

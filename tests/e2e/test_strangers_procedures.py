@@ -1,7 +1,7 @@
-"""Three procedures that a lab writes from the docs alone: what they measure is in every table, with label and unit.
+"""Three procedures that a lab writes with the docs alone: their values are in every table, with label and unit.
 
-Two transfers of two sizes, both ways at once, while two other robots are busy; a robot without ROS that runs a
-vendor's tool with JSON; a range walk that keeps what the operator sees.
+Two transfers of different sizes in opposite directions, while two other robots are busy; a robot without ROS that
+runs a vendor's tool with JSON output; a range walk that records the operator's observations.
 """
 
 import csv
@@ -88,23 +88,23 @@ printf 'words='
 printf '<%s>' "$@"
 printf '\\ncopies=%s\\n' "$(find ../.. -name probe.sh | wc -l)"
 """
-"""What a lab copies to a robot: it prints its arguments, and how many copies of itself are there."""
+"""A program that a lab copies to a robot: it prints its arguments and the number of its copies there."""
 DISTANCES = {"asymmetric": ["10m"], "vendor": ["10m", "20m"], "walk": ["5m", "15m"]}
 ANSWERS = "wet\n3.5\n2\n4\n0\ndry\n1\n-\n2 m/s\n1\n"
 
 
 @dataclass(frozen=True)
-class Stranger:
-    """A lab that has done its trials, and looked at them.
+class LabResults:
+    """The trials and outputs of a lab.
 
     Attributes:
-        trials: The nearest first.
-        said: What its commands printed: `trial`, `aggregate` as CSV, `compare` of the first trial with the last.
-        page: The words of its report.
+        trials: The trials, nearest first.
+        outputs: Outputs of its commands: `trial`, `aggregate` as CSV, `compare` of the first trial with the last.
+        page: The text of its report.
     """
 
     trials: tuple[Path, ...]
-    said: Mapping[str, str]
+    outputs: Mapping[str, str]
     page: str
 
     def rows(self) -> list[dict[str, str]]:
@@ -112,7 +112,7 @@ class Stranger:
         return [row for trial in self.trials for row in rows(trial)]
 
 
-def worked(folder: Path, name: str) -> Stranger:
+def run_lab(folder: Path, name: str) -> LabResults:
     (folder / "robots").mkdir(parents=True)
     (folder / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
@@ -122,68 +122,68 @@ def worked(folder: Path, name: str) -> Stranger:
     (folder / "tools" / "probe.sh").chmod(0o755)
     write_procedure(folder, HEAD.replace("NAME", name) + PROCEDURES[name])
 
-    def says(command: str, *words: str) -> str:
+    def run_command(command: str, *words: str) -> str:
         run = fieldkit(folder, command, *words)
         missed = command == "trial" and "expect:" in PROCEDURES[name]
         assert run.code == (1 if missed else 0), run.err + run.out
         return run.out
 
-    said = {"trial": says("trial", name, *DISTANCES[name], "--answers", "answers.txt")}
+    outputs = {"trial": run_command("trial", name, *DISTANCES[name], "--answers", "answers.txt")}
     trials = tuple(sorted((folder / "trials").iterdir()))
     ends = (str(trials[0]), str(trials[-1]))
-    said["aggregate"] = says("aggregate", "trials", "--format", "csv")
-    said["compare"] = says("compare", *ends, "--by", "protocol")
-    said["table"] = says("aggregate", "trials")
-    said["all"] = says("aggregate", "trials", "--all")
-    says("report", "trials")
-    says("export", ends[0], "--format", "mcap", "-o", "time.mcap")
+    outputs["aggregate"] = run_command("aggregate", "trials", "--format", "csv")
+    outputs["compare"] = run_command("compare", *ends, "--by", "protocol")
+    outputs["table"] = run_command("aggregate", "trials")
+    outputs["all"] = run_command("aggregate", "trials", "--all")
+    run_command("report", "trials")
+    run_command("export", ends[0], "--format", "mcap", "-o", "time.mcap")
     page = (folder / "report.html").read_text(encoding="utf-8")
     words = html.unescape(re.sub(r"<style.*?</style>|<[^>]+>", " ", page, flags=re.DOTALL)).split()
-    return Stranger(trials, said, " ".join(words))
+    return LabResults(trials, outputs, " ".join(words))
 
 
 @pytest.fixture(scope="module")
-def strangers(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Stranger]:
+def lab_results(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, LabResults]:
     base = tmp_path_factory.mktemp("strangers")
     with ThreadPoolExecutor(3) as pool:
-        return dict(zip(PROCEDURES, pool.map(lambda name: worked(base / name, name), PROCEDURES), strict=True))
+        return dict(zip(PROCEDURES, pool.map(lambda name: run_lab(base / name, name), PROCEDURES), strict=True))
 
 
-def test_each_is_about_ten_lines_of_steps() -> None:
+def test_each_procedure_has_about_ten_lines_of_steps() -> None:
     assert all(len(text.partition("steps:\n")[2].splitlines()) <= 12 for text in PROCEDURES.values())
 
 
-def test_both_transfers_are_measured_for_themselves(strangers: Mapping[str, Stranger]) -> None:
-    for row in strangers["asymmetric"].rows():
+def test_both_transfers_are_measured_separately(lab_results: Mapping[str, LabResults]) -> None:
+    for row in lab_results["asymmetric"].rows():
         assert (row["status"], row["others"]) == ("valid", "hearer=box-4 talker=box-3")
         assert (row["up.sent_bytes"], row["down.sent_bytes"]) == ("5000000", "1000000")
         assert (row["up.hash_match"], row["down.hash_match"]) == ("true", "true")
         for name, size_bytes in (("up", 5e6), ("down", 1e6)):
             seconds = float(row[f"{name}.transfer_s"])
             assert float(row[f"{name}.goodput_bit_s"]) == pytest.approx(8 * size_bytes / seconds, rel=0.01)
-        # The load shares the air with them: more than 2 Mbit/s at 65 Mbit/s, preambles apart, and they themselves.
+        # The load shares the air with them: the sum is more than 2 Mbit/s of 65 Mbit/s, without preambles.
         assert float(row["sender_busy_share"]) > 0.1
 
 
-def test_a_vendor_s_tool_fills_columns(strangers: Mapping[str, Stranger]) -> None:
-    one = strangers["vendor"]
-    outputs = [path for trial in one.trials for path in sorted(trial.glob("repeats/*/run.txt"))]
-    for row, output in zip(one.rows(), outputs, strict=True):
+def test_the_output_of_a_vendors_tool_fills_columns(lab_results: Mapping[str, LabResults]) -> None:
+    results = lab_results["vendor"]
+    outputs = [path for trial in results.trials for path in sorted(trial.glob("repeats/*/run.txt"))]
+    for row, output in zip(results.rows(), outputs, strict=True):
         (printed,) = json.loads(output.read_text(encoding="utf-8"))
         assert (row["queue"], row["up"], row["driver"]) == (str(printed["txqlen"]), "true", "tun")
 
 
-def test_a_program_of_the_lab_gets_the_distance_and_the_repeat(strangers: Mapping[str, Stranger]) -> None:
-    one = strangers["vendor"]
-    found = [(row["probe.words"], row["probe.copies"]) for row in one.rows()]
+def test_a_program_of_the_lab_gets_the_distance_and_the_repeat(lab_results: Mapping[str, LabResults]) -> None:
+    results = lab_results["vendor"]
+    values = [(row["probe.words"], row["probe.copies"]) for row in results.rows()]
     wanted = [f"<{at}><no {number}><{{repeat}}><${{distance}}>" for at in ("10m", "20m") for number in (1, 2)]
-    assert found == [(words, "1") for words in wanted], "the copy of each attempt is deleted with it"
-    assert not [path for trial in one.trials for path in trial.rglob("probe.sh")]
+    assert values == [(words, "1") for words in wanted], "the copy of each attempt is deleted after it"
+    assert not [path for trial in results.trials for path in trial.rglob("probe.sh")]
 
 
-def test_what_the_operator_says_is_kept(strangers: Mapping[str, Stranger]) -> None:
-    said = [(row["distance"], row["grass"], row["wind"], row["people"]) for row in strangers["walk"].rows()]
-    assert said == [
+def test_the_answers_of_the_operator_are_stored(lab_results: Mapping[str, LabResults]) -> None:
+    outputs = [(row["distance"], row["grass"], row["wind"], row["people"]) for row in lab_results["walk"].rows()]
+    assert outputs == [
         ("5m", "wet", "3.5", "2"),
         ("5m", "wet", "4", "0"),
         ("15m", "dry", "1", ""),
@@ -208,76 +208,81 @@ LABELS = {
         "rtt_median_s": ("s", "RTT", "RTT, 502-byte ping", "ms"),
     },
 }
-"""Figures by column: unit in files, label, label in the trial's own table (empty where only --all shows it), unit."""
+"""Figures by column: unit in files, label, label in the trial's table (empty if only --all shows it), unit."""
 
 
 @pytest.mark.parametrize("name", PROCEDURES)
-def test_nothing_is_lost_on_the_way_to_the_aggregate(strangers: Mapping[str, Stranger], name: str) -> None:
-    one = strangers[name]
-    cells = list(csv.DictReader(io.StringIO(one.said["aggregate"])))
+def test_the_aggregate_contains_all_values(lab_results: Mapping[str, LabResults], name: str) -> None:
+    results = lab_results[name]
+    cells = list(csv.DictReader(io.StringIO(results.outputs["aggregate"])))
     wanted = {quantity: unit for quantity, (unit, *_) in LABELS[name].items()}
     assert {cell["quantity"]: cell["unit"] for cell in cells}.items() >= wanted.items()
     for cell in cells:
         column, _, _ = cell["quantity"].partition("=")  # a text has a line per word
-        values = [row[column] for row in one.rows() if row["distance"] == cell["distance"]]
+        values = [row[column] for row in results.rows() if row["distance"] == cell["distance"]]
         assert int(cell["n"]) == sum(value != "" for value in values), cell
 
 
 @pytest.mark.parametrize("name", PROCEDURES)
-def test_people_read_labels_and_units(strangers: Mapping[str, Stranger], name: str) -> None:
-    one = strangers[name]
+def test_tables_have_labels_and_units(lab_results: Mapping[str, LabResults], name: str) -> None:
+    results = lab_results[name]
     for _, label, of_operator, unit in LABELS[name].values():
         for table, row in (("trial", of_operator), ("compare", label)):
             lines = [
-                line for line in one.said[table].splitlines() if re.match(rf" {row or label}(, median)?  ", line)
+                line
+                for line in results.outputs[table].splitlines()
+                if re.match(rf" {row or label}(, median)?  ", line)
             ]
             assert bool(lines) is bool(row), (table, label)
             assert all(unit in line for line in lines)
         head = rf"^{of_operator if label == 'RTT' else label}{re.escape(f' ({unit})') if unit else ''}$"
-        assert re.search(head, one.said["all"], re.MULTILINE), head
-        # The page gives each named step a table.
-        assert re.search(rf"{label.rpartition(': ')[2]}\b.*? [0-9.]+ ?{unit}", one.page)
+        assert re.search(head, results.outputs["all"], re.MULTILINE), head
+        # The page has a table for each named step.
+        assert re.search(rf"{label.rpartition(': ')[2]}\b.*? [0-9.]+ ?{unit}", results.page)
 
 
-def test_words_of_the_operator_are_counted_everywhere(strangers: Mapping[str, Stranger]) -> None:
-    one = strangers["walk"]
+def test_text_answers_are_counted_in_all_outputs(lab_results: Mapping[str, LabResults]) -> None:
+    results = lab_results["walk"]
     cells = {
-        (cell["distance"], cell["quantity"]): cell for cell in csv.DictReader(io.StringIO(one.said["aggregate"]))
+        (cell["distance"], cell["quantity"]): cell
+        for cell in csv.DictReader(io.StringIO(results.outputs["aggregate"]))
     }
     assert [cells[key]["events"] for key in (("5m", "grass=wet"), ("15m", "grass=dry"))] == ["2", "2"]
-    assert re.search(r"^ grass +wet 2$", one.said["trial"], re.MULTILINE)
-    assert re.search(r"^ 15m +2  dry 2$", one.said["table"].partition("\ngrass\n")[2], re.MULTILINE)
-    assert re.search(r"^ grass +wet 2 +dry 2 +words are counted, not judged$", one.said["compare"], re.MULTILINE)
+    assert re.search(r"^ grass +wet 2$", results.outputs["trial"], re.MULTILINE)
+    assert re.search(r"^ 15m +2  dry 2$", results.outputs["table"].partition("\ngrass\n")[2], re.MULTILINE)
+    assert re.search(
+        r"^ grass +wet 2 +dry 2 +words are counted, not judged$", results.outputs["compare"], re.MULTILINE
+    )
     assert re.search(
         r"TCP, expected and own figures condition repeats wind, median people, median grass 5m 2 valid "
         r"3\.75 m/s \[[^]]+\]\* 1\.00 \[[^]]+\]\* wet 2 15m 2 valid 1\.50 m/s \[[^]]+\]\* 1\.00 \(1 of 2\) dry 2 ",
-        one.page,
+        results.page,
     )
 
 
-def test_what_was_expected_and_its_verdict_are_in_the_report(strangers: Mapping[str, Stranger]) -> None:
-    page = strangers["asymmetric"].page
+def test_expectations_and_verdicts_are_in_the_report(lab_results: Mapping[str, LabResults]) -> None:
+    page = lab_results["asymmetric"].page
     assert "Expectations 2 of 3 hold." in page
     assert re.search(r"up\.file_loss < 90 % TCP, 10m holds 0\.00 % \[0\.00, [0-9.]+\]", page)
     assert re.search(r"down\.transfer_s > 60min TCP, 10m does not hold [0-9.]+ m?s \[", page)
-    assert "Expectations" not in strangers["walk"].page
+    assert "Expectations" not in lab_results["walk"].page
 
 
-def test_each_transfer_has_a_time_line_of_its_own(strangers: Mapping[str, Stranger]) -> None:
-    one = strangers["asymmetric"]
-    folder = one.trials[0].parents[1]
+def test_each_transfer_has_a_separate_timeline(lab_results: Mapping[str, LabResults]) -> None:
+    results = lab_results["asymmetric"]
+    folder = results.trials[0].parents[1]
     page = (folder / "report.html").read_text(encoding="utf-8")
     spans = re.findall(r"((?:send|receive) \w+) from ([0-9.]+) to ([0-9.]+) s", page)
-    # By when they began, which of two that run together may be either.
+    # In order of their start; of two that run together either may be first.
     assert sorted(lane for lane, _, _ in spans) == ["receive down", "receive up", "send down", "send up"]
     assert all(float(start_s) < float(stop_s) for _, start_s, stop_s in spans)
     assert [float(start_s) for _, start_s, _ in spans] == sorted(float(start_s) for _, start_s, _ in spans)
-    assert "up, TCP, masterless Marked: segments sent again" in one.page
-    assert "down, TCP, masterless Marked: segments sent again" in one.page
-    found: dict[str, list[str]] = {}
+    assert "up, TCP, masterless Marked: segments sent again" in results.page
+    assert "down, TCP, masterless Marked: segments sent again" in results.page
+    values: dict[str, list[str]] = {}
     with (folder / "time.mcap").open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
-            found.setdefault(channel.topic, []).append(json.loads(message.data).get("phase", ""))
-    assert {topic: set(phases) for topic, phases in found.items() if "/phase" in topic} == {
+            values.setdefault(channel.topic, []).append(json.loads(message.data).get("phase", ""))
+    assert {topic: set(phases) for topic, phases in values.items() if "/phase" in topic} == {
         f"/{role}/phase/{name}": {"transfer", "idle"} for role in ("sender", "receiver") for name in ("up", "down")
     }

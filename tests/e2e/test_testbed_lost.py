@@ -1,4 +1,4 @@
-"""A testbed that dies in the middle of a trial stops it; no repeat is failed by that, and `resume` ends the trial."""
+"""A testbed that dies during a trial stops it; no repeat fails because of that, and `resume` completes the trial."""
 
 import os
 import re
@@ -17,12 +17,12 @@ TRIAL = ("trial", "--repeats", "2", "--protocol", "tcp", "--record", "1s", "--js
 
 
 def process_of(family: set[int], module: str) -> int:
-    """Return the process of a family that runs a module; of a robot's processes, the first of its own namespace."""
+    """Return the process of a family that runs a module; for a robot's processes, the first of its namespace."""
 
     def runs_it(pid: int) -> bool:
         try:
             return module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
-        except (FileNotFoundError, ProcessLookupError):  # it ended since the family was listed
+        except (FileNotFoundError, ProcessLookupError):  # it has ended after the family was listed
             return False
 
     def is_first(pid: int) -> bool:
@@ -35,7 +35,7 @@ def process_of(family: set[int], module: str) -> int:
 
 
 @pytest.mark.parametrize("victim", ["emulated.medium.process", "emulated.robot.init"])
-def test_a_part_that_dies_stops_the_trial_which_resume_ends(
+def test_a_part_that_dies_stops_the_trial_and_resume_completes_it(
     tmp_path: Path, untouched: Untouched, victim: str
 ) -> None:
     built_in_ros(tmp_path)

@@ -1,4 +1,4 @@
-"""A trial on robots with each variant of their tools ends valid, or is refused before its first repeat."""
+"""A trial on robots with each variant of their tools ends valid, or is rejected before its first repeat."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ MCAP: Final = (
     *("variant: ros1", "variant: ros2", "distribution: foxy", "distribution: jazzy"),
     *("/opt/ros/foxy", "/opt/ros/jazzy", "_0.db3", "_0.mcap"),
 )
-# What takes time in the procedure and has no variants.
+# Parts of the procedure that take time and have no variants.
 SHORTER: Final = (
     *("count: 10", "count: 5", "interval: 200ms", "interval: 50ms"),
     *("topology: master", "topology: masterless"),
@@ -40,7 +40,7 @@ SHORTER: Final = (
 
 @dataclass(frozen=True)
 class Pair:
-    """Two robots: the tools of each as the site file says them, what the sender's profile says otherwise, and ROS."""
+    """Two robots: the tools of each in the site file, changes of the sender's profile, and ROS."""
 
     sender: str
     receiver: str
@@ -49,7 +49,7 @@ class Pair:
 
 
 def trial(lab: Path, pair: Pair, *words: str) -> Run:
-    """Run a short trial in a lab of two robots whose only netcat is `nc`, whatever it is."""
+    """Run a short trial in a lab of two robots whose only netcat is `nc`, of any variant."""
     for name, recorder in (("one", pair.recorder), ("two", ROSBAG)):
         changes = ("name: turtlebot3_burger", f"name: {name}", "netcat: nc.traditional", "netcat: nc", *recorder)
         copy_shipped(lab, "robots", "turtlebot3_burger", *changes, called=name)
@@ -77,7 +77,7 @@ def trial(lab: Path, pair: Pair, *words: str) -> Run:
 def test_a_trial_ends_valid(tmp_path: Path, pair: Pair) -> None:
     run = trial(tmp_path, pair)
     assert run.code == 0, run.out + run.err
-    assert "the link is lost" not in run.out + run.err, "what fieldkit does must not make a server hang up"
+    assert "the link is lost" not in run.out + run.err, "no action of fieldkit may make a server hang up"
     table = rows(only_trial(tmp_path))
     assert [(row["protocol"], row["attempt"], row["status"]) for row in table] == [
         ("tcp", "1", "valid"),
@@ -105,10 +105,10 @@ def test_busybox_sends_and_receives_by_tcp(tmp_path: Path) -> None:
     ],
     ids=lambda value: f"{value.sender} to {value.receiver}" if isinstance(value, Pair) else "",
 )
-def test_what_cannot_work_is_refused_before_repeat_1(tmp_path: Path, pair: Pair, words: tuple[str, str]) -> None:
+def test_unsuitable_tools_are_rejected_before_repeat_1(tmp_path: Path, pair: Pair, words: tuple[str, str]) -> None:
     run = trial(tmp_path, pair)
     assert run.code == 3, run.out + run.err
     what, package = words
     assert what in run.err
-    assert f"  apt-get install {package}" in run.err, "as root, who needs no sudo"
+    assert f"  apt-get install {package}" in run.err, "root needs no sudo"
     assert rows(only_trial(tmp_path)) == [], "no repeat began"

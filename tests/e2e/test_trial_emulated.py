@@ -1,4 +1,4 @@
-"""The main job from the outside: `fieldkit trial` on emulated robots, and what its user then does with the folder."""
+"""The main use, end to end: `fieldkit trial` on emulated robots, and the use of its folder."""
 
 import hashlib
 import math
@@ -21,7 +21,7 @@ TRIAL = ("trial", "los", "30ft", "--repeats", "2", "--record", "2s")
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
-    """Return a lab whose trial ended without a void attempt, and what its run printed; nobody changes it."""
+    """Return a lab whose trial ended without a void attempt, and its output; tests must not change it."""
     lab = tmp_path_factory.mktemp("lab")
     run = fieldkit(lab, *TRIAL)
     assert run.code == 0, run.err
@@ -30,7 +30,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
 
 
 @pytest.fixture
-def own_copy(finished: tuple[Path, Run], tmp_path: Path) -> Path:
+def lab_copy(finished: tuple[Path, Run], tmp_path: Path) -> Path:
     """Return a copy of that lab, which the test may change."""
     return Path(shutil.copytree(finished[0], tmp_path / "copy"))
 
@@ -44,7 +44,7 @@ def test_the_trial_ends_valid_and_prints_its_table(finished: tuple[Path, Run]) -
     assert "\x1b" not in run.out, "no terminal codes off a terminal"
 
 
-def test_the_folder_holds_every_piece_of_evidence(finished: tuple[Path, Run]) -> None:
+def test_the_folder_contains_every_piece_of_evidence(finished: tuple[Path, Run]) -> None:
     trial = only_trial(finished[0])
     assert trial.name.endswith("_los_30ft_master")
     present = {path.name for path in trial.iterdir()}
@@ -63,8 +63,8 @@ def test_the_folder_holds_every_piece_of_evidence(finished: tuple[Path, Run]) ->
     assert evidence >= {f"{role}-{when}.txt" for role in ("sender", "receiver") for when in ("before", "after")}
 
 
-def test_aggregate_of_one_trial_is_its_summary_from_raw_evidence_too(own_copy: Path) -> None:
-    lab = own_copy
+def test_aggregate_of_one_trial_from_raw_evidence_is_its_summary(lab_copy: Path) -> None:
+    lab = lab_copy
     trial = only_trial(lab)
     (trial / "trial.csv").rename(lab / "trial.csv.away")
     rebuilt = fieldkit(lab, "aggregate", "trials", "--rebuild", "--format", "csv")
@@ -74,7 +74,7 @@ def test_aggregate_of_one_trial_is_its_summary_from_raw_evidence_too(own_copy: P
     assert fieldkit(lab, "verify", str(trial)).code == 0
 
 
-def test_the_rows_say_what_happened(finished: tuple[Path, Run]) -> None:
+def test_the_rows_contain_the_results(finished: tuple[Path, Run]) -> None:
     trial = only_trial(finished[0])
     table = rows(trial)
     assert list(table[0]) == [column.name for column in trial_columns()]
@@ -108,8 +108,8 @@ def test_the_rows_say_what_happened(finished: tuple[Path, Run]) -> None:
         assert row["ip_loss"] == "", "missing is empty"
 
 
-def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(own_copy: Path) -> None:
-    lab = own_copy
+def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy: Path) -> None:
+    lab = lab_copy
     trial = only_trial(lab)
     assert fieldkit(lab, "verify", str(trial)).code == 0
     before = {name: (trial / name).read_bytes() for name in ("trial.csv", "summary.csv")}
@@ -128,7 +128,7 @@ def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(own_copy
     assert "repeats/tcp-02/receiver.pcap: changed" in broken.err
 
 
-def test_json_events_are_one_object_a_line(tmp_path: Path) -> None:
+def test_json_events_are_one_object_per_line(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     run = fieldkit(
         tmp_path, "trial", "los", "30ft", "--repeats", "1", "--record", "1s", "--protocol", "tcp", "--json"
@@ -180,7 +180,7 @@ def test_a_silent_topic_makes_every_attempt_void_and_the_trial_invalid(tmp_path:
     assert fieldkit(tmp_path, "verify", str(trial)).code == 0
 
 
-def test_a_tool_that_a_robot_lacks_stops_the_trial_before_repeat_1(tmp_path: Path) -> None:
+def test_a_missing_tool_stops_the_trial_before_repeat_1(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     copy_shipped(tmp_path, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
     run = fieldkit(tmp_path, "trial", "los", "30ft")
@@ -190,7 +190,7 @@ def test_a_tool_that_a_robot_lacks_stops_the_trial_before_repeat_1(tmp_path: Pat
     assert "remedy" in run.err
 
 
-def test_kill_9_leaves_nothing_but_the_repeats_that_had_ended(tmp_path: Path, untouched: Untouched) -> None:
+def test_kill_9_leaves_only_finished_repeats(tmp_path: Path, untouched: Untouched) -> None:
     process = start(
         tmp_path, "trial", "los", "30ft", "--repeats", "5", "--record", "2s", "--protocol", "tcp", "--json"
     )

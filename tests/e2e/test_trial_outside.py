@@ -33,19 +33,19 @@ def test_robots_and_their_jobs_outlive_a_fieldkit_that_is_killed(tmp_path: Path)
             tmp_path, "trial", "los", "5m", "--topology", "masterless", "--record", "30s", "--yes", "--json"
         )
         wait_for_line(process, '"record"')
-        recording = until_it_records(outside)
+        recording = wait_until_recording(outside)
         process.kill()
         process.communicate(timeout=60)
         wait_for_end({process.pid}, within_s=60.0)
-        assert left(outside, Role.SENDER) == recording
+        assert jobs_left(outside, Role.SENDER) == recording
 
 
-def until_it_records(outside: Outside) -> tuple[str, ...]:
+def wait_until_recording(outside: Outside) -> tuple[str, ...]:
     deadline = Deadline.after(60)
-    while not (found := left(outside, Role.SENDER)):
+    while not (running_jobs := jobs_left(outside, Role.SENDER)):
         assert not deadline.expired, "it never began to record"
-    return found
+    return running_jobs
 
 
-def left(outside: Outside, role: Role) -> tuple[str, ...]:
+def jobs_left(outside: Outside, role: Role) -> tuple[str, ...]:
     return jobs.list_running(outside.testbed.shells[role], Deadline.after(30))

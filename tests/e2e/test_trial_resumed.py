@@ -1,4 +1,4 @@
-"""A trial that is stopped by Ctrl-C or by kill -9, and resumed: each planned repeat exactly once."""
+"""A trial that is stopped by Ctrl-C or kill -9, and resumed: each planned repeat exactly once."""
 
 import json
 import signal
@@ -19,13 +19,13 @@ TRIAL = ("trial", "--repeats", "3", "--protocol", "tcp", "--json", "los", "30ft"
 
 
 @pytest.fixture(autouse=True)
-def _nothing_is_asked_of_ros(tmp_path: Path) -> None:
-    """What kill -9 leaves of Debian's is asked in `test_trial_emulated`."""
+def _use_builtin_ros(tmp_path: Path) -> None:
+    """Use the built-in ROS; remains of Debian's after kill -9 are tested in `test_trial_emulated`."""
     built_in_ros(tmp_path)
 
 
 def begin(lab: Path, *words: str, until: str) -> "subprocess.Popen[str]":
-    """Start a trial and return when it printed a line with `until`."""
+    """Start a trial and return when it has printed a line with `until`."""
     process = start(lab, *TRIAL, *words)
     wait_for_line(process, until)
     return process
@@ -36,7 +36,7 @@ def resume(lab: Path) -> Run:
 
 
 def check_whole(lab: Path, repeats: int) -> list[dict[str, str]]:
-    """Check what every trial must be in the end, and return its rows."""
+    """Check the final state of every trial, and return its rows."""
     trial = only_trial(lab)
     table = rows(trial)
     valid = Counter((row["protocol"], row["repeat"]) for row in table if row["status"] == "valid")
@@ -47,7 +47,7 @@ def check_whole(lab: Path, repeats: int) -> list[dict[str, str]]:
     return table
 
 
-def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_goes_on(tmp_path: Path, untouched: Untouched) -> None:
+def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_continues(tmp_path: Path, untouched: Untouched) -> None:
     process = begin(tmp_path, "--record", "2s", until='"record"')
     family = descendants(process.pid)
     process.send_signal(signal.SIGINT)
@@ -67,7 +67,7 @@ def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_goes_on(tmp_path: Path,
     assert len(check_whole(tmp_path, 3)) == 3
 
 
-def test_the_second_ctrl_c_stops_the_repeat_at_once(tmp_path: Path, untouched: Untouched) -> None:
+def test_the_second_ctrl_c_stops_the_repeat_immediately(tmp_path: Path, untouched: Untouched) -> None:
     process = begin(tmp_path, "6m", "7m", "--record", "60s", until='"record"')
     family = descendants(process.pid)
     process.send_signal(signal.SIGINT)
@@ -88,7 +88,7 @@ def test_the_second_ctrl_c_stops_the_repeat_at_once(tmp_path: Path, untouched: U
     assert "its files ended with it" in unfetched.read_text(encoding="utf-8")
 
 
-def test_kill_9_in_mid_repeat_then_resume(tmp_path: Path) -> None:
+def test_kill_9_during_a_repeat_then_resume(tmp_path: Path) -> None:
     process = begin(tmp_path, "--record", "1s", until='"repeat_ended"')
     wait_for_line(process, '"transfer"')
     family = descendants(process.pid)
@@ -119,7 +119,7 @@ def test_two_fieldkits_cannot_run_one_trial(tmp_path: Path) -> None:
     assert finish(process).code == 130
 
 
-def test_other_code_a_changed_lab_and_no_trial_are_refused(tmp_path: Path) -> None:
+def test_resume_rejects_other_code_a_changed_lab_and_no_trial(tmp_path: Path) -> None:
     process = begin(tmp_path, "--record", "1s", until='"repeat_ended"')
     process.terminate()
     assert finish(process).code == 130
@@ -142,8 +142,8 @@ def test_other_code_a_changed_lab_and_no_trial_are_refused(tmp_path: Path) -> No
     assert json.loads((trial / journal.JOURNAL_FILE).read_text(encoding="utf-8").splitlines()[0])
 
 
-def test_nobody_reading_along_ends_no_trial(tmp_path: Path) -> None:
-    """Ctrl-C in a shell ends `tee` at once and lets fieldkit finish its repeat."""
+def test_a_closed_output_pipe_does_not_end_the_trial(tmp_path: Path) -> None:
+    """Ctrl-C in a shell ends `tee` immediately and lets fieldkit finish its repeat."""
     process = begin(tmp_path, "--record", "1s", until='"record"')
     assert process.stdout is not None
     process.stdout.close()

@@ -1,4 +1,4 @@
-"""Hunt for inputs that break a reader: `python -m tests.fuzz --minutes 60`; again with one: `--replay FILE`."""
+"""Search for inputs that break a reader: `python -m tests.fuzz --minutes 60`; repeat one with `--replay FILE`."""
 
 import argparse
 import sys
@@ -10,45 +10,49 @@ from tests.helpers.paths import ROOT
 
 
 def main(argv: list[str]) -> int:
-    """Hunt, or try again what a hunt has kept; return 1 where something broke."""
+    """Run a search, or repeat an input that a search has kept; return 1 if a reader broke."""
     if argv[:1] == ["work"]:
-        names, seed, at, stop, folder = argv[1:]
-        harness.work(targets.named(names), int(seed), range(int(at), int(stop)), Path(folder))
+        names, seed, start, stop, work_folder = argv[1:]
+        harness.work(targets.select_targets(names), int(seed), range(int(start), int(stop)), Path(work_folder))
         return 0
     if argv[:1] == ["again"]:
-        kept, place = map(Path, argv[1:])
-        (target,) = targets.named(kept.name.partition(".")[0])
-        print(harness.tried(target, kept.read_bytes(), place / "place") or "")
+        input_file, folder = map(Path, argv[1:])
+        (target,) = targets.select_targets(input_file.name.partition(".")[0])
+        print(harness.try_input(target, input_file.read_bytes(), folder / "place") or "")
         return 0
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--inputs", type=int, default=1 << 60)
-    parser.add_argument("--seed", type=int, default=int(time.time()), help="makes the inputs; each run's is another")
-    parser.add_argument("--targets", default="", help=f"some of {','.join(targets.NAMES)}")
-    parser.add_argument("--keep", type=Path, default=ROOT / "tests" / "fuzz" / "kept", help="gets inputs that broke")
-    parser.add_argument("--replay", type=Path, help="an input that was kept")
+    parser.add_argument(
+        "--seed", type=int, default=int(time.time()), help="seed of the inputs; different for each run by default"
+    )
+    parser.add_argument("--targets", default="", help=f"targets, separated by commas, of {','.join(targets.NAMES)}")
+    parser.add_argument(
+        "--keep", type=Path, default=ROOT / "tests" / "fuzz" / "kept", help="folder for inputs that break a reader"
+    )
+    parser.add_argument("--replay", type=Path, help="repeat a kept input")
     options = parser.parse_args(argv)
     if options.replay is not None:
-        what = harness.replayed(options.replay)
-        print(what or "nothing broke")
-        return int(what is not None)
+        failure = harness.replay(options.replay)
+        print(failure or "nothing broke")
+        return int(failure is not None)
     return _hunt(options)
 
 
 def _hunt(options: argparse.Namespace) -> int:
-    began_s, defects, seen = time.monotonic(), 0, set[str]()
-    ends_s = began_s + 60 * options.minutes
+    start_s, defects, seen = time.monotonic(), 0, set[str]()
+    end_s = start_s + 60 * options.minutes
     options.keep.mkdir(exist_ok=True)
     print(f"seed {options.seed}", flush=True)
-    for found in harness.hunted(options.targets, options.seed, options.inputs, options.keep, ends_s):
-        if isinstance(found, int):
-            print(f"{found} inputs, {(time.monotonic() - began_s) / 60:.1f} minutes, {defects} defects")
-        elif (which := f"{found.target}: {found.what.partition(': ')[0]}") in seen:
-            found.input.unlink()  # one of each says it
+    for result in harness.hunt(options.targets, options.seed, options.inputs, options.keep, end_s):
+        if isinstance(result, int):
+            print(f"{result} inputs, {(time.monotonic() - start_s) / 60:.1f} minutes, {defects} defects")
+        elif (defect_key := f"{result.target}: {result.failure.partition(': ')[0]}") in seen:
+            result.input.unlink()  # one input per defect is enough
         else:
-            seen.add(which)
+            seen.add(defect_key)
             defects += 1
-            print(f"{found.target}: {found.what}\n  {found.input}", flush=True)
+            print(f"{result.target}: {result.failure}\n  {result.input}", flush=True)
     return int(defects > 0)
 
 

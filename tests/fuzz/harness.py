@@ -1,4 +1,4 @@
-"""Feed mutated outputs to readers, in a process that may break, and keep each input that broke it."""
+"""Feed mutated outputs to readers, in a process that may crash, and keep each input that breaks a reader."""
 
 import contextlib
 import hashlib
@@ -24,12 +24,12 @@ from tests.helpers.paths import ROOT
 
 CPU_S: Final = 30.0
 MEMORY_BYTES: Final = 512 << 20
-"""An input of at most 1 MiB may take so much computing and memory."""
-WAITS_S: Final = 200.0
-"""A reader that waits for what never comes computes nothing; after this time it is a defect too."""
+"""Limits of processor time and memory for an input of at most 1 MiB."""
+MAX_WAIT_S: Final = 200.0
+"""Maximum real time, for readers that wait without computing; a longer time is a defect as well."""
 
-_TOGETHER: Final = 5_000
-"""Inputs that one process tries: what memory it may lose by itself is none of theirs."""
+_INPUTS_PER_WORKER: Final = 5_000
+"""Inputs per process, so that slow memory leaks of the process itself are not attributed to an input."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Target:
     """A reader of something that a robot or a colleague sends.
 
     Attributes:
-        name: What it reads.
-        seeds: Kept real outputs.
-        read: Reads one, given an empty folder to write it into; may raise fieldkit's errors alone.
-        weight: How often it is tried, compared with others; slow ones less.
-        cpu_s: How long it may compute, in seconds.
+        name: Name of the target.
+        seeds: Stored real outputs.
+        read: Reads one output in an empty folder; may raise only fieldkit's errors.
+        weight: Relative frequency; lower for slow readers.
+        cpu_s: Maximum processor time, in seconds.
     """
 
     name: str
@@ -56,20 +56,21 @@ class Defect:
     """An input that broke its reader.
 
     Attributes:
-        target: Name of the reader.
-        what: What was raised and where, or how the process ended.
-        input: The file that holds it.
+        target: Name of the target.
+        failure: The exception and its location, or how the process ended.
+        input: The file with the input.
     """
 
     target: str
-    what: str
+    failure: str
     input: Path
 
 
 def work(targets: Sequence[Target], seed: int, inputs: range, folder: Path) -> None:
-    """Try the inputs of these numbers, each made from `seed` and its number alone; end with the first that breaks.
+    """Try the inputs with these numbers, each derived only from `seed` and its number; stop at the first that breaks.
 
-    Prints a line of JSON per input begun, so that whoever started this process knows what broke it.
+    Prints a line of JSON before each input, so that the parent process can identify the input that ended this
+    process.
     """
     weights = [target.weight for target in targets]
     for number in inputs:
@@ -77,104 +78,108 @@ def work(targets: Sequence[Target], seed: int, inputs: range, folder: Path) -> N
         target = rng.choices(targets, weights)[0]
         data = mutated(rng.choice(target.seeds), target.seeds, rng)
         (folder / "input").write_bytes(data)
-        _say({"number": number, "target": target.name})
-        if what := tried(target, data, folder / "place"):
-            _say({"number": number, "target": target.name, "broke": what})
+        _print_json({"number": number, "target": target.name})
+        if failure := try_input(target, data, folder / "place"):
+            _print_json({"number": number, "target": target.name, "broke": failure})
             return
 
 
-def tried(target: Target, data: bytes, place: Path) -> str | None:
-    """Let a reader read an input; return what it raised, but for fieldkit's errors.
+def try_input(target: Target, data: bytes, place: Path) -> str | None:
+    """Let a reader read an input; return a description of its exception, except for fieldkit's errors.
 
-    Where it takes longer than it may, this process ends by a signal, whatever it is in the midst of.
+    If a limit of time is exceeded, this process is ended by a signal.
 
     Args:
         target: The reader.
         data: The input.
-        place: An empty folder is made of it, the current one meanwhile.
+        place: Folder that is created empty and is the current folder of the reader.
     """
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
-    held_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (held_bytes + MEMORY_BYTES, most))
+    used_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used_bytes + MEMORY_BYTES, hard_limit))
     signal.setitimer(signal.ITIMER_PROF, target.cpu_s)
-    signal.setitimer(signal.ITIMER_REAL, WAITS_S)
+    signal.setitimer(signal.ITIMER_REAL, MAX_WAIT_S)
     try:
         with contextlib.chdir(place):
             target.read(data, place)
     except FieldkitError as error:
-        return None if str(error) else "an error that says nothing"
-    except BaseException as error:  # noqa: BLE001 (that is what is looked for)
-        return _where(error)
+        return None if str(error) else "an error without text"
+    except BaseException as error:  # noqa: BLE001 (any exception is a defect)
+        return _describe(error)
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        resource.setrlimit(resource.RLIMIT_AS, (hard_limit, hard_limit))
     return None
 
 
-def hunted(targets: str, seed: int, inputs: int, folder: Path, ends_s: float = math.inf) -> Iterator[Defect | int]:
-    """Yield each defect that mutated inputs show, and at last how many inputs were tried.
+def hunt(targets: str, seed: int, inputs: int, folder: Path, end_s: float = math.inf) -> Iterator[Defect | int]:
+    """Yield each defect that mutated inputs cause, and finally the number of tried inputs.
 
     Args:
         targets: Names of targets, separated by commas; empty for all.
-        seed: Makes the inputs: the same seed, the same inputs.
-        inputs: How many of them.
-        folder: Gets the inputs that broke something, a file each.
-        ends_s: When to end on the monotonic clock, however many were tried.
+        seed: Seed of the inputs.
+        inputs: Number of inputs.
+        folder: Folder for the inputs that break a reader, one file each.
+        end_s: Time on the monotonic clock at which to stop early.
     """
-    at = 0
-    while at < inputs and time.monotonic() < ends_s:
+    start = 0
+    while start < inputs and time.monotonic() < end_s:
         with tempfile.TemporaryDirectory() as place:
-            stop = min(inputs, at + _TOGETHER)
-            last, what = _watched(("work", targets, str(seed), str(at), str(stop), place), ends_s)
-            if what:
+            stop = min(inputs, start + _INPUTS_PER_WORKER)
+            current, failure = _run_worker(("work", targets, str(seed), str(start), str(stop), place), end_s)
+            if failure:
                 data = Path(place, "input").read_bytes()
-                kept = folder / f"{last['target']}.{hashlib.sha256(data).hexdigest()[:12]}"
-                kept.write_bytes(data)
-                yield Defect(last["target"], what, kept)
-        at = last["number"] + 1
-    yield at
+                input_file = folder / f"{current['target']}.{hashlib.sha256(data).hexdigest()[:12]}"
+                input_file.write_bytes(data)
+                yield Defect(current["target"], failure, input_file)
+        start = current["number"] + 1
+    yield start
 
 
-def _watched(what: Sequence[str], ends_s: float) -> tuple[dict[str, Any], str | None]:
-    """Run a worker; return the last input that it began, and what broke it."""
-    command = (sys.executable, "-m", "tests.fuzz", *what)
-    last: dict[str, Any] = {"number": -1, "target": ""}
+def _run_worker(failure: Sequence[str], end_s: float) -> tuple[dict[str, Any], str | None]:
+    """Run a worker; return the last input that it started, and the defect, if any."""
+    command = (sys.executable, "-m", "tests.fuzz", *failure)
+    current: dict[str, Any] = {"number": -1, "target": ""}
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as worker:
         assert worker.stdout is not None
         for line in worker.stdout:
-            last = json.loads(line)
-            if "broke" in last:
-                return last, last["broke"]
-            if time.monotonic() > ends_s:
+            current = json.loads(line)
+            if "broke" in current:
+                return current, current["broke"]
+            if time.monotonic() > end_s:
                 worker.kill()
-                return last, None
+                return current, None
     if worker.returncode == 0:
-        return last, None
-    if not last["target"]:
+        return current, None
+    if not current["target"]:
         raise RuntimeError(f"the worker does not start: {command}")
-    ended = signal.Signals(-worker.returncode).name if worker.returncode < 0 else f"exit code {worker.returncode}"
-    return last, f"ended by {ended}"
+    ending = signal.Signals(-worker.returncode).name if worker.returncode < 0 else f"exit code {worker.returncode}"
+    return current, f"ended by {ending}"
 
 
-def _say(what: dict[str, object]) -> None:
-    sys.stdout.write(json.dumps(what) + "\n")
+def _print_json(failure: dict[str, object]) -> None:
+    sys.stdout.write(json.dumps(failure) + "\n")
     sys.stdout.flush()
 
 
-def _where(error: BaseException) -> str:
+def _describe(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
-    ours = [frame for frame in frames if "/fieldkit/" in frame.filename and "/tests/" not in frame.filename] or frames
-    return f"{type(error).__name__} at {Path(ours[-1].filename).name}:{ours[-1].lineno}: {str(error)[:150]}"
+    own_frames = [
+        frame for frame in frames if "/fieldkit/" in frame.filename and "/tests/" not in frame.filename
+    ] or frames
+    return (
+        f"{type(error).__name__} at {Path(own_frames[-1].filename).name}:{own_frames[-1].lineno}: {str(error)[:150]}"
+    )
 
 
-def replayed(kept: Path) -> str | None:
-    """Try an input that a hunt has kept, in a process of its own; return what broke."""
+def replay(input_file: Path) -> str | None:
+    """Try a kept input in a separate process; return the defect, if any."""
     with tempfile.TemporaryDirectory() as place:
-        command = (sys.executable, "-m", "tests.fuzz", "again", str(kept.absolute()), place)
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    if done.returncode < 0:
-        return f"ended by {signal.Signals(-done.returncode).name}"
-    return done.stdout.strip() or None
+        command = (sys.executable, "-m", "tests.fuzz", "again", str(input_file.absolute()), place)
+        process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if process.returncode < 0:
+        return f"ended by {signal.Signals(-process.returncode).name}"
+    return process.stdout.strip() or None

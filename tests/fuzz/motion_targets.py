@@ -1,4 +1,4 @@
-"""Readers of where robots were, how they drove and flew, and of what preflight asks for before they may."""
+"""Fuzz targets: readers of positions, drive logs and flight data, and of preflight queries."""
 
 import json
 import math
@@ -47,7 +47,7 @@ _ARMING: Final = (
     b"babeld\nbatman-adv\n",
     b"5000000\n",
 )
-_NEEDY: Final = """\
+_DEMANDING_PROCEDURE: Final = """\
 name: needy
 summary: Steps that ask robots for more than programs
 scenario: los
@@ -73,20 +73,20 @@ _GPX: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def _drove(data: bytes, place: Path) -> None:
+def _measure_drive(data: bytes, place: Path) -> None:
     (place / drive_log.FILE).write_bytes(data)
-    found = drive_log.measure(drive_log.read(place / drive_log.FILE))
+    measured = drive_log.measure(drive_log.read(place / drive_log.FILE))
     for column in drive_log.COLUMNS:
-        assert column.invalid_value_reason(cell(found.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
 
 
-def _driver(data: bytes, _: Path) -> None:
+def _read_drive_status(data: bytes, _: Path) -> None:
     lease = DriveLease(cast("Shell", None), _JOB, "{}", 1.0)
     lease.output = data
     assert lease.end_state.isprintable()
 
 
-def _answer(data: bytes, place: Path) -> None:
+def _read_answer(data: bytes, place: Path) -> None:
     path = place / "answer-wind.txt"
     path.write_bytes(data)
     questions = (Question("how strong is the wind", unit="m/s"), Question("how is it", choices=("a", "b")))
@@ -96,71 +96,71 @@ def _answer(data: bytes, place: Path) -> None:
 
 
 @cache
-def _needy() -> Procedure:
-    """Return a procedure whose steps ask for something of robots, each kind of it at least once."""
+def _demanding_procedure() -> Procedure:
+    """Return a procedure whose steps have requirements of every kind."""
     drone = next(role for role, robot in CAST.items() if robot.profile.mavlink is not None)
-    return schema.validate(schema.parse(_NEEDY.replace("ROLE", drone), source="needy.yaml"), Procedure)
+    return schema.validate(schema.parse(_DEMANDING_PROCEDURE.replace("ROLE", drone), source="needy.yaml"), Procedure)
 
 
-def _needs(data: bytes, _: Path) -> None:
-    """Judge every answer that preflight asks a robot for by the input."""
-    asked = {"flies": True, "ros_master": CAST[Role.RELAY].address}
-    cast_of = {role: robot.model_copy(update=asked) for role, robot in CAST.items()}
-    scene = replace(los_plan().scenes()[0], cast=cast_of)
+def _judge_needs(data: bytes, _: Path) -> None:
+    """Judge every preflight query by the same input as its response."""
+    overrides = {"flies": True, "ros_master": CAST[Role.RELAY].address}
+    demanding_cast = {role: robot.model_copy(update=overrides) for role, robot in CAST.items()}
+    scene = replace(los_plan().scenes()[0], cast=demanding_cast)
     report, text = Report("robot"), data.decode(errors="replace")
-    for placed in _needy().walk():
+    for placed in _demanding_procedure().walk():
         for need in placed.step.needs(scene):
             for code in (0, 1, CommandResult.MISSING):
                 report.add(need.name, *need.judge(CommandResult(text, code)))
-    assert all(one.detail.isprintable() and one.remedy.isprintable() for one in report.findings)
+    assert all(finding.detail.isprintable() and finding.remedy.isprintable() for finding in report.findings)
 
 
-def _kept(sender: Account, receiver: Account) -> bytes:
+def _accounts_text(sender: Account, receiver: Account) -> bytes:
     clocks = {Role.SENDER: Offset(0.2, 0.01), Role.RECEIVER: Offset(-0.2, 0.01)}
     return accounts.text(Accounts({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
 
 
 @cache
 def _tracks() -> dict[str, bytes]:
-    """Return bags that tell where a robot was, by the kind of message."""
-    made = {
+    """Return bags with a robot's positions, by the kind of message."""
+    messages_by_kind = {
         "odometry": [odometry(BEGAN_NS + n * S, float(n), 0.0, 0.1 * n) for n in range(9)],
         "fix": [fix(BEGAN_NS + n * S, 48 + n / 1e5, 11.0) for n in range(9)],
         "transform": [transform(BEGAN_NS + n * S, float(n), 0.0, "base") for n in range(9)],
     }
     found = {}
-    for name, messages in made.items():
+    for name, messages in messages_by_kind.items():
         with tempfile.TemporaryDirectory() as folder:
             found[name] = written(Path(folder), messages).read_bytes()
     return found
 
 
-def _sound(samples: Samples) -> None:
+def _check_samples(samples: Samples) -> None:
     assert len(samples.times_ns) == len(samples.values) > 0
     assert (np.diff(samples.times_ns) > 0).all()
     assert np.isfinite(samples.values[:, :2]).all()
 
 
-def _bag(data: bytes, place: Path) -> None:
+def _read_bag(data: bytes, place: Path) -> None:
     path = place / "track.bag"
     path.write_bytes(data)
     for stamps in ("header", "received"):
         account = Account(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
         with suppress(EvidenceError):
             found = recorded.read_topic(path, account)
-            _sound(found)
+            _check_samples(found)
             if found.yaws_rad is not None:
-                _sound(recorded.to_placement_frame(found, account))
+                _check_samples(recorded.to_placement_frame(found, account))
 
 
-def _file(ending: str, data: bytes, place: Path) -> None:
+def _read_positions_file(ending: str, data: bytes, place: Path) -> None:
     path = place / f"walk.{ending}"
     path.write_bytes(data)
-    _sound(recorded.read_file(path))
+    _check_samples(recorded.read_file(path))
 
 
-def _whole(of_trial: bool, data: bytes, place: Path) -> None:
-    """Measure how far two robots were apart by a mutated account of an attempt, or of its trial."""
+def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
+    """Measure the distance of two robots with mutated position sources of an attempt, or of its trial."""
     attempt = place / "repeats" / "udp-01"
     attempt.mkdir(parents=True)
     (attempt / "track.bag").write_bytes(_tracks()["odometry"])
@@ -171,7 +171,7 @@ def _whole(of_trial: bool, data: bytes, place: Path) -> None:
     evidence = AttemptEvidence(attempt)
     times_ns = [BEGAN_NS + S, BEGAN_NS + 3 * S]
     found = where.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
-    assert all(math.isfinite(float(value)) for value in found.values.values())  # what is too far, gates refuse
+    assert all(math.isfinite(float(value)) for value in found.values.values())  # gates reject excessive distances
     where.distances_m(evidence, _ENDS)
     where.readable_samples(evidence)
     said = accounts.read(folder / accounts.FILE)
@@ -182,31 +182,31 @@ def _whole(of_trial: bool, data: bytes, place: Path) -> None:
 
 
 def _accounts() -> tuple[bytes, ...]:
-    odometry_told = Account(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
-    standing = Account(place=(0.0, 0.0, 0.2))
+    by_odometry = Account(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
+    at_rest = Account(place=(0.0, 0.0, 0.2))
     degrees = Account(place=(48.1, 11.5, None), frame=WGS84)
     metres = Account(place=(0.0, 0.0, 0.0), frame=LOCAL)
     return (
-        _kept(standing, odometry_told),
-        _kept(degrees, Account(file="positions-receiver.gpx", offset_s=0.5)),
-        _kept(metres, Account(file="positions-receiver.csv")),
+        _accounts_text(at_rest, by_odometry),
+        _accounts_text(degrees, Account(file="positions-receiver.gpx", offset_s=0.5)),
+        _accounts_text(metres, Account(file="positions-receiver.csv")),
     )
 
 
 @cache
-def _heard() -> bytes:
+def _recorded_bag() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder), "", {"/scan": [BEGAN_NS + n * S for n in range(5)]})
         return Path(folder, "scan.bag").read_bytes()
 
 
-def _received(data: bytes, place: Path) -> None:
-    """Read how soon topics were heard, by a mutated log beside a whole bag."""
+def _read_reception(data: bytes, place: Path) -> None:
+    """Measure when topics were received, with a mutated log and an intact bag."""
     (place / "log").write_bytes(data)
-    (place / "scan.bag").write_bytes(_heard())
-    found = reception.measure(reception.read(place, "log", "scan.bag", ["/scan"], 5.0))
+    (place / "scan.bag").write_bytes(_recorded_bag())
+    measured = reception.measure(reception.read(place, "log", "scan.bag", ["/scan"], 5.0))
     for column in reception.COLUMNS:
-        assert column.invalid_value_reason(cell(found.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
 
 
 def _lines(lines: Iterator[dict[str, Any]]) -> bytes:
@@ -215,14 +215,14 @@ def _lines(lines: Iterator[dict[str, Any]]) -> bytes:
 
 def motion_targets() -> Iterator[Target]:
     """Yield the targets."""
-    yield Target("drive-log", (_lines(drive(4.0, 0.5, 1.0)), _lines(drive(0.3, 0.1, 1.0))), _drove)
-    yield Target("drive-status", (_STATUS, b'{"phase": "out", "ended": ""}'), _driver)
-    yield Target("needs", _ARMING, _needs)
-    yield Target("answer", (b"3.5\n", b"-\n", b"a\n"), _answer)
+    yield Target("drive-log", (_lines(drive(4.0, 0.5, 1.0)), _lines(drive(0.3, 0.1, 1.0))), _measure_drive)
+    yield Target("drive-status", (_STATUS, b'{"phase": "out", "ended": ""}'), _read_drive_status)
+    yield Target("needs", _ARMING, _judge_needs)
+    yield Target("answer", (b"3.5\n", b"-\n", b"a\n"), _read_answer)
     logs = (log({"/scan": BEGAN_NS}), ROS2.format(s=BEGAN_NS // S, ns=BEGAN_NS % S))
-    yield Target("reception", tuple(one.encode() for one in logs), _received, 0.5)
-    yield Target("positions-csv", (_CSV, _CSV_DEGREES), partial(_file, "csv"))
-    yield Target("positions-gpx", (_GPX,), partial(_file, "gpx"))
-    yield Target("positions-bag", tuple(_tracks().values()), _bag, 0.3)
+    yield Target("reception", tuple(text.encode() for text in logs), _read_reception, 0.5)
+    yield Target("positions-csv", (_CSV, _CSV_DEGREES), partial(_read_positions_file, "csv"))
+    yield Target("positions-gpx", (_GPX,), partial(_read_positions_file, "gpx"))
+    yield Target("positions-bag", tuple(_tracks().values()), _read_bag, 0.3)
     for name, of_trial in (("attempt", False), ("trial", True)):
-        yield Target(f"positions-of-{name}", _accounts(), partial(_whole, of_trial), 0.5)
+        yield Target(f"positions-of-{name}", _accounts(), partial(_measure_positions, of_trial), 0.5)

@@ -1,4 +1,4 @@
-"""Changes to a kept output: what cables, disks and people do to it, and what somebody does who means harm."""
+"""Changes to a stored output, as caused by cables, disks, people and attackers."""
 
 import random
 import re
@@ -6,8 +6,8 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Final
 
-MOST_BYTES: Final = 1 << 20
-"""Longer inputs say nothing new; a repetition stops here."""
+MAX_BYTES: Final = 1 << 20
+"""Maximum input size; longer inputs find nothing new."""
 
 _NUMBER: Final = re.compile(rb"-?[0-9]+(?:\.[0-9]+)?")
 _NUMBERS: Final = (
@@ -71,18 +71,18 @@ _TIMES: Final = (2, 3, 10, 1000, 100_000)
 
 
 def mutated(seed: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """Return `seed` with one to four changes, most often one; pieces may come from `others`."""
+    """Return `seed` with one to four changes, most often one; inserted pieces may come from `others`."""
     data = bytearray(seed)
     for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 4))):
         rng.choice(_CHANGES)(data, others, rng)
-    return bytes(data[:MOST_BYTES])
+    return bytes(data[:MAX_BYTES])
 
 
-def _somewhere(data: bytearray, rng: random.Random) -> int:
+def _position(data: bytearray, rng: random.Random) -> int:
     return rng.randrange(len(data) + 1)
 
 
-def _piece(data: bytes | bytearray, rng: random.Random) -> tuple[int, int]:
+def _range(data: bytes | bytearray, rng: random.Random) -> tuple[int, int]:
     start = rng.randrange(len(data) + 1)
     return start, min(len(data), start + rng.choice((1, 2, 4, 8, 16, 64, 512, 1 << 14)))
 
@@ -93,33 +93,33 @@ def _flip(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
             data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
 
 
-def _byte(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+def _set_byte(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
     if data:
         data[rng.randrange(len(data))] = rng.choice(
             (0, 1, 0x7F, 0x80, 0xFF, 0x20, 0x0A, 0x2D, 0x39, rng.randrange(256))
         )
 
 
-def _cut(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
-    del data[_somewhere(data, rng) :]
+def _truncate(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    del data[_position(data, rng) :]
 
 
-def _leave_out(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
-    start, stop = _piece(data, rng)
+def _delete(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    start, stop = _range(data, rng)
     del data[start:stop]
 
 
 def _repeat(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
-    start, stop = _piece(data, rng)
-    most = max(1, (MOST_BYTES - len(data)) // max(1, stop - start))
-    data[start:stop] = data[start:stop] * min(rng.choice(_TIMES), most)
+    start, stop = _range(data, rng)
+    max_times = max(1, (MAX_BYTES - len(data)) // max(1, stop - start))
+    data[start:stop] = data[start:stop] * min(rng.choice(_TIMES), max_times)
 
 
 def _repeat_line(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
     lines = bytes(data).split(b"\n")
-    at = rng.randrange(len(lines))
-    most = max(1, (MOST_BYTES - len(data)) // (len(lines[at]) + 1))
-    lines[at : at + 1] = lines[at : at + 1] * min(rng.choice(_TIMES), most)
+    position = rng.randrange(len(lines))
+    max_times = max(1, (MAX_BYTES - len(data)) // (len(lines[position]) + 1))
+    lines[position : position + 1] = lines[position : position + 1] * min(rng.choice(_TIMES), max_times)
     data[:] = b"\n".join(lines)
 
 
@@ -131,19 +131,19 @@ def _move_line(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
 
 
 def _insert(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
-    at = _somewhere(data, rng)
-    data[at:at] = rng.choice(_WORDS) * rng.choice((1, 1, 1, 3))
+    position = _position(data, rng)
+    data[position:position] = rng.choice(_WORDS) * rng.choice((1, 1, 1, 3))
 
 
-def _number(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
-    start = _somewhere(data, rng)
-    found = _NUMBER.search(data, start) or _NUMBER.search(data)
-    if found is not None:
-        data[found.start() : found.end()] = rng.choice(_NUMBERS)
+def _replace_number(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    start = _position(data, rng)
+    match = _NUMBER.search(data, start) or _NUMBER.search(data)
+    if match is not None:
+        data[match.start() : match.end()] = rng.choice(_NUMBERS)
 
 
-def _size(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
-    """Write an integer as headers have it, of 2, 4 or 8 bytes and either order."""
+def _write_size(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
+    """Write a binary integer of 2, 4 or 8 bytes, as in headers, in either byte order."""
     form = rng.choice(("<H", ">H", "<I", ">I", "<Q", ">Q"))
     size = struct.calcsize(form)
     if len(data) >= size:
@@ -153,18 +153,31 @@ def _size(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
 
 def _splice(data: bytearray, others: Sequence[bytes], rng: random.Random) -> None:
     other = rng.choice(others)
-    start, stop = _piece(other, rng)
-    begin, end = _piece(data, rng)
+    start, stop = _range(other, rng)
+    begin, end = _range(data, rng)
     data[begin:end] = other[start:stop]
 
 
 def _copy(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:
-    start, stop = _piece(data, rng)
-    at = _somewhere(data, rng)
-    data[at:at] = data[start:stop]
+    start, stop = _range(data, rng)
+    position = _position(data, rng)
+    data[position:position] = data[start:stop]
 
 
 _CHANGES: Final[tuple[Callable[[bytearray, Sequence[bytes], random.Random], None], ...]] = (
-    *(_flip, _byte, _cut, _leave_out, _repeat, _repeat_line, _move_line, _insert, _number, _number, _size, _size),
+    *(
+        _flip,
+        _set_byte,
+        _truncate,
+        _delete,
+        _repeat,
+        _repeat_line,
+        _move_line,
+        _insert,
+        _replace_number,
+        _replace_number,
+        _write_size,
+        _write_size,
+    ),
     *(_splice, _copy),
 )

@@ -1,4 +1,4 @@
-"""Readers of what radios and programs say during a repeat, and of the paths and expressions that look into it."""
+"""Fuzz targets: readers of radio and program outputs during a repeat, and of paths and expressions into them."""
 
 import gzip
 import json
@@ -31,30 +31,30 @@ _EXPRESSIONS: Final = (b"rtt = ([0-9.]+) ms", b"^(\\S+) +dB$", b"(?i)(?:loss|los
 _PRINTED: Final = {"end": {"sum": {"bits_per_second": 5e6}}, "intervals": [{"sum": {"seconds": 1, "bytes": 12}}]}
 
 
-def _measured(samples: list[LinkSample]) -> None:
-    """Measure a link; a table can hold what came of it."""
-    found = link.measure(Role.SENDER, samples)
+def _measure(samples: list[LinkSample]) -> None:
+    """Measure a link; all values must be valid in the table."""
+    measured = link.measure(Role.SENDER, samples)
     link.link_history(samples)
     for column in link.COLUMNS:
-        assert column.invalid_value_reason(cell(found.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
 
 
-def _testbeds(data: bytes, place: Path) -> None:
+def _read_testbed_samples(data: bytes, place: Path) -> None:
     (place / link_samples.FILE).write_bytes(data)
     for samples in link_samples.read(place / link_samples.FILE).values():
-        _measured(list(samples))
+        _measure(list(samples))
 
 
-def _own(name: str, data: bytes, place: Path) -> None:
-    """Read a robot's own samples, of which one file is the input and the others are whole."""
+def _read_robot_samples(name: str, data: bytes, place: Path) -> None:
+    """Read a robot's own link samples, with one mutated file and the others intact."""
     (place / "sender-before.txt").write_text(_CLOCK, encoding="utf-8")
     if "link" not in name:
         (place / "sender-link.txt").write_text(_OWN, encoding="utf-8")
     (place / name).write_bytes(data)
-    _measured(list(link_samples.read_robot(place, Role.SENDER)))
+    _measure(list(link_samples.read_robot(place, Role.SENDER)))
 
 
-def _iw(data: bytes, _: Path) -> None:
+def _parse_iw(data: bytes, _: Path) -> None:
     text = data.decode(errors="replace")
     iw.stations(text)
     iw.cell(text)
@@ -63,16 +63,16 @@ def _iw(data: bytes, _: Path) -> None:
         iw.wireless(line)
 
 
-def _path(data: bytes, place: Path) -> None:
-    """Look where a procedure's author says, a text of any length."""
-    where = data.decode(errors="replace")
+def _evaluate_path(data: bytes, place: Path) -> None:
+    """Evaluate a path of any length, as given by the author of a procedure."""
+    path_text = data.decode(errors="replace")
     (place / "run.txt").write_text(json.dumps(_PRINTED), encoding="ascii")
-    if printed.path_error(where) is None:
+    if printed.path_error(path_text) is None:
         with suppress(EvidenceError):
-            printed.at_path(place / "run.txt", where)
+            printed.at_path(place / "run.txt", path_text)
 
 
-def _expression(data: bytes, place: Path) -> None:
+def _match_expression(data: bytes, place: Path) -> None:
     expression = data.decode(errors="replace")
     (place / "run.txt").write_text("rtt = 12.5 ms\nloss: 3%\n" + "a" * 5000 + "b\n", encoding="ascii")
     if printed.expression_error(expression) is None:
@@ -83,15 +83,15 @@ def radio_targets() -> Iterator[Target]:
     """Yield the targets."""
     samples = link_samples.parse(_OWN)
     testbeds = link_samples.text({Role.SENDER: samples, Role.RECEIVER: samples[:3]}).encode()
-    yield Target("link-csv", (testbeds,), _testbeds)
+    yield Target("link-csv", (testbeds,), _read_testbed_samples)
     states = (_CLOCK + (_IW / "station-iwlwifi-6.txt").read_text(encoding="utf-8")).encode()
     for name, seed in (
         ("sender-link.txt", _OWN.encode()),
         ("sender-link.txt.gz", gzip.compress(_OWN.encode(), mtime=0)),
         ("sender-before.txt", states),
     ):
-        yield Target(f"own-{name}".replace(".", "_"), (seed,), partial(_own, name))
-    said = (*sorted(path.read_bytes() for path in _IW.glob("*.txt")), _WIRELESS.encode())
-    yield Target("telemetry", said, _iw)
-    yield Target("json-path", _PATHS, _path)
-    yield Target("expression", _EXPRESSIONS, _expression)
+        yield Target(f"own-{name}".replace(".", "_"), (seed,), partial(_read_robot_samples, name))
+    outputs = (*sorted(path.read_bytes() for path in _IW.glob("*.txt")), _WIRELESS.encode())
+    yield Target("telemetry", outputs, _parse_iw)
+    yield Target("json-path", _PATHS, _evaluate_path)
+    yield Target("expression", _EXPRESSIONS, _match_expression)

@@ -1,4 +1,4 @@
-"""Every reader of what a robot or a colleague sends, with kept real outputs of what it reads."""
+"""All fuzz targets: readers of everything that a robot or a colleague sends, with stored real outputs as seeds."""
 
 import io
 import math
@@ -59,7 +59,7 @@ from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.running import locks
 from tests.fuzz.harness import Target
 from tests.fuzz.motion_targets import motion_targets
-from tests.fuzz.mutate import MOST_BYTES
+from tests.fuzz.mutate import MAX_BYTES
 from tests.fuzz.radio_targets import radio_targets
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
 from tests.helpers.drones import flight
@@ -72,8 +72,8 @@ TRIALS: Final = DATA / "fieldkit" / "4" / "trials"
 LOS: Final = TRIALS / "20261122T013134.573068Z_los_30ft_master"
 SELFHEAL: Final = TRIALS / "20261122T011151.376739Z_selfheal_10ft_masterless"
 
-# What the job script says of itself, its jobs and its locks (fieldkit/remote/*.sh).
-_REPLIES: Final = (
+# Output of the job script about itself, its jobs and its locks (fieldkit/remote/*.sh).
+_SCRIPT_REPLIES: Final = (
     b"job.sh: held 12 3588 1795309788 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
     b"job.sh: aborted 1795309788 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
     b"job.sh: gone 1795309788 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
@@ -84,53 +84,53 @@ _REPLIES: Final = (
 )
 
 
-def _all(*patterns: str, below: Path = DATA) -> tuple[bytes, ...]:
-    found = sorted({path for pattern in patterns for path in below.glob(pattern) if path.is_file()})
-    assert found, patterns
-    return tuple(dict.fromkeys(path.read_bytes() for path in found))
+def _stored(*patterns: str, below: Path = DATA) -> tuple[bytes, ...]:
+    result = sorted({path for pattern in patterns for path in below.glob(pattern) if path.is_file()})
+    assert result, patterns
+    return tuple(dict.fromkeys(path.read_bytes() for path in result))
 
 
-def _attempts(*names: str) -> tuple[bytes, ...]:
-    return _all(*(f"*/repeats/*/{name}" for name in names), below=TRIALS)
+def _stored_attempts(*names: str) -> tuple[bytes, ...]:
+    return _stored(*(f"*/repeats/*/{name}" for name in names), below=TRIALS)
 
 
-def _written(read: Callable[[Path], object], name: str, data: bytes, place: Path) -> None:
+def _read_file(read: Callable[[Path], object], name: str, data: bytes, place: Path) -> None:
     (place / name).write_bytes(data)
     read(place / name)
 
 
-def _bag(path: Path) -> None:
+def _read_bag(path: Path) -> None:
     bag.read(path)
     bag.battery_share(path, TOPIC)
     bag.topic_stats(path)
 
 
 @cache
-def _ros2(storage: str) -> dict[str, bytes]:
-    """The files of a ROS 2 bag, written by rosbags: none was kept of a real recorder."""
+def _ros2_files(storage: str) -> dict[str, bytes]:
+    """Return the files of a ROS 2 bag, written by rosbags: no bag of a real recorder is stored."""
     with tempfile.TemporaryDirectory() as folder:
         path = write_ros2_bag(Path(folder, "scan"), storage, {"/scan": 40, "/odom": 3})
-        return {one.name: one.read_bytes() for one in path.parent.iterdir()}
+        return {file.name: file.read_bytes() for file in path.parent.iterdir()}
 
 
 @cache
-def _batteries() -> tuple[bytes, ...]:
+def _battery_bags() -> tuple[bytes, ...]:
     with tempfile.TemporaryDirectory() as folder:
         return (ros1(Path(folder), [0.5, 0.25]).read_bytes(), write_bag(Path(folder, "b"), {"/a": 9}).read_bytes())
 
 
-def _ros2_bag(storage: str, changed: str, data: bytes, place: Path) -> None:
-    files = _ros2(storage)
+def _read_ros2_bag(storage: str, changed: str, data: bytes, place: Path) -> None:
+    files = _ros2_files(storage)
     for name, content in files.items():
         (place / name).write_bytes(data if name.endswith(changed) else content)
-    _bag(place / f"scan_0.{storage}")
+    _read_bag(place / f"scan_0.{storage}")
 
 
-def _capture(data: bytes, _: Path) -> None:
+def _parse_capture(data: bytes, _: Path) -> None:
     pcap.parse(data, where="capture")
 
 
-def _fault(data: bytes, place: Path) -> None:
+def _measure_fault(data: bytes, place: Path) -> None:
     for kind in FaultKind:
         for name in (recovery.note_file(kind), recovery.observed_file(kind)):
             stored = next(SELFHEAL.glob(f"repeats/*/{name}"), None)
@@ -143,8 +143,8 @@ def _fault(data: bytes, place: Path) -> None:
                 (place / recovery.note_file(kind)).write_bytes(data)
 
 
-def _sections(data: bytes, _: Path) -> None:
-    """Judge a robot by a mutated probe, and by sections that all say the same."""
+def _judge_sections(data: bytes, _: Path) -> None:
+    """Judge a robot by a mutated probe, and by sections that all have the same text."""
     text = data.decode(errors="replace")
     the_plan, said = los_plan(), CommandResult(text.strip("\n"), 0)
     names = ("wifi-info", "wifi-link", "wifi-stations", "wifi-power-save", "interface", "offloads", "control", "disk")
@@ -154,10 +154,10 @@ def _sections(data: bytes, _: Path) -> None:
             radio.judge(robot, sections, report)
             system.judge(the_plan, role, sections, report)
             software.judge(the_plan, role, sections, report)
-        assert all(one.detail.isprintable() for one in report.findings)
+        assert all(finding.detail.isprintable() for finding in report.findings)
 
 
-def _probe() -> tuple[bytes, ...]:
+def _probe_seeds() -> tuple[bytes, ...]:
     files = {"interface": "ip/6.1.0/up.txt", "offloads": "ethtool/6.1/tun.txt", "wifi-info": "iw/info-station.txt"}
     files |= {"wifi-link": "iw/link-station.txt", "wifi-power-save": "iw/power-save-on.txt"}
     files |= {"wifi-stations": "iw/stations-ap.txt"}
@@ -166,7 +166,7 @@ def _probe() -> tuple[bytes, ...]:
     return (b"".join((*parts, b"==> disk: 0 <==\n", disk, b"==> batteries: 0 <==\nBAT0 80\n")),)
 
 
-def _tools(data: bytes, _: Path) -> None:
+def _parse_tools(data: bytes, _: Path) -> None:
     for output in (data, b"==> user <==\n0\n==> exit 0 <==\n" + data):
         tools.parse(output, TURTLEBOT)
 
@@ -175,65 +175,69 @@ def _tool_seeds() -> tuple[bytes, ...]:
     abouts = {"netcat": "nc.openbsd/*/about.txt", "ping": "ping/*/about.txt", "capture": "tcpdump/4.99.3/about.txt"}
     abouts |= {"recorder": "ros2-bag/jazzy/record-help.txt"}
     parts = [b"==> user <==\n1000\n\n==> exit 0 <==\n"]
-    parts += [b"==> %s <==\n%s\n==> exit 0 <==\n" % (name.encode(), _all(file)[0]) for name, file in abouts.items()]
-    return (b"".join(parts), *_all("*/*/*about.txt", "*/*/record-help.txt"))
+    parts += [
+        b"==> %s <==\n%s\n==> exit 0 <==\n" % (name.encode(), _stored(file)[0]) for name, file in abouts.items()
+    ]
+    return (b"".join(parts), *_stored("*/*/*about.txt", "*/*/record-help.txt"))
 
 
-def _tar(data: bytes, place: Path) -> None:
+def _fetch_tar(data: bytes, place: Path) -> None:
     fetching.fetch(Sender(place, data), "x", "sender", "lo", place)
 
 
-def _tars() -> tuple[bytes, ...]:
+def _tar_seeds() -> tuple[bytes, ...]:
     folder = LOS / "repeats" / "udp-01"
     small = (path for path in sorted(folder.iterdir()) if path.stat().st_size < 9000)
     files = [(path.name.encode(), path.read_bytes()) for path in small if not laptop_files.is_reserved(path.name)]
     members = [entry(b"scan/scan.db3", b"x"), *(entry(name, content) for name, content in files)]
     whole = b"".join(members) + bytes(1024)
-    names = [one.name for one in archive.members(io.BytesIO(whole), "robot")]
+    names = [member.name for member in archive.members(io.BytesIO(whole), "robot")]
     assert len(names) == len(members)
     return (whole,)
 
 
-def _replies(data: bytes, place: Path) -> None:
+def _read_replies(data: bytes, place: Path) -> None:
     shells = [Sender(place, data, code=code, stderr=data) for code in (0, 1, 28, 75, 76, 255)]
     for shell in shells:
-        for ask in (locks.holder, partial(jobs.list_running, deadline=Deadline.after(1)), _called):
+        for ask in (locks.holder, partial(jobs.list_running, deadline=Deadline.after(1)), _call_script):
             with suppress(RobotError):
                 ask(shell)
     offsets.parse_date(data.decode("ascii", "replace"))
     printable(data)
 
 
-def _called(shell: Sender) -> None:
+def _call_script(shell: Sender) -> None:
     script.call(shell, "begin", deadline=Deadline.after(1))
 
 
-def _journal(data: bytes, place: Path) -> None:
+def _read_journal(data: bytes, place: Path) -> None:
     (place / journal.JOURNAL_FILE).write_bytes(data)
     for _ in range(2):
         with suppress(EvidenceError):
-            found = journal.history(place, _plan())
-            journal.ended(found)
-            journal.interrupted(found)
+            result = journal.history(place, _plan())
+            journal.ended(result)
+            journal.interrupted(result)
         journal.remove_torn_line(place)
 
 
-def _measured(name: str, data: bytes, place: Path) -> None:
-    """Measure an attempt of which one file is the input; the nets that catch what a reader raises are looked into."""
+def _measure_attempt(name: str, data: bytes, place: Path) -> None:
+    """Measure an attempt with one mutated file; errors that evidence has stored count as raised."""
     the_plan, folders = _plan(), sorted((LOS / "repeats").glob("*-0?"))
     for folder in folders[:1] + folders[-1:]:
         attempt = place / folder.name
-        shutil.copytree(folder, attempt, copy_function=lambda one, to: Path(to).symlink_to(one))
+        shutil.copytree(folder, attempt, copy_function=lambda source, target: Path(target).symlink_to(source))
         (attempt / name).unlink(missing_ok=True)
         (attempt / name).write_bytes(data)
-        found = AttemptEvidence(attempt)
+        result = AttemptEvidence(attempt)
         protocol, _, number = folder.name.partition("-")
-        scene = the_plan.scene(RepeatId(next(one for one in the_plan.protocols if one == protocol), int(number)), "")
+        scene = the_plan.scene(
+            RepeatId(next(known for known in the_plan.protocols if known == protocol), int(number)), ""
+        )
         for placed in the_plan.procedure.walk():
-            view = View(scene, found, placed.within)
+            view = View(scene, result, placed.within)
             placed.step.measure(view)
             list(placed.step.check(view))
-        for error in found._failed.values():
+        for error in result._failed.values():
             if error.__cause__ is not None and not isinstance(error.__cause__, OSError | ReaderError):
                 raise error.__cause__
 
@@ -243,41 +247,41 @@ def _plan() -> plan.Plan:
     return store.read_plan(LOS)
 
 
-def _trial(name: str, data: bytes, place: Path) -> None:
+def _rebuild_trial(name: str, data: bytes, place: Path) -> None:
     folder = place / LOS.name
-    shutil.copytree(LOS, folder, copy_function=lambda one, to: Path(to).symlink_to(one))
-    for own in (*folder.glob("*.csv"), folder / name):
-        own.unlink()
+    shutil.copytree(LOS, folder, copy_function=lambda source, target: Path(target).symlink_to(source))
+    for replaced in (*folder.glob("*.csv"), folder / name):
+        replaced.unlink()
     (folder / name).write_bytes(data)
     rebuild.rebuild(folder)
 
 
-def _csv(data: bytes, place: Path) -> None:
+def _read_csv(data: bytes, place: Path) -> None:
     (place / "trial.csv").write_bytes(data)
     duplicates.deduplicated(repeats.read([place / "trial.csv"], columns.trial_columns()))
 
 
-def _manifest(path: Path) -> None:
+def _verify_manifest(path: Path) -> None:
     manifest.verify(path.parent)
 
 
-def _site(path: Path) -> None:
+def _load_site(path: Path) -> None:
     load_site(path)
 
 
-def _campaign(path: Path) -> None:
+def _load_campaign(path: Path) -> None:
     load_campaign(path)
 
 
-def _parsed(parse: Callable[[str], object], data: bytes, _: Path) -> None:
+def _parse_text(parse: Callable[[str], object], data: bytes, _: Path) -> None:
     parse(data.decode(errors="replace"))
 
 
-def _measured_text(read: Callable[[Path], object], data: bytes, place: Path) -> None:
-    _written(read, "evidence.txt", data, place)
+def _read_evidence(read: Callable[[Path], object], data: bytes, place: Path) -> None:
+    _read_file(read, "evidence.txt", data, place)
 
 
-def _host(path: Path) -> None:
+def _read_host(path: Path) -> None:
     host.read(path)
     host.stations(path)
     state = host.state(path)
@@ -287,99 +291,115 @@ def _host(path: Path) -> None:
         clock.step_description(state.clock, state.clock)
 
 
-def _pinged(text: str) -> None:
-    found = ping.parse(text)
-    ping.measure(found)
-    assert len(found.gaps) <= 1 << 16
+def _measure_ping(text: str) -> None:
+    result = ping.parse(text)
+    ping.measure(result)
+    assert len(result.gaps) <= 1 << 16
 
 
-def _tracked(path: Path) -> None:
-    found = track.read(path)
-    track.separation_between(found, Role.SENDER, Role.RECEIVER, 0, 1 << 62)
+def _measure_track(path: Path) -> None:
+    result = track.read(path)
+    track.separation_between(result, Role.SENDER, Role.RECEIVER, 0, 1 << 62)
 
 
-def _iperf3(path: Path) -> None:
-    found = iperf3.read(path)
+def _measure_iperf3(path: Path) -> None:
+    result = iperf3.read(path)
     for protocol in Protocol:
-        measured = iperf3.measure(protocol, found, found)
+        measured = iperf3.measure(protocol, result, result)
         assert all(isinstance(value, int | float) for value in measured.values.values())
 
 
 def _topic_logs() -> tuple[bytes, ...]:
-    """Return a log of each end of a topic, as the agent writes them."""
+    """Return a log of each end of a topic, as written by the agent."""
     start_ns = 1_700_000_000 * 10**9
-    begun = [(2, 0, 0, 0, 0, start_ns), (3, 0, 0, 0, 0, start_ns + 10**8)]
-    samples = [(1, 0, 220, one, start_ns + one * 10**8, start_ns + one * 10**8 + 10**6) for one in range(20)]
-    logs = ([*begun, *samples, (5, 0, 0, 3, 0, start_ns), (7, 0, 0, 20, 0, start_ns)], [*begun, *samples[::2]])
-    whole, killed = (records.MAGIC + b"".join(records.RECORD.pack(*one) for one in log) for log in logs)
+    start_records = [(2, 0, 0, 0, 0, start_ns), (3, 0, 0, 0, 0, start_ns + 10**8)]
+    samples = [
+        (1, 0, 220, number, start_ns + number * 10**8, start_ns + number * 10**8 + 10**6) for number in range(20)
+    ]
+    logs = (
+        [*start_records, *samples, (5, 0, 0, 3, 0, start_ns), (7, 0, 0, 20, 0, start_ns)],
+        [*start_records, *samples[::2]],
+    )
+    whole, killed = (records.MAGIC + b"".join(records.RECORD.pack(*record) for record in log) for log in logs)
     return whole, killed + bytes(500)
 
 
-def _tlog(path: Path) -> None:
-    found = tlog.measure(tlog.read(path, 0, 0))
-    assert all(math.isfinite(value) for value in found.values.values() if not isinstance(value, str))
+def _measure_tlog(path: Path) -> None:
+    result = tlog.measure(tlog.read(path, 0, 0))
+    assert all(math.isfinite(value) for value in result.values.values() if not isinstance(value, str))
     for kind in (tlog.LOCAL, tlog.GLOBAL):
         for stamps in ("header", "received"):
             with suppress(EvidenceError):
                 recorded.read_tlog(path, Account(topic=kind, stamps=stamps))
 
 
-def _topic_log(path: Path) -> None:
-    found = topic_log.read(path)
+def _measure_topic_log(path: Path) -> None:
+    result = topic_log.read(path)
     flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
     plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, on_ports=True)
-    list(topic_checks.check_logs(plan, found, found))
-    list(topic_captures.check_captures(plan, found, found, CapturedTopic(None, None, complete=False)))
-    topics.measure(flow, found, found, None, None)
+    list(topic_checks.check_logs(plan, result, result))
+    list(topic_captures.check_captures(plan, result, result, CapturedTopic(None, None, complete=False)))
+    topics.measure(flow, result, result, None, None)
 
 
-def _printed(data: bytes, place: Path) -> None:
-    """Look for values in whatever a program printed, by paths and expressions that find some in all of it."""
+def _read_printed(data: bytes, place: Path) -> None:
+    """Evaluate paths and expressions that have matches in any output of a program."""
     path = place / "run.txt"
     path.write_bytes(data)
-    looks = (
+    readings = (
         *(partial(printed.at_path, path, where) for where in ("[0].a[1].b", "end.sum.bytes", "@", "*", "[].a[]")),
         *(partial(printed.by_expression, path, what) for what in (r"(a+)+$", r"= ([0-9]+)", r"(?s)(.*)")),
     )
-    for look in looks:
+    for reading in readings:
         for unit in ("V", "count", "ns", "share", "bool", "text"):
             with suppress(EvidenceError):
-                printed.value(Column("x", unit, "X."), look())
+                printed.value(Column("x", unit, "X."), reading())
 
 
 def _all_targets() -> Iterator[Target]:
-    yield Target("bag", (*_all("rosbag/*/*"), *_batteries()), partial(_written, _bag, "scan.bag"), 2)
+    yield Target("bag", (*_stored("rosbag/*/*"), *_battery_bags()), partial(_read_file, _read_bag, "scan.bag"), 2)
     for storage in ("db3", "mcap"):
         yield Target(
-            f"ros2-{storage}", (_ros2(storage)[f"scan_0.{storage}"],), partial(_ros2_bag, storage, storage), 2
+            f"ros2-{storage}",
+            (_ros2_files(storage)[f"scan_0.{storage}"],),
+            partial(_read_ros2_bag, storage, storage),
+            2,
         )
-    yield Target("ros2-metadata", (_ros2("db3")["metadata.yaml"],), partial(_ros2_bag, "db3", "metadata.yaml"), 0.3)
-    yield Target("pcap", _all("tcpdump/**/*.pcap"), _capture, 4)
-    yield Target("pcapng", _all("tshark/**/*.pcapng"), _capture, 4)
-    pings = _all("ping/*/*.txt", "busybox/*/ping*.txt")
-    yield Target("ping", (*pings, *_attempts("ping.txt")), partial(_parsed, _pinged), 3)
-    yield Target("tcpdump-log", _all("tcpdump/*/*.log"), partial(_parsed, tcpdump_log.parse))
-    yield Target("host", _attempts("*-before.txt", "*-after.txt"), partial(_measured_text, _host))
-    yield Target("lateness", _attempts(lateness.FILE), partial(_measured_text, lateness.read))
-    yield Target("medium", _attempts(medium.FILE), partial(_measured_text, medium.read))
-    yield Target("track", _attempts(track.FILE), partial(_measured_text, _tracked))
-    yield Target("fault", _attempts("fault-*.txt"), _fault)
-    yield Target("iperf3", _all("iperf3/*/*.json"), partial(_measured_text, _iperf3))
-    yield Target("tlog", (flight(3), flight(2, lost=lambda at: at % 3 == 1)), partial(_written, _tlog, "x.tlog"))
-    told = b'{"frames": 203, "left_out": 0, "ended_us": 1795000010000000, "refused": {"32": 2}}\n'
-    yield Target("tlog-told", (told,), partial(_measured_text, tlog.read_summary))
-    yield Target("topic-log", _topic_logs(), partial(_measured_text, _topic_log))
-    yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_all("iperf3/3.12/*.json")), _printed)
-    yield Target("iw", (*_all("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe()), _sections, 2)
+    yield Target(
+        "ros2-metadata", (_ros2_files("db3")["metadata.yaml"],), partial(_read_ros2_bag, "db3", "metadata.yaml"), 0.3
+    )
+    yield Target("pcap", _stored("tcpdump/**/*.pcap"), _parse_capture, 4)
+    yield Target("pcapng", _stored("tshark/**/*.pcapng"), _parse_capture, 4)
+    pings = _stored("ping/*/*.txt", "busybox/*/ping*.txt")
+    yield Target("ping", (*pings, *_stored_attempts("ping.txt")), partial(_parse_text, _measure_ping), 3)
+    yield Target("tcpdump-log", _stored("tcpdump/*/*.log"), partial(_parse_text, tcpdump_log.parse))
+    yield Target("host", _stored_attempts("*-before.txt", "*-after.txt"), partial(_read_evidence, _read_host))
+    yield Target("lateness", _stored_attempts(lateness.FILE), partial(_read_evidence, lateness.read))
+    yield Target("medium", _stored_attempts(medium.FILE), partial(_read_evidence, medium.read))
+    yield Target("track", _stored_attempts(track.FILE), partial(_read_evidence, _measure_track))
+    yield Target("fault", _stored_attempts("fault-*.txt"), _measure_fault)
+    yield Target("iperf3", _stored("iperf3/*/*.json"), partial(_read_evidence, _measure_iperf3))
+    yield Target(
+        "tlog", (flight(3), flight(2, lost=lambda at: at % 3 == 1)), partial(_read_file, _measure_tlog, "x.tlog")
+    )
+    summary = b'{"frames": 203, "left_out": 0, "ended_us": 1795000010000000, "refused": {"32": 2}}\n'
+    yield Target("tlog-told", (summary,), partial(_read_evidence, tlog.read_summary))
+    yield Target("topic-log", _topic_logs(), partial(_read_evidence, _measure_topic_log))
+    yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_stored("iperf3/3.12/*.json")), _read_printed)
+    yield Target("iw", (*_stored("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe_seeds()), _judge_sections, 2)
     yield from radio_targets()
     yield from motion_targets()
-    yield Target("tools", _tool_seeds(), _tools)
-    yield Target("tar", _tars(), _tar, 2)
-    yield Target("replies", _REPLIES, _replies)
-    yield Target("journal", _all("*/journal.jsonl", below=TRIALS), _journal, 2)
-    yield Target("csv", _all("fieldkit/*/trial.csv", "fieldkit/*/trials/*/trial.csv"), _csv)
-    yield Target("manifest", _all("*/MANIFEST.sha256", below=TRIALS), partial(_written, _manifest, "MANIFEST.sha256"))
-    yield from _yaml()
+    yield Target("tools", _tool_seeds(), _parse_tools)
+    yield Target("tar", _tar_seeds(), _fetch_tar, 2)
+    yield Target("replies", _SCRIPT_REPLIES, _read_replies)
+    yield Target("journal", _stored("*/journal.jsonl", below=TRIALS), _read_journal, 2)
+    yield Target("csv", _stored("fieldkit/*/trial.csv", "fieldkit/*/trials/*/trial.csv"), _read_csv)
+    yield Target(
+        "manifest",
+        _stored("*/MANIFEST.sha256", below=TRIALS),
+        partial(_read_file, _verify_manifest, "MANIFEST.sha256"),
+    )
+    yield from _yaml_targets()
     for name in (
         "sender.pcap",
         "receiver.pcap",
@@ -388,20 +408,24 @@ def _all_targets() -> Iterator[Target]:
         "scan.bag",
         "receiver-capture.log",
     ):
-        yield Target(f"attempt-{name}".replace(".", "_"), _attempts(name), partial(_measured, name), 0.5)
+        yield Target(
+            f"attempt-{name}".replace(".", "_"), _stored_attempts(name), partial(_measure_attempt, name), 0.5
+        )
     for name in (journal.JOURNAL_FILE, plan.PLAN_FILE):
-        yield Target(f"trial-{name}".replace(".", "_"), ((LOS / name).read_bytes(),), partial(_trial, name), 0.2)
+        yield Target(
+            f"trial-{name}".replace(".", "_"), ((LOS / name).read_bytes(),), partial(_rebuild_trial, name), 0.2
+        )
 
 
-def _yaml() -> Iterator[Target]:
+def _yaml_targets() -> Iterator[Target]:
     def of(model: type[schema.Strict]) -> Callable[[bytes, Path], None]:
-        return partial(_written, lambda path: schema.load(path, model), "file.yaml")
+        return partial(_read_file, lambda path: schema.load(path, model), "file.yaml")
 
-    yield Target("plan", _all("*/trial.yaml", below=TRIALS), of(plan.Plan))
-    yield Target("procedure", _all("*.yaml", below=ROOT / "procedures"), of(Procedure))
-    yield Target("robot", _all("*.yaml", below=ROOT / "robots"), of(RobotProfile))
-    yield Target("site", (_SITE,), partial(_written, _site, "fieldkit.yaml"))
-    yield Target("campaign", (_CAMPAIGN,), partial(_written, _campaign, "campaign.yaml"))
+    yield Target("plan", _stored("*/trial.yaml", below=TRIALS), of(plan.Plan))
+    yield Target("procedure", _stored("*.yaml", below=ROOT / "procedures"), of(Procedure))
+    yield Target("robot", _stored("*.yaml", below=ROOT / "robots"), of(RobotProfile))
+    yield Target("site", (_SITE,), partial(_read_file, _load_site, "fieldkit.yaml"))
+    yield Target("campaign", (_CAMPAIGN,), partial(_read_file, _load_campaign, "campaign.yaml"))
 
 
 _SITE: Final = b"""\
@@ -432,18 +456,21 @@ walk: 300m
 
 
 @cache
-def _known() -> dict[str, Target]:
+def _targets_by_name() -> dict[str, Target]:
     return {target.name: target for target in _all_targets()}
 
 
-def named(names: str) -> Sequence[Target]:
-    """Return the targets of these names, separated by commas; all for none."""
-    return [(_known() | {PLANTED.name: PLANTED})[name] for name in (names.split(",") if names else _known())]
+def select_targets(names: str) -> Sequence[Target]:
+    """Return the targets with these names, separated by commas; all if it is empty."""
+    return [
+        (_targets_by_name() | {PLANTED.name: PLANTED})[name]
+        for name in (names.split(",") if names else _targets_by_name())
+    ]
 
 
-NAMES: Final = tuple(_known())
+NAMES: Final = tuple(_targets_by_name())
 
-# As the judge of `iw` once did it: from each empty line the pattern goes on through all that follow.
+# Like an earlier version of the `iw` reader: from each empty line the pattern continues through all that follow.
 _SQUARE: Final = re.compile(r"^\s*type (.{1,30})$", re.MULTILINE)
-PLANTED: Final = Target("planted", [b"\n" * MOST_BYTES], partial(_parsed, _SQUARE.search), cpu_s=0.5)
-"""A defect that a hunt must find; in no other."""
+PLANTED: Final = Target("planted", [b"\n" * MAX_BYTES], partial(_parse_text, _SQUARE.search), cpu_s=0.5)
+"""A planted defect that a search must find; it is in no other target."""

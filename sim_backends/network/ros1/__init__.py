@@ -1,1 +1,1 @@
-"""ROS 1: a master with whom nodes register, and TCPROS or UDPROS between them."""
+"""ROS 1: a master at which nodes register, and TCPROS or UDPROS between them."""

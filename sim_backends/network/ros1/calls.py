@@ -1,4 +1,4 @@
-"""Calls between nodes and their master by XML-RPC: requests and answers over TCP, and trying again."""
+"""Calls between nodes and their master by XML-RPC: requests and responses over TCP, with retries."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,24 +10,24 @@ from sim_backends.network.wire import Wire
 
 @dataclass(frozen=True, slots=True)
 class CallAnswer:
-    """What a call is answered.
+    """The response to a call.
 
     Attributes:
-        size_bytes: Of the answer.
-        told: What the caller does when it has it.
+        size_bytes: Size of the response.
+        on_received: Called at the caller when the response arrives.
     """
 
     size_bytes: int
-    told: Callable[[], None]
+    on_received: Callable[[], None]
 
 
 @dataclass(frozen=True, slots=True)
 class CallRetry:
-    """When a call is tried again whose connection was given up.
+    """Times of the retries of a call whose connection was given up.
 
     Attributes:
-        first_ns: After how long at first; each time after twice as long.
-        longest_ns: But never longer than this.
+        first_ns: Delay of the first retry; it doubles for each further retry.
+        longest_ns: Maximum delay.
     """
 
     first_ns: int
@@ -35,11 +35,11 @@ class CallRetry:
 
 
 class RemoteCalls:
-    """Makes calls. One without an answer stays open until a connection is given up, its own or that of the answer.
+    """Makes calls; a call is open until its response arrives or a connection that it uses is given up.
 
     Args:
-        wire: Keeps the time.
-        streams: What calls go over. A host keeps its connection to another, but for calls that have their own.
+        wire: Provides the clock.
+        streams: Carries the calls. A host keeps its connection to another; some calls have a separate connection.
     """
 
     def __init__(self, wire: Wire, streams: TcpStreams) -> None:
@@ -59,23 +59,26 @@ class RemoteCalls:
         """Call from one host to another.
 
         Args:
-            caller: Who calls.
-            callee: Who is called.
-            size_bytes: Of the request.
-            serve: What the callee does, which gives the answer; a call that is tried again may be served twice.
-            retry: When it is tried again; None for never.
-            about: What it is about, if it has a connection of its own.
+            caller: The calling host.
+            callee: The called host.
+            size_bytes: Size of the request.
+            serve: Executes the call at the callee and returns the response; a call that is repeated may be executed
+                twice.
+            retry: Times of retries; None for no retry.
+            about: Topic of the call if it has a separate connection, else empty.
         """
         connection = f"xmlrpc {caller} {callee} {about}".rstrip()
 
-        def fail(reason: str) -> None:  # noqa: ARG001 (see Lost)
+        def on_lost(reason: str) -> None:  # noqa: ARG001 (see Lost)
             if retry is not None:
-                later = CallRetry(min(2 * retry.first_ns, retry.longest_ns), retry.longest_ns)
-                again = partial(self.call, caller, callee, size_bytes, serve, later, about=about)
-                self._wire.at(self._wire.now_ns + retry.first_ns, caller, again)
+                next_retry = CallRetry(min(2 * retry.first_ns, retry.longest_ns), retry.longest_ns)
+                call_again = partial(self.call, caller, callee, size_bytes, serve, next_retry, about=about)
+                self._wire.at(self._wire.now_ns + retry.first_ns, caller, call_again)
 
-        def arrive() -> None:
+        def on_request() -> None:
             answer = serve()
-            self._streams.send((callee, caller), connection, answer.size_bytes, answer.told, fail, back=True)
+            self._streams.send(
+                (callee, caller), connection, answer.size_bytes, answer.on_received, on_lost, reverse=True
+            )
 
-        self._streams.send((caller, callee), connection, size_bytes, arrive, fail)
+        self._streams.send((caller, callee), connection, size_bytes, on_request, on_lost)

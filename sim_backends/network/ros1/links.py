@@ -12,25 +12,25 @@ from sim_backends.network.timer import WireTimer
 from sim_backends.network.wire import IpPacket, Wire
 
 TRANSPORT: Final = "ros1"
-"""Name of the transport, as packets of programs have it."""
+"""Name of the transport, as in packets of programs."""
 NOT_CONNECTED: Final = "no subscriber is connected"
 GIVEN_UP: Final = "the subscriber has given this connection up"
 OUT_OF_ORDER: Final = "blocks of UDPROS out of order"
 _PROBE_BYTES: Final = 20 + 32
-"""A segment of TCP without data, with timestamps."""
+"""A TCP segment without data, with timestamps."""
 _UDP_BYTES: Final = 20 + 8
 _UDPROS_HEADER_BYTES: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """Asks whether a connection is alive, or answers that.
+    """A query whether a connection is alive, or its response.
 
     Attributes:
-        flow: Whose connection.
-        connection: Which, from 1.
-        number: Which probe.
-        alive: The answer; None asks.
+        flow: Flow of the connection.
+        connection: Number of the connection, from 1.
+        number: Number of the probe.
+        alive: The response; None for a query.
     """
 
     flow: str
@@ -44,10 +44,10 @@ class Block:
     """A datagram of UDPROS.
 
     Attributes:
-        flow: Of which flow.
-        packet_id: Of the message.
-        index: Which block of it.
-        of: How many it has.
+        flow: Name of the flow.
+        packet_id: Number of the message.
+        index: Index of the block in the message.
+        of: Number of blocks of the message.
     """
 
     flow: str
@@ -57,14 +57,14 @@ class Block:
 
 
 class TcprosLink:
-    """Messages over a TCP connection that the subscriber opens, after an exchange of headers.
+    """Messages over a TCP connection that the subscriber opens with an exchange of headers.
 
     Args:
-        wire: Keeps the time, and tells what became of messages.
-        streams: What messages go over.
-        name: Of the flow.
-        flow: Who publishes to whom.
-        options: Of the nodes.
+        wire: Provides the clock, and receives the results of messages.
+        streams: Carries the messages.
+        name: Name of the flow.
+        flow: Publisher and subscriber.
+        options: Options of the nodes.
     """
 
     def __init__(self, wire: Wire, streams: TcpStreams, name: str, flow: Ros1Flow, options: Ros1Options) -> None:
@@ -73,114 +73,114 @@ class TcprosLink:
         self._name = name
         self._flow = flow
         self._options = options
-        self._down = flow.publisher, flow.subscriber
+        self._downstream = flow.publisher, flow.subscriber
         self._retry_ns = options.reconnect.first_ns
-        # Which connection each end takes to be open; 0 for none.
-        self._of_publisher = 0
-        self._of_subscriber = 0
-        self._opened = 0
-        self._unanswered = 0
-        self._probed = 0
-        self._silence = WireTimer(wire, flow.subscriber, self._probe)
+        # The connection that each end regards as open; 0 for none.
+        self._publisher_connection = 0
+        self._subscriber_connection = 0
+        self._connection_count = 0
+        self._unanswered_probes = 0
+        self._probe_count = 0
+        self._silence_timer = WireTimer(wire, flow.subscriber, self._probe)
 
     def accept(self) -> None:
-        """Do nothing, at the publisher: it has told the subscriber where it listens."""
+        """Do nothing, at the publisher, which has sent its address to the subscriber."""
 
-    def begin(self) -> None:
-        """Open a connection, at the subscriber, which has learned from the publisher where."""
-        self._opened += 1
-        opened = self._of_subscriber = self._opened
-        self._hear()
-        up = self._flow.subscriber, self._flow.publisher
-        accept, give_up = partial(self._accept, opened), partial(self._give_up, opened)
+    def connect(self) -> None:
+        """Open a connection, at the subscriber, which has received the publisher's address."""
+        self._connection_count += 1
+        connection = self._subscriber_connection = self._connection_count
+        self._reset_silence_timer()
+        upstream = self._flow.subscriber, self._flow.publisher
+        accept, reconnect = partial(self._accept, connection), partial(self._reconnect_later, connection)
         size_bytes = LENGTH_BYTES + self._flow.header_bytes
-        self._streams.send(up, f"{self._name} {opened}", size_bytes, accept, give_up)
+        self._streams.send(upstream, f"{self._name} {connection}", size_bytes, accept, reconnect)
 
     def publish(self, packet: Packet) -> None:
         """Send a message, at the publisher."""
-        if not self._of_publisher:
+        if not self._publisher_connection:
             self._wire.drop(packet.packet_id, NOT_CONNECTED)
             return
-        connection, packet_id = self._of_publisher, packet.packet_id
+        connection, packet_id = self._publisher_connection, packet.packet_id
         arrive = partial(self._arrive, connection, packet_id)
         self._send(connection, LENGTH_BYTES + packet.size_bytes, arrive, partial(self._lose, connection, packet_id))
 
     def receive(self, packet: IpPacket) -> None:
-        """Take a probe, or an answer to one."""
+        """Process a probe or its response."""
         probe: Probe = packet.body
         if probe.alive is None:
-            alive = probe.connection == self._of_publisher
-            self._emit(self._down, Probe(self._name, probe.connection, probe.number, alive))
+            alive = probe.connection == self._publisher_connection
+            self._emit(self._downstream, Probe(self._name, probe.connection, probe.number, alive))
         elif not probe.alive:
-            self._give_up(probe.connection, "")
-        elif probe.connection == self._of_subscriber:
-            self._hear()
+            self._reconnect_later(probe.connection, "")
+        elif probe.connection == self._subscriber_connection:
+            self._reset_silence_timer()
 
     def lost(self, packet: IpPacket, reason: str) -> None:
-        """Learn that a probe will not arrive, which changes nothing."""
+        """Ignore the loss of a probe."""
 
     def _accept(self, connection: int) -> None:
-        """Take the subscriber's header, at the publisher, and answer by one's own."""
-        if connection < self._of_publisher:
-            return  # It has opened another since.
-        self._of_publisher = connection
+        """Process the subscriber's header, at the publisher, and send the publisher's header."""
+        if connection < self._publisher_connection:
+            return  # The subscriber has opened another connection since.
+        self._publisher_connection = connection
         size_bytes = LENGTH_BYTES + self._flow.header_bytes
         self._send(connection, size_bytes, partial(self._open, connection), partial(self._close, connection))
 
     def _open(self, connection: int) -> None:
-        """Take the publisher's header, at the subscriber."""
-        if connection == self._of_subscriber:
+        """Process the publisher's header, at the subscriber."""
+        if connection == self._subscriber_connection:
             self._retry_ns = self._options.reconnect.first_ns
-            self._hear()
+            self._reset_silence_timer()
 
-    def _give_up(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
-        """Open another connection later, at the subscriber, unless that has been done."""
-        if connection != self._of_subscriber:
+    def _reconnect_later(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
+        """Give up the connection and open another one later, at the subscriber, unless that has been done."""
+        if connection != self._subscriber_connection:
             return
-        self._of_subscriber = 0
-        self._silence.stop()
+        self._subscriber_connection = 0
+        self._silence_timer.stop()
         retry_ns, self._retry_ns = self._retry_ns, min(2 * self._retry_ns, self._options.reconnect.longest_ns)
-        self._wire.at(self._wire.now_ns + retry_ns, self._flow.subscriber, self.begin)
+        self._wire.at(self._wire.now_ns + retry_ns, self._flow.subscriber, self.connect)
 
     def _close(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
-        """Forget a connection, at the publisher, whose TCP has given it up."""
-        if connection == self._of_publisher:
-            self._of_publisher = 0
+        """Close a connection, at the publisher, whose TCP has given it up."""
+        if connection == self._publisher_connection:
+            self._publisher_connection = 0
 
     def _lose(self, connection: int, packet_id: int, reason: str) -> None:
         self._wire.drop(packet_id, reason)
         self._close(connection, reason)
 
     def _arrive(self, connection: int, packet_id: int) -> None:
-        """Take a message, at the subscriber."""
-        if connection == self._of_subscriber:
+        """Deliver a message, at the subscriber."""
+        if connection == self._subscriber_connection:
             self._wire.deliver(packet_id)
-            self._hear()
+            self._reset_silence_timer()
         else:
             self._wire.drop(packet_id, GIVEN_UP)
 
-    def _hear(self) -> None:
-        self._unanswered = 0
-        self._silence.set(self._wire.now_ns + self._options.silence_ns)
+    def _reset_silence_timer(self) -> None:
+        self._unanswered_probes = 0
+        self._silence_timer.set(self._wire.now_ns + self._options.silence_ns)
 
     def _probe(self) -> None:
-        """Ask whether the connection is alive, at the subscriber, or give it up."""
-        if self._unanswered == self._options.probes:
-            self._give_up(self._of_subscriber, "")
+        """Probe the connection, at the subscriber, or give it up."""
+        if self._unanswered_probes == self._options.probes:
+            self._reconnect_later(self._subscriber_connection, "")
             return
-        self._unanswered += 1
-        self._probed += 1
-        up = self._flow.subscriber, self._flow.publisher
-        self._emit(up, Probe(self._name, self._of_subscriber, self._probed))
-        self._silence.set(self._wire.now_ns + self._options.probe_ns)
+        self._unanswered_probes += 1
+        self._probe_count += 1
+        upstream = self._flow.subscriber, self._flow.publisher
+        self._emit(upstream, Probe(self._name, self._subscriber_connection, self._probe_count))
+        self._silence_timer.set(self._wire.now_ns + self._options.probe_ns)
 
     def _send(self, connection: int, size_bytes: int, delivered: Callable[[], None], lost: Lost) -> None:
-        self._streams.send(self._down, f"{self._name} {connection}", size_bytes, delivered, lost, back=True)
+        self._streams.send(self._downstream, f"{self._name} {connection}", size_bytes, delivered, lost, reverse=True)
 
     def _emit(self, ends: tuple[str, str], probe: Probe) -> None:
         source, destination = ends
         if source == destination:
-            self._hear()
+            self._reset_silence_timer()
             return
         kind = "probe" if probe.alive is None else "probe answer"
         identity = f"{self._name} {kind}", probe.number
@@ -188,18 +188,18 @@ class TcprosLink:
 
 
 class UdprosLink:
-    """Messages in datagrams, of which nobody asks for one again.
+    """Messages in datagrams, without retransmission.
 
-    Blocks of a message must come in order, and one that comes too late or not takes the message with it.
+    Blocks of a message must arrive in order; if one is late or lost, the whole message is lost.
 
     Args:
-        wire: What datagrams go over.
-        name: Of the flow.
-        flow: Who publishes to whom.
-        options: Of the nodes.
+        wire: The network below.
+        name: Name of the flow.
+        flow: Publisher and subscriber.
+        options: Options of the nodes.
 
     Attributes:
-        connected: Whether the publisher knows of its subscriber.
+        connected: True if the publisher has a subscriber.
     """
 
     def __init__(self, wire: Wire, name: str, flow: Ros1Flow, options: Ros1Options) -> None:
@@ -207,17 +207,17 @@ class UdprosLink:
         self._name = name
         self._flow = flow
         self._payload_bytes = options.datagram_bytes - _UDPROS_HEADER_BYTES
-        # The message that the subscriber puts together, and the block that it expects.
+        # The message that the subscriber is reassembling, and the index of the next block.
         self._current = -1
         self._next = 0
         self._open: set[int] = set()
         self.connected = False
 
-    def begin(self) -> None:
-        """Do nothing, at the subscriber: it has told the publisher where it listens."""
+    def connect(self) -> None:
+        """Do nothing, at the subscriber, which has sent its address to the publisher."""
 
     def accept(self) -> None:
-        """Take it, at the publisher, that there is a subscriber."""
+        """Add the subscriber, at the publisher."""
         self.connected = True
 
     def publish(self, packet: Packet) -> None:
@@ -227,19 +227,19 @@ class UdprosLink:
             return
         source, destination = self._flow.publisher, self._flow.subscriber
         packet_id, (_, number) = packet.packet_id, packet.identity
-        left_bytes = LENGTH_BYTES + packet.size_bytes
-        of = -(-left_bytes // self._payload_bytes)
+        remaining_bytes = LENGTH_BYTES + packet.size_bytes
+        of = -(-remaining_bytes // self._payload_bytes)
         self._open.add(packet_id)
         for index in range(of):
-            payload_bytes = min(left_bytes, self._payload_bytes)
-            left_bytes -= payload_bytes
+            payload_bytes = min(remaining_bytes, self._payload_bytes)
+            remaining_bytes -= payload_bytes
             size_bytes = _UDP_BYTES + _UDPROS_HEADER_BYTES + payload_bytes
             identity = f"{self._name} block{index}", number
             block = Block(self._name, packet_id, index, of)
             self._wire.transmit(IpPacket(source, destination, TRANSPORT, size_bytes, identity, block))
 
     def receive(self, packet: IpPacket) -> None:
-        """Take a datagram, at the subscriber."""
+        """Process a datagram, at the subscriber."""
         block: Block = packet.body
         if block.index == 0 and block.packet_id != self._current:
             self._current, self._next = block.packet_id, 0
@@ -255,7 +255,7 @@ class UdprosLink:
                 self._wire.deliver(block.packet_id)
 
     def lost(self, packet: IpPacket, reason: str) -> None:
-        """Learn, for the account, that a datagram will not arrive."""
+        """Record, for statistics only, that a datagram will not arrive."""
         self._drop(packet.body.packet_id, reason)
 
     def _drop(self, packet_id: int, reason: str) -> None:

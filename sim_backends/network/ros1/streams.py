@@ -1,4 +1,4 @@
-"""Messages of ROS 1's own over TCP: a transport that stands on another one."""
+"""Messages of ROS 1 over TCP: a transport on top of another transport."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,18 +10,18 @@ from sim_backends.network.tcp.transport import Tcp
 from sim_backends.network.wire import IpPacket, Wire
 
 Lost = Callable[[str], None]
-"""Called with the reason."""
+"""Called with the reason of a loss."""
 
 
 class TcpStreams:
-    """Carries messages by TCP connections, and tells each end what its own TCP does.
+    """Carries messages over TCP connections, and reports delivery and loss to the ends by callbacks.
 
-    To its TCP it is the `Wire`; on the wire below, segments are packets of the transport that it belongs to.
+    It is the `Wire` of its TCP; on the wire below, segments are packets of the transport to which it belongs.
 
     Args:
-        wire: What segments go over.
-        transport: Name of the transport that gets their arrivals.
-        options: Of TCP.
+        wire: The network below.
+        transport: Name of the transport that receives the arriving packets.
+        options: Options of TCP.
 
     Attributes:
         now_ns: See `Wire`.
@@ -33,72 +33,72 @@ class TcpStreams:
         self._transport = transport
         self._tcp = Tcp(self, options)
         self._sent = 0
-        self._under_way: dict[int, tuple[Callable[[], None], Lost]] = {}
+        self._in_flight: dict[int, tuple[Callable[[], None], Lost]] = {}
 
     def send(
         self,
         ends: tuple[str, str],
         connection: str,
         size_bytes: int,
-        delivered: Callable[[], None],
-        lost: Lost,
+        on_delivered: Callable[[], None],
+        on_lost: Lost,
         *,
-        back: bool = False,
+        reverse: bool = False,
     ) -> None:
         """Send a message from one end to the other.
 
         Args:
-            ends: Source and destination; within one host a message arrives at once.
-            connection: Name of the connection, which is opened by its first message and after it was given up.
-            size_bytes: Of the message.
-            delivered: Called when it is whole at the destination.
-            lost: Called when its connection was given up before.
-            back: Whether it goes to who opened the connection.
+            ends: Source and destination; within one host a message arrives immediately.
+            connection: Name of the connection, which is opened by its first message, and again after it was given up.
+            size_bytes: Size of the message.
+            on_delivered: Called when the message is complete at the destination.
+            on_lost: Called when the connection was given up before that.
+            reverse: True if the message goes to the host that opened the connection.
         """
         source, destination = ends
         if source == destination:
-            self._wire.at(self._wire.now_ns, source, delivered)
+            self._wire.at(self._wire.now_ns, source, on_delivered)
             return
         self.now_ns = self._wire.now_ns
         self._sent += 1
-        self._under_way[self._sent] = delivered, lost
+        self._in_flight[self._sent] = on_delivered, on_lost
         self._tcp.send(
             Packet(
                 self._sent,
                 source,
                 destination,
                 size_bytes,
-                (f"{connection} back" if back else connection, self._sent),
+                (f"{connection} back" if reverse else connection, self._sent),
                 self.now_ns,
                 self.now_ns,
                 self._transport,
             ),
-            back_of=connection if back else None,
+            reverse_of=connection if reverse else None,
         )
 
     def receive(self, host: str, packet: IpPacket) -> None:
-        """Take a segment that arrived at `host`."""
+        """Process a segment that arrived at `host`."""
         self.now_ns = self._wire.now_ns
         self._tcp.receive(host, packet)
 
     def transmit(self, packet: IpPacket) -> None:
-        """See `Wire.transmit`."""
+        """Implement `Wire.transmit`."""
         self._wire.transmit(replace(packet, transport=self._transport))
 
     def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
-        """See `Wire.at`."""
-        self._wire.at(at_ns, host, partial(self._ring, call))
+        """Implement `Wire.at`."""
+        self._wire.at(at_ns, host, partial(self._call_now, call))
 
     def deliver(self, packet_id: int) -> None:
-        """See `Wire.deliver`."""
-        delivered, _ = self._under_way.pop(packet_id)
-        delivered()
+        """Implement `Wire.deliver`."""
+        on_delivered, _ = self._in_flight.pop(packet_id)
+        on_delivered()
 
     def drop(self, packet_id: int, reason: str) -> None:
-        """See `Wire.drop`."""
-        _, lost = self._under_way.pop(packet_id)
-        lost(reason)
+        """Implement `Wire.drop`."""
+        _, on_lost = self._in_flight.pop(packet_id)
+        on_lost(reason)
 
-    def _ring(self, call: Callable[[], None]) -> None:
+    def _call_now(self, call: Callable[[], None]) -> None:
         self.now_ns = self._wire.now_ns
         call()

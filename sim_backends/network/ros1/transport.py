@@ -1,4 +1,4 @@
-"""ROS 1: publishers and subscribers find each other by a master, and then talk without it."""
+"""ROS 1: publishers and subscribers find each other through a master, and then communicate without it."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -14,28 +14,29 @@ from sim_backends.network.wire import IpPacket, Wire
 
 
 class Ros1:
-    """The transport of packets that go by ROS 1.
+    """The transport of packets of ROS 1.
 
-    Publisher and subscriber of a flow register at the master, each when its node starts. The master tells the
-    subscriber of the publisher, in its answer or by a call of its own. The subscriber asks the publisher how to
-    connect, and does: by TCPROS, or by UDPROS, for which the question is enough. Before its first connection by
-    TCPROS it asks the master whether connections are to be kept alive, as rospy does. What is published before goes
-    nowhere. If the master cannot be reached no new connection comes up, and those that are go on.
+    The publisher and the subscriber of a flow register at the master when their nodes start. The master sends the
+    publisher's address to the subscriber, in its response or by a separate call. The subscriber requests the
+    connection parameters from the publisher and connects: by TCPROS, or by UDPROS, for which the request is
+    sufficient. Before its first TCPROS connection it queries the master for the keep-alive setting, as rospy does.
+    Messages published before are dropped. If the master cannot be reached, no new connection is opened, and existing
+    connections continue.
 
-    An agent keeps its connection to the master, as rospy does, while each question to a publisher has its own. So
-    between hosts d apart, with a connection to the master, 12 d pass from registering to the first message: 2 for the
-    answer, 4 for the publisher's, 2 for the master's, 4 for connection and headers. That is what rospy 1.15.15 takes,
-    for messages that fill a segment or subscribers that ask for `tcp_nodelay`; smaller ones wait for an ACK (Nagle),
-    2 d more.
+    An agent keeps its connection to the master, as rospy does, while each request to a publisher has a separate
+    connection. Between hosts with the delay d, and an open connection to the master, registration to first message
+    takes 12 d: 2 for the response of the master, 4 for that of the publisher, 2 for the keep-alive query, 4 for
+    connection and headers. This is the time of rospy 1.15.15 for messages that fill a segment or subscribers that
+    request `tcp_nodelay`; smaller messages wait for an ACK (Nagle), which takes 2 d more.
 
-    Every flow is registered by itself, as if it were a topic with one publisher and one subscriber. What nodes do
-    beside (other parameters, services, `/rosout`) is left out.
+    Every flow is registered separately, as a topic with one publisher and one subscriber. Other traffic of nodes
+    (other parameters, services, `/rosout`) is not modelled.
 
     Args:
-        wire: What it stands on.
-        flows: Every flow of the scenario that goes by ROS 1, by its name.
-        master: On which agent the master runs.
-        options: Of nodes and their TCP; None is as in ROS.
+        wire: The network below.
+        flows: All flows of the scenario that use ROS 1, by name.
+        master: The agent on which the master runs.
+        options: Options of nodes and their TCP; None for those of ROS.
     """
 
     def __init__(
@@ -55,35 +56,35 @@ class Ros1:
         }
         self._published: set[str] = set()
         self._subscribed: set[str] = set()
-        self._asked: set[str] = set()
-        self._know_keepalive: set[str] = set()
+        self._topic_requested: set[str] = set()
+        self._has_keepalive: set[str] = set()
         for name, flow in self._flows.items():
             self._at_start(flow.publisher, partial(self._register_publisher, name))
             self._at_start(flow.subscriber, partial(self._register_subscriber, name))
 
     def send(self, packet: Packet) -> None:
-        """See `Transport.send`.
+        """Implement `Transport.send`.
 
         Raises:
-            ConfigurationError: The packet is of no flow that is known.
+            ConfigurationError: The packet belongs to an unknown flow.
         """
         name, _ = packet.identity
         if name not in self._links:
             raise ConfigurationError(
-                f"{packet.source} publishes in a flow {name!r} that is none of ROS 1",
+                f"{packet.source} publishes in the flow {name!r}, which does not use ROS 1",
                 remedy=did_you_mean(name, self._links, "flows: " + ", ".join(self._links)),
             )
         self._links[name].publish(packet)
 
     def receive(self, host: str, packet: IpPacket) -> None:
-        """See `Transport.receive`."""
+        """Implement `Transport.receive`."""
         if isinstance(packet.body, Probe | Block):
             self._links[packet.body.flow].receive(packet)
         else:
             self._streams.receive(host, packet)
 
     def lost(self, packet: IpPacket, reason: str) -> None:
-        """See `Transport.lost`."""
+        """Implement `Transport.lost`."""
         if isinstance(packet.body, Probe | Block):
             self._links[packet.body.flow].lost(packet, reason)
 
@@ -113,7 +114,7 @@ class Ros1:
         self._calls.call(subscriber, self._master, sizes.REGISTER_SUBSCRIBER_BYTES, serve, self._options.register)
 
     def _update(self, name: str) -> None:
-        """Tell a subscriber of its publisher, at the master."""
+        """Send the publisher's address to a subscriber, at the master."""
 
         def serve() -> CallAnswer:
             self._request_topic(name)
@@ -123,17 +124,17 @@ class Ros1:
         self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
 
     def _request_topic(self, name: str) -> None:
-        """Ask a publisher how to connect, at the subscriber, unless that is asked already."""
-        if name in self._asked:
+        """Request the connection parameters from a publisher, at the subscriber, unless this has been done."""
+        if name in self._topic_requested:
             return
-        self._asked.add(name)
+        self._topic_requested.add(name)
         flow, link = self._flows[name], self._links[name]
         udp = flow.protocol == "udpros"
 
         def serve() -> CallAnswer:
             link.accept()
             if udp:
-                return CallAnswer(sizes.UDPROS_REQUESTED_BYTES, link.begin)
+                return CallAnswer(sizes.UDPROS_REQUESTED_BYTES, link.connect)
             return CallAnswer(sizes.TOPIC_REQUESTED_BYTES, partial(self._connect, name))
 
         size_bytes = sizes.REQUEST_UDPROS_BYTES if udp else sizes.REQUEST_TOPIC_BYTES
@@ -141,21 +142,21 @@ class Ros1:
         self._calls.call(flow.subscriber, flow.publisher, size_bytes, serve, request, about=name)
 
     def _connect(self, name: str) -> None:
-        """Open a connection, at a subscriber, which asks the master before its first one how."""
+        """Open a connection, at a subscriber; before the first one, query the master for the keep-alive setting."""
         subscriber, link = self._flows[name].subscriber, self._links[name]
-        if subscriber in self._know_keepalive:
-            link.begin()
+        if subscriber in self._has_keepalive:
+            link.connect()
             return
 
-        def know() -> None:
-            self._know_keepalive.add(subscriber)
-            link.begin()
+        def on_keepalive() -> None:
+            self._has_keepalive.add(subscriber)
+            link.connect()
 
         def serve() -> CallAnswer:
-            return CallAnswer(sizes.KEEPALIVE_BYTES, know)
+            return CallAnswer(sizes.KEEPALIVE_BYTES, on_keepalive)
 
         self._calls.call(subscriber, self._master, sizes.GET_KEEPALIVE_BYTES, serve, self._options.request)
 
 
 def _nothing() -> None:
-    """Do nothing with an answer."""
+    """Ignore a response."""

@@ -1,4 +1,4 @@
-"""A connection: its two ends, the messages that go through it, and the packets that its segments travel in."""
+"""A connection: its two ends, the messages that it carries, and the IP packets of its segments."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ from sim_backends.network.wire import IpPacket, Wire
 
 @dataclass(frozen=True, slots=True)
 class ConnectionName:
-    """Names a connection; stands for addresses and ports.
+    """The name of a connection, in place of addresses and ports.
 
     Attributes:
-        source: Who sends.
-        destination: To whom.
-        flow: Which flow.
-        number: Which connection of that flow, from 0.
+        source: Name of the sender.
+        destination: Name of the receiver.
+        flow: Name of the flow.
+        number: Number of the connection in the flow, from 0.
     """
 
     source: str
@@ -31,15 +31,15 @@ class ConnectionName:
 
 @dataclass(frozen=True, slots=True)
 class TcpSample:
-    """The state of a sender after something happened to it.
+    """The state of a sender after an event.
 
     Attributes:
-        at_ns: When.
-        connection: Whose.
-        event: What happened: `ack`, `loss`, `timeout`, `idle`.
+        at_ns: Time of the event.
+        connection: Name of the connection.
+        event: The event: `ack`, `loss`, `timeout`, `idle`.
         window_bytes: Congestion window.
-        threshold_bytes: Slow-start threshold; None while it is as high as can be.
-        flight_bytes: What is taken to be under way.
+        threshold_bytes: Slow-start threshold; None if it is unlimited.
+        flight_bytes: Estimate of the bytes in flight.
         round_trip_ns: Smoothed round trip.
         timeout_ns: Retransmission timeout.
     """
@@ -58,18 +58,19 @@ TcpLog = Callable[[TcpSample], None]
 
 
 class TcpConnection:
-    """One connection, open or being opened, and used in one direction.
+    """One connection, open or being opened, which carries messages in one direction.
 
-    What goes back on the same connection is another one here, which is open from the beginning. Its ACKs and the data
-    of the first travel in packets of their own.
+    The reverse direction of the same connection is a second object, which is open from the start. ACKs of the first
+    and data of the second are never combined in one packet.
 
     Args:
-        wire: What it stands on.
-        options: Of TCP.
+        wire: The network below.
+        options: Options of TCP.
         name: Its name.
-        closed: Told when it was given up and its messages were dropped.
-        log: Handed the state of the sender after everything that happened to it; None for nobody.
-        round_trip_ns: If it is open already, the round trip that its handshake told; None opens it.
+        on_closed: Called after the connection was given up and its messages were dropped.
+        log: Called with the state of the sender after every event; None for no log.
+        round_trip_ns: Round trip measured by the handshake of a connection that is already open; None opens a new
+            one.
     """
 
     def __init__(
@@ -78,62 +79,63 @@ class TcpConnection:
         options: TcpOptions,
         name: ConnectionName,
         *,
-        closed: Callable[[ConnectionName], None],
+        on_closed: Callable[[ConnectionName], None],
         log: TcpLog | None,
         round_trip_ns: int | None = None,
     ) -> None:
         self._wire = wire
         self._name = name
-        self._closed = closed
+        self._on_closed = on_closed
         self._log = log
         self._stream = MessageStream(options.segment_bytes)
         self._receiver = Receiver(
             wire,
             name.destination,
             options,
-            transmit=self._to_source,
-            read=self._read,
-            opened=round_trip_ns is not None,
+            transmit=self._send_to_source,
+            on_readable=self._read,
+            is_open=round_trip_ns is not None,
         )
         self._sender = Sender(
             wire,
             name.source,
             options,
             self._stream,
-            transmit=self._to_destination,
+            transmit=self._send_to_destination,
             give_up=self._give_up,
-            log=self._note,
+            log=self._log_event,
             round_trip_ns=round_trip_ns,
         )
 
     @property
     def round_trip_ns(self) -> int | None:
-        """The smoothed round trip; None before its handshake is over."""
+        """The smoothed round trip; None before the handshake is complete."""
         return self._sender.round_trips.smoothed_ns
 
     def send(self, packet: Packet) -> None:
         """Write a message to the stream."""
         self._stream.write(packet.packet_id, packet.size_bytes)
-        self._sender.written()
+        self._sender.on_written()
 
     def receive(self, host: str, segment: Segment) -> None:
-        """Take a segment that arrived at one of the ends."""
+        """Process a segment that arrived at one of the ends."""
         if host == self._name.destination:
             self._receiver.receive(segment)
         else:
             self._sender.receive(segment)
 
-    def _to_destination(self, segment: Segment) -> None:
+    def _send_to_destination(self, segment: Segment) -> None:
         name = self._name
         kind = "data" if segment.length else "syn" if segment.syn else "open"
         self._transmit(name.source, name.destination, kind, segment)
 
-    def _to_source(self, segment: Segment) -> None:
+    def _send_to_source(self, segment: Segment) -> None:
         name = self._name
         self._transmit(name.destination, name.source, "syn-ack" if segment.syn else "ack", segment)
 
     def _transmit(self, source: str, destination: str, kind: str, segment: Segment) -> None:
-        # Draws are for what is sent the so-manieth time; an ACK is told by the segment that it answers.
+        # Draws are keyed by the number of earlier transmissions; an ACK is identified by the segment that it
+        # acknowledges.
         stream = f"{self._name.flow} {self._name.number} {kind} {segment.times}"
         identity = stream, segment.number
         body = self._name, segment
@@ -147,9 +149,9 @@ class TcpConnection:
         self._sender.close()
         for packet_id in self._stream.unread():
             self._wire.drop(packet_id, reason)
-        self._closed(self._name)
+        self._on_closed(self._name)
 
-    def _note(self, event: str) -> None:
+    def _log_event(self, event: str) -> None:
         if self._log is None:
             return
         control, round_trips = self._sender.control, self._sender.round_trips
@@ -160,7 +162,7 @@ class TcpConnection:
                 event,
                 control.window_bytes,
                 control.threshold_bytes,
-                self._sender.board.pipe_bytes,
+                self._sender.scoreboard.pipe_bytes,
                 round_trips.smoothed_ns,
                 round_trips.timeout_ns,
             )

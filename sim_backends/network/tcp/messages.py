@@ -1,4 +1,4 @@
-"""The stream that a program's messages are written to, one after the other."""
+"""The byte stream to which a program's messages are written in order."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ class _Message:
 
 
 class MessageStream:
-    """Where in the stream each message lies.
+    """The positions of messages in the stream.
 
     Args:
-        segment_bytes: Data in a full segment.
+        segment_bytes: Data bytes in a full segment.
 
     Attributes:
-        end: The sequence number after the last byte that was written.
+        end: The sequence number after the last written byte.
     """
 
     def __init__(self, segment_bytes: int) -> None:
@@ -38,10 +38,11 @@ class MessageStream:
         self._unread.append(message)
 
     def number(self, first: int) -> int:
-        """Return which segment of the stream begins with the byte `first`, which never goes back.
+        """Return the number of the segment that starts with the byte `first`, which must not decrease between calls.
 
-        A segment ends when it is full or with a message. So no two begin in the same full segment's length of one
-        message, and counting these lengths gives each segment a number of its own, whatever was sent before.
+        A segment ends when it is full or at the end of a message. Therefore at most one segment starts in each
+        segment-sized part of a message; the number of these parts before it is unique and independent of what was
+        sent before.
         """
         while self._unsent[0].end <= first:
             self._unsent.popleft()
@@ -49,11 +50,11 @@ class MessageStream:
         return message.number + (first - message.first) // self._segment_bytes
 
     def read(self, upto: int) -> list[int]:
-        """Return the packets whose last byte is before `upto` and that were not returned before."""
-        whole = []
+        """Return the packets that are complete before `upto` and were not returned before."""
+        packet_ids = []
         while self._unread and self._unread[0].end <= upto:
-            whole.append(self._unread.popleft().packet_id)
-        return whole
+            packet_ids.append(self._unread.popleft().packet_id)
+        return packet_ids
 
     def unread(self) -> list[int]:
         """Return the packets that were not read."""

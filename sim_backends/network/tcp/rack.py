@@ -1,8 +1,8 @@
-"""Loss detection by time of transmission: RACK (RFC 8985), as Linux does it.
+"""Time-based loss detection: RACK (RFC 8985), as in Linux.
 
-A segment is lost if one that was sent later has arrived and a round trip has passed since. So a segment that was sent
-again and lost again is found within a round trip, and needs no timeout. The wire does not reorder packets, so the
-reordering window never grows beyond a quarter of the shortest round trip.
+A segment is lost if a segment that was sent later has arrived and a round trip has passed since. The loss of a
+retransmission is therefore also detected within a round trip, without a timeout. The wire does not reorder packets,
+so the reordering window is never increased above a quarter of the minimum round trip.
 """
 
 from collections import deque
@@ -10,20 +10,20 @@ from collections import deque
 from sim_backends.network.tcp.scoreboard import DUPLICATE_THRESHOLD, Scoreboard, SentSegment
 
 _REORDERING_SHARE = 4
-"""The reordering window is the shortest round trip divided by this (RFC 8985, 6.2, step 4)."""
+"""The reordering window is the minimum round trip divided by this (RFC 8985, 6.2, step 4)."""
 
 
 class RackScoreboard(Scoreboard):
-    """A scoreboard that finds losses by time."""
+    """A scoreboard that detects losses by time."""
 
     def __init__(self) -> None:
         super().__init__()
-        # Transmissions in the order of time, each with how often its segment had been sent then.
+        # Transmissions in order of time, each with the number of transmissions of its segment up to then.
         self._transmissions: deque[tuple[SentSegment, int]] = deque()
-        # When the most recently sent of the arrived segments was sent, and its end (RACK.xmit_ts, RACK.end_seq).
-        self._latest_arrived = (-1, 0)
+        # Transmission time and end of the most recently sent segment that arrived (RACK.xmit_ts, RACK.end_seq).
+        self._latest_delivered = (-1, 0)
         self._round_trip_ns = 0
-        self._shortest_ns: int | None = None
+        self._min_round_trip_ns: int | None = None
 
     def send(self, now_ns: int, length: int, number: int) -> SentSegment:
         """Record a new segment and the time of its transmission."""
@@ -32,47 +32,53 @@ class RackScoreboard(Scoreboard):
         return segment
 
     def send_again(self, now_ns: int, segment: SentSegment) -> None:
-        """Record a segment that is sent again and the time of its transmission."""
+        """Record a retransmitted segment and the time of its transmission."""
         super().send_again(now_ns, segment)
         self._transmissions.append((segment, segment.times))
 
     def detect_losses(self, now_ns: int, *, recovering: bool) -> int | None:
-        """Count as lost what was sent a round trip and a reordering window ago, before a segment that arrived."""
+        """Mark segments as lost that were sent before one that arrived, and more than the time limit ago.
+
+        The limit is a round trip and the reordering window.
+        """
         limit_ns = self._round_trip_ns + self._reordering_window_ns(recovering=recovering)
-        transmissions, waiting, due_ns = self._transmissions, list[tuple[SentSegment, int]](), None
+        transmissions, undecided, due_ns = self._transmissions, list[tuple[SentSegment, int]](), None
         while transmissions:
             segment, times = transmissions[0]
             is_current = segment.copies and segment.times == times and segment.end > self.acknowledged
-            if is_current and (segment.sent_ns, segment.end) >= self._latest_arrived:
+            if is_current and (segment.sent_ns, segment.end) >= self._latest_delivered:
                 break
             transmissions.popleft()
             if not is_current:
                 continue
             if segment.sent_ns + limit_ns <= now_ns:
-                self._lose(segment)
+                self._mark_lost(segment)
             else:
-                waiting.append((segment, times))
+                undecided.append((segment, times))
                 due_ns = segment.sent_ns + limit_ns
-        transmissions.extendleft(reversed(waiting))
+        transmissions.extendleft(reversed(undecided))
         return due_ns
 
-    def overtaken(self) -> None:
-        """Return None: what was overtaken counts as lost after the reordering window."""
+    def next_overtaken(self) -> None:
+        """Return None: overtaken segments are marked as lost after the reordering window."""
 
-    def _deliver(self, now_ns: int, segment: SentSegment) -> None:
-        super()._deliver(now_ns, segment)
+    def _count_delivered(self, now_ns: int, segment: SentSegment) -> None:
+        super()._count_delivered(now_ns, segment)
         round_trip_ns = now_ns - segment.sent_ns
-        if segment.times > 1 and self._shortest_ns is not None and round_trip_ns < self._shortest_ns:
-            # It is an earlier transmission that arrived (RFC 8985, 6.2, step 2).
+        if segment.times > 1 and self._min_round_trip_ns is not None and round_trip_ns < self._min_round_trip_ns:
+            # It was an earlier transmission that arrived (RFC 8985, 6.2, step 2).
             return
         if segment.times == 1:
-            self._shortest_ns = min(round_trip_ns, self._shortest_ns or round_trip_ns)
+            self._min_round_trip_ns = min(round_trip_ns, self._min_round_trip_ns or round_trip_ns)
         self._round_trip_ns = round_trip_ns
-        self._latest_arrived = max(self._latest_arrived, (segment.sent_ns, segment.end))
+        self._latest_delivered = max(self._latest_delivered, (segment.sent_ns, segment.end))
 
     def _reordering_window_ns(self, *, recovering: bool) -> int:
-        """Return how much later than a round trip a segment may arrive (RFC 8985, 6.2, step 4)."""
-        three_arrived = len(self._latest) == DUPLICATE_THRESHOLD and self._latest[0] >= self._dropped + self._gone
-        if recovering or three_arrived:
+        """Return the tolerated delay of a segment beyond a round trip (RFC 8985, 6.2, step 4)."""
+        threshold_reached = (
+            len(self._latest_sacked) == DUPLICATE_THRESHOLD
+            and self._latest_sacked[0] >= self._removed_count + self._acked_count
+        )
+        if recovering or threshold_reached:
             return 0
-        return (self._shortest_ns or 0) // _REORDERING_SHARE
+        return (self._min_round_trip_ns or 0) // _REORDERING_SHARE

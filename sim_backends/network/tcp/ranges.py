@@ -1,14 +1,14 @@
-"""Ranges of sequence numbers, kept in order and apart."""
+"""Sorted, disjoint ranges of sequence numbers."""
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 
 Range = tuple[int, int]
-"""Its first number, and the one after its last."""
+"""The first number, and the number after the last."""
 
 
 class Ranges:
-    """A set of numbers as ranges that neither overlap nor touch."""
+    """A set of numbers, stored as ranges that neither overlap nor touch."""
 
     def __init__(self) -> None:
         self._firsts: list[int] = []
@@ -21,17 +21,17 @@ class Ranges:
         return len(self._firsts)
 
     def add(self, first: int, end: int) -> list[Range]:
-        """Add the numbers from `first` to before `end`; return those of them that are new, in order."""
+        """Add the numbers from `first` up to, but without, `end`; return the parts that are new, in order."""
         begin = bisect_left(self._ends, first)
         after = bisect_right(self._firsts, end)
         new = []
-        at = first
-        for known, known_end in zip(self._firsts[begin:after], self._ends[begin:after], strict=True):
-            if at < known:
-                new.append((at, known))
-            at = max(at, known_end)
-        if at < end:
-            new.append((at, end))
+        position = first
+        for known_first, known_end in zip(self._firsts[begin:after], self._ends[begin:after], strict=True):
+            if position < known_first:
+                new.append((position, known_first))
+            position = max(position, known_end)
+        if position < end:
+            new.append((position, end))
         if begin < after:
             first = min(first, self._firsts[begin])
             end = max(end, self._ends[after - 1])
@@ -39,15 +39,15 @@ class Ranges:
         self._ends[begin:after] = [end]
         return new
 
-    def around(self, number: int) -> Range | None:
-        """Return the range that `number` is in, None if it is in none."""
+    def containing(self, number: int) -> Range | None:
+        """Return the range that contains `number`, or None."""
         index = bisect_right(self._firsts, number) - 1
         if index < 0 or self._ends[index] <= number:
             return None
         return self._firsts[index], self._ends[index]
 
-    def forget_before(self, number: int) -> None:
-        """Drop all ranges that end at `number` or before."""
-        gone = bisect_right(self._ends, number)
-        del self._firsts[:gone]
-        del self._ends[:gone]
+    def remove_before(self, number: int) -> None:
+        """Remove all ranges that end at or before `number`."""
+        count = bisect_right(self._ends, number)
+        del self._firsts[:count]
+        del self._ends[:count]

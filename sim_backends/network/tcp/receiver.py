@@ -1,30 +1,30 @@
-"""The receiving end of a connection: puts the stream in order and acknowledges it."""
+"""The receiving end of a connection: reassembles and acknowledges the stream."""
 
 from collections.abc import Callable
 
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.ranges import Ranges
-from sim_backends.network.tcp.segments import MOST_SACKS, Segment
+from sim_backends.network.tcp.segments import MAX_SACKS, Segment
 from sim_backends.network.timer import WireTimer
 from sim_backends.network.wire import Wire
 
 
 class Receiver:
-    """Gets segments and answers them.
+    """Receives segments and acknowledges them.
 
-    Its program reads at once. So the window that it offers never closes, nobody probes it, and what waits in it is
-    only what is out of order, which it never gives up again.
+    Its program reads immediately. The offered window is therefore never closed and never probed, and it holds only
+    out-of-order data, which is never discarded.
 
     Args:
-        wire: Its clock.
-        host: Where it is.
+        wire: Provides the clock.
+        host: Name of its host.
         options: Window and delayed ACKs.
         transmit: Sends a segment.
-        read: Told the sequence number up to which the stream is complete, whenever that moves.
-        opened: Whether the connection is open already.
+        on_readable: Called with the sequence number up to which the stream is complete, whenever it increases.
+        is_open: True if the connection is already open.
 
     Attributes:
-        expected: The sequence number that it waits for (RCV.NXT); 0 before a SYN arrived.
+        expected: The next expected sequence number (RCV.NXT); 0 before a SYN has arrived.
     """
 
     def __init__(
@@ -34,89 +34,91 @@ class Receiver:
         options: TcpOptions,
         *,
         transmit: Callable[[Segment], None],
-        read: Callable[[int], None],
-        opened: bool = False,
+        on_readable: Callable[[int], None],
+        is_open: bool = False,
     ) -> None:
         self._options = options
         self._wire = wire
         self._transmit = transmit
-        self._read = read
-        self._beyond = Ranges()
-        # A sequence number in each range beyond, the one that got something last first.
-        self._newest: list[int] = []
-        self._timer = WireTimer(wire, host, self._say)
-        self._unanswered = 0
-        self._answered = int(opened)
-        self._echoes_ns = 0
-        self._asked: Segment | None = None
-        self.expected = int(opened)
+        self._on_readable = on_readable
+        self._out_of_order = Ranges()
+        # One sequence number in each out-of-order range, the most recently extended range first.
+        self._sack_order: list[int] = []
+        self._timer = WireTimer(wire, host, self._send_ack)
+        self._unacknowledged_segments = 0
+        self._last_ack = int(is_open)
+        self._echo_ns = 0
+        self._last_segment: Segment | None = None
+        self.expected = int(is_open)
 
     def receive(self, segment: Segment) -> None:
-        """Take a segment of the other end."""
+        """Process a segment of the other end."""
         if segment.syn:
             if not self.expected:
                 self.expected = 1
-                self._echoes_ns = segment.sent_ns
-            self._asked = segment
-            self._say()
+                self._echo_ns = segment.sent_ns
+            self._last_segment = segment
+            self._send_ack()
             return
         if not self.expected or not segment.length:
             return
-        # RFC 7323, 4.3: the timestamp of what the last ACK waited for, so that a delayed ACK's delay counts.
-        if segment.first <= self._answered and segment.sent_ns >= self._echoes_ns:
-            self._echoes_ns = segment.sent_ns
-        self._asked = segment
+        # RFC 7323, 4.3: echo the timestamp of the segment at the last ACK's number, so that the ACK delay is
+        # included.
+        if segment.first <= self._last_ack and segment.sent_ns >= self._echo_ns:
+            self._echo_ns = segment.sent_ns
+        self._last_segment = segment
         if segment.first <= self.expected < segment.end:
             self._advance(segment)
         else:
             if segment.first > self.expected:
-                self._keep(segment)
-            self._say()
+                self._store_out_of_order(segment)
+            self._send_ack()
 
     def _advance(self, segment: Segment) -> None:
-        filled = bool(self._newest)
+        had_gap = bool(self._sack_order)
         self.expected = segment.end
-        if filled:
-            self._beyond.add(segment.first, segment.end)
-            joined = self._beyond.around(segment.first)
-            assert joined is not None
-            self.expected = joined[1]
-            self._beyond.forget_before(self.expected)
-            self._newest = [number for number in self._newest if number >= self.expected]
-        self._unanswered += 1
-        self._read(self.expected)
-        # RFC 5681, 4.2: at once for every second segment, and where a gap is filled, wholly or not.
-        if filled or self._unanswered >= self._options.segments_per_ack:
-            self._say()
+        if had_gap:
+            self._out_of_order.add(segment.first, segment.end)
+            merged = self._out_of_order.containing(segment.first)
+            assert merged is not None
+            self.expected = merged[1]
+            self._out_of_order.remove_before(self.expected)
+            self._sack_order = [number for number in self._sack_order if number >= self.expected]
+        self._unacknowledged_segments += 1
+        self._on_readable(self.expected)
+        # RFC 5681, 4.2: send an ACK immediately for every second segment, and if a gap was filled completely or
+        # partly.
+        if had_gap or self._unacknowledged_segments >= self._options.segments_per_ack:
+            self._send_ack()
         elif self._timer.due_ns is None:
             self._timer.set(self._wire.now_ns + self._options.delayed_ack_ns)
 
-    def _keep(self, segment: Segment) -> None:
-        """Keep a segment that came too early, and put its range first (RFC 2018, 4)."""
-        self._beyond.add(segment.first, segment.end)
-        block = self._beyond.around(segment.first)
+    def _store_out_of_order(self, segment: Segment) -> None:
+        """Store an out-of-order segment, and put its range first in the SACK order (RFC 2018, 4)."""
+        self._out_of_order.add(segment.first, segment.end)
+        block = self._out_of_order.containing(segment.first)
         assert block is not None
-        apart = [number for number in self._newest if not block[0] <= number < block[1]]
-        self._newest = [segment.first, *apart]
+        others = [number for number in self._sack_order if not block[0] <= number < block[1]]
+        self._sack_order = [segment.first, *others]
 
-    def _say(self) -> None:
-        assert self._asked is not None
-        blocks = [self._beyond.around(number) for number in self._newest[:MOST_SACKS]]
+    def _send_ack(self) -> None:
+        assert self._last_segment is not None
+        blocks = [self._out_of_order.containing(number) for number in self._sack_order[:MAX_SACKS]]
         sacks = tuple(block for block in blocks if block is not None)
         self._timer.stop()
-        self._unanswered = 0
-        self._answered = self.expected
+        self._unacknowledged_segments = 0
+        self._last_ack = self.expected
         self._transmit(
             Segment(
-                syn=self._asked.syn,
-                first=0 if self._asked.syn else 1,
+                syn=self._last_segment.syn,
+                first=0 if self._last_segment.syn else 1,
                 length=0,
                 acknowledges=self.expected,
                 sacks=sacks,
                 window_bytes=self._options.receive_window_bytes,
                 sent_ns=self._wire.now_ns,
-                echoes_ns=self._echoes_ns,
-                number=self._asked.number,
-                times=self._asked.times,
+                echoes_ns=self._echo_ns,
+                number=self._last_segment.number,
+                times=self._last_segment.times,
             )
         )

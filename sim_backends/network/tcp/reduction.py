@@ -1,15 +1,15 @@
-"""Proportional rate reduction (RFC 6937): how much may be sent in a recovery, as Linux does it."""
+"""Proportional rate reduction (RFC 6937): the bytes that may be sent in a recovery, as in Linux."""
 
 
 class ProportionalReduction:
-    """Brings what is under way down to the threshold over a round trip, never faster than data arrives.
+    """Reduces the bytes in flight to the threshold over a round trip, never faster than data arrives.
 
-    RFC 6675 alone would send as much at once as is found lost, into the queue that has just run over.
+    RFC 6675 alone would send a burst of the size of the detected loss into a queue that has just overflowed.
 
     Args:
-        threshold_bytes: What shall be under way at the end.
-        flight_bytes: What was sent and not acknowledged at the beginning (RecoverFS).
-        segment_bytes: Data in a full segment.
+        threshold_bytes: Bytes in flight at the end of the recovery.
+        flight_bytes: Bytes sent and not acknowledged at the start of the recovery (RecoverFS).
+        segment_bytes: Data bytes in a full segment.
     """
 
     def __init__(self, threshold_bytes: int, flight_bytes: int, segment_bytes: int) -> None:
@@ -23,21 +23,21 @@ class ProportionalReduction:
         """Return the window after an ACK.
 
         Args:
-            pipe_bytes: What is taken to be under way.
-            delivered_bytes: What the ACK shows to have arrived, by its number or by SACK.
-            safe: Whether the ACK is of new data and shows no further loss; then slow start may make up for what was
-                lost beyond the reduction (RFC 6937, 3, SSRB), as Linux decides between the two bounds.
+            pipe_bytes: Estimate of the bytes in flight.
+            delivered_bytes: Bytes newly reported as received by the ACK number or by SACK.
+            safe: True if the ACK acknowledges new data and shows no further loss. Slow start may then compensate for
+                losses beyond the reduction (RFC 6937, 3, SSRB); Linux uses the same condition.
         """
         self._delivered_bytes += delivered_bytes
-        behind_bytes = self._delivered_bytes - self._sent_bytes
+        deficit_bytes = self._delivered_bytes - self._sent_bytes
         if pipe_bytes > self._threshold_bytes:
             share = -(-self._delivered_bytes * self._threshold_bytes // self._flight_bytes)
-            more_bytes = share - self._sent_bytes
+            allowed_bytes = share - self._sent_bytes
         else:
-            limit = max(behind_bytes, delivered_bytes) + self._segment_bytes if safe else behind_bytes
-            more_bytes = min(self._threshold_bytes - pipe_bytes, limit)
-        return pipe_bytes + max(more_bytes, 0)
+            limit = max(deficit_bytes, delivered_bytes) + self._segment_bytes if safe else deficit_bytes
+            allowed_bytes = min(self._threshold_bytes - pipe_bytes, limit)
+        return pipe_bytes + max(allowed_bytes, 0)
 
-    def sent(self, length: int) -> None:
-        """Take note of data that is sent."""
+    def on_sent(self, length: int) -> None:
+        """Record sent data."""
         self._sent_bytes += length

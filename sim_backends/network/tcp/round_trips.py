@@ -4,7 +4,7 @@ from sim_backends.network.tcp.options import TcpOptions
 
 
 class RoundTrips:
-    """Estimates the round trip from samples, and the timeout from that.
+    """Estimates the round trip from samples, and the timeout from the estimate.
 
     Args:
         options: Bounds of the timeout.
@@ -22,7 +22,7 @@ class RoundTrips:
         self.timeout_ns = options.first_timeout_ns
 
     def sample(self, round_trip_ns: int) -> None:
-        """Take a round trip; a timeout that was backed off is as before again."""
+        """Record a measured round trip; this also cancels the exponential backoff of the timeout."""
         if self.smoothed_ns is None:
             # RFC 6298, 2.2
             self.smoothed_ns = round_trip_ns

@@ -1,4 +1,4 @@
-"""What was sent and not acknowledged: what of it arrived by SACK, what is lost, what is under way (RFC 6675)."""
+"""Sent segments that are not acknowledged: those that arrived (by SACK), those lost, those in flight (RFC 6675)."""
 
 import heapq
 from bisect import bisect_left
@@ -10,24 +10,24 @@ from typing import Final
 from sim_backends.network.tcp.ranges import Range, Ranges
 
 DUPLICATE_THRESHOLD: Final = 3
-"""So many later segments must have arrived before one counts as lost (RFC 5681, 3.2; RFC 6675, 2: DupThresh)."""
+"""Number of later segments that must arrive before a segment is lost (RFC 5681, 3.2; RFC 6675, 2: DupThresh)."""
 
 _COMPACT: Final = 256
 
 
 @dataclass(slots=True)
 class SentSegment:
-    """A segment of the stream that was sent; it is sent again as it was.
+    """A sent segment of the stream; it is retransmitted with the same boundaries.
 
     Attributes:
         first: Sequence number of its first byte.
-        end: The one after its last.
-        number: Which it is of the stream, for random draws.
-        sent_ns: When it was last sent.
-        times: How often it was sent.
-        copies: How many of these are taken to be under way.
-        arrived: Whether a SACK says that it arrived.
-        lost: Whether what was sent is taken for lost.
+        end: Sequence number after its last byte.
+        number: Its number in the stream, for random draws.
+        sent_ns: Time of its last transmission.
+        times: Number of transmissions.
+        copies: Number of transmissions that are assumed to be in flight.
+        arrived: True if a SACK reports that it arrived.
+        lost: True if it is marked as lost.
     """
 
     first: int
@@ -43,15 +43,16 @@ class SentSegment:
 class Scoreboard:
     """The segments between SND.UNA and SND.NXT.
 
-    A segment is lost once three later ones arrived. RFC 6675 (4, IsLost) counts their bytes, which is the same for
-    full segments; Linux counts segments, as here, and so sees losses among the small messages of robots.
+    A segment is lost once three later ones have arrived. RFC 6675 (4, IsLost) counts their bytes, which is the same
+    for full segments; Linux counts segments, as here, and therefore detects losses among the small messages of
+    robots.
 
     Attributes:
-        next: The sequence number that is sent next (SND.NXT).
-        acknowledged: The first that was not acknowledged (SND.UNA).
-        pipe_bytes: What is taken to be under way (RFC 6675, 4, SetPipe).
-        delivered_bytes: What arrived so far, by ACK or SACK.
-        losses: How many segments were counted as lost so far.
+        next: The next sequence number to send (SND.NXT).
+        acknowledged: The first unacknowledged sequence number (SND.UNA).
+        pipe_bytes: Estimate of the bytes in flight (RFC 6675, 4, SetPipe).
+        delivered_bytes: Bytes that arrived so far, by ACK or SACK.
+        losses: Number of segments marked as lost so far.
     """
 
     def __init__(self) -> None:
@@ -60,18 +61,18 @@ class Scoreboard:
         self.pipe_bytes = 0
         self.delivered_bytes = 0
         self.losses = 0
-        # Those acknowledged stay at the front of the list until some have gathered.
+        # Acknowledged segments stay at the front of the list until `_COMPACT` of them can be removed together.
         self._sent: list[SentSegment] = []
-        self._gone = 0
-        self._dropped = 0
+        self._acked_count = 0
+        self._removed_count = 0
         self._arrived = Ranges()
-        # Places, counted over the whole stream, of the last three segments that arrived by SACK.
-        self._latest: list[int] = []
-        self._judged = 0
+        # Indices, counted over the whole stream, of the last three segments that arrived by SACK.
+        self._latest_sacked: list[int] = []
+        self._examined = 0
         self._to_resend: deque[SentSegment] = deque()
 
     def __len__(self) -> int:
-        return len(self._sent) - self._gone
+        return len(self._sent) - self._acked_count
 
     def send(self, now_ns: int, length: int, number: int) -> SentSegment:
         """Record a new segment that is sent, and return it."""
@@ -89,105 +90,105 @@ class Scoreboard:
         self.pipe_bytes += segment.end - segment.first
 
     def acknowledge(self, now_ns: int, upto: int) -> None:
-        """Take an ACK of everything before `upto`."""
+        """Process an ACK of everything before `upto`."""
         self.acknowledged = upto
-        while self._gone < len(self._sent) and self._sent[self._gone].end <= upto:
-            segment = self._sent[self._gone]
+        while self._acked_count < len(self._sent) and self._sent[self._acked_count].end <= upto:
+            segment = self._sent[self._acked_count]
             if not segment.arrived:
-                self._deliver(now_ns, segment)
-            self._land(segment)
-            self._gone += 1
-        self._arrived.forget_before(upto)
-        if self._gone >= _COMPACT:
-            del self._sent[: self._gone]
-            self._dropped += self._gone
-            self._gone = 0
+                self._count_delivered(now_ns, segment)
+            self._remove_from_pipe(segment)
+            self._acked_count += 1
+        self._arrived.remove_before(upto)
+        if self._acked_count >= _COMPACT:
+            del self._sent[: self._acked_count]
+            self._removed_count += self._acked_count
+            self._acked_count = 0
 
     def arrive(self, now_ns: int, sacks: Iterable[Range]) -> None:
-        """Take what a SACK reports as arrived."""
+        """Process the ranges that a SACK reports as arrived."""
         for block in sacks:
             first = max(block[0], self.acknowledged)
             if first < block[1]:
                 for new in self._arrived.add(first, block[1]):
-                    self._mark(now_ns, new)
+                    self._mark_arrived(now_ns, new)
 
     def detect_losses(self, now_ns: int, *, recovering: bool) -> int | None:  # noqa: ARG002 (see RackScoreboard)
-        """Count as lost the segments that the arrived ones show to be lost: those that three later ones overtook.
+        """Mark segments as lost that three later ones have overtaken.
 
         Args:
-            now_ns: Now.
-            recovering: Whether a recovery is under way.
+            now_ns: Current time.
+            recovering: True if a recovery is in progress.
 
         Returns:
-            When to call this again even if no ACK arrives before; None if only an ACK can show a further loss.
+            The time to call this again if no ACK arrives before; None if only an ACK can show a further loss.
         """
-        if len(self._latest) == DUPLICATE_THRESHOLD:
-            self._judge(self._latest[0])
+        if len(self._latest_sacked) == DUPLICATE_THRESHOLD:
+            self._mark_overtaken_lost(self._latest_sacked[0])
         return None
 
     def lose_all(self) -> None:
-        """Count as lost whatever has not arrived, as after a timeout."""
+        """Mark all segments that have not arrived as lost, as after a timeout."""
         self._to_resend.clear()
-        for segment in self._sent[self._gone :]:
+        for segment in self._sent[self._acked_count :]:
             if not segment.arrived:
-                self._lose(segment)
-        self._judged = self._dropped + len(self._sent)
+                self._mark_lost(segment)
+        self._examined = self._removed_count + len(self._sent)
 
-    def lost(self) -> SentSegment | None:
-        """Return the first lost segment that was not sent again since, None if there is none."""
+    def next_lost(self) -> SentSegment | None:
+        """Return the first lost segment that was not sent again since, or None."""
         waiting = self._to_resend
         while waiting and (waiting[0].arrived or not waiting[0].lost or waiting[0].copies):
             waiting.popleft()
         return waiting[0] if waiting else None
 
-    def overtaken(self) -> SentSegment | None:
-        """Return the first segment that later ones overtook, though not three, and that was sent once only.
+    def next_overtaken(self) -> SentSegment | None:
+        """Return the first segment that was sent once and was overtaken by fewer than three later ones, or None.
 
-        It is what may be sent again when nothing is lost and nothing new is there (RFC 6675, 4, NextSeg, rule 3).
+        It may be sent again when no segment is lost and there is no new data (RFC 6675, 4, NextSeg, rule 3).
         """
-        last = max(self._latest, default=-1) - self._dropped
-        for segment in self._sent[max(self._judged - self._dropped, self._gone) : max(last, 0)]:
+        last = max(self._latest_sacked, default=-1) - self._removed_count
+        for segment in self._sent[max(self._examined - self._removed_count, self._acked_count) : max(last, 0)]:
             if not segment.arrived and segment.times == 1:
                 return segment
         return None
 
-    def _mark(self, now_ns: int, block: Range) -> None:
+    def _mark_arrived(self, now_ns: int, block: Range) -> None:
         sent = self._sent
-        place = bisect_left(sent, block[0], lo=self._gone, key=lambda segment: segment.first)
-        while place < len(sent) and sent[place].end <= block[1]:
-            segment = sent[place]
-            self._land(segment)
+        index = bisect_left(sent, block[0], lo=self._acked_count, key=lambda segment: segment.first)
+        while index < len(sent) and sent[index].end <= block[1]:
+            segment = sent[index]
+            self._remove_from_pipe(segment)
             segment.arrived = True
-            self._deliver(now_ns, segment)
-            heapq.heappush(self._latest, self._dropped + place)
-            if len(self._latest) > DUPLICATE_THRESHOLD:
-                heapq.heappop(self._latest)
-            place += 1
+            self._count_delivered(now_ns, segment)
+            heapq.heappush(self._latest_sacked, self._removed_count + index)
+            if len(self._latest_sacked) > DUPLICATE_THRESHOLD:
+                heapq.heappop(self._latest_sacked)
+            index += 1
 
-    def _deliver(self, now_ns: int, segment: SentSegment) -> None:  # noqa: ARG002 (see RackScoreboard)
+    def _count_delivered(self, now_ns: int, segment: SentSegment) -> None:  # noqa: ARG002 (see RackScoreboard)
         """Count a segment that an ACK or a SACK reports for the first time."""
         self.delivered_bytes += segment.end - segment.first
 
-    def _judge(self, before: int) -> None:
-        """Count as lost what has not arrived of the segments before this place, each once."""
-        begin = max(self._judged - self._dropped, self._gone)
-        for segment in self._sent[begin : max(before - self._dropped, begin)]:
+    def _mark_overtaken_lost(self, before: int) -> None:
+        """Mark the segments before this index that have not arrived as lost, each once."""
+        begin = max(self._examined - self._removed_count, self._acked_count)
+        for segment in self._sent[begin : max(before - self._removed_count, begin)]:
             if segment.copies > 1:
-                # It was sent again before it was lost: only the first copy is.
+                # It was sent again before it was marked as lost: only the first copy is lost.
                 segment.copies -= 1
                 self.pipe_bytes -= segment.end - segment.first
             elif not segment.arrived:
-                self._lose(segment)
-        self._judged = max(self._judged, before)
+                self._mark_lost(segment)
+        self._examined = max(self._examined, before)
 
-    def _lose(self, segment: SentSegment) -> None:
-        self._land(segment)
+    def _mark_lost(self, segment: SentSegment) -> None:
+        self._remove_from_pipe(segment)
         segment.lost = True
         self.losses += 1
         self._to_resend.append(segment)
 
-    def _land(self, segment: SentSegment) -> None:
-        """Take a segment out of what is under way."""
+    def _remove_from_pipe(self, segment: SentSegment) -> None:
+        """Remove a segment from the bytes in flight."""
         self.pipe_bytes -= segment.copies * (segment.end - segment.first)
         segment.copies = 0
         segment.lost = False

@@ -1,7 +1,7 @@
-"""Segments of TCP as they are on the wire, but for ports and checksums.
+"""TCP segments as they are on the wire, without ports and checksums.
 
-Sequence numbers are relative, as analysers print them: a SYN has number 0, the first byte of data number 1. They do
-not wrap around.
+Sequence numbers are relative, as in packet analysers: a SYN has number 0, the first data byte number 1. They do not
+wrap around.
 """
 
 from dataclasses import dataclass
@@ -12,28 +12,28 @@ from sim_backends.network.tcp.ranges import Range
 HEADER_BYTES: Final = 20 + 20 + 12
 """IP header, TCP header, and the timestamps option with its padding (RFC 7323, appendix A)."""
 
-MOST_SACKS: Final = 3
-"""As many blocks as fit beside timestamps (RFC 2018, 3)."""
+MAX_SACKS: Final = 3
+"""Maximum number of SACK blocks together with timestamps (RFC 2018, 3)."""
 
-# MSS, SACK permitted, timestamps, window scale: 4 + 2 + 10 + 3 and a byte of padding, as Linux orders them.
+# MSS, SACK permitted, timestamps, window scale: 4 + 2 + 10 + 3 bytes and a byte of padding, in Linux's order.
 _SYN_BYTES: Final = 20 + 20 + 20
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A segment.
+    """A TCP segment.
 
     Attributes:
-        syn: Whether it opens the connection.
+        syn: True if it opens the connection.
         first: Sequence number of its first byte.
-        length: How many bytes of data it carries.
-        acknowledges: The sequence number that its sender waits for; None only in the first SYN.
-        sacks: What its sender has got beyond that, the newest first.
-        window_bytes: How much more its sender takes from `acknowledges` on, after scaling.
-        sent_ns: The time that it was sent: the timestamp's value.
-        echoes_ns: The timestamp that it echoes; None in the first SYN.
-        number: Which it is of the stream's segments; for an ACK that of the segment which it answers.
-        times: How often that was sent before.
+        length: Number of data bytes.
+        acknowledges: Acknowledgement number; None only in the first SYN.
+        sacks: Ranges beyond it that its sender has received, most recent first.
+        window_bytes: Receive window of its sender, after scaling.
+        sent_ns: Transmission time: the timestamp's value (TSval).
+        echoes_ns: The echoed timestamp (TSecr); None in the first SYN.
+        number: Its number in the stream; for an ACK the number of the acknowledged segment.
+        times: Number of earlier transmissions of that segment.
     """
 
     syn: bool

@@ -1,4 +1,4 @@
-"""The sending end of a connection: opens it, sends the stream, and sends again what is lost."""
+"""The sending end of a connection: opens it, sends the stream, and retransmits lost segments."""
 
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -24,27 +24,27 @@ _CONTROLS: Final[Mapping[Congestion, tuple[type[NewReno], type[Scoreboard]]]] = 
 
 
 class Sender:
-    """Sends a stream and hears ACKs; the connection is opened as it is made, unless it is open already.
+    """Sends a stream and processes ACKs; opens the connection when it is created, unless it is already open.
 
-    Losses are detected by RFC 6675, or by RFC 8985 where the congestion control is Linux's. A loss begins a recovery:
-    the window closes once, and what is lost is sent again, then new data, as far as the reduction of RFC 6937 allows.
-    After a timeout everything that has not arrived is lost, and slow start begins (RFC 5681, 3.1). What arrived by
-    SACK stays so, as the receiver never discards it.
+    Losses are detected by RFC 6675, or by RFC 8985 with Linux's congestion control. A loss starts a recovery: the
+    window is reduced once; then lost segments are sent again, followed by new data, as far as the rate reduction of
+    RFC 6937 allows. After a timeout all segments that have not arrived count as lost, and slow start begins (RFC
+    5681, 3.1). Segments reported by SACK count as arrived for good, because the receiver never discards them.
 
     Args:
-        wire: Its clock.
-        host: Where it is.
-        options: Of TCP.
-        stream: What it sends.
+        wire: Provides the clock.
+        host: Name of its host.
+        options: Options of TCP.
+        stream: The data to send.
         transmit: Sends a segment.
-        give_up: Told why, when the connection is given up; nothing happens in it any more.
-        log: Told what happened whenever the state may have changed: `ack`, `loss`, `timeout`, `idle`.
-        round_trip_ns: The round trip of a connection that is open already; None opens it.
+        give_up: Called with the reason when the connection is given up, after which nothing is sent.
+        log: Called with the event whenever the state may have changed: `ack`, `loss`, `timeout`, `idle`.
+        round_trip_ns: The round trip of a connection that is already open; None opens a new one.
 
     Attributes:
         control: The congestion window.
-        board: What is under way.
-        round_trips: The timeout.
+        scoreboard: The segments that are not acknowledged.
+        round_trips: The retransmission timeout.
     """
 
     def __init__(
@@ -65,235 +65,235 @@ class Sender:
         self._transmit = transmit
         self._give_up = give_up
         self._log = log
-        self._timer = WireTimer(wire, host, self._expire)
-        self._reordering_timer = WireTimer(wire, host, self._reordering_expired)
+        self._timer = WireTimer(wire, host, self._on_timeout)
+        self._reordering_timer = WireTimer(wire, host, self._on_reordering_timeout)
         self._open = False
-        self._echoes_ns: int | None = None
+        self._echo_ns: int | None = None
         self._receive_window_bytes = 0
-        # Timeouts without any progress in between.
-        self._expired = 0
-        # What must be acknowledged before a recovery is over (RecoveryPoint); None outside of one.
+        # Consecutive timeouts without progress.
+        self._timeouts = 0
+        # Sequence number whose acknowledgement ends the recovery (RecoveryPoint); None outside a recovery.
         self._recovery_end: int | None = None
-        # Says how much may be under way in a recovery that no timeout began, in place of the congestion window.
+        # Limits the bytes in flight in a recovery after a loss (not a timeout), in place of the congestion window.
         self._reduction: ProportionalReduction | None = None
         self._window_bytes = 0
-        # Whether the window kept data back when it was tried last.
-        self._full = False
-        self._sent_ns = 0
-        self._heard_ns = 0
-        control, board = _CONTROLS[options.congestion]
+        # True if the window prevented sending at the last attempt.
+        self._is_window_limited = False
+        self._last_sent_ns = 0
+        self._last_ack_ns = 0
+        control, scoreboard = _CONTROLS[options.congestion]
         self.control = control(options)
-        self.board = board()
+        self.scoreboard = scoreboard()
         self.round_trips = RoundTrips(options)
         if round_trip_ns is None:
-            self._synchronize()
+            self._send_syn()
         else:
             self._open = True
             self._receive_window_bytes = options.receive_window_bytes
             self.round_trips.sample(round_trip_ns)
 
-    def written(self) -> None:
-        """Send what was written to the stream, as far as may be."""
+    def on_written(self) -> None:
+        """Send data that was written to the stream, as far as the windows allow."""
         if not self._open:
             return
-        idle_ns = self._wire.now_ns - self._sent_ns
-        if self._options.restart_after_idle and not self.board and idle_ns > self.round_trips.timeout_ns:
-            self.control.restarted()
+        idle_ns = self._wire.now_ns - self._last_sent_ns
+        if self._options.restart_after_idle and not self.scoreboard and idle_ns > self.round_trips.timeout_ns:
+            self.control.on_restart()
             self._log("idle")
         self._send()
 
     def receive(self, segment: Segment) -> None:
-        """Take a segment of the other end."""
+        """Process a segment of the other end."""
         if segment.syn:
-            self._synchronized(segment)
+            self._on_syn_ack(segment)
         elif self._open:
-            self._acknowledged(segment)
+            self._on_ack(segment)
 
     def close(self) -> None:
-        """Do nothing any more."""
+        """Stop sending and all timers."""
         self._open = False
         self._timer.stop()
         self._reordering_timer.stop()
 
-    def _synchronize(self) -> None:
-        self._emit(0, 0, number=0, times=self._expired, syn=True)
+    def _send_syn(self) -> None:
+        self._emit(0, 0, number=0, times=self._timeouts, syn=True)
         self._timer.set(self._wire.now_ns + self.round_trips.timeout_ns)
 
-    def _synchronized(self, segment: Segment) -> None:
-        """Take a SYN-ACK; one that came before is only acknowledged again."""
+    def _on_syn_ack(self, segment: Segment) -> None:
+        """Process a SYN-ACK; a repeated one is only acknowledged again."""
         if not self._open:
             self._open = True
             self._timer.stop()
-            if self._expired > 1:
-                self.control.begun_late()
-            self._expired = 0
+            if self._timeouts > 1:
+                self.control.on_syn_losses()
+            self._timeouts = 0
             self._receive_window_bytes = segment.window_bytes
-            self._heard(segment)
-        self._echoes_ns = segment.sent_ns
+            self._sample_round_trip(segment)
+        self._echo_ns = segment.sent_ns
         self._emit(1, 0, number=segment.number, times=segment.times)
         self._send()
 
-    def _heard(self, segment: Segment) -> None:
-        """Measure the round trip by the timestamp that came back (RFC 7323, 4.1)."""
+    def _sample_round_trip(self, segment: Segment) -> None:
+        """Measure the round trip by the echoed timestamp (RFC 7323, 4.1)."""
         assert segment.echoes_ns is not None
         self.round_trips.sample(self._wire.now_ns - segment.echoes_ns)
 
-    def _acknowledged(self, segment: Segment) -> None:
-        board, upto, now_ns = self.board, segment.acknowledges, self._wire.now_ns
+    def _on_ack(self, segment: Segment) -> None:
+        scoreboard, upto, now_ns = self.scoreboard, segment.acknowledges, self._wire.now_ns
         assert upto is not None
         self._receive_window_bytes = segment.window_bytes
-        self._echoes_ns = segment.sent_ns
-        delivered_bytes, losses = board.delivered_bytes, board.losses
-        board.arrive(now_ns, segment.sacks)
-        advances = upto > board.acknowledged
+        self._echo_ns = segment.sent_ns
+        delivered_bytes, losses = scoreboard.delivered_bytes, scoreboard.losses
+        scoreboard.arrive(now_ns, segment.sacks)
+        advances = upto > scoreboard.acknowledged
         if advances:
-            board.acknowledge(now_ns, upto)
-            self._expired = 0
-            self._heard(segment)
+            scoreboard.acknowledge(now_ns, upto)
+            self._timeouts = 0
+            self._sample_round_trip(segment)
             self._restart_timer()
-            self._grow(board.delivered_bytes - delivered_bytes)
+            self._update_window(scoreboard.delivered_bytes - delivered_bytes)
         self._detect_losses()
         if self._reduction is not None:
             self._window_bytes = self._reduction.window_bytes(
-                board.pipe_bytes,
-                board.delivered_bytes - delivered_bytes,
-                safe=advances and board.losses == losses,
+                scoreboard.pipe_bytes,
+                scoreboard.delivered_bytes - delivered_bytes,
+                safe=advances and scoreboard.losses == losses,
             )
         self._send()
         self._log("ack")
 
     def _detect_losses(self) -> None:
-        """Find what is lost, and begin a recovery if there is none."""
-        due_ns = self.board.detect_losses(self._wire.now_ns, recovering=self._recovery_end is not None)
+        """Detect losses, and start a recovery if none is in progress."""
+        due_ns = self.scoreboard.detect_losses(self._wire.now_ns, recovering=self._recovery_end is not None)
         if due_ns is None:
             self._reordering_timer.stop()
         else:
             self._reordering_timer.set(due_ns)
-        if self._recovery_end is None and (lost := self.board.lost()) is not None:
-            self._recover(lost)
+        if self._recovery_end is None and (lost := self.scoreboard.next_lost()) is not None:
+            self._start_recovery(lost)
 
-    def _reordering_expired(self) -> None:
-        """Find what is lost now that the reordering window has passed (RFC 8985, 6.3)."""
+    def _on_reordering_timeout(self) -> None:
+        """Detect losses after the reordering window has passed (RFC 8985, 6.3)."""
         if self._open:
             self._detect_losses()
             if self._reduction is not None:
-                self._window_bytes = self._reduction.window_bytes(self.board.pipe_bytes, 0, safe=False)
+                self._window_bytes = self._reduction.window_bytes(self.scoreboard.pipe_bytes, 0, safe=False)
             self._send()
 
-    def _grow(self, delivered_bytes: int) -> None:
-        """Open the window by an ACK of new data, or end the recovery that it completes.
+    def _update_window(self, delivered_bytes: int) -> None:
+        """Increase the window for an ACK of new data, or end the recovery that it completes.
 
-        What a SACK told of before does not count again: after a timeout one ACK may cover much that left the network
-        long ago (RFC 3465, 2.3; Linux: acked_sacked).
+        Bytes that a SACK reported before are not counted again: after a timeout one ACK may cover much data that left
+        the network long ago (RFC 3465, 2.3; Linux: acked_sacked).
         """
         now_ns = self._wire.now_ns
-        heard_ns, self._heard_ns = self._heard_ns, now_ns
+        last_ack_ns, self._last_ack_ns = self._last_ack_ns, now_ns
         recovering = self._reduction is not None
-        if self._recovery_end is not None and self.board.acknowledged >= self._recovery_end:
+        if self._recovery_end is not None and self.scoreboard.acknowledged >= self._recovery_end:
             self._recovery_end = None
             self._reduction = None
         if recovering:
             return
-        if self._full:
+        if self._is_window_limited:
             assert self.round_trips.smoothed_ns is not None
-            self.control.acknowledged(now_ns, delivered_bytes, self.round_trips.smoothed_ns)
+            self.control.on_ack(now_ns, delivered_bytes, self.round_trips.smoothed_ns)
         else:
-            self.control.idled(now_ns - heard_ns)
+            self.control.on_idle(now_ns - last_ack_ns)
 
-    def _recover(self, lost: SentSegment) -> None:
-        """Begin a recovery: close the window and send the first lost segment (RFC 6675, 5, step 4)."""
-        board = self.board
-        self._recovery_end = board.next
-        self.control.lost(self._flight_bytes())
+    def _start_recovery(self, lost: SentSegment) -> None:
+        """Start a recovery: reduce the window and send the first lost segment (RFC 6675, 5, step 4)."""
+        scoreboard = self.scoreboard
+        self._recovery_end = scoreboard.next
+        self.control.on_loss(self._flight_bytes())
         self._reduction = ProportionalReduction(
-            self.control.window_bytes, board.next - board.acknowledged, self._options.segment_bytes
+            self.control.window_bytes, scoreboard.next - scoreboard.acknowledged, self._options.segment_bytes
         )
         self._log("loss")
         self._send_again(lost)
 
     def _flight_bytes(self) -> int:
-        """Return FlightSize without what limited transmit sent beyond the window (RFC 5681, 3.2, step 2)."""
-        return min(self.board.next - self.board.acknowledged, self.control.window_bytes)
+        """Return FlightSize without the data that limited transmit sent beyond the window (RFC 5681, 3.2, step 2)."""
+        return min(self.scoreboard.next - self.scoreboard.acknowledged, self.control.window_bytes)
 
-    def _expire(self) -> None:
-        self._expired += 1
+    def _on_timeout(self) -> None:
+        self._timeouts += 1
         if not self._open:
-            self._expire_opening()
+            self._on_syn_timeout()
             return
-        if self._expired > self._options.retries:
-            self._give_up(f"tcp: not acknowledged, sent {self._expired} times")
+        if self._timeouts > self._options.retries:
+            self._give_up(f"tcp: not acknowledged, sent {self._timeouts} times")
             return
-        board = self.board
-        again = self._expired > 1 or (self._reduction is not None and not self.control.reduces_in_recovery)
-        self.control.timed_out(self._flight_bytes(), again=again)
-        board.lose_all()
-        self._recovery_end = board.next
+        scoreboard = self.scoreboard
+        is_repeated = self._timeouts > 1 or (self._reduction is not None and not self.control.reduces_in_recovery)
+        self.control.on_timeout(self._flight_bytes(), again=is_repeated)
+        scoreboard.lose_all()
+        self._recovery_end = scoreboard.next
         self._reduction = None
         self.round_trips.back_off()
         self._log("timeout")
         self._send()
 
-    def _expire_opening(self) -> None:
-        if self._expired > self._options.syn_retries:
-            self._give_up(f"tcp: not connected after {self._expired} tries")
+    def _on_syn_timeout(self) -> None:
+        if self._timeouts > self._options.syn_retries:
+            self._give_up(f"tcp: not connected after {self._timeouts} tries")
             return
         self.round_trips.back_off()
-        self._synchronize()
+        self._send_syn()
 
     def _send(self) -> None:
-        """Send lost segments again, then new ones, as far as the windows let (RFC 6675, 4, NextSeg)."""
-        board = self.board
+        """Send lost segments again, then new ones, as far as the windows allow (RFC 6675, 4, NextSeg)."""
+        scoreboard = self.scoreboard
         if self._reduction is None:
             self._window_bytes = self.control.window_bytes
-        self._full = False
+        self._is_window_limited = False
         while True:
-            again = board.lost()
-            length = again.end - again.first if again else self._next_length()
+            resend = scoreboard.next_lost()
+            length = resend.end - resend.first if resend else self._next_length()
             if not length and self._recovery_end is not None:
-                again = board.overtaken()
-                length = again.end - again.first if again else 0
+                resend = scoreboard.next_overtaken()
+                length = resend.end - resend.first if resend else 0
             if not length:
                 return
-            if board.pipe_bytes + length > self._window_bytes:
-                self._full = True
+            if scoreboard.pipe_bytes + length > self._window_bytes:
+                self._is_window_limited = True
                 return
-            if again:
-                self._send_again(again)
+            if resend:
+                self._send_again(resend)
             else:
                 self._send_new(length)
 
     def _next_length(self) -> int:
-        """Return how much new data the next segment takes; 0 for none."""
-        board, options = self.board, self._options
-        length = min(options.segment_bytes, self._stream.end - board.next)
-        if board.next + length > board.acknowledged + self._receive_window_bytes:
+        """Return the length of the next new segment; 0 if there is none."""
+        scoreboard, options = self.scoreboard, self._options
+        length = min(options.segment_bytes, self._stream.end - scoreboard.next)
+        if scoreboard.next + length > scoreboard.acknowledged + self._receive_window_bytes:
             return 0
-        if options.nagle and length < options.segment_bytes and board:
+        if options.nagle and length < options.segment_bytes and scoreboard:
             return 0
         return length
 
     def _send_new(self, length: int) -> None:
-        segment = self.board.send(self._wire.now_ns, length, self._stream.number(self.board.next))
+        segment = self.scoreboard.send(self._wire.now_ns, length, self._stream.number(self.scoreboard.next))
         self._emit(segment.first, length, number=segment.number, times=0)
-        self._note_sent(length)
+        self._record_sent(length)
         if self._timer.due_ns is None:
             self._restart_timer()
 
     def _send_again(self, segment: SentSegment) -> None:
         self._emit(segment.first, segment.end - segment.first, number=segment.number, times=segment.times)
-        self.board.send_again(self._wire.now_ns, segment)
-        self._note_sent(segment.end - segment.first)
-        # RFC 6675, 6: each one starts the timer anew, so that a long recovery ends in no needless timeout.
+        self.scoreboard.send_again(self._wire.now_ns, segment)
+        self._record_sent(segment.end - segment.first)
+        # RFC 6675, 6: each retransmission restarts the timer, so that a long recovery causes no needless timeout.
         self._restart_timer()
 
-    def _note_sent(self, length: int) -> None:
-        self._sent_ns = self._wire.now_ns
+    def _record_sent(self, length: int) -> None:
+        self._last_sent_ns = self._wire.now_ns
         if self._reduction is not None:
-            self._reduction.sent(length)
+            self._reduction.on_sent(length)
 
     def _restart_timer(self) -> None:
-        """Start the timer anew while anything is under way (RFC 6298, 5.1 to 5.3)."""
-        if self.board:
+        """Restart the timer if anything is in flight (RFC 6298, 5.1 to 5.3)."""
+        if self.scoreboard:
             self._timer.set(self._wire.now_ns + self.round_trips.timeout_ns)
         else:
             self._timer.stop()
@@ -309,7 +309,7 @@ class Sender:
                 sacks=(),
                 window_bytes=self._options.receive_window_bytes,
                 sent_ns=self._wire.now_ns,
-                echoes_ns=self._echoes_ns,
+                echoes_ns=self._echo_ns,
                 number=number,
                 times=times,
             )

@@ -1,1 +1,1 @@
-"""Publish-subscribe as DDS carries it: RTPS, best effort or reliable, with discovery."""
+"""Publish-subscribe as in DDS: RTPS, best effort or reliable, with discovery."""

@@ -1,13 +1,13 @@
 """Discovery of publish-subscribe: participants by SPDP, their endpoints by SEDP (DDSI-RTPS 2.5, clause 8.5).
 
-Nothing but peers is needed. A participant announces itself by multicast; who hears of it for the first time answers
-by unicast, and tells it over reliable built-in topics what it publishes and subscribes to. CycloneDDS packs what
-these topics have to say to a participant into one message; here they are one flow, with heartbeats and
-acknowledgements for all of them in each message. Whoever is not heard of for a lease is forgotten with all its
-endpoints, and may be found again. Times are those of CycloneDDS
-(`ddsi_spdp_schedule.c`, `ddsi_discovery_spdp.c`), and so are sizes, which were measured on version 11.0.1 from PyPI.
-Its participants answer at once whom they hear of first, and three times more, a second apart; nothing keeps them from
-talking together (`SPDPResponseMaxDelay` is 0 ms). What n of them tell each other grows with n^2.
+No master is needed. A participant announces itself by multicast. A participant that receives an announcement for the
+first time responds by unicast, and sends its publications and subscriptions over reliable built-in topics. CycloneDDS
+packs the data of these topics for one participant into one message; here they are one flow, with heartbeats and
+acknowledgements for all topics in each message. If nothing is received from a participant for a lease, it is removed
+with all its endpoints, and may be discovered again. Times are those of CycloneDDS (`ddsi_spdp_schedule.c`,
+`ddsi_discovery_spdp.c`); sizes were measured on version 11.0.1 from PyPI. Its participants respond to a new
+participant immediately and three more times at intervals of a second; no random delay separates the responses of
+different participants (`SPDPResponseMaxDelay` is 0 ms). The traffic of n participants grows with n^2.
 """
 
 from collections.abc import Mapping
@@ -22,13 +22,15 @@ from sim_backends.network.topics.rtps import IP_AND_UDP_BYTES, RTPS_HEADER_BYTES
 from sim_backends.network.wire import IpPacket, Wire
 
 SPDP_BYTES: Final = 436
-"""Of an announcement, from the header of IP on: INFO_DST, INFO_TS, and DATA of 360."""
+"""Size of an announcement with the IP header: INFO_DST, INFO_TS, and DATA of 360 bytes."""
 _BUILTIN_TOPICS: Final = 5
-"""Whose heartbeats and acknowledgements a message holds: endpoints of two kinds, liveliness, and look-up of types."""
+"""Number of built-in topics with heartbeats and acknowledgements in a message: two kinds of endpoints, liveliness,
+and look-up of types.
+"""
 _LIVELINESS_BYTES: Final = 28
 _WRITER_BYTES: Final = 200
 _READER_BYTES: Final = 212
-"""What SEDP tells of a writer and of a reader, without the names of topic and type."""
+"""Sizes of the SEDP data of a writer and of a reader, without the names of topic and type."""
 _DIRECTED: Final = 4
 _LEASE: Final = "the subscriber's lease ran out"
 
@@ -38,11 +40,11 @@ class DiscoveryTiming:
     """Times of the discovery.
 
     Attributes:
-        lease_ns: For how long a participant that is not heard of is believed to be there.
-        second_ns: From a participant's first announcement to its second.
-        period_ns: From then on; CycloneDDS takes 2 s off the lease.
-        directed_ns: Between the four answers to an announcement of somebody new.
-        starts_ns: When participants start, by name; others start at 0.
+        lease_ns: Time without messages after which a participant is removed.
+        second_ns: Time from a participant's first announcement to its second.
+        period_ns: Interval of later announcements; in CycloneDDS the lease minus 2 s.
+        directed_ns: Interval of the four responses to the announcement of a new participant.
+        starts_ns: Start times of participants, by name; others start at 0.
     """
 
     lease_ns: int = 10 * SECOND
@@ -54,10 +56,10 @@ class DiscoveryTiming:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """SPDP's message.
+    """An SPDP message.
 
     Attributes:
-        directed: Whether it answers one of another, and wants no answer.
+        directed: True if it responds to an announcement and needs no response.
     """
 
     directed: bool
@@ -65,10 +67,10 @@ class Announcement:
 
 @dataclass(frozen=True, slots=True)
 class SharedHeartbeats:
-    """Heartbeats for several participants at once, by multicast.
+    """Heartbeats for several participants in one multicast message.
 
     Attributes:
-        by_peer: For whom, and what it is told; in reality a built-in writer tells all of them the same.
+        by_peer: Heartbeat for each peer; in reality a built-in writer sends the same heartbeat to all of them.
     """
 
     by_peer: Mapping[str, Heartbeat]
@@ -76,28 +78,28 @@ class SharedHeartbeats:
 
 @dataclass(slots=True)
 class _Remote:
-    """What a participant knows of another.
+    """State of a remote participant at a participant.
 
     Attributes:
-        lease: Rings when it may have run out.
-        heard_ns: When it was heard of last.
-        alive: Whether it is believed to be there.
+        lease: Fires when the lease may have expired.
+        renewed_ns: Time of the last message from it.
+        alive: True from its announcement until its lease expires.
     """
 
     lease: WireTimer
-    heard_ns: int = 0
+    renewed_ns: int = 0
     alive: bool = False
 
 
 class TopicDiscovery:
-    """Matches the writers and readers of flows as their participants find each other.
+    """Matches the writers and readers of flows when their participants discover each other.
 
     Args:
-        wire: What messages go over.
+        wire: The network below.
         flows: All flows, by name.
-        sessions: Theirs, by the same names; those of the discovery's own topics are added.
-        timing: Of the protocol.
-        times: Of the discovery.
+        sessions: Their sessions, by the same names; sessions of the discovery's built-in topics are added.
+        timing: Times of the protocol.
+        times: Times of the discovery.
     """
 
     def __init__(
@@ -115,28 +117,28 @@ class TopicDiscovery:
         self._timing = timing
         self._times = times
         self._remotes: dict[tuple[str, str], _Remote] = {}
-        self._announced: dict[tuple[str, str], int] = {}
-        self._gathered: dict[str, dict[str, Heartbeat]] = {}
-        self._shared: dict[str, int] = {}
+        self._announcement_counts: dict[tuple[str, str], int] = {}
+        self._collected_heartbeats: dict[str, dict[str, Heartbeat]] = {}
+        self._shared_counts: dict[str, int] = {}
         self._participants = sorted({end for flow in flows.values() for end in (flow.publisher, flow.subscriber)})
         for participant in self._participants:
             starts_ns = max(times.starts_ns.get(participant, 0), wire.now_ns)
             wire.at(starts_ns, participant, partial(self._start, participant))
 
-    def heard(self, host: str, peer: str) -> None:
-        """Take it that a message from `peer` arrived at `host`, which renews its lease."""
+    def renew_lease(self, host: str, peer: str) -> None:
+        """Record that a message from `peer` arrived at `host`, which renews its lease."""
         remote = self._remotes.get((host, peer))
         if remote is not None and remote.alive:
-            remote.heard_ns = self._wire.now_ns
+            remote.renewed_ns = self._wire.now_ns
 
     def receive(self, host: str, peer: str, message: Announcement | SharedHeartbeats) -> None:
-        """Take a message of `peer` that arrived at `host`."""
+        """Process a message of `peer` that arrived at `host`."""
         if isinstance(message, Announcement):
-            self._take_announcement(host, peer, directed=message.directed)
+            self._on_announcement(host, peer, directed=message.directed)
         elif (heartbeat := message.by_peer.get(host)) is not None:
-            self._between(peer, host).reader.take(heartbeat)
+            self._sedp_session(peer, host).reader.on_message(heartbeat)
 
-    def _take_announcement(self, host: str, peer: str, *, directed: bool) -> None:
+    def _on_announcement(self, host: str, peer: str, *, directed: bool) -> None:
         if self._wire.now_ns < self._times.starts_ns.get(host, 0) or host not in self._participants:
             return
         remote = self._remotes.get((host, peer))
@@ -147,11 +149,11 @@ class TopicDiscovery:
         if remote.alive:
             return
         remote.alive = True
-        remote.heard_ns = self._wire.now_ns
+        remote.renewed_ns = self._wire.now_ns
         remote.lease.bring_forward(self._wire.now_ns + self._times.lease_ns)
         if not directed:
-            self._answer(host, peer, _DIRECTED)
-        self._meet(host, peer)
+            self._respond(host, peer, _DIRECTED)
+        self._start_sedp(host, peer)
 
     def _start(self, participant: str) -> None:
         now_ns, times = self._wire.now_ns, self._times
@@ -160,35 +162,37 @@ class TopicDiscovery:
         self._wire.at(now_ns + times.second_ns + times.period_ns, participant, partial(self._repeat, participant))
 
     def _repeat(self, participant: str) -> None:
-        """Announce and assert liveliness, again and again."""
+        """Announce a participant and assert its liveliness periodically."""
         self._announce(participant)
         for peer in self._participants:
             if (remote := self._remotes.get((participant, peer))) is not None and remote.alive:
-                writer = self._between(participant, peer).writer
+                writer = self._sedp_session(participant, peer).writer
                 writer.write(Sample(_LIVELINESS_BYTES, writer.last + 1))
         self._wire.at(self._wire.now_ns + self._times.period_ns, participant, partial(self._repeat, participant))
 
     def _announce(self, participant: str, peer: str = "") -> None:
-        """Announce a participant to everybody, or to one."""
-        number = self._announced[participant, peer] = self._announced.get((participant, peer), -1) + 1
+        """Announce a participant to all participants, or to one peer."""
+        number = self._announcement_counts[participant, peer] = (
+            self._announcement_counts.get((participant, peer), -1) + 1
+        )
         key = f"spdp {participant} {peer}", number
         body = Announcement(directed=bool(peer))
         self._wire.transmit(IpPacket(participant, peer or None, TRANSPORT, SPDP_BYTES, key, body))
 
-    def _answer(self, host: str, peer: str, times: int) -> None:
+    def _respond(self, host: str, peer: str, times: int) -> None:
         if times and self._remotes[host, peer].alive:
             self._announce(host, peer)
-            again_ns = self._wire.now_ns + self._times.directed_ns
-            self._wire.at(again_ns, host, partial(self._answer, host, peer, times - 1))
+            next_ns = self._wire.now_ns + self._times.directed_ns
+            self._wire.at(next_ns, host, partial(self._respond, host, peer, times - 1))
 
-    def _meet(self, host: str, peer: str) -> None:
-        """Begin to tell `peer` of the endpoints of `host`, and to listen to its own."""
-        self._between(host, peer).writer.match()
-        self._between(peer, host).reader.match()
-        self._tell(host, peer)
+    def _start_sedp(self, host: str, peer: str) -> None:
+        """Start to send the endpoints of `host` to `peer`, and to receive the peer's endpoints."""
+        self._sedp_session(host, peer).writer.match()
+        self._sedp_session(peer, host).reader.match()
+        self._offer_endpoints(host, peer)
 
-    def _between(self, host: str, peer: str) -> TopicSession:
-        """Return the session by which `host` tells `peer` about itself."""
+    def _sedp_session(self, host: str, peer: str) -> TopicSession:
+        """Return the session in which `host` sends its endpoints to `peer`."""
         name = f"rtps {host} {peer}"
         if name not in self._sessions:
             session = self._sessions[name] = TopicSession(
@@ -196,46 +200,46 @@ class TopicDiscovery:
                 name,
                 TopicFlow(host, peer, Qos(history="keep_all")),
                 self._timing,
-                deliver=partial(self._told, peer, host),
-                drop=_forget,
+                deliver=partial(self._on_endpoint, peer, host),
+                drop=_ignore_loss,
                 topics=_BUILTIN_TOPICS,
             )
-            session.writer.begun = partial(self._tell, host, peer)
-            session.writer.share = partial(self._gather, host, peer)
+            session.writer.on_reader_start = partial(self._offer_endpoints, host, peer)
+            session.writer.share_heartbeat = partial(self._collect_heartbeat, host, peer)
         return self._sessions[name]
 
-    def _gather(self, host: str, peer: str, heartbeat: Heartbeat) -> None:
-        """Send heartbeats of the same time together."""
-        gathered = self._gathered.setdefault(host, {})
-        if not gathered:
-            self._wire.at(self._wire.now_ns, host, partial(self._share, host))
-        gathered[peer] = heartbeat
+    def _collect_heartbeat(self, host: str, peer: str, heartbeat: Heartbeat) -> None:
+        """Collect heartbeats of the same time, to send them in one message."""
+        heartbeats = self._collected_heartbeats.setdefault(host, {})
+        if not heartbeats:
+            self._wire.at(self._wire.now_ns, host, partial(self._send_shared_heartbeats, host))
+        heartbeats[peer] = heartbeat
 
-    def _share(self, host: str) -> None:
-        heartbeats = self._gathered.pop(host)
-        number = self._shared[host] = self._shared.get(host, -1) + 1
+    def _send_shared_heartbeats(self, host: str) -> None:
+        heartbeats = self._collected_heartbeats.pop(host)
+        number = self._shared_counts[host] = self._shared_counts.get(host, -1) + 1
         size_bytes = IP_AND_UDP_BYTES + RTPS_HEADER_BYTES
-        size_bytes += _BUILTIN_TOPICS * max(one.size_bytes for one in heartbeats.values())
+        size_bytes += _BUILTIN_TOPICS * max(heartbeat.size_bytes for heartbeat in heartbeats.values())
         key = f"rtps {host} heartbeats", number
         self._wire.transmit(IpPacket(host, None, TRANSPORT, size_bytes, key, SharedHeartbeats(heartbeats)))
 
-    def _tell(self, host: str, peer: str) -> None:
-        """Offer what `host` publishes and subscribes to `peer`, unless any of that is on offer already."""
-        writer = self._between(host, peer).writer
-        if any(sample.tells for sample in writer.unacknowledged):
+    def _offer_endpoints(self, host: str, peer: str) -> None:
+        """Add the endpoints of `host` to the writer for `peer`, unless earlier ones are still unacknowledged."""
+        writer = self._sedp_session(host, peer).writer
+        if any(sample.endpoint_flow for sample in writer.unacknowledged):
             return
         for name, flow in self._flows.items():
             for agent, publishes in ((flow.publisher, True), (flow.subscriber, False)):
                 if agent == host:
                     size_bytes = _endpoint_bytes(flow, writer=publishes)
-                    writer.offer(Sample(size_bytes, writer.last + 1, tells=name))
+                    writer.add_historical(Sample(size_bytes, writer.last + 1, endpoint_flow=name))
 
-    def _told(self, host: str, peer: str, sample: Sample) -> None:
-        """Match an endpoint of `host` with one of `peer` that it has now been told of."""
-        flow = self._flows.get(sample.tells)
+    def _on_endpoint(self, host: str, peer: str, sample: Sample) -> None:
+        """Match an endpoint of `host` with the endpoint of `peer` that it has received."""
+        flow = self._flows.get(sample.endpoint_flow)
         if flow is None or not self._remotes[host, peer].alive:
             return
-        session = self._user_sessions[sample.tells]
+        session = self._user_sessions[sample.endpoint_flow]
         if (flow.publisher, flow.subscriber) == (peer, host) and not session.reader.matched:
             session.reader.match()
         elif (flow.publisher, flow.subscriber) == (host, peer) and not session.writer.matched:
@@ -243,25 +247,25 @@ class TopicDiscovery:
 
     def _check_lease(self, host: str, peer: str) -> None:
         remote = self._remotes[host, peer]
-        ends_ns = remote.heard_ns + self._times.lease_ns
-        if self._wire.now_ns < ends_ns:
-            remote.lease.bring_forward(ends_ns)
+        expires_ns = remote.renewed_ns + self._times.lease_ns
+        if self._wire.now_ns < expires_ns:
+            remote.lease.bring_forward(expires_ns)
             return
         remote.alive = False
-        self._between(host, peer).writer.unmatch(_LEASE)
-        self._between(peer, host).unmatch_reader()
+        self._sedp_session(host, peer).writer.remove_reader(_LEASE)
+        self._sedp_session(peer, host).unmatch_reader()
         for name, flow in self._flows.items():
             if (flow.publisher, flow.subscriber) == (host, peer):
-                self._user_sessions[name].writer.unmatch(_LEASE)
+                self._user_sessions[name].writer.remove_reader(_LEASE)
             elif (flow.subscriber, flow.publisher) == (host, peer):
                 self._user_sessions[name].unmatch_reader()
 
 
-def _forget(sample: Sample, reason: str) -> None:
-    """Take it that a sample of the discovery was lost, which no account is kept of."""
+def _ignore_loss(sample: Sample, reason: str) -> None:
+    """Ignore the loss of a sample of the discovery, which no statistics include."""
 
 
 def _endpoint_bytes(flow: TopicFlow, *, writer: bool) -> int:
-    """Return the size of what SEDP tells of an endpoint; names end with a zero and fill whole words of 4 bytes."""
+    """Return the SEDP size of an endpoint; names end with a zero byte and are padded to multiples of 4 bytes."""
     names = sum(-(-(len(name.encode()) + 1) // 4) * 4 for name in (flow.topic, flow.type_name))
     return names + (_WRITER_BYTES if writer else _READER_BYTES)

@@ -1,7 +1,7 @@
-"""A flow of publish-subscribe: a writer, its reader, and the account of what became of each sample.
+"""A flow of publish-subscribe: a writer, its reader, and the record of the result of each sample.
 
-The two ends know of each other only by messages. The account knows both: a sample will never arrive once its writer
-sends it no more, nothing of it is under way, and its reader does not hold it.
+The two ends exchange information only by messages. The record uses both: a sample will never arrive if its writer has
+given it up, no message with a part of it is in flight, and its reader does not hold it.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from sim_backends.network.wire import IpPacket, Wire
 from sim_backends.radio.random_streams import PacketIdentity
 
 TRANSPORT: Final = "topic"
-"""Name of the transport, as packets of programs have it."""
+"""Name of the transport, as in packets of programs."""
 NOT_MATCHED: Final = "not matched yet"
 
 
@@ -32,17 +32,18 @@ class TopicSession:
     """Writer and reader of one flow.
 
     Args:
-        wire: What messages go over.
-        name: Of the flow.
-        flow: Who publishes to whom, and how.
-        timing: Of the protocol.
-        deliver: Called with a sample that is delivered.
-        drop: Called with one that never will be, and the reason.
-        topics: For how many topics that share messages a message has its heartbeats and acknowledgements.
+        wire: The network below.
+        name: Name of the flow.
+        flow: Publisher, subscriber and quality of service.
+        timing: Times of the protocol.
+        deliver: Called with each delivered sample.
+        drop: Called with each sample that will never be delivered, and the reason.
+        topics: Number of topics that share the messages; each message has heartbeats and acknowledgements for all of
+            them.
 
     Attributes:
-        writer: At the publisher.
-        reader: At the subscriber.
+        writer: The writer at the publisher.
+        reader: The reader at the subscriber.
     """
 
     def __init__(
@@ -63,64 +64,64 @@ class TopicSession:
         self._drop = drop
         self._topics = topics
         self._reliable = flow.qos.reliability == "reliable"
-        self.writer = TopicWriter(wire, flow, timing, self._to_reader, self._give_up)
-        self.reader = TopicReader(wire, flow, timing, self._to_writer, self._take)
+        self.writer = TopicWriter(wire, flow, timing, self._to_reader, self._on_given_up)
+        self.reader = TopicReader(wire, flow, timing, self._to_writer, self._on_delivered)
 
     def receive(self, host: str, message: RtpsMessage) -> None:
-        """Take a message that arrived at `host`."""
-        samples = self._land(message)
+        """Process a message that arrived at `host`."""
+        samples = self._resolve(message)
         at_reader = host == self._flow.subscriber
         for submessage in message.submessages:
             if isinstance(submessage, AckNack | NackFrag):
                 if not at_reader:
-                    self.writer.take(submessage)
+                    self.writer.on_acknack(submessage)
             elif at_reader:
-                self.reader.take(submessage)
+                self.reader.on_message(submessage)
         for sample in samples:
             if not self._reliable and not self.reader.matched:
                 sample.given_up = NOT_MATCHED
             self._settle(sample)
 
     def lost(self, message: RtpsMessage, reason: str) -> None:
-        """Learn, for the account, that a message will not arrive."""
-        for sample in self._land(message):
+        """Record, for statistics only, that a message will not arrive."""
+        for sample in self._resolve(message):
             if not self._reliable:
                 sample.given_up = reason
             self._settle(sample)
 
     def unmatch_reader(self) -> None:
-        """Let the reader have no writer any more."""
-        for sample in self.reader.unmatch():
+        """Remove the writer from the reader."""
+        for sample in self.reader.remove_writer():
             self._settle(sample)
 
-    def _land(self, message: RtpsMessage) -> list[Sample]:
-        """Return the samples of a message that is heard of for the first time, a copy after which changes nothing."""
-        if message.landed:
+    def _resolve(self, message: RtpsMessage) -> list[Sample]:
+        """Mark a message as arrived or lost; return its samples the first time, and none for further copies."""
+        if message.resolved:
             return []
-        message.landed = True
-        samples = [one.sample for one in message.submessages if isinstance(one, Data)]
+        message.resolved = True
+        samples = [submessage.sample for submessage in message.submessages if isinstance(submessage, Data)]
         for sample in samples:
-            sample.under_way -= 1
+            sample.in_flight -= 1
         return samples
 
-    def _take(self, sample: Sample) -> None:
+    def _on_delivered(self, sample: Sample) -> None:
         if not sample.settled:
             sample.settled = True
             self._deliver(sample)
 
-    def _give_up(self, sample: Sample, reason: str) -> None:
+    def _on_given_up(self, sample: Sample, reason: str) -> None:
         sample.given_up = reason
         self._settle(sample)
 
     def _settle(self, sample: Sample) -> None:
-        if sample.given_up and not sample.under_way and not sample.held and not sample.settled:
+        if sample.given_up and not sample.in_flight and not sample.held and not sample.settled:
             sample.settled = True
             self._drop(sample, sample.given_up)
 
     def _to_reader(self, submessages: tuple[Submessage, ...], key: PacketIdentity) -> None:
         for submessage in submessages:
             if isinstance(submessage, Data):
-                submessage.sample.under_way += 1
+                submessage.sample.in_flight += 1
         self._transmit(self._flow.publisher, self._flow.subscriber, submessages, key)
 
     def _to_writer(self, submessages: tuple[Submessage, ...], key: PacketIdentity) -> None:
@@ -135,6 +136,6 @@ class TopicSession:
         size_bytes = ip_bytes(submessages)
         if self._topics > 1:
             size_bytes += (self._topics - 1) * sum(
-                one.size_bytes for one in submessages if isinstance(one, Heartbeat | AckNack)
+                submessage.size_bytes for submessage in submessages if isinstance(submessage, Heartbeat | AckNack)
             )
         self._wire.transmit(IpPacket(source, destination, TRANSPORT, size_bytes, identity, message))

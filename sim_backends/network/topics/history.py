@@ -1,4 +1,4 @@
-"""The history of a reliable writer: what it can send again, and when there is too much of that to write on."""
+"""The history of a reliable writer: samples that it can send again, and the limits at which it blocks."""
 
 from typing import Final
 
@@ -9,19 +9,20 @@ _GROWTH_PAUSE_NS: Final = 10 * MS
 
 
 class WriterHistory:
-    """Samples that are not acknowledged.
+    """The unacknowledged samples.
 
-    With `keep_all` a writer blocks while they are above a mark, until they are below another and nothing that was
-    asked for again is unacknowledged. The upper mark grows while nothing is lost, and shrinks when something is
-    (CycloneDDS, `ddsi_transmit.c`: `throttle_writer`, `maybe_grow_whc`; `ddsi_endpoint.c`: `set_retransmitting`).
+    With `keep_all` a writer blocks while the samples' size is above a high watermark, until it is below a low
+    watermark and no sample that was sent again is unacknowledged. The high watermark grows while nothing is lost, and
+    shrinks after a loss (CycloneDDS, `ddsi_transmit.c`: `throttle_writer`, `maybe_grow_whc`; `ddsi_endpoint.c`:
+    `set_retransmitting`).
 
     Args:
-        qos: Of the flow.
-        timing: With the marks.
+        qos: Quality of service of the flow.
+        timing: Contains the watermarks.
 
     Attributes:
-        samples: By sequence number, the oldest first; without holes.
-        unacknowledged_bytes: Their sizes together.
+        samples: Samples by sequence number, oldest first, without gaps.
+        unacknowledged_bytes: Sum of their sizes.
     """
 
     def __init__(self, qos: Qos, timing: RtpsTiming) -> None:
@@ -30,17 +31,17 @@ class WriterHistory:
         self._high_bytes = timing.high_bytes
         self._most_high_bytes = timing.most_high_bytes
         self._grew_ns = 0
-        self._repeating = False
+        self._resending = False
         self.samples: dict[int, Sample] = {}
         self.unacknowledged_bytes = 0
 
     @property
     def first(self) -> int | None:
-        """The oldest sequence number; None where everything is acknowledged."""
+        """The oldest sequence number; None if all samples are acknowledged."""
         return next(iter(self.samples), None)
 
     def insert(self, sample: Sample) -> Sample | None:
-        """Keep a sample that is sent now; return the one that it pushes out."""
+        """Insert a sample that is sent now; return the sample that it evicts, or None."""
         self.samples[sample.number] = sample
         self.unacknowledged_bytes += sample.size_bytes
         if self._depth is None or len(self.samples) <= self._depth:
@@ -48,42 +49,42 @@ class WriterHistory:
         return self._remove(next(iter(self.samples)))
 
     def acknowledge(self, base: int) -> None:
-        """Forget the samples before `base`."""
+        """Remove the samples before `base`."""
         for number in [number for number in self.samples if number < base]:
             self._remove(number)
         if not self.samples:
-            self._repeating = False
+            self._resending = False
 
     def clear(self) -> list[Sample]:
-        """Forget everything; return what was there."""
+        """Remove and return all samples."""
         samples = list(self.samples.values())
         self.acknowledge(max(self.samples, default=0) + 1)
         return samples
 
-    def note_repeat(self) -> None:
-        """Take it that something is sent again: the upper mark shrinks once, until all is acknowledged."""
-        if not self._repeating:
-            self._repeating = True
+    def on_resend(self) -> None:
+        """Reduce the high watermark for a retransmission, once until all samples are acknowledged."""
+        if not self._resending:
+            self._resending = True
             self._high_bytes = max(8 * self._high_bytes // 10, self._low_bytes)
 
     def admits(self, now_ns: int) -> bool:
-        """Return whether a writer may write now, after raising the upper mark where that stands against it."""
+        """Return True if a writer may write now; raise the high watermark if it prevents that."""
         if self._depth is not None or self.unacknowledged_bytes <= self._high_bytes:
             return True
-        room = self._most_high_bytes - self._high_bytes
-        if not self._repeating and room > 0 and now_ns >= self._grew_ns + _GROWTH_PAUSE_NS:
-            self._high_bytes += room // 32 or room
+        headroom_bytes = self._most_high_bytes - self._high_bytes
+        if not self._resending and headroom_bytes > 0 and now_ns >= self._grew_ns + _GROWTH_PAUSE_NS:
+            self._high_bytes += headroom_bytes // 32 or headroom_bytes
             self._grew_ns = now_ns
         return self.unacknowledged_bytes <= self._high_bytes
 
     @property
-    def lets_go_on(self) -> bool:
-        """Whether a writer that was blocked may write again."""
-        return self.unacknowledged_bytes <= self._low_bytes and not self._repeating
+    def can_resume(self) -> bool:
+        """True if a blocked writer may write again."""
+        return self.unacknowledged_bytes <= self._low_bytes and not self._resending
 
     @property
-    def crowding(self) -> int:
-        """How full it is: 0 below half of the way between the marks, 1 below three quarters, 2 above."""
+    def fill_level(self) -> int:
+        """Fill level: 0 below the middle between the watermarks, 1 below three quarters, 2 above."""
         if self._depth is not None:
             return 0
         span_bytes = self._high_bytes - self._low_bytes

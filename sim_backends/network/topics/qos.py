@@ -1,4 +1,4 @@
-"""Quality of service of publish-subscribe by the names that ROS 2 has for it, and the timing of the protocol."""
+"""Quality of service of publish-subscribe with the names of ROS 2, and the timing of the protocol."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -11,15 +11,15 @@ SECOND: Final = 1000 * MS
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """What a flow is promised; durability is always volatile. The defaults are those of ROS 2.
+    """Quality of service of a flow; durability is always volatile. The defaults are those of ROS 2.
 
     Attributes:
         reliability: `reliable`, or `best_effort`.
-        history: `keep_last` samples up to `depth`, or `keep_all`: then the writer blocks while too much of them is
+        history: `keep_last` samples up to `depth`, or `keep_all`: then the writer blocks while too many of them are
             unacknowledged.
-        depth: How many samples `keep_last` keeps, those that are not acknowledged included.
-        max_blocking_ns: How long a sample waits for a blocked writer before it is dropped; None is for ever, as
-            ROS 2 has it on CycloneDDS.
+        depth: Number of samples that `keep_last` keeps, including unacknowledged ones.
+        max_blocking_ns: Time for which a sample waits for a blocked writer before it is dropped; None means without
+            limit, as in ROS 2 on CycloneDDS.
     """
 
     reliability: Literal["reliable", "best_effort"] = "reliable"
@@ -28,20 +28,20 @@ class Qos:
     max_blocking_ns: int | None = None
 
     def __post_init__(self) -> None:
-        """Check what types do not.
+        """Check values beyond their types.
 
         Raises:
-            ConfigurationError: The depth is below 1, a time is below 0, or a word is none of its own.
+            ConfigurationError: The depth is below 1, a time is below 0, or a policy name is unknown.
         """
         if self.reliability not in {"reliable", "best_effort"} or self.history not in {"keep_last", "keep_all"}:
             raise ConfigurationError(
-                f"a quality of service cannot be {self.reliability}, {self.history}",
-                remedy="reliability is reliable or best_effort, history is keep_last or keep_all",
+                f"the quality of service {self.reliability}, {self.history} does not exist",
+                remedy="use reliable or best_effort as reliability, and keep_last or keep_all as history",
             )
         if self.depth < 1 or (self.max_blocking_ns is not None and self.max_blocking_ns < 0):
             raise ConfigurationError(
-                f"a history of {self.depth} samples and a blocking time of {self.max_blocking_ns} ns cannot be",
-                remedy="the depth is 1 or more, the time 0 or more",
+                f"a depth of {self.depth} samples with a blocking time of {self.max_blocking_ns} ns is invalid",
+                remedy="use a depth of at least 1 and a time of at least 0",
             )
 
 
@@ -52,9 +52,9 @@ class TopicFlow:
     Attributes:
         publisher: Agent with the writer.
         subscriber: Agent with the reader.
-        qos: Of both.
-        topic: Name of the topic as ROS has it; its length is that of what the discovery tells.
-        type_name: Name of its type, as DDS has it, likewise.
+        qos: Quality of service of both.
+        topic: Name of the topic in ROS; its length affects the size of discovery messages.
+        type_name: DDS name of its type; its length also affects their size.
     """
 
     publisher: str
@@ -69,23 +69,23 @@ class RtpsTiming:
     """Times and sizes of the protocol. The defaults are CycloneDDS's (`defconfig.c` of its main branch in 2026).
 
     Attributes:
-        fragment_bytes: What a sample is cut into (`FragmentSize`); a whole multiple goes into one message.
-        message_bytes: The most that a message of new data holds (`MaxMessageSize`).
-        answer_bytes: The most that a message of repeated data holds (`MaxRexmitMessageSize`).
-        heartbeat_ns: From the last write to a heartbeat of its own, and between such (`HeartbeatInterval`).
-        first_heartbeat_ns: From finding a reader to the first heartbeat.
-        heartbeat_min_ns: The least of that, while much is unacknowledged.
-        heartbeat_max_ns: The most, when nobody answers.
-        heartbeat_ask_ns: The least between heartbeats that ask for an answer while much is unacknowledged.
-        heartbeat_response_ns: From a heartbeat to what answers it (Fast DDS 5 ms).
-        nack_delay_ns: The least between two requests for the same (`NackDelay`).
-        ack_delay_ns: The least between two acknowledgements of the same (`AckDelay`).
-        nack_repeat_ns: From a request to the next when no heartbeat comes (`AutoReschedNackDelay`).
-        begin_ns: From finding a writer to the message by which a reader begins (`PreEmptiveAckDelay`).
-        begin_repeat_ns: From that to the next.
-        low_bytes: Unacknowledged data below which a blocked writer goes on (`WhcLow`).
-        high_bytes: Above which it blocks at first (`WhcHighInit`).
-        most_high_bytes: To what the latter grows while nothing is lost (`WhcHigh`).
+        fragment_bytes: Size of a sample's fragments (`FragmentSize`); a message contains an integer number of them.
+        message_bytes: Maximum size of a message of new data (`MaxMessageSize`).
+        answer_bytes: Maximum size of a message of retransmitted data (`MaxRexmitMessageSize`).
+        heartbeat_ns: Time from the last write to a separate heartbeat, and interval of these (`HeartbeatInterval`).
+        first_heartbeat_ns: Time from matching a reader to the first heartbeat.
+        heartbeat_min_ns: Minimum heartbeat interval, used while much data is unacknowledged.
+        heartbeat_max_ns: Maximum heartbeat interval, reached if the reader does not respond.
+        heartbeat_ask_ns: Minimum interval of heartbeats that require a response while much data is unacknowledged.
+        heartbeat_response_ns: Time from a heartbeat to its response (Fast DDS 5 ms).
+        nack_delay_ns: Minimum interval of two requests for the same data (`NackDelay`).
+        ack_delay_ns: Minimum interval of two acknowledgements of the same data (`AckDelay`).
+        nack_repeat_ns: Time from a request to the next if no heartbeat arrives (`AutoReschedNackDelay`).
+        begin_ns: Time from matching a writer to the reader's first ACKNACK (`PreEmptiveAckDelay`).
+        begin_repeat_ns: Initial interval of its repetitions.
+        low_bytes: Low watermark: unacknowledged data below which a blocked writer resumes (`WhcLow`).
+        high_bytes: Initial high watermark, above which a writer blocks (`WhcHighInit`).
+        most_high_bytes: Maximum high watermark, reached while nothing is lost (`WhcHigh`).
     """
 
     fragment_bytes: int = 1344

@@ -1,6 +1,6 @@
-"""Messages of RTPS and their sizes (OMG DDSI-RTPS 2.5, clause 9.4), as far as publish-subscribe here uses them.
+"""Messages of RTPS and their sizes (OMG DDSI-RTPS 2.5, clause 9.4), as far as they are used here.
 
-A message is a header and submessages. Sizes hold everything that goes over the air, from the header of IP on.
+A message is a header and submessages. Message sizes include the headers of IP and UDP.
 """
 
 from dataclasses import dataclass, field
@@ -22,19 +22,19 @@ _GAP_BYTES: Final = 32
 
 @dataclass(slots=True, eq=False)
 class Sample:
-    """A sample of a topic, and what is known of it from outside of both ends.
+    """A sample of a topic, with statistics that neither end uses.
 
     Attributes:
-        size_bytes: As serialized, with the encapsulation's header of 4 bytes.
-        key: What draws over it are keyed by: its number in the flow, which the program gave it.
-        packet_id: Of the program's packet that it carries; -1 for samples of the discovery.
+        size_bytes: Serialized size with the encapsulation header of 4 bytes.
+        key: Key of its random draws: its number in the flow, assigned by the program.
+        packet_id: Number of the program's packet that it carries; -1 for samples of the discovery.
         number: Its sequence number at its writer; 0 until it is sent.
-        times_sent: How often each of its fragments was sent.
-        under_way: How many messages that carry a part of it have neither arrived nor been lost.
-        held: Whether its reader has it whole, though it may wait there for one before it.
-        given_up: Why its writer sends it no more; empty while it may.
-        settled: Whether it was delivered, or dropped.
-        tells: The flow of which a sample of the discovery tells an endpoint.
+        times_sent: Number of transmissions of each fragment.
+        in_flight: Number of messages with a part of it that have neither arrived nor been lost.
+        held: True if its reader has it complete, possibly waiting for an earlier one.
+        given_up: Reason for which its writer will not send it again; empty while it may.
+        settled: True if it was delivered or dropped.
+        endpoint_flow: For a sample of the discovery, the flow whose endpoint it describes.
     """
 
     size_bytes: int
@@ -42,27 +42,27 @@ class Sample:
     packet_id: int = -1
     number: int = 0
     times_sent: dict[int, int] = field(default_factory=dict)
-    under_way: int = 0
+    in_flight: int = 0
     held: bool = False
     given_up: str = ""
     settled: bool = False
-    tells: str = ""
+    endpoint_flow: str = ""
 
     def fragments(self, fragment_bytes: int) -> int:
-        """Return how many fragments it is sent in."""
+        """Return the number of fragments in which it is sent."""
         return max(-(-self.size_bytes // fragment_bytes), 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Data:
-    """DATA, or DATA_FRAG with one or more fragments of a sample that is too large for it (8.3.8.2, 8.3.8.3).
+    """DATA, or DATA_FRAG with consecutive fragments of a sample that is too large for DATA (8.3.8.2, 8.3.8.3).
 
     Attributes:
-        sample: The sample; its reader looks at nothing of it but number and size.
-        first: Its first fragment in here, from 0.
-        count: How many follow each other in here.
-        of: How many the sample has.
-        fragment_bytes: Size of each but the last.
+        sample: The sample; its reader uses only its number and size.
+        first: Index of the first fragment, from 0.
+        count: Number of consecutive fragments.
+        of: Number of fragments of the whole sample.
+        fragment_bytes: Size of each fragment except the last.
     """
 
     sample: Sample
@@ -73,7 +73,7 @@ class Data:
 
     @property
     def size_bytes(self) -> int:
-        """Its size; a timestamp goes before the first fragment."""
+        """Its size, with a timestamp before the first fragment."""
         begin = self.first * self.fragment_bytes
         payload = min(self.count * self.fragment_bytes, self.sample.size_bytes - begin)
         header = _DATA_BYTES if self.of == 1 else _DATA_FRAG_BYTES
@@ -82,14 +82,14 @@ class Data:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """HEARTBEAT: which samples a writer has (8.3.8.6).
+    """HEARTBEAT: the samples that a writer has (8.3.8.6).
 
     Attributes:
-        first: The oldest that it can send again; one beyond `last` where there is none.
-        last: The newest that it sent.
-        count: Counts its heartbeats.
-        final: Whether it asks for no answer.
-        directed: Whether it goes to one reader, after what that asked for.
+        first: The oldest sample that it can send again; `last` + 1 if there is none.
+        last: The newest sample that it sent.
+        count: Number of the heartbeat.
+        final: True if no response is required.
+        directed: True if it is for one reader, in response to its request.
     """
 
     first: int
@@ -106,13 +106,13 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class AckNack:
-    """ACKNACK: what a reader has, and what it misses (8.3.8.1).
+    """ACKNACK: the samples that a reader has, and those that it misses (8.3.8.1).
 
     Attributes:
         base: It has all samples before this one.
-        missing: Samples that it asks for, rising, the first not before `base`.
-        count: Counts its messages.
-        final: Whether it asks for no heartbeat in answer, unlike the one by which a reader begins.
+        missing: Requested samples in ascending order, none before `base`.
+        count: Number of the message.
+        final: True if no heartbeat is required in response; False for a reader's first ACKNACK.
     """
 
     base: int
@@ -122,18 +122,18 @@ class AckNack:
 
     @property
     def size_bytes(self) -> int:
-        """Its size, with a bitmap of whole words from `base` to the last sample that is asked for."""
+        """Its size, with a bitmap of 4-byte words from `base` to the last requested sample."""
         return _ACKNACK_BYTES + _bitmap_bytes(self.missing[-1] - self.base + 1 if self.missing else 0)
 
 
 @dataclass(frozen=True, slots=True)
 class NackFrag:
-    """NACK_FRAG: which fragments of a sample a reader misses (8.3.8.11).
+    """NACK_FRAG: the fragments of a sample that a reader misses (8.3.8.11).
 
     Attributes:
-        number: Of the sample.
-        missing: Fragments, from 0, rising, within 256 of each other.
-        count: Counts its messages.
+        number: Number of the sample.
+        missing: Indices of fragments, from 0, in ascending order, within 256 of each other.
+        count: Number of the message.
     """
 
     number: int
@@ -142,7 +142,7 @@ class NackFrag:
 
     @property
     def size_bytes(self) -> int:
-        """Its size, with a bitmap of whole words from the first fragment to the last."""
+        """Its size, with a bitmap of 4-byte words from the first fragment to the last."""
         return _NACK_FRAG_BYTES + _bitmap_bytes(self.missing[-1] - self.missing[0] + 1)
 
 
@@ -169,25 +169,31 @@ Submessage = Data | Heartbeat | AckNack | NackFrag | Gap
 
 @dataclass(slots=True, eq=False)
 class RtpsMessage:
-    """A message of one end of a flow for the other.
+    """A message from one end of a flow to the other.
 
     Attributes:
         flow: Name of the flow.
-        submessages: What it says.
-        landed: Whether it has arrived or been lost already, for the account.
+        submessages: Its content.
+        resolved: True if it has already arrived or been lost, for statistics.
     """
 
     flow: str
     submessages: tuple[Submessage, ...]
-    landed: bool = False
+    resolved: bool = False
 
 
 def ip_bytes(submessages: tuple[Submessage, ...]) -> int:
-    """Return the size of an IP packet that carries a message of these; what answers one reader or writer names it."""
-    head = IP_AND_UDP_BYTES + RTPS_HEADER_BYTES
-    if not all(isinstance(one, Data) or (isinstance(one, Heartbeat) and not one.directed) for one in submessages):
-        head += INFO_DESTINATION_BYTES
-    return head + sum(one.size_bytes for one in submessages)
+    """Return the size of an IP packet with these submessages.
+
+    Messages for one reader or writer contain an INFO_DST.
+    """
+    header_bytes = IP_AND_UDP_BYTES + RTPS_HEADER_BYTES
+    if not all(
+        isinstance(submessage, Data) or (isinstance(submessage, Heartbeat) and not submessage.directed)
+        for submessage in submessages
+    ):
+        header_bytes += INFO_DESTINATION_BYTES
+    return header_bytes + sum(submessage.size_bytes for submessage in submessages)
 
 
 def _bitmap_bytes(bits: int) -> int:

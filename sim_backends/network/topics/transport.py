@@ -1,4 +1,4 @@
-"""Publish-subscribe as DDS does it by RTPS, without any master."""
+"""Publish-subscribe as in DDS, by RTPS and without a master."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -15,22 +15,21 @@ _DISCOVERY: Final = DiscoveryTiming()
 
 
 class Topics:
-    """The transport of packets that go by topics: each flow has a writer and a reader of its own.
+    """The transport of packets on topics: each flow has its own writer and reader.
 
-    A subscriber gets what is published to it by unicast, as CycloneDDS sends where multicast is kept to discovery
-    (`AllowMulticast: spdp`), which is the advice for Wi-Fi: multicast has no link-layer acknowledgement there. A
-    program does not stand still while its writer is blocked: what it publishes meanwhile waits its turn. A subscriber
-    takes samples at once, so that its own history is never full.
+    A subscriber receives data by unicast, like in CycloneDDS if multicast is restricted to discovery
+    (`AllowMulticast: spdp`); this is recommended for Wi-Fi, where multicast has no link-layer acknowledgement. A
+    program continues while its writer is blocked: its samples are queued. A subscriber reads samples immediately, so
+    that its own history is never full.
 
-    Left out: durability other than volatile, HEARTBEAT_FRAG, which is advice only, and the topics that ROS 2 adds to
+    Not modelled: durability other than volatile, HEARTBEAT_FRAG, which is optional, and the topics that ROS 2 adds to
     every node.
 
     Args:
-        wire: What messages go over.
-        flows: Every flow of the scenario that goes by topics, by its name.
-        discovery: When participants announce themselves; None matches all endpoints from the beginning, without any
-            traffic.
-        timing: Of the protocol; None is CycloneDDS's.
+        wire: The network below.
+        flows: All flows of the scenario that use topics, by name.
+        discovery: Times of the discovery; None matches all endpoints from the start, without any traffic.
+        timing: Times of the protocol; None for CycloneDDS's.
     """
 
     def __init__(
@@ -51,25 +50,25 @@ class Topics:
         self._discovery = TopicDiscovery(wire, flows, self._sessions, timing, discovery) if discovery else None
         if self._discovery is None:
             for session in self._sessions.values():
-                session.writer.match(answered=True)
-                session.reader.match(begin=False)
+                session.writer.match(responded=True)
+                session.reader.match(request_heartbeat=False)
 
     @property
     def matched(self) -> bool:
-        """Whether the writer and the reader of every flow have found each other."""
+        """True if the writer and the reader of every flow are matched."""
         sessions = [self._sessions[name] for name in self._flows]
         return all(session.writer.matched and session.reader.matched for session in sessions)
 
     def send(self, packet: Packet) -> None:
-        """See `Transport.send`.
+        """Implement `Transport.send`.
 
         Raises:
-            ConfigurationError: The packet is of no flow that is known.
+            ConfigurationError: The packet belongs to an unknown flow.
         """
         name, number = packet.identity
         if name not in self._flows:
             raise ConfigurationError(
-                f"{packet.source} publishes in a flow {name!r} that no topic is known for",
+                f"{packet.source} publishes in the flow {name!r}, which has no topic",
                 remedy=did_you_mean(name, self._flows, "flows: " + ", ".join(self._flows)),
             )
         writer = self._sessions[name].writer
@@ -79,16 +78,16 @@ class Topics:
             self._wire.drop(packet.packet_id, NOT_MATCHED)
 
     def receive(self, host: str, packet: IpPacket) -> None:
-        """See `Transport.receive`."""
+        """Implement `Transport.receive`."""
         if self._discovery is not None:
-            self._discovery.heard(host, packet.source)
+            self._discovery.renew_lease(host, packet.source)
         if isinstance(packet.body, RtpsMessage):
             self._sessions[packet.body.flow].receive(host, packet.body)
         elif self._discovery is not None:
             self._discovery.receive(host, packet.source, packet.body)
 
     def lost(self, packet: IpPacket, reason: str) -> None:
-        """See `Transport.lost`."""
+        """Implement `Transport.lost`."""
         if isinstance(packet.body, RtpsMessage):
             self._sessions[packet.body.flow].lost(packet.body, reason)
 

@@ -1,9 +1,9 @@
-"""The writer of a flow: sends samples, tells its reader what there is, and sends again what that asks for.
+"""The writer of a flow: sends samples, announces them to its reader, and sends requested ones again.
 
-It behaves as CycloneDDS does (`ddsi_transmit.c`, `ddsi_hbcontrol.c`, `ddsi_receive.c`), which keeps DDSI-RTPS 2.5,
-clauses 8.4.7 to 8.4.9: after every sample a heartbeat in the same message, which asks for an answer only when the
-sample before is long gone; heartbeats of their own while something is unacknowledged, less often the longer nobody
-answers; and one after whatever was asked for again.
+It behaves like CycloneDDS (`ddsi_transmit.c`, `ddsi_hbcontrol.c`, `ddsi_receive.c`), which implements DDSI-RTPS 2.5,
+clauses 8.4.7 to 8.4.9. After every sample there is a heartbeat in the same message, which requires a response only if
+the previous sample was sent long ago. Separate heartbeats are sent while samples are unacknowledged, at growing
+intervals if the reader does not respond, and one after each retransmission.
 """
 
 from collections.abc import Callable, Iterable
@@ -17,11 +17,11 @@ from sim_backends.network.wire import Wire
 from sim_backends.radio.random_streams import PacketIdentity
 
 Transmit = Callable[[tuple[Submessage, ...], PacketIdentity], None]
-"""Sends a message to the other end; what draws over it are keyed by begins with the kind of message."""
+"""Sends a message to the other end; the key of its random draws begins with the kind of message."""
 
 PUSHED_OUT: Final = "pushed out of the writer's history before it was acknowledged"
 OVERTAKEN: Final = "overtaken by a later sample"
-"""What becomes of a sample that nobody sends again, unless it is lost or delivered."""
+"""Result of a sample that is never sent again, unless it is delivered or lost."""
 BLOCKED: Final = "the writer was blocked for longer than max_blocking_time"
 _LONG_AGO_NS: Final = -(10**18)
 _PIGGYBACK_PAUSE_NS: Final = 100_000
@@ -32,16 +32,16 @@ class TopicWriter:
     """A writer with one reader.
 
     Args:
-        wire: Keeps the time.
-        flow: From whom to whom, and its quality of service.
-        timing: Of the protocol.
-        transmit: Sends to the reader.
-        give_up: Called with a sample that is never sent, or never again, and the reason.
+        wire: Provides the clock.
+        flow: Publisher, subscriber and quality of service.
+        timing: Times of the protocol.
+        transmit: Sends a message to the reader.
+        give_up: Called with a sample that will not be sent, or not again, and the reason.
 
     Attributes:
-        begun: Called when its reader begins, or begins anew.
-        share: Takes heartbeats of their own that lie on whole periods, to send them with those of other writers; None
-            sends them.
+        on_reader_start: Called when its reader starts, or starts again.
+        share_heartbeat: Called with separate heartbeats at whole periods, to send them with those of other writers;
+            None sends them directly.
     """
 
     def __init__(
@@ -63,18 +63,18 @@ class TopicWriter:
         self._waiting: dict[Sample, None] = {}
         self._last = 0
         self._matched = False
-        self._answered = False
-        # Counts of heartbeats and gaps, and that of the reader's last message.
-        self._heartbeats = self._gaps = self._taken = 0
+        self._reader_responded = False
+        # Numbers of heartbeats and gaps, and the number of the reader's last message.
+        self._heartbeats = self._gaps = self._last_acknack_count = 0
         self._heartbeats_since_write = 0
-        self._wrote_ns = self._beat_ns = self._asked_ns = _LONG_AGO_NS
-        self._beat = WireTimer(wire, flow.publisher, self._heartbeat_alone)
-        self.begun: Callable[[], None] = lambda: None
-        self.share: Callable[[Heartbeat], None] | None = None
+        self._written_ns = self._heartbeat_ns = self._ack_requested_ns = _LONG_AGO_NS
+        self._heartbeat_timer = WireTimer(wire, flow.publisher, self._send_heartbeat)
+        self.on_reader_start: Callable[[], None] = lambda: None
+        self.share_heartbeat: Callable[[Heartbeat], None] | None = None
 
     @property
     def matched(self) -> bool:
-        """Whether there is a reader to write to."""
+        """True if the writer has a reader."""
         return self._matched
 
     @property
@@ -84,27 +84,27 @@ class TopicWriter:
 
     @property
     def unacknowledged(self) -> Iterable[Sample]:
-        """The samples that its reader has not acknowledged, the oldest first."""
+        """The samples that its reader has not acknowledged, oldest first."""
         return self._history.samples.values()
 
-    def match(self, *, answered: bool = False) -> None:
-        """Take it that there is a reader from now on; heartbeats call it unless it has `answered` already."""
+    def match(self, *, responded: bool = False) -> None:
+        """Add the reader; send it heartbeats unless it has already responded."""
         self._matched = True
-        self._answered = answered
+        self._reader_responded = responded
         self._heartbeats_since_write = 0
-        if self._reliable and not answered:
-            self._beat.bring_forward(self._wire.now_ns + self._timing.first_heartbeat_ns)
+        if self._reliable and not responded:
+            self._heartbeat_timer.bring_forward(self._wire.now_ns + self._timing.first_heartbeat_ns)
 
-    def offer(self, sample: Sample) -> None:
-        """Have a sample for its reader to ask for, of which the next heartbeat tells."""
+    def add_historical(self, sample: Sample) -> None:
+        """Add a sample without sending it; the next heartbeat announces it and the reader requests it."""
         self._last += 1
         sample.number = self._last
         self._history.insert(sample)
 
-    def unmatch(self, reason: str) -> None:
-        """Take it that there is no reader any more: what is unacknowledged is given up."""
+    def remove_reader(self, reason: str) -> None:
+        """Remove the reader and give up all unacknowledged samples."""
         self._matched = False
-        self._beat.stop()
+        self._heartbeat_timer.stop()
         waiting, self._waiting = self._waiting, {}
         for sample in (*self._history.clear(), *waiting):
             self._give_up(sample, reason)
@@ -115,34 +115,34 @@ class TopicWriter:
             self._send(sample)
             return
         if not self._waiting:
-            # As the writer begins to block, it asks for the acknowledgements that it waits for.
+            # When the writer starts to block, it requests the acknowledgements for which it waits.
             heartbeat = self._heartbeat(final=False)
             self._transmit((heartbeat,), self._key_of((heartbeat,)))
         self._waiting[sample] = None
         if self._max_blocking_ns is not None:
             self._wire.at(self._wire.now_ns + self._max_blocking_ns, self._host, lambda: self._expire(sample))
 
-    def take(self, message: AckNack | NackFrag) -> None:
-        """Take what the reader answered: forget what it has, send again what it asks for."""
-        if not self._matched or message.count <= self._taken:
+    def on_acknack(self, message: AckNack | NackFrag) -> None:
+        """Process a response of the reader: remove acknowledged samples, send requested ones again."""
+        if not self._matched or message.count <= self._last_acknack_count:
             return
-        self._taken = message.count
+        self._last_acknack_count = message.count
         if isinstance(message, NackFrag):
-            self._answer_nack_frag(message)
+            self._on_nack_frag(message)
             return
-        self._answered = True
+        self._reader_responded = True
         self._history.acknowledge(message.base)
         if not message.final and not message.missing:
-            self.begun()
+            self.on_reader_start()
             self._respond(())
         elif message.missing:
-            self._answer_nack(message)
-        self._go_on()
+            self._on_nack(message)
+        self._resume()
 
     def _send(self, sample: Sample) -> None:
         self._last += 1
         sample.number = self._last
-        pushed_out = self._history.insert(sample) if self._reliable else None
+        evicted = self._history.insert(sample) if self._reliable else None
         of = sample.fragments(self._timing.fragment_bytes)
         per_message = max(self._timing.message_bytes // self._timing.fragment_bytes, 1)
         for first in range(0, of, per_message):
@@ -150,8 +150,8 @@ class TopicWriter:
             if self._reliable and first + per_message >= of:
                 submessages += self._piggyback()
             self._transmit(submessages, (f"data{first}", sample.key))
-        if pushed_out is not None:
-            self._give_up(pushed_out, PUSHED_OUT)
+        if evicted is not None:
+            self._give_up(evicted, PUSHED_OUT)
         if not self._reliable:
             self._give_up(sample, OVERTAKEN)
 
@@ -163,19 +163,19 @@ class TopicWriter:
 
     def _piggyback(self) -> tuple[Submessage, ...]:
         now_ns = self._wire.now_ns
-        # Asking is due soon, and this saves a message of its own.
-        asks = now_ns >= self._wrote_ns + 4 * self._timing.heartbeat_ns // 5 or self._crowded()
-        since_beat_ns = now_ns - self._beat_ns
-        self._wrote_ns = now_ns
-        self._keep_rate()
-        if not asks and since_beat_ns <= _PIGGYBACK_PAUSE_NS:
+        # A response will be required soon; requiring it now saves a separate message.
+        requires_response = now_ns >= self._written_ns + 4 * self._timing.heartbeat_ns // 5 or self._above_watermark()
+        since_heartbeat_ns = now_ns - self._heartbeat_ns
+        self._written_ns = now_ns
+        self._reset_heartbeat_rate()
+        if not requires_response and since_heartbeat_ns <= _PIGGYBACK_PAUSE_NS:
             return ()
-        return (self._heartbeat(final=not asks),)
+        return (self._heartbeat(final=not requires_response),)
 
     def _heartbeat(self, *, final: bool) -> Heartbeat:
-        self._beat_ns = self._wire.now_ns
+        self._heartbeat_ns = self._wire.now_ns
         if not final:
-            self._asked_ns = self._wire.now_ns
+            self._ack_requested_ns = self._wire.now_ns
         self._heartbeats_since_write += 1
         return self._new_heartbeat(final=final, directed=False)
 
@@ -183,56 +183,59 @@ class TopicWriter:
         self._heartbeats += 1
         return Heartbeat(self._history.first or self._last + 1, self._last, self._heartbeats, final, directed)
 
-    def _heartbeat_alone(self) -> None:
-        if not (self._matched and (self._history.samples or not self._answered)):
+    def _send_heartbeat(self) -> None:
+        if not (self._matched and (self._history.samples or not self._reader_responded)):
             return
         now_ns = self._wire.now_ns
-        if now_ns >= self._beat_ns + self._interval_ns():
-            asks = now_ns >= self._wrote_ns + self._timing.heartbeat_ns or self._crowded()
-            heartbeat = self._heartbeat(final=not asks)
-            if self.share is None or now_ns % self._timing.heartbeat_ns:
+        if now_ns >= self._heartbeat_ns + self._interval_ns():
+            requires_response = now_ns >= self._written_ns + self._timing.heartbeat_ns or self._above_watermark()
+            heartbeat = self._heartbeat(final=not requires_response)
+            if self.share_heartbeat is None or now_ns % self._timing.heartbeat_ns:
                 self._transmit((heartbeat,), self._key_of((heartbeat,)))
             else:
-                self.share(heartbeat)
-        self._plan_heartbeat(self._interval_ns())
+                self.share_heartbeat(heartbeat)
+        self._schedule_heartbeat(self._interval_ns())
 
-    def _plan_heartbeat(self, after_ns: int) -> None:
+    def _schedule_heartbeat(self, after_ns: int) -> None:
         at_ns = self._wire.now_ns + after_ns
-        if self.share is not None:
+        if self.share_heartbeat is not None:
             at_ns += -at_ns % self._timing.heartbeat_ns
-        self._beat.bring_forward(at_ns)
+        self._heartbeat_timer.bring_forward(at_ns)
 
     def _interval_ns(self) -> int:
-        """Return the time from one heartbeat to the next: twice as long after every second one, from the sixth on."""
+        """Return the time to the next heartbeat: it doubles after every second heartbeat from the sixth."""
         interval_ns = self._timing.heartbeat_ns
         for _ in range((self._heartbeats_since_write - _HEARTBEATS_AT_FULL_RATE) // 2):
             if 2 * interval_ns >= self._timing.heartbeat_max_ns:
                 break
             interval_ns *= 2
-        interval_ns >>= self._history.crowding + bool(self._waiting)
+        interval_ns >>= self._history.fill_level + bool(self._waiting)
         return max(interval_ns, self._timing.heartbeat_min_ns)
 
-    def _crowded(self) -> bool:
-        """Whether so much is unacknowledged that it is time to ask."""
-        return self._history.crowding > 0 and self._wire.now_ns >= self._asked_ns + self._timing.heartbeat_ask_ns
+    def _above_watermark(self) -> bool:
+        """Return True if so much data is unacknowledged that a response is required now."""
+        return (
+            self._history.fill_level > 0
+            and self._wire.now_ns >= self._ack_requested_ns + self._timing.heartbeat_ask_ns
+        )
 
-    def _keep_rate(self) -> None:
+    def _reset_heartbeat_rate(self) -> None:
         self._heartbeats_since_write = 0
-        self._plan_heartbeat(self._timing.heartbeat_ns)
+        self._schedule_heartbeat(self._timing.heartbeat_ns)
 
-    def _answer_nack(self, nack: AckNack) -> None:
-        again: list[Submessage] = []
+    def _on_nack(self, nack: AckNack) -> None:
+        submessages: list[Submessage] = []
         first = self._history.first or self._last + 1
         if nack.missing[0] < first:
-            again.append(Gap(nack.missing[0], first))
+            submessages.append(Gap(nack.missing[0], first))
         for number in nack.missing:
             sample = self._history.samples.get(number)
             if sample is not None:
-                # Of a larger one the reader asks for the rest once it knows how many fragments there are.
-                again.append(self._data(sample, 0, 1))
-        self._respond(again)
+                # The reader requests the other fragments of a larger sample when it knows their number.
+                submessages.append(self._data(sample, 0, 1))
+        self._respond(submessages)
 
-    def _answer_nack_frag(self, nack: NackFrag) -> None:
+    def _on_nack_frag(self, nack: NackFrag) -> None:
         sample = self._history.samples.get(nack.number)
         if sample is None:
             self._respond([Gap(nack.number, nack.number + 1)] if nack.number <= self._last else [])
@@ -240,18 +243,18 @@ class TopicWriter:
             of = sample.fragments(self._timing.fragment_bytes)
             self._respond([self._data(sample, fragment, 1) for fragment in nack.missing if fragment < of])
 
-    def _respond(self, again: list[Submessage] | tuple[()]) -> None:
-        """Send what was asked for again, and a heartbeat, in as few messages as hold them."""
-        if any(isinstance(one, Data) for one in again):
-            self._history.note_repeat()
+    def _respond(self, submessages: list[Submessage] | tuple[()]) -> None:
+        """Send the requested data and a heartbeat in as few messages as possible."""
+        if any(isinstance(submessage, Data) for submessage in submessages):
+            self._history.on_resend()
         message: tuple[Submessage, ...] = ()
-        for submessage in (*again, self._new_heartbeat(final=False, directed=True)):
+        for submessage in (*submessages, self._new_heartbeat(final=False, directed=True)):
             if message and ip_bytes((*message, submessage)) > self._timing.answer_bytes:
                 self._transmit(message, self._key_of(message))
                 message = ()
             message += (submessage,)
         self._transmit(message, self._key_of(message))
-        self._keep_rate()
+        self._reset_heartbeat_rate()
 
     def _key_of(self, message: tuple[Submessage, ...]) -> PacketIdentity:
         head = message[0]
@@ -262,9 +265,9 @@ class TopicWriter:
         self._gaps += 1
         return "gap", self._gaps
 
-    def _go_on(self) -> None:
-        """Write what waited, if the writer was blocked and no longer is."""
-        if self._waiting and self._history.lets_go_on:
+    def _resume(self) -> None:
+        """Write waiting samples, if the writer was blocked and may resume."""
+        if self._waiting and self._history.can_resume:
             while self._waiting and self._history.admits(self._wire.now_ns):
                 sample = next(iter(self._waiting))
                 del self._waiting[sample]

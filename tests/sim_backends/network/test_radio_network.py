@@ -1,4 +1,4 @@
-"""The radio network: exact order of time, stations placed lazily, every packet with one end."""
+"""The radio network: exact order of time, stations placed only at events, one result per packet."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -35,39 +35,43 @@ NAMES = "abcd"
 FADING = RadioOptions(shadowing_db=3.0)
 
 
-class Eager(RadioNetwork):
-    """Places stations at every window, whether anything happens or not."""
+class EagerNetwork(RadioNetwork):
+    """Places stations at every window, even without events."""
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
     ) -> tuple[list[Arrival], list[Drop]]:
-        self._known = states
+        self._states = states
         self._place(self.now_ns)
         return super().advance(to_ns, packets, states)
 
 
-def driving(
+def passing_robots(
     kind: type[RadioNetwork], policy: SyncPolicy, seed: int, disturbances: Sequence[Disturbance]
 ) -> Coordinator:
-    """Let four robots drive past each other at the border of their range, each sending to the next."""
-    ways = {
+    """Let four robots pass each other at the limit of their range; each sends to the next."""
+    paths = {
         "a": [(0.0, 0.0, 1.0), (0.0, 60.0, 1.0)],
         "b": [(50.0, 30.0, 1.0), (50.0, -30.0, 1.0)],
         "c": [(20.0, 0.0, 1.0)],
         "d": [(80.0, 0.0, 1.0), (-20.0, 5.0, 1.0)],
     }
-    physics = Paths([WayPoints(name, way, 5.0 + number) for number, (name, way) in enumerate(ways.items())])
+    physics = Paths([WayPoints(name, path, 5.0 + number) for number, (name, path) in enumerate(paths.items())])
     pairs = [("a", "b"), ("b", "c"), ("c", "d"), ("d", "a")]
     programs = {
-        one: Periodic(one, other, period_ns=7_300_001, size_bytes=800 + 700 * number, first_ns=number * 1_700_000)
-        for number, (one, other) in enumerate(pairs)
+        sender: Periodic(
+            sender, receiver, period_ns=7_300_001, size_bytes=800 + 700 * number, first_ns=number * 1_700_000
+        )
+        for number, (sender, receiver) in enumerate(pairs)
     }
     net = kind(wifi(NAMES, FADING, seed=seed), NAMES, disturbances=disturbances)
     return Coordinator(Agents(physics, programs), net, policy, pairs)
 
 
-def driven(kind: type[RadioNetwork], policy: SyncPolicy, seed: int, disturbances: Sequence[Disturbance]) -> Run:
-    return driving(kind, policy, seed, disturbances).advance(250 * MS)
+def run_passing_robots(
+    kind: type[RadioNetwork], policy: SyncPolicy, seed: int, disturbances: Sequence[Disturbance]
+) -> Run:
+    return passing_robots(kind, policy, seed, disturbances).advance(250 * MS)
 
 
 JAM = [Jammer(5.0, 50 * MS, 80 * MS, agent="c"), Jammer(10.0, 60 * MS, 200 * MS, (40.0, 0.0, 1.0))]
@@ -79,48 +83,53 @@ JAM = [Jammer(5.0, 50 * MS, 80 * MS, agent="c"), Jammer(10.0, 60 * MS, 200 * MS,
     st.sampled_from([EventDriven, VariableStepped, lambda: Scheduled(0.0011), lambda: SlidingWindow(0.01)]),
     st.sampled_from([[], JAM, [NodeLoss("c", 100 * MS, 150 * MS), LinkCut("a", "b", 60 * MS, None)]]),
 )
-def test_placing_stations_only_when_something_happens_changes_nothing(
+def test_placing_stations_only_at_events_does_not_change_results(
     seed: int, policy: type[SyncPolicy], disturbances: list[Disturbance]
 ) -> None:
-    lazy, eager = driven(RadioNetwork, policy(), seed, disturbances), driven(Eager, policy(), seed, disturbances)
-    assert lazy.digest == eager.digest
-    assert any(fate.arrived_ns is not None for fate in lazy.fates.values())
+    lazy_run, eager_run = (
+        run_passing_robots(RadioNetwork, policy(), seed, disturbances),
+        run_passing_robots(EagerNetwork, policy(), seed, disturbances),
+    )
+    assert lazy_run.digest == eager_run.digest
+    assert any(fate.arrived_ns is not None for fate in lazy_run.fates.values())
 
 
 @settings(max_examples=4)
 @given(st.integers(0, 2**32), st.sampled_from([[], JAM]))
 def test_exact_policies_agree_on_every_packet(seed: int, disturbances: list[Disturbance]) -> None:
-    one, other = (driven(RadioNetwork, policy, seed, disturbances) for policy in (EventDriven(), VariableStepped()))
-    assert {identity: (fate.arrived_ns, fate.reason) for identity, fate in one.fates.items()} == {
-        identity: (fate.arrived_ns, fate.reason) for identity, fate in other.fates.items()
+    first, second = (
+        run_passing_robots(RadioNetwork, policy, seed, disturbances) for policy in (EventDriven(), VariableStepped())
+    )
+    assert {identity: (fate.arrived_ns, fate.reason) for identity, fate in first.fates.items()} == {
+        identity: (fate.arrived_ns, fate.reason) for identity, fate in second.fates.items()
     }
 
 
-def test_a_fork_in_the_midst_of_frames_goes_on_as_its_origin_does() -> None:
-    origin = driving(RadioNetwork, EventDriven(), 1, JAM)
+def test_a_fork_during_frames_continues_like_its_origin() -> None:
+    origin = passing_robots(RadioNetwork, EventDriven(), 1, JAM)
     origin.advance(70 * MS + 123_456)
     fork = origin.fork()
     assert fork.advance(150 * MS).digest == origin.advance(150 * MS).digest
     assert fork.run.fates.keys() == origin.run.fates.keys()
 
 
-def test_what_happens_in_a_fork_is_in_no_log() -> None:
-    logged: list[int] = []
+def test_events_in_a_fork_are_not_logged() -> None:
+    logged_ns: list[int] = []
 
     class Logged(RadioNetwork):
         def __init__(
             self, radio: RadioModel[Fragment], names: Sequence[str], *, disturbances: Sequence[Disturbance]
         ) -> None:
             super().__init__(radio, names, disturbances=disturbances)
-            self.log_ip(lambda at_ns, _name, _fragment: logged.append(at_ns))
+            self.log_ip(lambda at_ns, _name, _fragment: logged_ns.append(at_ns))
 
-    origin = driving(Logged, EventDriven(), 1, [])
+    origin = passing_robots(Logged, EventDriven(), 1, [])
     origin.advance(70 * MS)
-    before = len(logged)
+    count_before = len(logged_ns)
     origin.fork().advance(150 * MS)
-    assert len(logged) == before
+    assert len(logged_ns) == count_before
     origin.advance(150 * MS)
-    assert len(logged) > before > 0
+    assert len(logged_ns) > count_before > 0
 
 
 PLACES = st.tuples(st.floats(0, 120), st.floats(0, 120), st.just(1.0))
@@ -160,7 +169,7 @@ WIFI = st.fixed_dictionaries({"queue_packets": st.integers(0, 10)})
     SENDS,
     st.tuples(DISTURBANCES, st.sampled_from([None, "c"])),
 )
-def test_every_packet_ends_once_and_no_window_changes_how(
+def test_every_packet_has_one_result_independent_of_windows(
     options: dict[str, str | int],
     seed: int,
     places_m: dict[str, tuple[float, float, float]],
@@ -169,42 +178,44 @@ def test_every_packet_ends_once_and_no_window_changes_how(
 ) -> None:
     disturbances, relay = setting
     if "loss" in options:
-        disturbances = [one for one in disturbances if not isinstance(one, Jammer)]
+        disturbances = [disturbance for disturbance in disturbances if not isinstance(disturbance, Jammer)]
     sent, states = packets(sends), standing(places_m)
 
-    def made() -> RadioNetwork:
+    def create_network() -> RadioNetwork:
         wireless = wifi(NAMES, RadioOptions.model_validate(options), seed=seed)
         radio = fixed(seed, **options) if "loss" in options else wireless
         return network(radio, NAMES, disturbances=disturbances, relay=relay)
 
-    net = made()
-    whole = carry(net, states, sent)
-    assert len(whole.arrived) + len(whole.dropped) == len(sent)
-    assert net.next_event_ns() is None, "nothing is under way"
-    # The same in windows of 5 ms, and from event to event, where nothing comes between two events.
+    net = create_network()
+    expected = carry(net, states, sent)
+    assert len(expected.arrived) + len(expected.dropped) == len(sent)
+    assert net.next_event_ns() is None, "nothing is in flight"
+    # The results are the same in windows of 5 ms, and from event to event.
     for next_end in (lambda now_ns, _: now_ns + 5 * MS, lambda _, next_ns: next_ns):
-        net, waiting, now_ns = made(), list(sent), 0
+        net, remaining, now_ns = create_network(), list(sent), 0
         arrivals: list[Arrival] = []
         drops: list[Drop] = []
-        while (next_ns := net.next_event_ns()) is not None or waiting:
-            ends = [one for one in (next_ns, waiting[0].enters_ns if waiting else None) if one is not None]
+        while (next_ns := net.next_event_ns()) is not None or remaining:
+            ends = [
+                end_ns for end_ns in (next_ns, remaining[0].enters_ns if remaining else None) if end_ns is not None
+            ]
             to_ns = next_end(now_ns, min(ends))
-            entering = [one for one in waiting if one.enters_ns <= to_ns]
-            del waiting[: len(entering)]
+            entering = [packet for packet in remaining if packet.enters_ns <= to_ns]
+            del remaining[: len(entering)]
             arrived, dropped = net.advance(to_ns, entering, states)
-            assert all(now_ns <= one.at_ns <= to_ns for one in arrived)
+            assert all(now_ns <= arrival.at_ns <= to_ns for arrival in arrived)
             arrivals += arrived
             drops += dropped
             now_ns = to_ns
-        assert outcome(sent, arrivals, drops) == whole
+        assert outcome(sent, arrivals, drops) == expected
 
 
-class Shouts:
-    """Sends every packet to everyone, and notes who got it."""
+class BroadcastTransport:
+    """Sends every packet as a broadcast, and records its receivers."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        self.heard: list[tuple[int, str, int]] = []
+        self.received: list[tuple[int, str, int]] = []
 
     def send(self, packet: Packet) -> None:
         self._wire.transmit(
@@ -212,59 +223,59 @@ class Shouts:
         )
 
     def receive(self, host: str, packet: IpPacket) -> None:
-        self.heard.append((self._wire.now_ns, host, packet.body))
+        self.received.append((self._wire.now_ns, host, packet.body))
 
     def lost(self, packet: IpPacket, reason: str) -> None:
-        raise AssertionError("of a broadcast each host may miss its own")
+        raise AssertionError("lost must not be called for broadcasts")
 
 
-def shouted(places_m: dict[str, tuple[float, float, float]], sent: Sequence[Packet]) -> list[tuple[int, str, int]]:
-    made: list[Shouts] = []
+def broadcast(places_m: dict[str, tuple[float, float, float]], sent: Sequence[Packet]) -> list[tuple[int, str, int]]:
+    create_network: list[BroadcastTransport] = []
 
-    def make(wire: Wire) -> Shouts:
-        made.append(Shouts(wire))
-        return made[0]
+    def make(wire: Wire) -> BroadcastTransport:
+        create_network.append(BroadcastTransport(wire))
+        return create_network[0]
 
     net = network(wifi(list(places_m)), list(places_m), transports={"shout": make})
     net.advance(10**9, sent, standing(places_m))
-    return made[0].heard
+    return create_network[0].received
 
 
-def test_a_broadcast_reaches_everyone_in_range_whole() -> None:
+def test_a_fragmented_broadcast_reaches_all_stations_in_range() -> None:
     places_m = {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 1.0), "c": (0.0, 20.0, 1.0), "d": (200.0, 0.0, 1.0)}
-    heard = shouted(places_m, packets([(0, "a", "b", 4000)], protocol="shout"))
-    assert [(host, number) for _, host, number in heard] == [("b", 1), ("c", 1)]
+    received = broadcast(places_m, packets([(0, "a", "b", 4000)], protocol="shout"))
+    assert [(host, number) for _, host, number in received] == [("b", 1), ("c", 1)]
 
 
-@pytest.mark.parametrize("apart_ns", [5_000, 300_000, 1_000_000, 1_410_000, 1_430_000, 3_000_000])
+@pytest.mark.parametrize("interval_ns", [5_000, 300_000, 1_000_000, 1_410_000, 1_430_000, 3_000_000])
 @pytest.mark.parametrize("hidden", [True, False])
-def test_two_stations_collide_where_they_overlap_and_cannot_hear_each_other(hidden: bool, apart_ns: int) -> None:
-    """A frame of 1000 bytes at 6 Mbit/s; the listener is as near to both, so that neither is understood."""
-    aside_m = 60.0 if hidden else 10.0
-    places_m = {"a": (-aside_m, 0.0, 1.0), "b": (0.0, 0.0, 1.0), "c": (aside_m, 0.0, 1.0)}
-    sent = packets([(0, "a", "b", 1000), (apart_ns, "c", "b", 1000)], protocol="shout")
-    heard = {number for _, host, number in shouted(places_m, sent) if host == "b"}
-    # 20 us of preamble, 6 us of extension, symbols of 4 us of 24 bits each.
+def test_overlapping_frames_of_hidden_stations_collide(hidden: bool, interval_ns: int) -> None:
+    """A frame of 1000 bytes at 6 Mbit/s; both senders are equally far from the receiver, so both frames are lost."""
+    distance_m = 60.0 if hidden else 10.0
+    places_m = {"a": (-distance_m, 0.0, 1.0), "b": (0.0, 0.0, 1.0), "c": (distance_m, 0.0, 1.0)}
+    sent = packets([(0, "a", "b", 1000), (interval_ns, "c", "b", 1000)], protocol="shout")
+    received = {number for _, host, number in broadcast(places_m, sent) if host == "b"}
+    # Preamble of 20 us, extension of 6 us, symbols of 4 us with 24 bits each.
     airtime_ns = 26_000 + 4_000 * -(-(22 + 8 * 1036) // 24)
     assert airtime_ns == G_MODES[0].airtime_ns(1036)
-    assert heard == (set() if hidden and apart_ns < airtime_ns else {1, 2})
+    assert received == (set() if hidden and interval_ns < airtime_ns else {1, 2})
 
 
-def test_what_happens_at_one_nanosecond_happens_in_the_stated_order() -> None:
-    """The radio's events, then disturbances, then timers as they were set, then packets as they are given."""
+def test_simultaneous_events_run_in_the_documented_order() -> None:
+    """Events of the radio, disturbances, timers in the order of setting, packets in the given order."""
     order: list[str] = []
 
-    class Noting(Udp):
+    class LoggingUdp(Udp):
         def __init__(self, wire: Wire) -> None:
             super().__init__(wire)
-            self._to = wire
+            self._own_wire = wire
 
         def send(self, packet: Packet) -> None:
-            order.append(f"sends {packet.identity[1]} at {self._to.now_ns}")
+            order.append(f"sends {packet.identity[1]} at {self._own_wire.now_ns}")
             super().send(packet)
             if packet.identity[1] == 0:
                 for name in ("one", "two"):
-                    self._to.at(5 * MS, "b", partial(order.append, f"timer {name}"))
+                    self._own_wire.at(5 * MS, "b", partial(order.append, f"timer {name}"))
 
         def receive(self, host: str, packet: IpPacket) -> None:
             order.append(f"gets {packet.identity[1]}")
@@ -275,7 +286,7 @@ def test_what_happens_at_one_nanosecond_happens_in_the_stated_order() -> None:
     net = network(
         fixed(delay="5ms"),
         "ab",
-        transports={"udp": Noting},
+        transports={"udp": LoggingUdp},
         disturbances=[NodeLoss("a", 5 * MS)],
     )
     net.advance(
@@ -291,41 +302,43 @@ def test_what_happens_at_one_nanosecond_happens_in_the_stated_order() -> None:
     ]
 
 
-class Answers(Udp):
-    """Sends every packet to and fro three times before it counts as delivered."""
+class EchoingUdp(Udp):
+    """Returns every packet three times before it counts as delivered."""
 
     def __init__(self, wire: Wire) -> None:
         super().__init__(wire)
-        self._to = wire
+        self._own_wire = wire
 
     def receive(self, host: str, packet: IpPacket) -> None:
         flow, number = packet.identity
         if number == 3:
-            self._to.deliver(packet.body)
+            self._own_wire.deliver(packet.body)
         else:
-            self._to.transmit(replace(packet, source=host, destination=packet.source, identity=(flow, number + 1)))
+            self._own_wire.transmit(
+                replace(packet, source=host, destination=packet.source, identity=(flow, number + 1))
+            )
 
 
 @pytest.mark.parametrize("delay_ms", [0, 2])
-def test_an_answer_without_delay_arrives_in_the_same_nanosecond(delay_ms: int) -> None:
-    net = network(fixed(delay=f"{delay_ms}ms"), "ab", transports={"udp": Answers})
+def test_replies_without_delay_arrive_in_the_same_nanosecond(delay_ms: int) -> None:
+    net = network(fixed(delay=f"{delay_ms}ms"), "ab", transports={"udp": EchoingUdp})
     sent = packets([(MS, "a", "b", 10)])
     assert outcome(sent, *net.advance(10 * MS, sent, standing(dict.fromkeys("ab", (0, 0, 0))))).arrived == {
         ("a to b", 0): MS + 4 * delay_ms * MS
     }
 
 
-def test_a_timer_in_the_past_is_refused() -> None:
+def test_a_timer_in_the_past_is_rejected() -> None:
     net = network(fixed(), "ab")
     net.advance(5, [], standing(dict.fromkeys("ab", (0, 0, 0))))
     with pytest.raises(ValueError, match="for 4 ns was set at 5 ns"):
         net.at(4, "a", lambda: None)
 
 
-def test_the_log_of_ip_has_every_fragment_at_both_ends() -> None:
+def test_the_ip_log_contains_every_fragment_at_both_ends() -> None:
     log: list[tuple[int, str, int, int]] = []
     net = network(fixed(delay="5ms"), "ab")
-    net.log_ip(lambda at_ns, host, one: log.append((at_ns, host, one.index, one.size_bytes)))
+    net.log_ip(lambda at_ns, host, fragment: log.append((at_ns, host, fragment.index, fragment.size_bytes)))
     carry(net, standing(dict.fromkeys("ab", (0, 0, 0))), packets([(MS, "a", "b", 1500)]))
     assert log == [(MS, "a", 0, 1500), (MS, "a", 1, 48), (6 * MS, "b", 0, 1500), (6 * MS, "b", 1, 48)]
 
@@ -334,8 +347,6 @@ def test_the_log_of_ip_has_every_fragment_at_both_ends() -> None:
     ("relay", "disturbance", "name"),
     [("x", None, "x"), (None, NodeLoss("y", 0), "y"), (None, LinkCut("a", "z", 0), "z")],
 )
-def test_a_station_that_is_not_there_is_refused(
-    relay: str | None, disturbance: Disturbance | None, name: str
-) -> None:
+def test_an_unknown_station_is_rejected(relay: str | None, disturbance: Disturbance | None, name: str) -> None:
     with pytest.raises(ConfigurationError, match=f"no station '{name}'"):
         network(wifi("ab"), "ab", relay=relay, disturbances=[disturbance] if disturbance else [])

@@ -1,4 +1,4 @@
-"""ROS 1 over a scripted link: who must be reached for a connection to come up, and for one to go on."""
+"""ROS 1 over a scripted link: which hosts must be reachable to establish and to keep a connection."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -35,13 +35,13 @@ def nodes(
 
 
 def publish(wire: ScriptedWire, times_ns: Sequence[int], size_bytes: int = 1492) -> None:
-    """Publish messages at these times; those of a LaserScan of 360 beams have 1,492 bytes."""
+    """Publish messages at these times; a LaserScan of 360 beams has 1,492 bytes."""
     for number, at_ns in enumerate(times_ns):
         wire.send_at(at_ns, Packet(number, "a", "b", size_bytes, ("scan", number), at_ns, at_ns, "ros1"))
 
 
-def cut(begin_ns: int, end_ns: int, *hosts: str) -> tuple[Script, list[ScriptedWire]]:
-    """Lose what goes between these hosts in this time; the wire is to be put into the list."""
+def losing_between(begin_ns: int, end_ns: int, *hosts: str) -> tuple[Script, list[ScriptedWire]]:
+    """Return a script that loses packets between these hosts in this time, and a list for its wire."""
     wires: list[ScriptedWire] = []
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
@@ -50,10 +50,10 @@ def cut(begin_ns: int, end_ns: int, *hosts: str) -> tuple[Script, list[ScriptedW
     return script, wires
 
 
-def test_a_connection_comes_up_as_quickly_as_that_of_rospy() -> None:
-    """Captured from rosmaster and rospy 1.15.15: 12 delays, beside the handshake with the master."""
+def test_a_connection_is_established_as_fast_as_with_rospy() -> None:
+    """Captured from rosmaster and rospy 1.15.15: 12 delays, in addition to the handshake with the master."""
     wire = nodes(TCPROS)
-    # A handshake with the master, call and answer; the same with the publisher; another call to the master; and a
+    # A handshake with the master, call and response; the same with the publisher; another call to the master; and a
     # handshake and the subscriber's header.
     connected_ns = (4 + 4 + 2 + 3) * D_NS
     publish(wire, [0, connected_ns - 1, connected_ns + 1, connected_ns + 10 * D_NS])
@@ -62,27 +62,27 @@ def test_a_connection_comes_up_as_quickly_as_that_of_rospy() -> None:
     assert wire.delivered == {2: connected_ns + 1 + D_NS, 3: connected_ns + 11 * D_NS}
 
 
-def test_only_the_first_connection_of_a_subscriber_asks_how_to_keep_it() -> None:
+def test_only_the_first_connection_of_a_subscriber_queries_the_keep_alive_setting() -> None:
     wire = ScriptedWire(D_NS, hosts=("a", "b", "m"))
     wire.transports["ros1"] = Ros1(
         wire, {"scan": TCPROS, "late": Ros1Flow("m", "b")}, master="m", options=Ros1Options(starts_ns={"m": SECOND})
     )
     wire.run(2 * SECOND)
-    asked = [one for one in wire.transmitted if one.packet.size_bytes == 52 + 370]
-    assert len(asked) == 1
-    assert asked[0].at_ns < SECOND
+    requests = [transmission for transmission in wire.transmitted if transmission.packet.size_bytes == 52 + 370]
+    assert len(requests) == 1
+    assert requests[0].at_ns < SECOND
 
 
-def test_an_answer_comes_back_on_the_connection_of_its_call() -> None:
+def test_a_response_uses_the_connection_of_its_call() -> None:
     wire = nodes(TCPROS)
     wire.run(SECOND)
     syns = [
-        one.packet
-        for one in wire.transmitted
-        if one.packet.size_bytes == 60 and one.packet.identity[0].endswith(" syn 0")
+        transmission.packet
+        for transmission in wire.transmitted
+        if transmission.packet.size_bytes == 60 and transmission.packet.identity[0].endswith(" syn 0")
     ]
-    opened = Counter((packet.source, packet.destination) for packet in syns)
-    assert opened == {("a", "m"): 1, ("b", "m"): 1, ("b", "a"): 2}
+    connections = Counter((packet.source, packet.destination) for packet in syns)
+    assert connections == {("a", "m"): 1, ("b", "m"): 1, ("b", "a"): 2}
 
 
 def test_udpros_is_connected_by_the_call_to_the_publisher() -> None:
@@ -94,9 +94,10 @@ def test_udpros_is_connected_by_the_call_to_the_publisher() -> None:
     assert wire.delivered == {1: connected_ns + 1 + D_NS}
 
 
-def test_a_publisher_that_comes_later_is_told_of_by_the_master() -> None:
+def test_the_master_reports_a_publisher_that_starts_later() -> None:
     wire = nodes(TCPROS, options=Ros1Options(starts_ns={"a": 5 * SECOND}))
-    # The publisher's call, the master's, the subscriber's to the publisher and to the master, and the header.
+    # The publisher's call, the master's call, the subscriber's calls to the publisher and to the master, and the
+    # header.
     connected_ns = 5 * SECOND + (3 + 3 + 4 + 2 + 3) * D_NS
     publish(wire, [connected_ns - 1, connected_ns + 1])
     wire.run(10 * SECOND)
@@ -112,9 +113,9 @@ def test_the_master_may_be_on_a_robot_that_publishes_or_subscribes(master: str) 
 
 
 @pytest.mark.parametrize("flow", [TCPROS, UDPROS])
-def test_without_its_master_no_connection_comes_up(flow: Ros1Flow) -> None:
-    """The robots hear each other all the time; the SYN that gets through is that of 31 s."""
-    script, wires = cut(0, 20 * SECOND, "b", "m")
+def test_without_the_master_no_connection_is_established(flow: Ros1Flow) -> None:
+    """The robots can always reach each other; the SYN to the master that arrives is the one sent at 31 s."""
+    script, wires = losing_between(0, 20 * SECOND, "b", "m")
     wire = nodes(flow, script)
     wires.append(wire)
     publish(wire, [number * SECOND for number in range(40)])
@@ -124,8 +125,8 @@ def test_without_its_master_no_connection_comes_up(flow: Ros1Flow) -> None:
 
 
 @pytest.mark.parametrize("flow", [TCPROS, UDPROS])
-def test_without_its_master_a_connection_goes_on(flow: Ros1Flow) -> None:
-    script, wires = cut(SECOND // 2, 100 * SECOND, "a", "b", "m")
+def test_without_the_master_a_connection_continues(flow: Ros1Flow) -> None:
+    script, wires = losing_between(SECOND // 2, 100 * SECOND, "a", "b", "m")
     wire = nodes(
         flow,
         lambda packet, receiver, number: (
@@ -138,13 +139,17 @@ def test_without_its_master_a_connection_goes_on(flow: Ros1Flow) -> None:
     assert len(wire.delivered) == 89
 
 
-def test_a_call_whose_connection_is_given_up_is_tried_again() -> None:
-    """With one repetition of its SYN, TCP gives up after 1 s and 2 s more; 50 ms later another call begins."""
-    script, wires = cut(0, 4 * SECOND, "b", "m")
+def test_a_call_whose_connection_is_given_up_is_retried() -> None:
+    """With one retransmission of its SYN, TCP gives up after 1 s and 2 s more; 50 ms later another call starts."""
+    script, wires = losing_between(0, 4 * SECOND, "b", "m")
     wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=1)))
     wires.append(wire)
     wire.run(20 * SECOND)
-    syns_ns = [one.at_ns for one in wire.transmitted if (one.packet.source, one.packet.destination) == ("b", "m")]
+    syns_ns = [
+        transmission.at_ns
+        for transmission in wire.transmitted
+        if (transmission.packet.source, transmission.packet.destination) == ("b", "m")
+    ]
     first_ns = [0, SECOND, 3050 * MS, 4050 * MS]
     assert syns_ns[:4] == first_ns
     publish(wire, [wire.now_ns])
@@ -153,54 +158,60 @@ def test_a_call_whose_connection_is_given_up_is_tried_again() -> None:
 
 
 def test_a_connection_that_tcp_gives_up_is_opened_again() -> None:
-    """The publisher's TCP gives up early; the subscriber asks after a minute's silence, and learns of it."""
-    script, wires = cut(2 * SECOND, 20 * SECOND, "a", "b")
+    """The publisher's TCP gives up early; the subscriber probes after a minute without messages, and reconnects."""
+    script, wires = losing_between(2 * SECOND, 20 * SECOND, "a", "b")
     wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(retries=3)))
     wires.append(wire)
     publish(wire, [number * SECOND for number in range(1, 100)])
     wire.run(120 * SECOND)
     reasons = Counter(wire.dropped.values())
-    # The last was heard at 1 s, so the question goes out at 61 s; 100 ms later the connection is opened.
+    # The last message arrived at 1 s, so the probe is sent at 61 s; 100 ms later the connection is opened.
     assert reasons.pop(NOT_CONNECTED) == 61 - 1 - sum(reasons.values())
     assert wire.delivered.keys() == {0, *range(61, 99)}
 
 
-def test_a_subscriber_that_hears_nothing_gives_up_and_tries_again() -> None:
-    """Nine questions from 60 s of silence on, 10 s apart; then the publisher gets a new connection."""
-    script, wires = cut(2 * SECOND, 200 * SECOND, "a", "b")
+def test_a_subscriber_without_messages_gives_up_and_reconnects() -> None:
+    """Nine probes after 60 s without messages, at intervals of 10 s; then the publisher gets a new connection."""
+    script, wires = losing_between(2 * SECOND, 200 * SECOND, "a", "b")
     wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=2)))
     wires.append(wire)
     publish(wire, [SECOND, 100 * SECOND, 250 * SECOND])
     wire.run(260 * SECOND)
-    probes_ns = [one.at_ns for one in wire.transmitted if one.packet.identity[0] == "scan probe"]
-    heard_ns = wire.delivered[0]
-    assert probes_ns == [heard_ns + (60 + 10 * number) * SECOND for number in range(9)]
-    # The publisher's TCP tries for longer, in a connection that nobody reads from any more.
+    probes_ns = [
+        transmission.at_ns for transmission in wire.transmitted if transmission.packet.identity[0] == "scan probe"
+    ]
+    received_ns = wire.delivered[0]
+    assert probes_ns == [received_ns + (60 + 10 * number) * SECOND for number in range(9)]
+    # The publisher's TCP retries for longer, on a connection that the subscriber has given up.
     assert wire.dropped == {1: "the subscriber has given this connection up"}
     assert list(wire.delivered) == [0, 2]
 
 
-def test_questions_that_are_answered_at_last_start_anew() -> None:
-    """Eight of nine are lost, and later eight once more."""
-    spans = [(30 * SECOND, 135 * SECOND), (150 * SECOND, 275 * SECOND)]
+def test_an_answered_probe_resets_the_probe_counter() -> None:
+    """Eight of nine probes are lost, and later eight again."""
+    outages_ns = [(30 * SECOND, 135 * SECOND), (150 * SECOND, 275 * SECOND)]
     wires: list[ScriptedWire] = []
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
-        return () if any(begin <= wires[0].now_ns < end for begin, end in spans) else (0,)
+        return () if any(begin <= wires[0].now_ns < end for begin, end in outages_ns) else (0,)
 
     wire = nodes(TCPROS, script)
     wires.append(wire)
     publish(wire, [SECOND, 400 * SECOND])
     wire.run(401 * SECOND)
-    lost = [one for one in wire.transmitted if one.packet.identity[0] == "scan probe" and not one.arrived]
+    lost = [
+        transmission
+        for transmission in wire.transmitted
+        if transmission.packet.identity[0] == "scan probe" and not transmission.arrived
+    ]
     assert len(lost) == 16
-    assert not any("header 2" in one.packet.identity[0] for one in wire.transmitted)
+    assert not any("header 2" in transmission.packet.identity[0] for transmission in wire.transmitted)
     assert list(wire.delivered) == [0, 1]
 
 
-def test_a_subscriber_that_the_master_does_not_reach_is_never_told() -> None:
-    """It registered first, and the master does not call twice: so it is with rosmaster."""
-    script, wires = cut(SECOND, 10 * SECOND, "b", "m")
+def test_a_subscriber_that_the_master_cannot_reach_never_connects() -> None:
+    """The subscriber registered first, and the master does not repeat its call, as in rosmaster."""
+    script, wires = losing_between(SECOND, 10 * SECOND, "b", "m")
     options = Ros1Options(tcp=TcpOptions(syn_retries=1), starts_ns={"a": 2 * SECOND})
     wire = nodes(TCPROS, script, options=options)
     wires.append(wire)
@@ -209,24 +220,30 @@ def test_a_subscriber_that_the_master_does_not_reach_is_never_told() -> None:
     assert wire.dropped == {0: NOT_CONNECTED}
 
 
-def test_a_call_that_is_served_twice_opens_one_connection() -> None:
-    """The master's answers to the publisher do not get through, and each time the subscriber is told of it again."""
+def test_a_call_that_is_executed_twice_opens_one_connection() -> None:
+    """The master's responses to the publisher are lost, so that the master calls the subscriber several times."""
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
         return () if (packet.source, receiver) == ("m", "a") and "back" in packet.identity[0] else (0,)
 
     wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(retries=2)))
     wire.run(20 * SECOND)
-    told = {one.packet.identity for one in wire.transmitted if one.packet.identity[0].startswith("xmlrpc m b 0 data")}
-    asked = {
-        one.packet.identity for one in wire.transmitted if one.packet.identity[0].startswith("xmlrpc b a scan 0 data")
+    updates = {
+        transmission.packet.identity
+        for transmission in wire.transmitted
+        if transmission.packet.identity[0].startswith("xmlrpc m b 0 data")
     }
-    assert len(told) > 3
-    assert len(asked) == 1
+    requests = {
+        transmission.packet.identity
+        for transmission in wire.transmitted
+        if transmission.packet.identity[0].startswith("xmlrpc b a scan 0 data")
+    }
+    assert len(updates) > 3
+    assert len(requests) == 1
 
 
-def test_a_header_that_is_never_answered_is_sent_again() -> None:
-    """The publisher's TCP gives its header up; the subscriber, which waits for it, asks after a minute."""
+def test_a_header_without_response_is_sent_again() -> None:
+    """The publisher's TCP gives up its header; the subscriber, which waits for it, probes after a minute."""
     wire = nodes(
         TCPROS,
         lambda packet, *_: () if packet.source == "a" and packet.identity[0].startswith("scan 1 ") else (0,),
@@ -237,18 +254,18 @@ def test_a_header_that_is_never_answered_is_sent_again() -> None:
     assert list(wire.delivered) == [0]
 
 
-def test_a_quiet_connection_is_asked_for_and_kept() -> None:
+def test_an_idle_connection_is_probed_and_kept() -> None:
     wire = nodes(TCPROS)
     publish(wire, [SECOND, 600 * SECOND])
     wire.run(601 * SECOND)
-    kinds = Counter(one.packet.identity[0] for one in wire.transmitted)
-    # Each answer is heard, so that the next question is 60 s after it.
+    kinds = Counter(transmission.packet.identity[0] for transmission in wire.transmitted)
+    # Each response counts as a message, so that the next probe follows 60 s after it.
     assert kinds["scan probe"] == kinds["scan probe answer"] == 9
     assert list(wire.delivered) == [0, 1]
 
 
 @pytest.mark.parametrize(("size_bytes", "blocks"), [(1488, 1), (1489, 2), (10_000, 7)])
-def test_udpros_loses_a_message_with_any_of_its_blocks(size_bytes: int, blocks: int) -> None:
+def test_udpros_loses_a_message_if_any_block_is_lost(size_bytes: int, blocks: int) -> None:
     draws = PacketDraws(1, "link")
     loss, count = 0.1, 2000
     wire = nodes(
@@ -259,19 +276,19 @@ def test_udpros_loses_a_message_with_any_of_its_blocks(size_bytes: int, blocks: 
     )
     publish(wire, [(1000 + number) * MS for number in range(count)], size_bytes)
     wire.run(10 * SECOND)
-    sent = [one.packet for one in wire.transmitted if "block" in one.packet.identity[0]]
+    sent = [transmission.packet for transmission in wire.transmitted if "block" in transmission.packet.identity[0]]
     assert len(sent) == blocks * count
-    # Length, UDPROS, UDP and IP.
+    # Headers of length, UDPROS, UDP and IP.
     assert sum(packet.size_bytes for packet in sent) == count * (size_bytes + 4 + blocks * (8 + 8 + 20))
-    # The last block of a message may be shorter than what the script loses.
-    losable = sum(packet.size_bytes >= 100 for packet in sent) / count
-    expected = 1 - (1 - loss) ** losable
+    # The last block of a message may be too short for the script to lose it.
+    blocks_subject_to_loss = sum(packet.size_bytes >= 100 for packet in sent) / count
+    expected = 1 - (1 - loss) ** blocks_subject_to_loss
     assert len(wire.dropped) / count == pytest.approx(expected, abs=4 * (expected * (1 - expected) / count) ** 0.5)
 
 
-@pytest.mark.parametrize("late", [0, 1])
-def test_blocks_that_overtake_each_other_take_the_message_with_them(late: int) -> None:
-    wire = nodes(UDPROS, lambda packet, *_: (5 * MS,) if packet.identity == (f"scan block{late}", 0) else (0,))
+@pytest.mark.parametrize("late_block", [0, 1])
+def test_udpros_loses_a_message_with_reordered_blocks(late_block: int) -> None:
+    wire = nodes(UDPROS, lambda packet, *_: (5 * MS,) if packet.identity == (f"scan block{late_block}", 0) else (0,))
     publish(wire, [SECOND, 2 * SECOND], 4000)
     wire.run(3 * SECOND)
     assert wire.dropped == {0: "blocks of UDPROS out of order"}
@@ -280,19 +297,19 @@ def test_blocks_that_overtake_each_other_take_the_message_with_them(late: int) -
 
 @settings(max_examples=20)
 @given(st.lists(st.one_of(st.just(()), st.just((0,)), st.just((0, 3 * MS)), st.just((20 * MS,))), max_size=60))
-def test_whatever_happens_messages_come_once_and_in_order_and_at_last_all(fates: Sequence[Sequence[int]]) -> None:
-    left = iter(fates)
-    quick = CallRetry(MS, MS)
+def test_messages_arrive_once_in_order_and_finally_all_after_any_losses(losses: Sequence[Sequence[int]]) -> None:
+    remaining = iter(losses)
+    fast_retry = CallRetry(MS, MS)
     options = Ros1Options(
         tcp=TcpOptions(syn_retries=1, retries=2),
-        register=quick,
-        update=quick,
-        request=quick,
-        reconnect=quick,
+        register=fast_retry,
+        update=fast_retry,
+        request=fast_retry,
+        reconnect=fast_retry,
         silence_ns=SECOND,
         probe_ns=SECOND,
     )
-    wire = nodes(TCPROS, lambda *_: next(left, (0,)), options=options)
+    wire = nodes(TCPROS, lambda *_: next(remaining, (0,)), options=options)
     publish(wire, [number * 2 * SECOND for number in range(60)])
     wire.run(300 * SECOND)
     assert list(wire.delivered) == sorted(wire.delivered)
@@ -300,7 +317,7 @@ def test_whatever_happens_messages_come_once_and_in_order_and_at_last_all(fates:
     assert wire.delivered.keys() >= set(range(50, 60))
 
 
-def test_a_flow_that_is_none_of_ros_is_refused() -> None:
+def test_an_unknown_flow_is_rejected() -> None:
     wire = nodes(TCPROS)
     with pytest.raises(ConfigurationError, match="'scam'") as error:
         wire.transports["ros1"].send(Packet(0, "a", "b", 100, ("scam", 0), 0, 0, "ros1"))

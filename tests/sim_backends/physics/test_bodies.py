@@ -1,4 +1,4 @@
-"""The federate of bodies: time, commands, and that it does not matter how time is cut into calls."""
+"""The physics federate of bodies: time, commands, and independence of the division of time into calls."""
 
 import math
 
@@ -24,7 +24,7 @@ YARD = world(
 )
 
 
-def two(world: World | None = YARD) -> Bodies:
+def two_bodies(world: World | None = YARD) -> Bodies:
     return Bodies(
         {"a": DifferentialDrive(HUSKY_A200, (-1.0, 0.0)), "b": DifferentialDrive(HUSKY_A200, (1.0, 0.5), math.pi)},
         world,
@@ -33,13 +33,15 @@ def two(world: World | None = YARD) -> Bodies:
 
 TWISTS = st.builds(Twist, st.floats(-1, 1), st.floats(-2, 2))
 COMMANDS = st.lists(
-    st.tuples(st.integers(0, 4000 * MS), st.sampled_from("ab"), TWISTS), max_size=8, unique_by=lambda one: one[0]
+    st.tuples(st.integers(0, 4000 * MS), st.sampled_from("ab"), TWISTS),
+    max_size=8,
+    unique_by=lambda command: command[0],
 )
 
 
-def told(commands: list[tuple[int, str, Twist]], cuts: list[int]) -> tuple[dict[str, State], Bodies]:
-    """Return the states after 4 s, commands given at their times, time cut there and at `cuts`."""
-    bodies = two()
+def run_commands(commands: list[tuple[int, str, Twist]], cuts: list[int]) -> tuple[dict[str, State], Bodies]:
+    """Return the states after 4.5 s; time is divided at the times of the commands and at `cuts`."""
+    bodies = two_bodies()
     by_time = {at_ns: (name, twist) for at_ns, name, twist in commands}
     given: dict[str, Twist] = {}
     for at_ns in sorted({*by_time, *cuts, 4000 * MS}):
@@ -50,52 +52,54 @@ def told(commands: list[tuple[int, str, Twist]], cuts: list[int]) -> tuple[dict[
 
 @settings(max_examples=25)
 @given(COMMANDS, st.lists(st.integers(0, 4000 * MS), max_size=30))
-def test_the_result_does_not_depend_on_how_time_is_cut(
+def test_the_result_does_not_depend_on_the_division_of_time(
     commands: list[tuple[int, str, Twist]], cuts: list[int]
 ) -> None:
-    whole, once = told(commands, [])
-    cut, often = told(commands, cuts)
-    assert cut == whole
-    assert often.collisions == once.collisions
+    expected, bodies_once = run_commands(commands, [])
+    actual, bodies_often = run_commands(commands, cuts)
+    assert actual == expected
+    assert bodies_often.collisions == bodies_once.collisions
 
 
-def test_states_are_those_of_the_last_own_step_and_commands_take_effect_at_the_next() -> None:
-    bodies = two(None)
+def test_states_are_those_of_the_last_step_and_commands_take_effect_at_the_next() -> None:
+    bodies = two_bodies(None)
     bodies.advance(1_500_000, {})
     assert bodies.advance(1_999_999, {"a": Twist(1.0)})["a"].velocity_m_s[0] == 0
-    # Told at 1.5 ms, so from 2 ms on; at 3 m/s^2 it has 3 mm/s a step later.
+    # Commanded at 1.5 ms, so effective from 2 ms on; at 3 m/s^2 it has 3 mm/s a step later.
     assert bodies.advance(2_999_999, {})["a"].velocity_m_s[0] == 0
     assert bodies.advance(3_000_000, {})["a"].velocity_m_s[0] == pytest.approx(0.003)
     assert bodies.advance(3_000_000, {"a": Twist()})["a"].velocity_m_s[0] == pytest.approx(0.003)
     assert bodies.advance(4_999_999, {})["a"].velocity_m_s[0] == 0
 
 
-def test_a_snapshot_stays_as_it_was() -> None:
-    bodies = two(None)
+def test_a_snapshot_does_not_change() -> None:
+    bodies = two_bodies(None)
     bodies.advance(0, {"a": Twist(-1.0)})
     early = bodies.advance(1000 * MS, {})
     late = bodies.advance(2000 * MS, {"a": Twist()})
-    # To 1 m/s over 1/6 m, in steps; as far again to stop.
+    # To 1 m/s over 1/6 m, in steps; the same distance to stop.
     assert early["a"].position_m[0] == pytest.approx(-1 - 5 / 6, abs=1e-6)
     assert late["a"].position_m[0] == pytest.approx(-2, abs=2e-6)
 
 
 @pytest.mark.parametrize(
-    ("places", "match"),
+    ("positions", "match"),
     [
-        ({"a": (2.6, 0.0)}, "a begins within wall, at 2.6, 0, 0 m"),
-        ({"a": (0.0, 0.0), "b": (0.7, 0.0)}, "b begins within a"),
-        ({"a": (math.nan, 0.0)}, "a begins at"),
+        ({"a": (2.6, 0.0)}, "a starts within wall, at 2.6, 0, 0 m"),
+        ({"a": (0.0, 0.0), "b": (0.7, 0.0)}, "b starts within a"),
+        ({"a": (math.nan, 0.0)}, "a starts at"),
     ],
 )
-def test_who_begins_within_something_is_refused(places: dict[str, tuple[float, float]], match: str) -> None:
-    bodies = {name: DifferentialDrive(HUSKY_A200, place) for name, place in places.items()}
+def test_a_body_that_starts_within_an_obstacle_is_rejected(
+    positions: dict[str, tuple[float, float]], match: str
+) -> None:
+    bodies = {name: DifferentialDrive(HUSKY_A200, place) for name, place in positions.items()}
     with pytest.raises(ConfigurationError, match=match):
         Bodies(bodies, YARD)
 
 
-def test_bad_input_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="no positive time"):
+def test_invalid_input_is_rejected() -> None:
+    with pytest.raises(ConfigurationError, match="is not positive"):
         Bodies({}, step_ns=0)
-    with pytest.raises(ConfigurationError, match="a command is for c, which is no body"):
-        two().advance(5 * MS, {"c": Twist()})
+    with pytest.raises(ConfigurationError, match="a command is for c, which is not a body"):
+        two_bodies().advance(5 * MS, {"c": Twist()})

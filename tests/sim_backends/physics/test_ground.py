@@ -1,4 +1,4 @@
-"""Slopes against what can be worked out on paper: heights, speeds, and what tires hold."""
+"""Slopes, compared with results computed by hand: heights, speeds, and grip of tires."""
 
 import math
 
@@ -23,22 +23,22 @@ def rover(east_m: float, north_m: float = 0.0, heading_deg: float = 0.0) -> Bodi
     return Bodies({"a": body}, HILL)
 
 
-def driven(bodies: Bodies, ms: int, twist: Twist) -> State:
+def state_after(bodies: Bodies, ms: int, twist: Twist) -> State:
     bodies.advance(0, {})
     bodies.advance(0, {"a": twist})
     return bodies.advance(ms * MS, {})["a"]
 
 
-def test_it_drives_up_a_ramp_onto_the_plateau_and_down_again() -> None:
+def test_a_robot_drives_up_a_ramp_onto_the_plateau_and_down_again() -> None:
     bodies = rover(0.0)
-    # 5 m to the ramp, sqrt(104) m up it, and the rest on the plateau; less what speeding up cost.
+    # 5 m to the ramp, sqrt(104) m up the ramp, and the rest on the plateau, minus the distance lost by accelerating.
     speeding_up_m = 1 / (2 * 0.5 * GRAVITY_M_S2)
     on_top_m = 18.0 - speeding_up_m - 5 - math.hypot(10, 2)
-    halfway = driven(bodies, 9000, Twist(1.0))
-    flat, up = 1 / math.hypot(1, RISE), RISE / math.hypot(1, RISE)
-    assert halfway.velocity_m_s == pytest.approx((flat, 0.0, up), abs=1e-12)
+    halfway = state_after(bodies, 9000, Twist(1.0))
+    horizontal, vertical = 1 / math.hypot(1, RISE), RISE / math.hypot(1, RISE)
+    assert halfway.velocity_m_s == pytest.approx((horizontal, 0.0, vertical), abs=1e-12)
     assert halfway.position_m == pytest.approx(
-        (5 + (4 - speeding_up_m) * flat, 0.0, (4 - speeding_up_m) * up), abs=2e-3
+        (5 + (4 - speeding_up_m) * horizontal, 0.0, (4 - speeding_up_m) * vertical), abs=2e-3
     )
     state = bodies.advance(18_000 * MS, {})["a"]
     assert state.position_m == pytest.approx((15 + on_top_m, 0.0, 2.0), abs=4e-3)
@@ -53,25 +53,27 @@ def test_it_drives_up_a_ramp_onto_the_plateau_and_down_again() -> None:
     ("heading_deg", "forward", "along", "across"),
     [(0.0, 0.9, -RISE, 0.0), (0.0, -0.9, RISE, 0.0), (180.0, 0.9, RISE, 0.0), (90.0, 0.9, 0.0, RISE)],
 )
-def test_what_tires_hold_shrinks_what_it_speeds_up_by(
+def test_the_grip_of_tires_limits_the_acceleration_on_a_slope(
     heading_deg: float, forward: float, along: float, across: float
 ) -> None:
-    """Friction carries mu m g cos(slope); gravity takes or gives m g sin(slope) along, and needs it across."""
+    """Friction is mu m g cos(slope); gravity adds or subtracts m g sin(slope) along the heading, and uses grip across
+    it.
+    """
     g_cos = GRAVITY_M_S2 / math.hypot(1, RISE)
     expected_m_s2 = g_cos * (math.sqrt(0.5**2 - across**2) + along)
-    state = driven(rover(10.0, heading_deg=heading_deg), 100, Twist(forward))
+    state = state_after(rover(10.0, heading_deg=heading_deg), 100, Twist(forward))
     assert math.hypot(*state.velocity_m_s) == pytest.approx(0.1 * expected_m_s2, rel=1e-9)
     assert state.position_m[2] == pytest.approx(RISE * (state.position_m[0] - 5), abs=1e-12)
 
 
-def test_turning_on_a_slope_it_stays_on_it() -> None:
-    state = driven(rover(10.0), 2000, Twist(0.5, 0.5))
+def test_a_turning_robot_stays_on_the_slope() -> None:
+    state = state_after(rover(10.0), 2000, Twist(0.5, 0.5))
     assert state.position_m[2] == pytest.approx(RISE * (state.position_m[0] - 5), abs=1e-9)
     assert math.hypot(*state.velocity_m_s) == pytest.approx(0.5)
     assert state.position_m[1] > 0.2
 
 
-def test_what_is_too_steep_for_its_tires_is_a_wall_from_below_and_an_edge_from_above() -> None:
+def test_a_slope_that_is_too_steep_is_a_wall_from_below_and_an_edge_from_above() -> None:
     steep = {**UP, "size_m": (10, 4, 6)}
     above = {**TOP, "size_m": (10, 4, 6)}
     bodies = Bodies(
@@ -88,20 +90,20 @@ def test_what_is_too_steep_for_its_tires_is_a_wall_from_below_and_an_edge_from_a
 
 
 def test_the_sides_of_a_ramp_are_walls_and_edges() -> None:
-    off = driven(rover(10.0, 1.0, heading_deg=90.0), 5000, Twist(1.0))
-    assert off.position_m == pytest.approx((10.0, 2.0, 1.0), abs=1e-6)
-    against = driven(rover(10.0, -4.0, heading_deg=90.0), 5000, Twist(1.0))
-    assert against.position_m == pytest.approx((10.0, -2.0 - 0.3, 0.0), abs=1e-6)
+    at_edge = state_after(rover(10.0, 1.0, heading_deg=90.0), 5000, Twist(1.0))
+    assert at_edge.position_m == pytest.approx((10.0, 2.0, 1.0), abs=1e-6)
+    stopped = state_after(rover(10.0, -4.0, heading_deg=90.0), 5000, Twist(1.0))
+    assert stopped.position_m == pytest.approx((10.0, -2.0 - 0.3, 0.0), abs=1e-6)
 
 
-@pytest.mark.parametrize("off", [0.0, -1e-15, -1e-12, -1e-6, -0.01])
+@pytest.mark.parametrize("grade_offset", [0.0, -1e-15, -1e-12, -1e-6, -0.01])
 @pytest.mark.parametrize("twist", [Twist(1.0), Twist(-1.0), Twist(0.5, 0.5), Twist(0.0, 1.0)])
 @pytest.mark.parametrize("heading_rad", [0.0, math.pi, 1.0])
-def test_a_ramp_that_takes_all_of_the_friction_is_driven_without_an_error(
-    off: float, twist: Twist, heading_rad: float
+def test_a_ramp_that_needs_all_of_the_friction_causes_no_error(
+    grade_offset: float, twist: Twist, heading_rad: float
 ) -> None:
-    """With nothing left of friction a speed cannot be changed; it may roll on."""
-    grade = HUSKY_A200.friction + off
+    """With no friction left the speed cannot be changed; the robot may continue to roll."""
+    grade = HUSKY_A200.friction + grade_offset
     hill = world({"name": "hill", "kind": "ramp", "centre_m": (5, 0), "size_m": (10, 10, 10 * grade)})
     bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (5.0, 0.0), heading_rad)}, hill)
     place_m = bodies.advance(0, {})["a"].position_m
@@ -109,5 +111,5 @@ def test_a_ramp_that_takes_all_of_the_friction_is_driven_without_an_error(
         state = bodies.advance(number * 50_000_000, {"a": twist})["a"]
         assert all(map(math.isfinite, (*state.position_m, *state.velocity_m_s)))
         assert math.hypot(*state.velocity_m_s) <= 1.0 + 1e-9
-    if not off and not twist.turn_rad_s and heading_rad == 0.0 and twist.forward_m_s > 0:
-        assert state.position_m == place_m, "up it does not get away"
+    if not grade_offset and not twist.turn_rad_s and heading_rad == 0.0 and twist.forward_m_s > 0:
+        assert state.position_m == place_m, "it does not move uphill"

@@ -1,4 +1,4 @@
-"""Who may meet whom, of many, is what lists of any two alone say; and a grid leaves out nobody who is near."""
+"""A neighbour list of many bodies equals the lists of all pairs; a grid search misses nothing nearby."""
 
 import math
 from collections.abc import Mapping
@@ -24,27 +24,27 @@ YARD = world({"name": "oak", "kind": "tree", "at_m": (0, 3), "trunk_radius": "0.
 
 @given(st.lists(PLACES, max_size=40), PLACES, st.floats(0, 20))
 @example([(1.0, 1.0, 0.0)], (1.0, 1.0, 0.0), 5e-324)
-def test_a_grid_leaves_out_nobody_who_is_near(
+def test_a_grid_search_contains_everything_nearby(
     places_m: list[tuple[float, float, float]], place_m: tuple[float, float, float], within_m: float
 ) -> None:
     grid = CellGrid(within_m)
-    for number, one_m in enumerate(places_m):
-        grid.add(number, one_m)
-    found = grid.near(place_m)
-    assert found == sorted(set(found))
-    near = {number for number, one_m in enumerate(places_m) if math.dist(one_m[:2], place_m[:2]) <= within_m}
-    assert near <= set(found)
+    for number, other_m in enumerate(places_m):
+        grid.add(number, other_m)
+    numbers = grid.near(place_m)
+    assert numbers == sorted(set(numbers))
+    expected = {number for number, other_m in enumerate(places_m) if math.dist(other_m[:2], place_m[:2]) <= within_m}
+    assert expected <= set(numbers)
 
 
-def test_a_grid_leaves_out_who_is_far() -> None:
+def test_a_grid_search_omits_distant_numbers() -> None:
     grid = CellGrid(1.0)
     grid.add(0, (100.0, 0.0, 0.0))
     assert grid.near((0.0, 0.0, 0.0)) == []
 
 
-def listed(bodies: Mapping[str, Body[Any]]) -> Neighbours:
-    grounds = {name: Ground(YARD, None if body.flies else body.steepest) for name, body in bodies.items()}
-    return Neighbours(bodies, {name: body.begin() for name, body in bodies.items()}, grounds, HORIZON_S)
+def neighbour_list(bodies: Mapping[str, Body[Any]]) -> Neighbours:
+    grounds = {name: Ground(YARD, None if body.flies else body.max_grade) for name, body in bodies.items()}
+    return Neighbours(bodies, {name: body.initial_pose() for name, body in bodies.items()}, grounds, HORIZON_S)
 
 
 def body(flies: bool, place_m: tuple[float, float, float]) -> Body[Any]:
@@ -55,20 +55,22 @@ BODIES = st.lists(
     st.builds(body, st.booleans(), st.tuples(st.floats(-6, 6), st.floats(-6, 6), st.floats(1, 4))),
     min_size=2,
     max_size=12,
-).map(lambda some: {f"r{number:02}": one for number, one in enumerate(some)})
+).map(lambda bodies: {f"r{number:02}": body for number, body in enumerate(bodies)})
 
 
 @settings(max_examples=60)
 @given(BODIES)
-def test_a_list_of_many_says_of_any_two_what_a_list_of_these_alone_says(bodies: dict[str, Body[Any]]) -> None:
-    many = listed(bodies)
-    pairs = {pair: listed({name: bodies[name] for name in pair}) for pair in combinations(bodies, 2)}
+def test_a_list_of_many_bodies_equals_the_lists_of_all_pairs(bodies: dict[str, Body[Any]]) -> None:
+    whole_list = neighbour_list(bodies)
+    pairs = {pair: neighbour_list({name: bodies[name] for name in pair}) for pair in combinations(bodies, 2)}
     for name in bodies:
-        of_it = [pair for pair in pairs if name in pair]
-        near = [
-            next(one for one in pair if one != name)
-            for pair in of_it
-            if name in pairs[pair].near and pairs[pair].near[name].bodies
+        own_pairs = [pair for pair in pairs if name in pair]
+        expected = [
+            next(other for other in pair if other != name)
+            for pair in own_pairs
+            if name in pairs[pair].candidates and pairs[pair].candidates[name].bodies
         ]
-        assert (many.near[name].bodies if name in many.near else []) == near
-        assert many.free_s(name) == min(pairs[pair].free_s(name) for pair in of_it)
+        assert (whole_list.candidates[name].bodies if name in whole_list.candidates else []) == expected
+        assert whole_list.min_time_to_contact_s(name) == min(
+            pairs[pair].min_time_to_contact_s(name) for pair in own_pairs
+        )

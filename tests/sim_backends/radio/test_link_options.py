@@ -1,4 +1,4 @@
-"""From options to fixed links."""
+"""Conversion of radio options to fixed links."""
 
 import pytest
 
@@ -18,7 +18,7 @@ def test_empty_options_are_valid() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("loss: 101%", "less than or equal to 1"),
         ("rate: fast", "unlimited"),
@@ -31,15 +31,15 @@ def test_empty_options_are_valid() -> None:
         ("queue_packets: -1", "greater than or equal to 0"),
     ],
 )
-def test_wrong_options_say_what_is_wrong(text: str, said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said) as caught:
+def test_invalid_options_are_named_in_the_error(text: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         options(text)
     assert caught.value.where == "radio.yaml:1"
 
 
-def test_given_values_hold_on_every_link() -> None:
-    said = options("{loss: 10%, delay: 5ms, jitter: 1ms, rate: 20Mbit/s, queue_packets: 7}")
-    links = mesh(said, ["a", "b", "c"])
+def test_given_values_apply_to_every_link() -> None:
+    given = options("{loss: 10%, delay: 5ms, jitter: 1ms, rate: 20Mbit/s, queue_packets: 7}")
+    links = mesh(given, ["a", "b", "c"])
     assert set(links) == {("a", "b"), ("b", "a"), ("a", "c"), ("c", "a"), ("b", "c"), ("c", "b")}
     expected = LinkParameters(
         rate_bit_s=20_000_000, delay_ns=5_000_000, jitter_ns=1_000_000, loss=0.1, queue_packets=7

@@ -1,4 +1,4 @@
-"""Losses as radio models tell them: of each packet every station that it was for hears once, or is told why not."""
+"""Losses reported by radio models: each addressed station of a packet is reported once, as delivery or as loss."""
 
 from collections import Counter
 
@@ -59,21 +59,21 @@ EVENTS = st.lists(
     EVENTS,
     st.sampled_from([None, "r"]),
 )
-def test_each_station_gets_a_packet_or_is_told_of_once(
+def test_each_receiver_of_a_packet_is_reported_exactly_once(
     options: dict[str, str | int],
     seed: int,
     places_m: dict[str, tuple[float, float, float]],
     events: list[tuple[int, tuple[str, str | None, int] | tuple[frozenset[str], frozenset[tuple[str, str]]]]],
     relay: str | None,
 ) -> None:
-    checked = RadioOptions.model_validate(options)
+    radio_options = RadioOptions.model_validate(options)
     model: RadioModel[int] = (
-        UniformLinks(seed, checked)
-        if checked.fixed
-        else WifiInWorld(seed, checked, dict.fromkeys(NAMES, ANTENNA), None)
+        UniformLinks(seed, radio_options)
+        if radio_options.fixed
+        else WifiInWorld(seed, radio_options, dict.fromkeys(NAMES, ANTENNA), None)
     )
-    told: Counter[tuple[int, str]] = Counter()
-    model.log_losses(lambda _, number, name, __: told.update([(number, name)]))
+    reports: Counter[tuple[int, str]] = Counter()
+    model.log_losses(lambda _, number, name, __: reports.update([(number, name)]))
     model.place(0, places_m, relay)
     sent: set[tuple[int, str]] = set()
     off: frozenset[str] = frozenset()
@@ -87,59 +87,59 @@ def test_each_station_gets_a_packet_or_is_told_of_once(
             continue
         sent |= {(number, name) for name in (destination or NAMES) if name != source}
         model.send(at_ns, source, number, size_bytes, destination)
-    told.update((number, name) for _, name, number, _, _ in model.deliveries(10**12))
+    reports.update((number, name) for _, name, number, _, _ in model.deliveries(10**12))
     assert model.next_event_ns() is None
-    assert told == Counter(sent)
+    assert reports == Counter(sent)
 
 
 def losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
-    found: list[tuple[int, str, str]] = []
-    wifi.log_losses(lambda _, number, name, reason: found.append((number, name, reason)))
-    return found
+    lost: list[tuple[int, str, str]] = []
+    wifi.log_losses(lambda _, number, name, reason: lost.append((number, name, reason)))
+    return lost
 
 
-def test_retries_that_run_out_at_the_relay_too() -> None:
-    for deaf, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
-        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[deaf]), 1)
+def test_exhausted_retries_are_reported_at_the_sender_and_the_relay() -> None:
+    for unheard_link, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
+        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[unheard_link]), 1)
         wifi.relay("r")
-        found = losses(wifi)
+        lost = losses(wifi)
         wifi.send(0, "a", 1, 100, "b")
         assert wifi.deliveries(10**9) == []
-        assert found == [(1, "b", RETRIES_EXHAUSTED)], lost_at
+        assert lost == [(1, "b", RETRIES_EXHAUSTED)], lost_at
 
 
 def test_a_frame_whose_acks_are_lost_was_delivered_not_lost() -> None:
     channel = FixedPowers("ab", G54)
     channel.rows[1][0] = 0.0
     wifi: Wifi[int] = Wifi(channel, 1)
-    found, attempts = losses(wifi), Counter[int]()
+    lost, attempts = losses(wifi), Counter[int]()
     wifi.log_attempts(lambda attempt: attempts.update([attempt.number]))
     wifi.send(0, "a", 1, 100, "b")
     assert [payload for _, _, payload, _, _ in wifi.deliveries(10**9)] == [1]
     assert attempts[SHORT_RETRY_LIMIT] == 1, "all retries were made"
-    assert found == []
+    assert lost == []
 
 
-def test_a_full_queue_and_a_broadcast_that_not_everyone_decodes() -> None:
+def test_queue_drops_and_undecoded_broadcasts_are_reported() -> None:
     channel = FixedPowers("abc", G54, deaf=[("a", "c")])
     wifi: Wifi[int] = Wifi(channel, 1, queue_packets=1)
-    found = losses(wifi)
+    lost = losses(wifi)
     for number in range(3):
         wifi.send(0, "a", number, 100, None)
     wifi.deliveries(10**9)
-    assert found == [(2, "b", QUEUE_FULL), (2, "c", QUEUE_FULL), (0, "c", NOT_DECODED), (1, "c", NOT_DECODED)]
+    assert lost == [(2, "b", QUEUE_FULL), (2, "c", QUEUE_FULL), (0, "c", NOT_DECODED), (1, "c", NOT_DECODED)]
 
 
-def test_a_radio_that_is_switched_off_loses_its_queue_and_what_it_sends() -> None:
+def test_a_radio_that_is_switched_off_loses_its_queue_and_current_frame() -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("ab", G54), 1)
-    found, decoded_by = losses(wifi), list[tuple[str, ...]]()
+    lost, decoded_by = losses(wifi), list[tuple[str, ...]]()
     wifi.log_attempts(lambda attempt: decoded_by.append(attempt.received))
     for number in range(3):
         wifi.send(0, "a", number, 1500, "b")
     wifi.switch_off(1000, {"a"})
     assert wifi.deliveries(10**9) == []
-    assert found == [(number, "b", RADIO_OFF) for number in range(3)]
-    assert decoded_by == [()], "broken off"
+    assert lost == [(number, "b", RADIO_OFF) for number in range(3)]
+    assert decoded_by == [()], "the transmission is aborted"
     wifi.switch_off(10**9, set())
     wifi.send(10**9, "a", 3, 1500, "b")
     assert [payload for _, _, payload, _, _ in wifi.deliveries(2 * 10**9)] == [3]
@@ -148,32 +148,32 @@ def test_a_radio_that_is_switched_off_loses_its_queue_and_what_it_sends() -> Non
 @pytest.mark.parametrize(
     ("options", "reason"), [({"loss": "100%"}, LOST), ({"queue_packets": 0, "rate": "8bit/s"}, QUEUE_FULL)]
 )
-def test_fixed_links_say_why(options: dict[str, str | int], reason: str) -> None:
+def test_fixed_links_report_the_reason(options: dict[str, str | int], reason: str) -> None:
     links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate(options))
     links.place(0, dict.fromkeys("ab", (0.0, 0.0, 0.0)), None)
-    found: list[tuple[int, str, str]] = []
-    links.log_losses(lambda at_ns, number, name, why: found.append((at_ns, name, why)))
+    lost: list[tuple[int, str, str]] = []
+    links.log_losses(lambda at_ns, number, name, reason: lost.append((at_ns, name, reason)))
     links.send(5, "a", 1, 100, "b")
     links.send(7, "a", 2, 100, "b")
-    assert found[-1] == (7, "b", reason)
+    assert lost[-1] == (7, "b", reason)
 
 
-def test_what_waits_for_a_fixed_link_is_lost_when_its_radio_goes_off_and_what_left_arrives() -> None:
+def test_switching_off_a_radio_loses_queued_packets_of_fixed_links_but_not_those_in_flight() -> None:
     links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate({"rate": "12Mbit/s", "delay": "5ms"}))
     links.place(0, dict.fromkeys("ab", (0.0, 0.0, 0.0)), None)
-    found: list[tuple[int, int, str]] = []
-    links.log_losses(lambda at_ns, number, _, why: found.append((at_ns, number, why)))
-    # Each takes 1 ms to send; at 2.5 ms two have left and the third is being sent.
+    lost: list[tuple[int, int, str]] = []
+    links.log_losses(lambda at_ns, number, _, reason: lost.append((at_ns, number, reason)))
+    # Each packet takes 1 ms to send; at 2.5 ms two have left and the third is being sent.
     for number in range(4):
         links.send(0, "a", number, 1500, "b")
     links.disturb(2_500_000, {"a"}, set())
     assert [(at_ns, number) for at_ns, _, number, _, _ in links.deliveries(10**9)] == [(6 * MS, 0), (7 * MS, 1)]
-    assert found == [(2_500_000, 2, RADIO_OFF), (2_500_000, 3, RADIO_OFF)]
+    assert lost == [(2_500_000, 2, RADIO_OFF), (2_500_000, 3, RADIO_OFF)]
     counters = links.counters()["a", "b"]
     assert (counters.sent, counters.lost, counters.delivered) == (4, 2, 2)
 
 
-def test_a_fixed_link_that_comes_back_has_nothing_waiting() -> None:
+def test_the_queue_of_a_fixed_link_is_empty_after_an_outage() -> None:
     links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate({"rate": "12Mbit/s", "delay": "5ms"}))
     links.place(0, dict.fromkeys("ab", (0.0, 0.0, 0.0)), None)
     for number in range(4):
@@ -184,27 +184,27 @@ def test_a_fixed_link_that_comes_back_has_nothing_waiting() -> None:
     assert [(at_ns, number) for at_ns, _, number, _, _ in links.deliveries(10**9)] == [(7 * MS, 4)]
 
 
-def test_who_leaves_while_a_packet_is_on_its_way_to_the_relay_is_told_of() -> None:
+def test_a_receiver_that_leaves_during_the_first_hop_is_reported() -> None:
     links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate({"delay": "5ms", "rate": "unlimited"}))
     links.place(0, dict.fromkeys("abr", (0.0, 0.0, 0.0)), "r")
-    found: list[tuple[int, str, str]] = []
-    links.log_losses(lambda at_ns, _, name, reason: found.append((at_ns, name, reason)))
+    lost: list[tuple[int, str, str]] = []
+    links.log_losses(lambda at_ns, _, name, reason: lost.append((at_ns, name, reason)))
     links.send(0, "a", 1, 100, "b")
     links.place(MS, dict.fromkeys("ar", (0.0, 0.0, 0.0)), "r")
     assert links.deliveries(10**9) == []
-    assert found == [(5 * MS, "b", OUT_OF_RANGE)]
+    assert lost == [(5 * MS, "b", OUT_OF_RANGE)]
 
 
-def test_a_cut_link_is_out_of_range_both_ways_and_comes_back() -> None:
+def test_a_cut_link_is_out_of_range_in_both_directions_until_restored() -> None:
     model: WifiInWorld[int] = WifiInWorld(1, RadioOptions(fading=False), dict.fromkeys("abc", ANTENNA), None)
     model.place(0, {name: (10.0 * number, 0.0, 1.0) for number, name in enumerate("abc")}, None)
-    found: list[tuple[int, str]] = []
-    model.log_losses(lambda _, number, __, reason: found.append((number, reason)))
+    lost: list[tuple[int, str]] = []
+    model.log_losses(lambda _, number, __, reason: lost.append((number, reason)))
     model.disturb(0, set(), {("a", "b")})
     for number, (source, destination) in enumerate([("a", "b"), ("b", "a"), ("a", "c"), ("c", "b")]):
         model.send(0, source, number, 100, destination)
     assert sorted(payload for _, _, payload, _, _ in model.deliveries(MS * 100)) == [2, 3]
-    assert found == [(0, OUT_OF_RANGE), (1, OUT_OF_RANGE)]
+    assert lost == [(0, OUT_OF_RANGE), (1, OUT_OF_RANGE)]
     model.disturb(MS * 100, set(), set())
     model.send(MS * 100, "a", 4, 100, "b")
     assert [payload for _, _, payload, _, _ in model.deliveries(MS * 200)] == [4]

@@ -1,4 +1,4 @@
-"""The four parts of each packet's delay, on a virtual clock, against closed forms."""
+"""The four parts of each packet's delay in virtual time, compared with closed-form results."""
 
 from itertools import permutations
 
@@ -24,32 +24,32 @@ LINK = st.builds(
     loss=st.sampled_from([0.0, 0.3]),
     queue_packets=st.integers(0, 5),
 )
-SENT = st.tuples(st.integers(0, 3 * MS), st.sampled_from("abr"), st.sampled_from("abr*"), st.integers(20, 1500))
+REQUEST = st.tuples(st.integers(0, 3 * MS), st.sampled_from("abr"), st.sampled_from("abr*"), st.integers(20, 1500))
 
 
 def engine(link: LinkParameters, relay: str | None = None) -> FixedLinks[int]:
-    made: FixedLinks[int] = FixedLinks(1)
-    made.connect(dict.fromkeys(permutations("abr", 2), link), relay)
-    return made
+    links: FixedLinks[int] = FixedLinks(1)
+    links.connect(dict.fromkeys(permutations("abr", 2), link), relay)
+    return links
 
 
-def drain(running: FixedLinks[int]) -> list[Delivery[int]]:
-    arrived = running.deliveries(0)
-    while (at_ns := running.next_event_ns()) is not None:
-        arrived += running.deliveries(at_ns)
+def drain(links: FixedLinks[int]) -> list[Delivery[int]]:
+    arrived = links.deliveries(0)
+    while (at_ns := links.next_event_ns()) is not None:
+        arrived += links.deliveries(at_ns)
     return arrived
 
 
 def burst(link: LinkParameters, packets: int, relay: str | None = None) -> DelayParts:
-    """Return the parts over what arrives at b of packets of 1,500 bytes that a sends at once."""
-    running = engine(link, relay)
+    """Return the delay parts at b of a burst of packets of 1,500 bytes sent by a."""
+    links = engine(link, relay)
     for number in range(packets):
-        running.send(0, "a", number, 1500, "b")
-    return delay.parts(sum(delayed for _, _, _, _, delayed in drain(running)))
+        links.send(0, "a", number, 1500, "b")
+    return delay.parts(sum(delay_sum for _, _, _, _, delay_sum in drain(links)))
 
 
 @pytest.mark.parametrize("packets", [1, 2, 7, 1000])
-def test_in_a_burst_packets_wait_for_those_before_them(packets: int) -> None:
+def test_packets_of_a_burst_wait_for_earlier_ones(packets: int) -> None:
     # 1500 bytes at 12 Mbit/s take 1 ms, so that packet k waits k ms: (n - 1)/2 ms in the mean.
     link = LinkParameters(rate_bit_s=12_000_000, delay_ns=5 * MS)
     assert burst(link, packets) == DelayParts(
@@ -61,8 +61,9 @@ def test_in_a_burst_packets_wait_for_those_before_them(packets: int) -> None:
     )
 
 
-def test_both_hops_of_a_relayed_packet_count() -> None:
-    # Packets reach the relay one transmission apart, just as fast as it sends them on: none waits there.
+def test_the_delay_of_a_relayed_packet_includes_both_hops() -> None:
+    # Packets arrive at the relay one transmission time apart, at the rate at which it forwards them: none waits
+    # there.
     link = LinkParameters(rate_bit_s=12_000_000, delay_ns=5 * MS)
     assert burst(link, 10, relay="r") == DelayParts(
         packets=10,
@@ -73,52 +74,52 @@ def test_both_hops_of_a_relayed_packet_count() -> None:
     )
 
 
-def test_what_the_queue_drops_counts_for_nothing() -> None:
+def test_dropped_packets_do_not_add_to_the_delay() -> None:
     parts = burst(LinkParameters(rate_bit_s=12_000_000, queue_packets=3), 20)
     assert (parts.packets, parts.transmission_ns, parts.queuing_ns) == (4, 4 * MS, 6 * MS)
 
 
-def test_what_is_lost_on_either_hop_counts_for_nothing() -> None:
-    running = engine(LinkParameters(loss=0.5, delay_ns=MS), "r")
+def test_lost_packets_do_not_add_to_the_delay() -> None:
+    links = engine(LinkParameters(loss=0.5, delay_ns=MS), "r")
     for number in range(200):
-        running.send(0, "a", number, 1500, "b")
-    arrived = drain(running)
-    parts = delay.parts(sum(delayed for _, _, _, _, delayed in arrived))
-    assert 0 < parts.packets == len(arrived) < running.counters()["a", "r"].delivered
+        links.send(0, "a", number, 1500, "b")
+    arrived = drain(links)
+    parts = delay.parts(sum(delay_sum for _, _, _, _, delay_sum in arrived))
+    assert 0 < parts.packets == len(arrived) < links.counters()["a", "r"].delivered
     assert parts.propagation_ns == len(arrived) * 2 * MS
 
 
-def test_jitter_and_waiting_for_its_turn_are_of_the_way() -> None:
-    running = engine(LinkParameters(delay_ns=MS, jitter_ns=2 * MS))
+def test_jitter_and_reordering_wait_count_as_propagation() -> None:
+    links = engine(LinkParameters(delay_ns=MS, jitter_ns=2 * MS))
     for number in range(100):
-        running.send(number, "a", number, 1500, "b")
-    for at_ns, _, number, _, delayed in drain(running):
-        assert delay.parts(delayed) == DelayParts(
+        links.send(number, "a", number, 1500, "b")
+    for at_ns, _, number, _, delay_sum in drain(links):
+        assert delay.parts(delay_sum) == DelayParts(
             packets=1, processing_ns=0, transmission_ns=0, propagation_ns=at_ns - number, queuing_ns=0
         )
 
 
-@given(traffic=st.lists(SENT, max_size=60), links=st.tuples(LINK, LINK), relay=st.sampled_from([None, "r"]))
-def test_the_parts_are_all_of_the_time_from_sending_to_arriving(
-    traffic: list[tuple[int, str, str, int]], links: tuple[LinkParameters, LinkParameters], relay: str | None
+@given(traffic=st.lists(REQUEST, max_size=60), parameters=st.tuples(LINK, LINK), relay=st.sampled_from([None, "r"]))
+def test_the_parts_add_up_to_the_time_from_sending_to_arrival(
+    traffic: list[tuple[int, str, str, int]], parameters: tuple[LinkParameters, LinkParameters], relay: str | None
 ) -> None:
-    running, now_ns, sent_ns = engine(links[0], relay), 0, []
+    links, now_ns, sent_ns = engine(parameters[0], relay), 0, []
     for number, (wait_ns, source, destination, size_bytes) in enumerate(traffic):
         if number == len(traffic) // 2:
-            running.connect(dict.fromkeys(permutations("abr", 2), links[1]), relay)
+            links.connect(dict.fromkeys(permutations("abr", 2), parameters[1]), relay)
         now_ns += wait_ns
         sent_ns.append((source, now_ns))
         if source != destination:
-            running.send(now_ns, source, number, size_bytes, None if destination == "*" else destination)
-    for at_ns, _, number, source, delayed in drain(running):
-        parts = delay.parts(delayed)
-        took_ns = parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
-        assert (source, at_ns - took_ns, parts.packets) == (*sent_ns[number], 1)
+            links.send(now_ns, source, number, size_bytes, None if destination == "*" else destination)
+    for at_ns, _, number, source, delay_sum in drain(links):
+        parts = delay.parts(delay_sum)
+        total_ns = parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
+        assert (source, at_ns - total_ns, parts.packets) == (*sent_ns[number], 1)
 
 
 @pytest.mark.parametrize("relay", [None, "r"])
 @pytest.mark.parametrize("destination", ["b", None])
-def test_what_a_packet_was_delayed_by_before_is_a_part_of_it(relay: str | None, destination: str | None) -> None:
+def test_the_delay_includes_an_earlier_delay(relay: str | None, destination: str | None) -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("abr", G_MODES[-1]), 1)
     wifi.relay(relay)
     fixed = engine(LinkParameters(delay_ns=MS), relay)
@@ -126,9 +127,9 @@ def test_what_a_packet_was_delayed_by_before_is_a_part_of_it(relay: str | None, 
         model.send(0, "a", 0, 1000, destination, before=delay.PACKET + 7 * delay.PROCESSING_NS)
         arrived = model.deliveries(10**9)
         assert arrived
-        for at_ns, _, _, _, delayed in arrived:
-            parts = delay.parts(delayed)
-            assert (parts.packets, parts.processing_ns, delay.processing_ns(delayed)) == (1, 7, 7)
+        for at_ns, _, _, _, delay_sum in arrived:
+            parts = delay.parts(delay_sum)
+            assert (parts.packets, parts.processing_ns, delay.processing_ns(delay_sum)) == (1, 7, 7)
             assert parts.transmission_ns + parts.propagation_ns + parts.queuing_ns == at_ns
 
 
@@ -141,15 +142,15 @@ PARTS = st.builds(
 
 
 @given(st.lists(PARTS, max_size=100))
-def test_delays_add_up_part_by_part(several: list[DelayParts]) -> None:
+def test_parts_of_delays_are_summed_separately(all_parts: list[DelayParts]) -> None:
     total = sum(
-        one.packets * delay.PACKET
-        + one.processing_ns * delay.PROCESSING_NS
-        + one.transmission_ns * delay.TRANSMISSION_NS
-        + one.propagation_ns * delay.PROPAGATION_NS
-        + one.queuing_ns * delay.QUEUING_NS
-        for one in several
+        parts.packets * delay.PACKET
+        + parts.processing_ns * delay.PROCESSING_NS
+        + parts.transmission_ns * delay.TRANSMISSION_NS
+        + parts.propagation_ns * delay.PROPAGATION_NS
+        + parts.queuing_ns * delay.QUEUING_NS
+        for parts in all_parts
     )
     assert vars(delay.parts(total)) == {
-        name: sum(getattr(one, name) for one in several) for name in DelayParts.__dataclass_fields__
+        name: sum(getattr(parts, name) for parts in all_parts) for name in DelayParts.__dataclass_fields__
     }

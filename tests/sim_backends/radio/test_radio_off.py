@@ -1,4 +1,4 @@
-"""A radio that is off relays nothing: a dead access point silences everyone, without one the others go on."""
+"""A radio that is off relays nothing: if it is the access point, all links are down; else others continue."""
 
 import os
 import re
@@ -38,75 +38,77 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     """Three namespaces a, b, r on a medium."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(request.param, seed=1))
-        spaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
-        for name, space in spaces.items():
-            fd = space.tun("wlan0", f"{ADDRESSES[name]}/24")
+        namespaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
+        for name, namespace in namespaces.items():
+            fd = namespace.tun("wlan0", f"{ADDRESSES[name]}/24")
             medium.attach(name, f"{ADDRESSES[name]}/24", RADIO, fd)
             os.close(fd)
-        yield medium, spaces
+        yield medium, namespaces
 
 
-def answers(space: Namespace, address: str, *, within_s: float = 10.0) -> int:
-    """Return how many of five pings are answered."""
-    said = space.run("ping", "-n", "-i", "0.01", "-W", f"{within_s:g}", "-c", "5", address, timeout_s=60).stdout
-    found = re.search(r"(\d+) received", said)
-    return int(found[1]) if found else 0
+def count_replies(namespace: Namespace, address: str, *, within_s: float = 10.0) -> int:
+    """Return the number of replies to five pings."""
+    output = namespace.run("ping", "-n", "-i", "0.01", "-W", f"{within_s:g}", "-c", "5", address, timeout_s=60).stdout
+    match = re.search(r"(\d+) received", output)
+    return int(match[1]) if match else 0
 
 
-def down(space: Namespace) -> None:
-    space.ip("link", "set", "wlan0", "down")
+def set_down(namespace: Namespace) -> None:
+    namespace.ip("link", "set", "wlan0", "down")
 
 
-def deleted(space: Namespace) -> None:
-    space.ip("link", "delete", "wlan0")
+def delete_interface(namespace: Namespace) -> None:
+    namespace.ip("link", "delete", "wlan0")
 
 
-@pytest.mark.parametrize("end", [down, deleted])
-def test_a_dead_access_point_silences_everyone(bench: Bench, end: Callable[[Namespace], None]) -> None:
-    medium, spaces = bench
+@pytest.mark.parametrize("switch_off", [set_down, delete_interface])
+def test_no_packets_are_relayed_without_the_access_point(
+    bench: Bench, switch_off: Callable[[Namespace], None]
+) -> None:
+    medium, namespaces = bench
     medium.place(PLACES, relay="r")
-    assert answers(spaces["a"], ADDRESSES["b"]) == 5
-    end(spaces["r"])
-    assert answers(spaces["a"], ADDRESSES["b"], within_s=0.3) == 0
+    assert count_replies(namespaces["a"], ADDRESSES["b"]) == 5
+    switch_off(namespaces["r"])
+    assert count_replies(namespaces["a"], ADDRESSES["b"], within_s=0.3) == 0
 
 
-@pytest.mark.parametrize("end", [down, deleted])
-def test_without_an_access_point_the_others_go_on(bench: Bench, end: Callable[[Namespace], None]) -> None:
-    medium, spaces = bench
+@pytest.mark.parametrize("switch_off", [set_down, delete_interface])
+def test_direct_links_continue_when_one_station_is_off(bench: Bench, switch_off: Callable[[Namespace], None]) -> None:
+    medium, namespaces = bench
     medium.place(PLACES)
-    end(spaces["r"])
-    assert answers(spaces["a"], ADDRESSES["b"]) == 5
-    assert answers(spaces["a"], ADDRESSES["r"], within_s=0.3) == 0
+    switch_off(namespaces["r"])
+    assert count_replies(namespaces["a"], ADDRESSES["b"]) == 5
+    assert count_replies(namespaces["a"], ADDRESSES["r"], within_s=0.3) == 0
 
 
-def test_in_master_a_dead_station_leaves_the_others_alone(bench: Bench) -> None:
-    medium, spaces = bench
+def test_a_station_that_is_off_does_not_affect_others_in_topology_master(bench: Bench) -> None:
+    medium, namespaces = bench
     medium.place(PLACES, relay="r")
-    down(spaces["b"])
-    assert answers(spaces["a"], ADDRESSES["r"]) == 5
+    set_down(namespaces["b"])
+    assert count_replies(namespaces["a"], ADDRESSES["r"]) == 5
 
 
-def test_an_access_point_that_is_back_relays_again(bench: Bench) -> None:
-    medium, spaces = bench
+def test_an_access_point_that_is_on_again_relays_again(bench: Bench) -> None:
+    medium, namespaces = bench
     medium.place(PLACES, relay="r")
-    down(spaces["r"])
-    assert answers(spaces["a"], ADDRESSES["b"], within_s=0.3) == 0
-    spaces["r"].ip("link", "set", "wlan0", "up")
-    assert answers(spaces["a"], ADDRESSES["b"]) == 5
+    set_down(namespaces["r"])
+    assert count_replies(namespaces["a"], ADDRESSES["b"], within_s=0.3) == 0
+    namespaces["r"].ip("link", "set", "wlan0", "up")
+    assert count_replies(namespaces["a"], ADDRESSES["b"]) == 5
 
 
-def test_who_is_off_when_all_are_placed_is_on_the_air_once_it_is_up(bench: Bench) -> None:
-    medium, spaces = bench
-    down(spaces["r"])
+def test_a_station_that_is_off_during_placement_works_once_it_is_up(bench: Bench) -> None:
+    medium, namespaces = bench
+    set_down(namespaces["r"])
     medium.place(PLACES, relay="r")
-    assert answers(spaces["a"], ADDRESSES["b"], within_s=0.3) == 0
-    spaces["r"].ip("link", "set", "wlan0", "up")
-    assert answers(spaces["a"], ADDRESSES["b"]) == 5
+    assert count_replies(namespaces["a"], ADDRESSES["b"], within_s=0.3) == 0
+    namespaces["r"].ip("link", "set", "wlan0", "up")
+    assert count_replies(namespaces["a"], ADDRESSES["b"]) == 5
 
 
 @pytest.fixture(scope="module")
-def up() -> Iterator[EmulatedTestbed]:
-    """Three robots; as long as all are up, each is in range of the others."""
+def robots() -> Iterator[EmulatedTestbed]:
+    """Three robots; while all are up, each is in range of the others."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     with testbed.bring_up(
         cast,
@@ -114,8 +116,8 @@ def up() -> Iterator[EmulatedTestbed]:
         world=load_world("lawn"),
         ros=RosChoice.BUILTIN,
         seed=1,
-    ) as robots:
-        yield robots
+    ) as started:
+        yield started
 
 
 FAULTS = [
@@ -127,27 +129,27 @@ FAULTS = [
 
 @pytest.mark.parametrize("topology", Topology)
 @pytest.mark.parametrize("fault", FAULTS, ids=[str(fault.kind) for fault in FAULTS])
-def test_a_fault_of_the_relay_silences_the_stations_in_master_alone(
-    up: EmulatedTestbed, topology: Topology, fault: Fault
+def test_a_fault_of_the_relay_interrupts_only_topology_master(
+    robots: EmulatedTestbed, topology: Topology, fault: Fault
 ) -> None:
-    up.place(Placement(Scenario.LOS, topology, parse_distance("5m")))
-    assert hears(up)
-    with inject_until_exit(up, fault):
+    robots.place(Placement(Scenario.LOS, topology, parse_distance("5m")))
+    assert is_reachable(robots)
+    with inject_until_exit(robots, fault):
         if topology is Topology.MASTER:
-            wait_until(lambda: not hears(up, within_s=0.3), Deadline.after(60))
+            wait_until(lambda: not is_reachable(robots, within_s=0.3), Deadline.after(60))
         else:
-            assert hears(up)
-    assert hears(up), "it is over"
+            assert is_reachable(robots)
+    assert is_reachable(robots), "the fault has ended"
 
 
-def test_an_access_point_relays_whatever_becomes_of_its_programs(up: EmulatedTestbed) -> None:
-    up.inject(Fault(FaultKind.KILL, Role.RELAY, process="sshd"))
+def test_an_access_point_relays_even_if_its_programs_are_killed(robots: EmulatedTestbed) -> None:
+    robots.inject(Fault(FaultKind.KILL, Role.RELAY, process="sshd"))
     for topology in Topology:
-        up.place(Placement(Scenario.LOS, topology, parse_distance("5m")))
-        assert hears(up)
+        robots.place(Placement(Scenario.LOS, topology, parse_distance("5m")))
+        assert is_reachable(robots)
 
 
-def hears(up: EmulatedTestbed, *, within_s: float = 10.0) -> bool:
-    """Return whether the sender gets an answer from the receiver over the radio."""
-    argv = ("ping", "-n", "-c", "1", "-W", f"{within_s:g}", up.robots[Role.RECEIVER].spec.ip)
-    return up.shells[Role.SENDER].run(argv, deadline=Deadline.after(60), check=False).exit_code == 0
+def is_reachable(robots: EmulatedTestbed, *, within_s: float = 10.0) -> bool:
+    """Return True if the sender receives a ping reply from the receiver over the radio."""
+    argv = ("ping", "-n", "-c", "1", "-W", f"{within_s:g}", robots.robots[Role.RECEIVER].spec.ip)
+    return robots.shells[Role.SENDER].run(argv, deadline=Deadline.after(60), check=False).exit_code == 0

@@ -1,4 +1,4 @@
-"""DCF: against the closed form of one station, Bianchi's model of many, and what must happen to hidden ones."""
+"""DCF, compared with the closed form for one station and Bianchi's model for many; hidden stations."""
 
 import math
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ def exchange_ns(mode: WifiMode) -> int:
 
 
 @pytest.mark.parametrize("mode", [G6, G54, N_MODES[-1]], ids=lambda mode: mode.name)
-def test_one_station_gets_what_the_closed_form_says(mode: WifiMode) -> None:
+def test_the_goodput_of_one_station_equals_the_closed_form(mode: WifiMode) -> None:
     """DIFS, mean backoff of CWmin / 2 slots, frame, SIFS, ACK, and no collision."""
     goodput = saturate(FixedPowers("ab", mode), "a", "b", seconds=3)["a"]
     expected = 8 * PAYLOAD_BYTES / ((exchange_ns(mode) + CW_MIN / 2 * SLOT_NS) * 1e-9)
@@ -55,50 +55,58 @@ def bianchi_bit_s(stations: int, mode: WifiMode) -> float:
         return 2 * (1 - 2 * p) / ((1 - 2 * p) * (window + 1) + p * window * (1 - (2 * p) ** doublings))
 
     p = brentq(lambda p: p - (1 - (1 - tau(p)) ** (stations - 1)), 0, 0.49)
-    sends = tau(p)
-    some = 1 - (1 - sends) ** stations
-    one = stations * sends * (1 - sends) ** (stations - 1) / some
+    sending_probability = tau(p)
+    any_sends = 1 - (1 - sending_probability) ** stations
+    only_one_sends = stations * sending_probability * (1 - sending_probability) ** (stations - 1) / any_sends
     success_ns = collision_ns = exchange_ns(mode)
-    slot_ns = (1 - some) * SLOT_NS + some * one * success_ns + some * (1 - one) * collision_ns
-    return some * one * 8 * PAYLOAD_BYTES / (slot_ns * 1e-9)
+    slot_ns = (
+        (1 - any_sends) * SLOT_NS
+        + any_sends * only_one_sends * success_ns
+        + any_sends * (1 - only_one_sends) * collision_ns
+    )
+    return any_sends * only_one_sends * 8 * PAYLOAD_BYTES / (slot_ns * 1e-9)
 
 
 @pytest.mark.parametrize("stations", [2, 5, 10, 20])
-def test_many_stations_share_as_bianchi_says(stations: int) -> None:
+def test_the_goodput_of_many_stations_equals_bianchi_s_model(stations: int) -> None:
     names = [f"s{n}" for n in range(stations)]
     goodput = saturate(FixedPowers([*names, "r"], G54), names, "r", seconds=4)
     total = sum(goodput.values())
     assert total == pytest.approx(bianchi_bit_s(stations, G54), rel=0.06)
-    fairness = total**2 / (stations * sum(one**2 for one in goodput.values()))
+    fairness = total**2 / (stations * sum(share**2 for share in goodput.values()))
     assert fairness > 0.96, "Jain's index: shares spread by 13 % over 4 s with 20 stations"
     assert min(goodput.values()) > total / stations / 2, "no station is starved"
 
 
-def test_hidden_stations_collide_and_those_that_hear_each_other_do_not() -> None:
-    seen = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
+def test_hidden_stations_collide_more_than_visible_ones() -> None:
+    visible = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
     hidden = saturate(FixedPowers("abr", G6, deaf=[("a", "b")]), "ab", "r", seconds=4)
-    assert sum(hidden.values()) < 0.75 * sum(seen.values())
+    assert sum(hidden.values()) < 0.75 * sum(visible.values())
 
 
-def test_an_access_point_spends_the_airtime_twice() -> None:
+def test_an_access_point_needs_twice_the_airtime() -> None:
     direct = saturate(FixedPowers("abr", G54), "a", "b", seconds=2)["a"]
     relayed = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
     # The access point competes with the station for each second hop, so a little is lost to collisions.
     assert relayed == pytest.approx(direct / 2, rel=0.06)
 
 
-def test_an_ack_follows_each_frame_that_arrived_after_sifs() -> None:
+def test_an_ack_follows_each_received_frame_after_sifs() -> None:
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers("abr", G54, deaf=[("a", "b")]), "ab", "r", seconds=0.2, log=log)
     acks = [attempt for attempt in log if not attempt.number]
-    arrived = {(one.end_ns, one.receiver, one.transmitter) for one in log if one.number and one.received}
+    arrived = {
+        (attempt.end_ns, attempt.receiver, attempt.transmitter)
+        for attempt in log
+        if attempt.number and attempt.received
+    }
     assert {(ack.start_ns - SIFS_NS, ack.transmitter, ack.receiver) for ack in acks} <= arrived
-    # Whoever sends itself by then answers none; the last of all may be still to come.
+    # A station that is sending at that time sends no ACK; the last ACK may not have been sent yet.
     assert 0.9 * len(arrived) < len(acks) <= len(arrived)
     assert {(ack.end_ns - ack.start_ns, ack.mode.name, ack.payload) for ack in acks} == {(ack_ns(G54), "g24", None)}
 
 
-def test_a_broadcast_goes_out_once_at_the_basic_rate_and_nobody_acknowledges() -> None:
+def test_a_broadcast_is_sent_once_at_the_basic_rate_without_ack() -> None:
     log: list[TransmissionAttempt] = []
     wifi: Wifi[bytes] = Wifi(FixedPowers("abc", G54), 1)
     wifi.log_attempts(log.append)
@@ -109,14 +117,14 @@ def test_a_broadcast_goes_out_once_at_the_basic_rate_and_nobody_acknowledges() -
     assert wifi.next_event_ns() is None
 
 
-def test_a_broadcast_through_an_access_point_reaches_everyone_once() -> None:
+def test_a_broadcast_through_an_access_point_reaches_each_station_once() -> None:
     wifi: Wifi[bytes] = Wifi(FixedPowers("abr", G54), 1)
     wifi.relay("r")
     wifi.send(0, "a", b"hello", 100, None)
     assert sorted(name for _, name, _, _, _ in wifi.deliveries(10**9)) == ["b", "r"]
 
 
-def test_a_receiver_that_is_gone_costs_every_retry() -> None:
+def test_an_unreachable_receiver_causes_all_retries() -> None:
     log: list[TransmissionAttempt] = []
     wifi: Wifi[bytes] = Wifi(FixedPowers("ab", G54, deaf=[("a", "b")]), 1)
     wifi.log_attempts(log.append)
@@ -126,7 +134,7 @@ def test_a_receiver_that_is_gone_costs_every_retry() -> None:
     assert wifi.counters()["a", "b"].lost == 1
 
 
-def test_a_full_queue_drops_what_comes_last() -> None:
+def test_a_full_queue_drops_the_newest_packets() -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("ab", G54), 1, queue_packets=10)
     for number in range(20):
         wifi.send(0, "a", number, 100, "b")
@@ -136,8 +144,10 @@ def test_a_full_queue_drops_what_comes_last() -> None:
     assert wifi.counters()["a", "b"].queue_dropped == 9
 
 
-def test_interference_that_begins_late_spoils_a_frame() -> None:
-    """Hidden from each other, the second begins in the midst of the first; at the receiver it is as strong."""
+def test_interference_that_starts_late_corrupts_a_frame() -> None:
+    """The stations are hidden from each other; the second starts during the first's frame, and is equally strong at
+    r.
+    """
     log: list[TransmissionAttempt] = []
     wifi: Wifi[str] = Wifi(FixedPowers("abr", G6, deaf=[("a", "b")]), 1)
     wifi.log_attempts(log.append)
@@ -156,7 +166,7 @@ def test_a_strong_frame_survives_weak_interference() -> None:
     assert wifi.deliveries(3_000_000)[0][2] == "first"
 
 
-def test_a_weak_link_loses_what_its_packet_error_says() -> None:
+def test_the_loss_of_a_weak_link_equals_its_packet_error() -> None:
     """Broadcasts, so that no retry hides a loss."""
     channel, ratio_db, size_bytes, frames = FixedPowers("ab", G6), 4.05, 1500, 4000
     channel.rows[0][1] = NOISE_MW * 10 ** (ratio_db / 10)
@@ -170,7 +180,7 @@ def test_a_weak_link_loses_what_its_packet_error_says() -> None:
     assert lost == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / frames))
 
 
-def test_below_four_decibels_not_even_a_preamble_is_found() -> None:
+def test_below_4_db_the_preamble_is_not_detected() -> None:
     channel = FixedPowers("ab", G6)
     channel.rows[0][1] = NOISE_MW * 10 ** (3.9 / 10)
     channel.sensitivity_mw = [NOISE_MW] * 2
@@ -181,40 +191,42 @@ def test_below_four_decibels_not_even_a_preamble_is_found() -> None:
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(0, 20_000_000), st.integers(40, 1500)), max_size=40))
-def test_equal_seeds_give_equal_fates_and_time_never_runs_back(seed: int, sends: list[tuple[int, int]]) -> None:
+def test_equal_seeds_give_equal_results_in_order_of_time(
+    seed: int, sending_probability: list[tuple[int, int]]
+) -> None:
     def run() -> tuple[list[Delivery[int]], list[TransmissionAttempt]]:
         log: list[TransmissionAttempt] = []
         wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[("a", "b")]), seed)
         wifi.log_attempts(log.append)
-        for number, (at_ns, size) in enumerate(sorted(sends)):
+        for number, (at_ns, size) in enumerate(sorted(sending_probability)):
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
         return wifi.deliveries(60 * 10**9), log
 
     arrived, log = run()
     assert run() == (arrived, log)
-    assert [one[0] for one in arrived] == sorted(one[0] for one in arrived)
-    assert len({one[2] for one in arrived}) == len(arrived), "a retry whose ACK was lost comes once"
+    assert [delivery[0] for delivery in arrived] == sorted(delivery[0] for delivery in arrived)
+    assert len({delivery[2] for delivery in arrived}) == len(arrived), "a retry after a lost ACK is delivered once"
     for sender in "ab":
-        own = [one[2] for one in arrived if "ab"[one[2] % 2] == sender]
-        assert own == sorted(own), "frames of one station arrive in order"
+        from_sender = [delivery[2] for delivery in arrived if "ab"[delivery[2] % 2] == sender]
+        assert from_sender == sorted(from_sender), "frames of one station arrive in order"
     assert all(math.isfinite(attempt.end_ns) and attempt.end_ns > attempt.start_ns for attempt in log)
 
 
-def test_deliveries_do_not_depend_on_when_they_are_asked_for() -> None:
+def test_deliveries_do_not_depend_on_the_times_of_calls() -> None:
     def run(step_ns: int) -> list[Delivery[int]]:
         wifi: Wifi[int] = Wifi(FixedPowers("abr", G54), 3)
         for number in range(50):
             wifi.send(0, "ab"[number % 2], number, 700, "r")
-        found: list[Delivery[int]] = []
+        deliveries: list[Delivery[int]] = []
         for now_ns in range(0, 40_000_001, step_ns):
-            found += wifi.deliveries(now_ns)
-        return found
+            deliveries += wifi.deliveries(now_ns)
+        return deliveries
 
     assert run(40_000_000) == run(1_000_000) == run(8_000)
 
 
-def test_the_engine_asks_for_attention_only_when_something_happens() -> None:
-    """Stations that wait longer because others send cost no event each: the medium would be woken for nothing."""
+def test_the_number_of_events_per_frame_is_bounded() -> None:
+    """Stations that wait longer because others send cause no events, so that the medium is not resumed needlessly."""
     log: list[TransmissionAttempt] = []
     wifi: Wifi[int] = Wifi(FixedPowers([*"abcdefghijklmnopqrst"], G54), 1)
     wifi.log_attempts(log.append)
@@ -226,11 +238,11 @@ def test_the_engine_asks_for_attention_only_when_something_happens() -> None:
         steps += 1
     sent = sum(attempt.number > 0 for attempt in log)
     assert sent >= 400
-    # Begin, end, its ACK's begin and end, and the time-out that the ACK made void.
+    # Start and end of the frame, start and end of its ACK, and the timeout that the ACK made void.
     assert steps <= 5 * sent
 
 
-def test_a_channel_that_changes_is_heard_as_it_is_then() -> None:
+def test_received_powers_follow_changes_of_the_channel() -> None:
     channel = FixedPowers("ab", G6)
     wifi: Wifi[str] = Wifi(channel, 1)
     wifi.send(0, "a", "near", 100, None)
@@ -245,17 +257,17 @@ def test_a_channel_that_changes_is_heard_as_it_is_then() -> None:
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32), st.sets(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=6))
-def test_nobody_begins_while_it_hears_another(seed: int, deaf: set[tuple[int, int]]) -> None:
-    """Whoever is hidden from whom: of two frames that overlap and hear each other, both began within 4 us."""
+def test_no_station_starts_while_it_detects_a_frame(seed: int, deaf: set[tuple[int, int]]) -> None:
+    """Of two overlapping frames of stations that are not hidden from each other, the second starts within 4 us."""
     names = "abcde"
-    pairs = [(names[one], names[other]) for one, other in deaf if one != other]
+    pairs = [(names[first], names[second]) for first, second in deaf if first != second]
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers(names, G54, deaf=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
-    hidden = {*pairs, *((other, one) for one, other in pairs)}
+    hidden = {*pairs, *((second, first) for first, second in pairs)}
     sent = [attempt for attempt in log if attempt.number]
-    begun = sorted(sent, key=lambda attempt: attempt.start_ns)
-    for number, first in enumerate(begun):
-        for second in begun[number + 1 :]:
+    frames = sorted(sent, key=lambda attempt: attempt.start_ns)
+    for number, first in enumerate(frames):
+        for second in frames[number + 1 :]:
             if second.start_ns >= first.end_ns:
                 break
             if (first.transmitter, second.transmitter) not in hidden:
@@ -263,28 +275,28 @@ def test_nobody_begins_while_it_hears_another(seed: int, deaf: set[tuple[int, in
 
 
 @pytest.mark.parametrize("relay", [None, "r"])
-def test_the_parts_of_the_delay_sum_up_to_the_time_that_passed(relay: str | None) -> None:
+def test_the_parts_of_the_delay_add_up_to_the_elapsed_time(relay: str | None) -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("abr", G54), 1)
     wifi.relay(relay)
     for number in range(100):
         wifi.send(number * 1000, "a", number * 1000, 1000, "b")
     arrived = wifi.deliveries(10**9)
     assert len(arrived) == 100
-    for at_ns, _, sent_ns, source, delayed in arrived:
-        parts = delay.parts(delayed)
+    for at_ns, _, sent_ns, source, delay_sum in arrived:
+        parts = delay.parts(delay_sum)
         assert source == "a"
         assert parts.packets == 1
-        took_ns = parts.queuing_ns + parts.transmission_ns + parts.propagation_ns + parts.processing_ns
-        assert took_ns == at_ns - sent_ns
+        total_ns = parts.queuing_ns + parts.transmission_ns + parts.propagation_ns + parts.processing_ns
+        assert total_ns == at_ns - sent_ns
         assert parts.transmission_ns >= (2 if relay else 1) * G54.airtime_ns(1000 + HEADER_BYTES)
 
 
-def test_frames_to_who_is_out_of_range_are_lost_at_once() -> None:
-    class Apart(FixedPowers):
+def test_frames_to_a_station_out_of_range_are_lost_immediately() -> None:
+    class Unlinked(FixedPowers):
         def linked(self, transmitter: int, receiver: int) -> bool:
             return False
 
-    wifi: Wifi[int] = Wifi(Apart("ab", G54), 1)
+    wifi: Wifi[int] = Wifi(Unlinked("ab", G54), 1)
     wifi.send(0, "a", 1, 100, "b")
     assert wifi.next_event_ns() is None
     assert wifi.counters()["a", "b"].lost == 1
@@ -292,8 +304,8 @@ def test_frames_to_who_is_out_of_range_are_lost_at_once() -> None:
 
 @given(st.sets(st.integers(0, 59)), st.booleans())
 @settings(max_examples=30)
-def test_one_packet_less_changes_nothing_for_the_others(missing: set[int], relayed: bool) -> None:
-    """Every draw is keyed by the packet and the attempt at it, also where there are others of other flows."""
+def test_a_missing_packet_does_not_change_the_others(missing: set[int], relayed: bool) -> None:
+    """Every draw is keyed by the packet and the attempt, also with packets of other flows."""
 
     def attempts(numbers: Sequence[int]) -> dict[int, list[tuple[int, str, bool]]]:
         channel = FixedPowers("abr", G54)
@@ -305,15 +317,17 @@ def test_one_packet_less_changes_nothing_for_the_others(missing: set[int], relay
         for number in numbers:
             wifi.send(number * 100_000_000, "a", number, 1000, "b", packet=(f"flow {number % 3}", number // 3))
         wifi.deliveries(10**12)
-        made: dict[int, list[tuple[int, str, bool]]] = {}
-        for one in log:
-            if one.payload is not None:
-                since_ns = one.start_ns - one.payload * 100_000_000
-                made.setdefault(one.payload, []).append((since_ns, one.transmitter, bool(one.received)))
-        return made
+        attempts_by_packet: dict[int, list[tuple[int, str, bool]]] = {}
+        for attempt in log:
+            if attempt.payload is not None:
+                since_ns = attempt.start_ns - attempt.payload * 100_000_000
+                attempts_by_packet.setdefault(attempt.payload, []).append(
+                    (since_ns, attempt.transmitter, bool(attempt.received))
+                )
+        return attempts_by_packet
 
-    whole = attempts(range(60))
-    assert max(map(len, whole.values())) > 2, "some are tried again"
+    all_attempts = attempts(range(60))
+    assert max(map(len, all_attempts.values())) > 2, "there are retries"
     assert attempts([number for number in range(60) if number not in missing]) == {
-        number: one for number, one in whole.items() if number not in missing
+        number: packet_attempts for number, packet_attempts in all_attempts.items() if number not in missing
     }

@@ -1,4 +1,4 @@
-"""Random streams: named, counted, independent of use."""
+"""Random streams are identified by name and number, independent of the order of use."""
 
 import math
 import subprocess
@@ -23,7 +23,7 @@ def test_draws_do_not_depend_on_order(numbers: list[int], seed: int, order: Rand
 
 
 @given(number=st.integers(0, 2**40))
-def test_draws_lie_in_the_half_open_unit_interval(number: int) -> None:
+def test_draws_are_in_the_half_open_unit_interval(number: int) -> None:
     assert 0.0 <= RandomStream(1, "x").draw(number) < 1.0
 
 
@@ -33,7 +33,7 @@ def test_blocks_neither_repeat_nor_overlap() -> None:
     assert len(set(draws)) == 5000
 
 
-def test_seed_link_direction_and_purpose_all_name_the_stream() -> None:
+def test_seed_link_direction_and_purpose_identify_the_stream() -> None:
     names = [
         (1, "a", "b", "loss"),
         (2, "a", "b", "loss"),
@@ -45,29 +45,29 @@ def test_seed_link_direction_and_purpose_all_name_the_stream() -> None:
 
 
 def test_streams_of_the_two_directions_are_uncorrelated() -> None:
-    there, back = RandomStream(3, "a", "b", "loss"), RandomStream(3, "b", "a", "loss")
+    forward, reverse = RandomStream(3, "a", "b", "loss"), RandomStream(3, "b", "a", "loss")
     n = 20_000
-    products = math.fsum((there.draw(i) - 0.5) * (back.draw(i) - 0.5) for i in range(n)) / n
+    products = math.fsum((forward.draw(i) - 0.5) * (reverse.draw(i) - 0.5) for i in range(n)) / n
     # Standard error of the mean product of two independent uniforms is (1/12) / sqrt(n).
     assert abs(products) < 4 / 12 / math.sqrt(n)
 
 
 def test_draws_are_the_same_in_every_version() -> None:
-    # A recorded value: a change here changes the fate of every packet of every seed.
+    # A recorded value: a change here would change the results of every packet for every seed.
     assert RandomStream(7, "a", "b", "loss").draw(0) == 0.3134544202867149
 
 
 @given(seed=st.integers(0, 2**64), names=st.lists(st.tuples(st.text(), st.text())), count=st.integers(1, 200))
 def test_first_draws_are_those_of_the_streams(seed: int, names: list[tuple[str, str]], count: int) -> None:
-    found = first_draws(seed, names, count)
-    assert found.tolist() == [RandomStream(seed, *name).first(count).tolist() for name in names]
+    draws = first_draws(seed, names, count)
+    assert draws.tolist() == [RandomStream(seed, *name).first(count).tolist() for name in names]
 
 
 def test_the_first_draw_imports_nothing() -> None:
-    """A module that is imported then delays the first packet by 7 ms."""
+    """An import at the first draw would delay the first packet by 7 ms."""
     program = (
         "import sys; from sim_backends.radio.random_streams import RandomStream; before = set(sys.modules); "
         "RandomStream(1, 'a').draw(0); print(sorted(set(sys.modules) - before))"
     )
-    done = subprocess.run((sys.executable, "-c", program), stdout=subprocess.PIPE, text=True, check=True)
-    assert done.stdout == "[]\n"
+    process = subprocess.run((sys.executable, "-c", program), stdout=subprocess.PIPE, text=True, check=True)
+    assert process.stdout == "[]\n"

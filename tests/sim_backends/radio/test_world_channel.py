@@ -1,4 +1,4 @@
-"""Moves in the air: only the links of who moved are looked at again, and fading goes on without a jump."""
+"""Moves of stations: only the links of moved stations are computed again, and fading is continuous."""
 
 from collections.abc import Callable
 from random import Random
@@ -24,60 +24,60 @@ METRES = st.integers(0, 400).map(lambda decimetres: decimetres / 10)
 PLACES = st.dictionaries(st.sampled_from(NAMES), st.tuples(METRES, METRES, st.just(0.2)))
 
 
-def heard(channel: WorldChannel) -> list[tuple[list[float], list[int], list[bool]]]:
+def link_states(channel: WorldChannel) -> list[tuple[list[float], list[int], list[bool]]]:
     stations = range(len(channel.names))
     return [
         (
-            channel.powers_mw(one, 10**12),
-            [channel.delay_ns(one, other) for other in stations if channel.linked(one, other)],
-            [channel.linked(one, other) for other in stations],
+            channel.powers_mw(first, 10**12),
+            [channel.delay_ns(first, second) for second in stations if channel.linked(first, second)],
+            [channel.linked(first, second) for second in stations],
         )
-        for one in stations
+        for first in stations
     ]
 
 
 @given(st.lists(PLACES, min_size=1, max_size=5))
-def test_what_was_before_a_move_changes_nothing_after_it(moves: list[dict[str, Vector]]) -> None:
+def test_links_depend_only_on_the_last_positions(moves: list[dict[str, Vector]]) -> None:
     moved, fresh = WorldChannel(1, ANTENNAS, STEADY, BAYLANDS), WorldChannel(1, ANTENNAS, STEADY, BAYLANDS)
     for now_ns, places in enumerate(moves):
         moved.move(now_ns, places)
     fresh.move(0, moves[-1])
-    assert heard(moved) == heard(fresh)
+    assert link_states(moved) == link_states(fresh)
 
 
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return how many links were worked out each time, from now on."""
-    looked: list[int] = []
-    whole: Callable[..., Any] = World.penetration_loss_db
+def count_computed_links(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that receives the number of links of each loss computation from now on."""
+    computed_counts: list[int] = []
+    original: Callable[..., Any] = World.penetration_loss_db
 
-    def count(world: World, start_m: Any, *others: Any) -> Any:  # noqa: ANN401 (as it is)
-        looked.append(len(start_m))
-        return whole(world, start_m, *others)
+    def counting_loss(world: World, start_m: Any, *others: Any) -> Any:  # noqa: ANN401 (the original signature)
+        computed_counts.append(len(start_m))
+        return original(world, start_m, *others)
 
-    monkeypatch.setattr(World, "penetration_loss_db", count)
-    return looked
+    monkeypatch.setattr(World, "penetration_loss_db", counting_loss)
+    return computed_counts
 
 
-def test_only_the_links_of_who_moved_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked = counted(monkeypatch)
+def test_only_the_links_of_moved_stations_are_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    computed_counts = count_computed_links(monkeypatch)
     channel = WorldChannel(1, ANTENNAS, FADING, load_world("lawn"))
     places: dict[str, Vector] = {name: (float(number), 0.0, 0.2) for number, name in enumerate(NAMES)}
     channel.move(0, places)
-    heard(channel)
-    assert sum(looked) == 6, "each once"
+    link_states(channel)
+    assert sum(computed_counts) == 6, "each link once"
     channel.move(1, places)
-    heard(channel)
-    assert sum(looked) == 6
+    link_states(channel)
+    assert sum(computed_counts) == 6
     channel.move(2, places | {"b": (9.0, 0.0, 0.2)})
-    heard(channel)
-    assert looked[-1] == 3
-    assert sum(looked) == 6 + 3
+    link_states(channel)
+    assert computed_counts[-1] == 3
+    assert sum(computed_counts) == 6 + 3
     channel.move(3, places | {"b": (9.0, 0.0, 0.2)}, {"c": (1.0, 0.0, 0.0)})
-    heard(channel)
-    assert sum(looked) == 6 + 3 + 3
+    link_states(channel)
+    assert sum(computed_counts) == 6 + 3 + 3
 
 
-def test_a_frame_on_the_air_arrives_as_strong_as_it_was_sent() -> None:
+def test_a_move_does_not_change_the_powers_of_a_frame_on_the_air() -> None:
     channel = WorldChannel(1, ANTENNAS, STEADY)
     channel.move(0, {"a": (0.0, 0.0, 0.2), "b": (5.0, 0.0, 0.2)})
     sent = channel.powers_mw(0, 0)
@@ -91,8 +91,8 @@ def test_a_frame_on_the_air_arrives_as_strong_as_it_was_sent() -> None:
     times_ns=st.lists(st.integers(1, 10**8), min_size=1, max_size=20),
     velocity=st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.just(0.0)),
 )
-def test_fading_goes_on_across_the_steps_of_a_move(times_ns: list[int], velocity: Vector) -> None:
-    """Told in any steps, a link has the gain that it has where both are told its place now, whoever asked before."""
+def test_fading_is_continuous_across_position_updates(times_ns: list[int], velocity: Vector) -> None:
+    """A link has the same gain after any number of position updates as by dead reckoning from the first."""
     places: dict[str, Vector] = {"a": (0.0, 0.0, 0.2), "b": (20.0, 0.0, 0.2)}
     stepped, straight = WorldChannel(7, ANTENNAS, FADING), WorldChannel(7, ANTENNAS, FADING)
     now_ns = 0
@@ -100,63 +100,68 @@ def test_fading_goes_on_across_the_steps_of_a_move(times_ns: list[int], velocity
         channel.move(0, places, {"b": velocity})
     for step_ns in times_ns:
         now_ns += step_ns
-        there = 20.0 + velocity[0] * now_ns / 1e9, velocity[1] * now_ns / 1e9, 0.2
-        # c has nothing to do with it.
-        stepped.move(now_ns, places | {"b": there, "c": (1.0, now_ns / 1e9, 0.2)}, {"b": velocity})
+        current_place = 20.0 + velocity[0] * now_ns / 1e9, velocity[1] * now_ns / 1e9, 0.2
+        # Station c is not part of the link.
+        stepped.move(now_ns, places | {"b": current_place, "c": (1.0, now_ns / 1e9, 0.2)}, {"b": velocity})
         stepped.powers_mw(1, now_ns)
     gains = [
-        channel.powers_mw(0, now_ns)[1] / 10 ** ((17.0 - channel.loss_db(*ends(places["a"], at))[0]) / 10)
-        for channel, at in ((stepped, there), (straight, places["b"]))
+        channel.powers_mw(0, now_ns)[1] / 10 ** ((17.0 - channel.loss_db(*as_arrays(places["a"], place_m))[0]) / 10)
+        for channel, place_m in ((stepped, current_place), (straight, places["b"]))
     ]
     assert gains[0] == pytest.approx(gains[1], rel=1e-5)
 
 
-def ends(one: Vector, other: Vector) -> tuple[Any, Any]:
-    return np.array([one]), np.array([other])
+def as_arrays(first: Vector, second: Vector) -> tuple[Any, Any]:
+    return np.array([first]), np.array([second])
 
 
 @given(st.lists(st.integers(0, 10**9), min_size=2, max_size=20), st.randoms(use_true_random=False))
-def test_whoever_asked_before_the_powers_are_the_same(times_ns: list[int], order: Random) -> None:
+def test_powers_do_not_depend_on_earlier_calls(times_ns: list[int], order: Random) -> None:
     places: dict[str, Vector] = {name: (3.0 * number, 1.0, 0.2) for number, name in enumerate(NAMES)}
     velocities: dict[str, Vector] = {"b": (1.0, 0.5, 0.0), "d": (-1.0, 0.0, 0.0)}
-    seldom, often = WorldChannel(7, ANTENNAS, FADING, BAYLANDS), WorldChannel(7, ANTENNAS, FADING, BAYLANDS)
-    for channel in (seldom, often):
+    called_once, called_often = (
+        WorldChannel(7, ANTENNAS, FADING, BAYLANDS),
+        WorldChannel(7, ANTENNAS, FADING, BAYLANDS),
+    )
+    for channel in (called_once, called_often):
         channel.move(0, places, velocities)
-    asked = [(at_ns, order.randrange(len(NAMES))) for at_ns in sorted(times_ns)]
-    heard_often = [often.powers_mw(station, at_ns) for at_ns, station in asked]
-    at_ns, station = asked[-1]
-    assert seldom.powers_mw(station, at_ns) == heard_often[-1]
+    queries = [(at_ns, order.randrange(len(NAMES))) for at_ns in sorted(times_ns)]
+    powers_often = [called_often.powers_mw(station, at_ns) for at_ns, station in queries]
+    at_ns, station = queries[-1]
+    assert called_once.powers_mw(station, at_ns) == powers_often[-1]
 
 
-def test_a_crowd_on_the_move_is_looked_at_only_where_somebody_sends(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked = counted(monkeypatch)
-    crowd = {f"r{number}": Antenna("802.11n", 17.0, -82.0) for number in range(20)}
-    channel = WorldChannel(1, crowd, FADING, load_world("lawn"))
+def test_links_of_many_moving_stations_are_computed_only_for_senders(monkeypatch: pytest.MonkeyPatch) -> None:
+    computed_counts = count_computed_links(monkeypatch)
+    antennas = {f"r{number}": Antenna("802.11n", 17.0, -82.0) for number in range(20)}
+    channel = WorldChannel(1, antennas, FADING, load_world("lawn"))
     for step in range(1, 100):
-        channel.move(step, {name: (step / 10 + number, 0.0, 0.2) for number, name in enumerate(crowd)})
-    assert not looked
+        channel.move(step, {name: (step / 10 + number, 0.0, 0.2) for number, name in enumerate(antennas)})
+    assert not computed_counts
     channel.powers_mw(2, 100)
-    assert looked == [19]
+    assert computed_counts == [19]
     channel.linked(2, 0)
     channel.delay_ns(2, 1)
-    assert looked == [19]
+    assert computed_counts == [19]
     channel.powers_mw(0, 100)
-    assert looked == [19, 18], "the link to station 2 is known"
+    assert computed_counts == [19, 18], "the link to station 2 is already computed"
     for station in range(20):
         channel.powers_mw(station, 100)
-    assert sum(looked) == 20 * 19 / 2
-    assert looked[-1] > 50, "the last ones at once"
+    assert sum(computed_counts) == 20 * 19 / 2
+    assert computed_counts[-1] > 50, "the last ones together"
 
 
-def test_a_station_of_802_11n_sends_in_a_mode_of_802_11g_too() -> None:
+def test_a_station_of_802_11n_supports_the_modes_of_802_11g() -> None:
     antennas = {"old": Antenna("802.11g", 15.0, -85.0), "new": Antenna("802.11n", 15.0, -92.0)}
     for mode in ("g6", "g54"):
         channel = WorldChannel(1, antennas, RadioOptions(mode=mode))
         assert channel.rate_control(1, 0).choose(0, ("flow", 0), 1).name == mode
 
 
-def test_a_mode_that_a_station_does_not_have_is_refused_before_anything_is_sent() -> None:
+def test_an_unsupported_fixed_mode_is_rejected_at_the_start() -> None:
     antennas = {"old": Antenna("802.11g", 15.0, -85.0), "new": Antenna("802.11n", 15.0, -92.0)}
-    with pytest.raises(ConfigurationError, match=r"radio\.mode n6 is of 802\.11n, and old has 802\.11g") as caught:
+    with pytest.raises(
+        ConfigurationError, match=r"radio\.mode n6 is a mode of 802\.11n, but old supports only 802\.11g"
+    ) as caught:
         WorldChannel(1, antennas, RadioOptions(mode="n6"))
     assert "g54" in caught.value.remedy

@@ -1,4 +1,4 @@
-"""Worlds: what paths cross and what it costs, against closed forms and a walk along the path in small steps."""
+"""Worlds: obstacles and losses of paths, compared with closed forms and with sampling along the path."""
 
 import cmath
 import math
@@ -34,17 +34,17 @@ def world(x: float = 5, text: str = WORLD) -> World:
     return validate(parse(text.replace("X", str(x)), source="yard.yaml"), World)
 
 
-def loss_db(of: World, start: Vector, end: Vector) -> float:
-    return float(of.penetration_loss_db(np.array([start]), np.array([end]), WIFI_HZ)[0])
+def loss_db(yard: World, start: Vector, end: Vector) -> float:
+    return float(yard.penetration_loss_db(np.array([start]), np.array([end]), WIFI_HZ)[0])
 
 
-def crossed(of: World, start: Vector, end: Vector) -> list[tuple[str, float]]:
-    """Return the material of each part that a path crosses, and how far it goes through it in metres, rounded."""
-    (crossings,) = of.crossings(np.array([start]), np.array([end]))
-    return [(one.material, round(one.length_m, 9)) for one in crossings]
+def crossed(yard: World, start: Vector, end: Vector) -> list[tuple[str, float]]:
+    """Return the material and the rounded length in metres of each part that a path crosses."""
+    (crossings,) = yard.crossings(np.array([start]), np.array([end]))
+    return [(crossing.material, round(crossing.length_m, 9)) for crossing in crossings]
 
 
-def test_a_wall_takes_what_itu_says_of_concrete() -> None:
+def test_the_loss_of_a_concrete_wall_follows_itu() -> None:
     """1636 sigma/sqrt(eps) = 47 dB/m and 0.7 dB a face (ITU-R P.2040-1, eq. 26 for small losses)."""
     sigma = 0.0326 * 2.437**0.8095
     expected = 0.2 * 1636 * sigma / math.sqrt(5.31) + 2 * 0.74
@@ -54,16 +54,18 @@ def test_a_wall_takes_what_itu_says_of_concrete() -> None:
 
 @pytest.mark.parametrize(("name", "thickness_m"), [("concrete", 0.2), ("brick", 0.2), ("wood", 0.1), ("ground", 1.0)])
 @pytest.mark.parametrize("frequency_hz", [2.437e9, 5.2e9])
-def test_a_thick_wall_takes_what_itu_says_of_a_slab(name: str, thickness_m: float, frequency_hz: float) -> None:
-    """ITU-R P.2040-1, 2.2.2, a slab of one layer met squarely, with the echoes inside, which a world leaves out."""
+def test_the_loss_of_a_thick_wall_is_near_that_of_an_itu_slab(
+    name: str, thickness_m: float, frequency_hz: float
+) -> None:
+    """ITU-R P.2040-1, 2.2.2: one slab at normal incidence, with inner reflections, which the model omits."""
     solid = MATERIALS[name]
     assert isinstance(solid, Solid)
     root = cmath.sqrt(solid.permittivity(frequency_hz))
     face = (1 - root) / (1 + root)
-    through = cmath.exp(-2j * math.pi * thickness_m * frequency_hz / 299_792_458 * root)
-    slab_db = -20 * math.log10(abs((1 - face**2) * through / (1 - face**2 * through**2)))
-    found_db = thickness_m * solid.loss_db_per_m(frequency_hz) + 2 * solid.face_loss_db(frequency_hz)
-    assert found_db == pytest.approx(slab_db, abs=0.5)
+    first = cmath.exp(-2j * math.pi * thickness_m * frequency_hz / 299_792_458 * root)
+    slab_db = -20 * math.log10(abs((1 - face**2) * first / (1 - face**2 * first**2)))
+    loss = thickness_m * solid.loss_db_per_m(frequency_hz) + 2 * solid.face_loss_db(frequency_hz)
+    assert loss == pytest.approx(slab_db, abs=0.5)
 
 
 def test_moving_a_wall_changes_the_loss() -> None:
@@ -74,31 +76,33 @@ def test_moving_a_wall_changes_the_loss() -> None:
     assert slanting > loss_db(world(5), start, end), "a slanting path is longer inside"
 
 
-def test_a_path_over_or_beside_a_wall_is_in_sight() -> None:
+def test_a_path_above_or_beside_a_wall_is_free() -> None:
     starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 1, 0.2], [0, 8.5, 0.2]])
     ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [10, 1, 0.2], [10, 8.5, 0.2]])
     assert [not crossed for crossed in world().crossings(starts, ends)] == [False, True, True, True]
 
 
-def test_paths_know_what_they_cross_each_by_itself() -> None:
+def test_crossings_are_computed_separately_for_each_path() -> None:
     starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 5, 0.2]])
     ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [20, 5, 0.2]])
-    through, over, further = world().crossings(starts, ends)
-    assert [(one.obstacle, one.material, round(one.length_m, 9)) for one in through] == [("wall", "concrete", 0.2)]
-    assert over == ()
-    assert [one.obstacle for one in further] == ["wall", "hill"]
-    taken_db = world().penetration_loss_db(starts, ends, WIFI_HZ)
-    assert [not taken for taken in taken_db] == [not crossings for crossings in (through, over, further)]
+    first, second, third = world().crossings(starts, ends)
+    assert [(crossing.obstacle, crossing.material, round(crossing.length_m, 9)) for crossing in first] == [
+        ("wall", "concrete", 0.2)
+    ]
+    assert second == ()
+    assert [crossing.obstacle for crossing in third] == ["wall", "hill"]
+    losses_db = world().penetration_loss_db(starts, ends, WIFI_HZ)
+    assert [not path_db for path_db in losses_db] == [not crossings for crossings in (first, second, third)]
 
 
-def test_raised_ground_carries_robots_and_stops_paths_through_it() -> None:
-    of = world()
-    assert [of.ground_m(place) for place in ((15, 5), (15, 7.7), (15, 8), (17, 7))] == [1.0, 1.0, 0.0, 0.0]
-    assert loss_db(of, (10, 5, 0.2), (20, 5, 0.2)) > 100
-    assert loss_db(of, (10, 5, 1.2), (20, 5, 1.2)) == 0
+def test_raised_ground_has_a_height_and_blocks_paths_through_it() -> None:
+    yard = world()
+    assert [yard.ground_m(place) for place in ((15, 5), (15, 7.7), (15, 8), (17, 7))] == [1.0, 1.0, 0.0, 0.0]
+    assert loss_db(yard, (10, 5, 0.2), (20, 5, 0.2)) > 100
+    assert loss_db(yard, (10, 5, 1.2), (20, 5, 1.2)) == 0
 
 
-def test_foliage_counts_by_its_depth_in_all() -> None:
+def test_the_loss_of_foliage_depends_on_its_total_depth() -> None:
     foliage = MATERIALS["foliage"]
     assert isinstance(foliage, Foliage)
     assert foliage.loss_db(10, 1e9) == pytest.approx(4.5)
@@ -108,29 +112,29 @@ def test_foliage_counts_by_its_depth_in_all() -> None:
         " trunk_radius: 0.2m}\n"
         for n in (1, 2, 3)
     )
-    of = world(text=WORLD[: WORLD.index("  - ")] + trees)
-    assert loss_db(of, (0, 0, 5), (40, 0, 5)) == pytest.approx(foliage.loss_db(24, WIFI_HZ))
-    assert {material for material, _ in crossed(of, (0, 0, 1), (40, 0, 1))} == {"wood"}
+    yard = world(text=WORLD[: WORLD.index("  - ")] + trees)
+    assert loss_db(yard, (0, 0, 5), (40, 0, 5)) == pytest.approx(foliage.loss_db(24, WIFI_HZ))
+    assert {material for material, _ in crossed(yard, (0, 0, 1), (40, 0, 1))} == {"wood"}
 
 
 def test_a_building_is_empty_inside() -> None:
     house = (
         "  - {name: house, kind: building, centre_m: [10, 5], size_m: [6, 4, 3], thickness: 0.2m, material: brick}\n"
     )
-    of = world(text=WORLD[: WORLD.index("  - ")] + house)
-    assert crossed(of, (0, 5, 1), (20, 5, 1)) == [("brick", 0.2)] * 2
-    assert crossed(of, (9, 5, 1), (11, 5, 1)) == []
-    assert crossed(of, (10, 5, 1), (10, 5, 5)) == [("brick", 0.2)]
+    yard = world(text=WORLD[: WORLD.index("  - ")] + house)
+    assert crossed(yard, (0, 5, 1), (20, 5, 1)) == [("brick", 0.2)] * 2
+    assert crossed(yard, (9, 5, 1), (11, 5, 1)) == []
+    assert crossed(yard, (10, 5, 1), (10, 5, 5)) == [("brick", 0.2)]
 
 
 @pytest.mark.parametrize("name", ["lawn", "baylands"])
 @pytest.mark.parametrize("scenario", list(Scenario))
-def test_shipped_worlds_have_the_sight_that_their_lines_promise(name: str, scenario: Scenario) -> None:
-    of = load_world(name)
-    line = of.lines[scenario]
+def test_lines_of_shipped_worlds_have_the_stated_line_of_sight(name: str, scenario: Scenario) -> None:
+    yard = load_world(name)
+    line = yard.lines[scenario]
     places = [line.at(distance) for distance in (0.0, 18.3)]
-    start, end = (np.array([[*place, of.ground_m(place) + ANTENNA_M]]) for place in places)
-    assert of.crossings(start, end).count(()) == (scenario is Scenario.LOS)
+    start, end = (np.array([[*place, yard.ground_m(place) + ANTENNA_M]]) for place in places)
+    assert yard.crossings(start, end).count(()) == (scenario is Scenario.LOS)
 
 
 COORDINATE = st.floats(-10, 10).map(lambda value: round(value, 3))
@@ -152,24 +156,25 @@ def is_inside(shape: Shape, points: Floats) -> Any:  # noqa: ANN401 (a mask)
 
 
 @given(st.lists(SHAPE, min_size=1, max_size=3), POINT, POINT)
-def test_depths_equal_a_walk_along_the_path(shapes: list[Shape], start: Vector, end: Vector) -> None:
+def test_depths_equal_a_sampling_along_the_path(shapes: list[Shape], start: Vector, end: Vector) -> None:
     steps = 4000
-    walk = np.linspace(start, end, steps)
+    points = np.linspace(start, end, steps)
     length_m = math.dist(start, end)
-    found = Solids(shapes).depths_m(np.array([start]), np.array([end]))[0]
-    walked = [is_inside(shape, walk).mean() * length_m for shape in shapes]
-    assert found == pytest.approx(walked, abs=3 * length_m / steps + 1e-9)
+    depths = Solids(shapes).depths_m(np.array([start]), np.array([end]))[0]
+    sampled = [is_inside(shape, points).mean() * length_m for shape in shapes]
+    assert depths == pytest.approx(sampled, abs=3 * length_m / steps + 1e-9)
 
 
 @given(st.lists(SHAPE, max_size=3), POINT, POINT)
 def test_a_path_is_the_same_in_both_directions(shapes: list[Shape], start: Vector, end: Vector) -> None:
-    there, back = (
-        Solids(shapes).depths_m(np.array([one]), np.array([other])) for one, other in ((start, end), (end, start))
+    forward, reverse = (
+        Solids(shapes).depths_m(np.array([first]), np.array([second]))
+        for first, second in ((start, end), (end, start))
     )
-    np.testing.assert_allclose(there, back, atol=1e-9)
+    np.testing.assert_allclose(forward, reverse, atol=1e-9)
 
 
-def test_metal_stops_everything_and_solids_absorb_more_at_higher_frequency() -> None:
+def test_solids_absorb_more_at_a_higher_frequency() -> None:
     for name, material in MATERIALS.items():
         if isinstance(material, Solid):
             assert material.loss_db_per_m(5.2e9) >= material.loss_db_per_m(2.4e9) > 0, name
@@ -177,21 +182,21 @@ def test_metal_stops_everything_and_solids_absorb_more_at_higher_frequency() -> 
 
 
 @pytest.mark.parametrize(
-    ("wrong", "complaint"),
+    ("replaced", "message"),
     [
         ("material: concrete", "there is no material 'concrte'; did you mean 'concrete'"),
         ("kind: wall", "kind"),
         ("height: 2.4m", "height"),
     ],
 )
-def test_a_wrong_world_is_told_with_its_line(wrong: str, complaint: str) -> None:
+def test_an_invalid_world_is_reported_with_its_line(replaced: str, message: str) -> None:
     broken = {"material: concrete": "material: concrte", "kind: wall": "kind: fence", "height: 2.4m": "height: 2.4"}
-    with pytest.raises(ConfigurationError, match=complaint) as caught:
-        world(text=WORLD.replace(wrong, broken[wrong]))
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        world(text=WORLD.replace(replaced, broken[replaced]))
     assert caught.value.where.startswith("yard.yaml:")
 
 
-def test_an_unknown_world_has_its_nearest_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_world_gets_a_suggestion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigurationError, match="no world 'lwn'") as caught:
         load_world("lwn")
@@ -201,9 +206,9 @@ def test_an_unknown_world_has_its_nearest_named(tmp_path: Path, monkeypatch: pyt
     assert load_world("yard").name == "yard"
 
 
-def test_a_ramp_rises_evenly_and_stands_in_the_way_of_waves_as_steps() -> None:
+def test_a_ramp_rises_evenly_and_blocks_radio_paths_in_steps() -> None:
     text = WORLD + "  - {name: ramp, kind: ramp, centre_m: [10, 1], size_m: [4, 2, 1], yaw_deg: 90}\n"
-    up = [world(text=text).ground_m((10.5, north_m)) for north_m in (-1.1, -1.0, 0.0, 1.0, 3.0)]
-    assert up == pytest.approx([0.0, 0.0, 0.25, 0.5, 1.0], abs=1e-12)
-    # Half its length is higher than half its height.
+    heights_m = [world(text=text).ground_m((10.5, north_m)) for north_m in (-1.1, -1.0, 0.0, 1.0, 3.0)]
+    assert heights_m == pytest.approx([0.0, 0.0, 0.25, 0.5, 1.0], abs=1e-12)
+    # Half of its length is higher than half of its height.
     assert crossed(world(text=text), (10, -5, 0.5001), (10, 2.9, 0.5001)) == [("ground", 0.5)] * 3 + [("ground", 0.4)]

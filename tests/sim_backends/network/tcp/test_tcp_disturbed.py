@@ -1,4 +1,4 @@
-"""TCP while nodes are off and while a jammer passes: who sends when, on paper, and that a message arrives once."""
+"""TCP while nodes are off and while a jammer passes: times computed by hand, and each message delivered once."""
 
 from itertools import pairwise
 
@@ -12,77 +12,77 @@ from tests.helpers.radio_networks import MS, fixed, packets, standing, wifi
 
 SECOND = 1000 * MS
 DELAY_NS = 10 * MS
-HERE = standing(dict.fromkeys("ab", (0.0, 0.0, 1.0)))
+AT_ORIGIN = standing(dict.fromkeys("ab", (0.0, 0.0, 1.0)))
 
 
-class Disturbed:
-    """Messages of 100 bytes from a to b, 10 ms away, and what both ends sent while one was off."""
+class DisturbedTransfer:
+    """Messages of 100 bytes from a to b, 10 ms away, and the packets that both ends sent while one was off."""
 
     def __init__(self, sent_ns: list[int], loss: NodeLoss) -> None:
         self.sent: dict[str, list[int]] = {"a": [], "b": []}
         self.net = RadioNetwork(fixed(delay="10ms"), "ab", transports={"tcp": Tcp}, disturbances=[loss])
-        self.net.log_ip(self._note)
+        self.net.log_ip(self._log)
         messages = packets([(at_ns, "a", "b", 100) for at_ns in sent_ns], protocol="tcp", flow="f")
-        arrivals, drops = self.net.advance(3600 * SECOND, messages, HERE)
+        arrivals, drops = self.net.advance(3600 * SECOND, messages, AT_ORIGIN)
         assert not drops
         self.arrived_ns = [arrival.at_ns for arrival in arrivals]
 
-    def _note(self, at_ns: int, host: str, fragment: Fragment) -> None:
+    def _log(self, at_ns: int, host: str, fragment: Fragment) -> None:
         if fragment.packet.source == host:
             self.sent[host].append(at_ns)
 
 
-def test_the_timers_of_a_sender_that_is_off_ring_when_it_is_on_again() -> None:
-    # The second message arrives, and its ACK finds the sender off; the timeout of 1.2 s waits until 5 s.
-    found = Disturbed([0, SECOND], NodeLoss("a", SECOND + 5 * MS, 5 * SECOND))
-    assert found.arrived_ns == [30 * MS, SECOND + DELAY_NS]
-    assert [at_ns for at_ns in found.sent["a"] if at_ns > SECOND] == [5 * SECOND]
+def test_the_timers_of_a_sender_that_is_off_fire_when_it_is_on_again() -> None:
+    # The second message arrives while the sender is off, so its ACK is lost; the timeout at 1.2 s waits until 5 s.
+    transfer = DisturbedTransfer([0, SECOND], NodeLoss("a", SECOND + 5 * MS, 5 * SECOND))
+    assert transfer.arrived_ns == [30 * MS, SECOND + DELAY_NS]
+    assert [at_ns for at_ns in transfer.sent["a"] if at_ns > SECOND] == [5 * SECOND]
 
 
-def test_the_timers_of_a_sender_that_stays_off_never_ring() -> None:
-    found = Disturbed([0, SECOND], NodeLoss("a", SECOND + 5 * MS))
-    assert max(found.sent["a"]) == SECOND
-    assert found.net.next_event_ns() is None
+def test_the_timers_of_a_sender_that_stays_off_never_fire() -> None:
+    transfer = DisturbedTransfer([0, SECOND], NodeLoss("a", SECOND + 5 * MS))
+    assert max(transfer.sent["a"]) == SECOND
+    assert transfer.net.next_event_ns() is None
 
 
-def test_an_ack_that_a_receiver_kept_back_leaves_when_it_is_on_again() -> None:
-    # It would have left at 1.05 s. The sender asks again at 1.2 s, in vain.
-    found = Disturbed([0, SECOND], NodeLoss("b", SECOND + 20 * MS, SECOND + 500 * MS))
-    assert [at_ns for at_ns in found.sent["a"] if at_ns > SECOND] == [SECOND + 200 * MS]
-    assert [at_ns for at_ns in found.sent["b"] if at_ns > SECOND] == [SECOND + 500 * MS]
+def test_a_delayed_ack_of_a_receiver_that_is_off_is_sent_when_it_is_on_again() -> None:
+    # The ACK would have been sent at 1.05 s. The sender retransmits at 1.2 s in vain.
+    transfer = DisturbedTransfer([0, SECOND], NodeLoss("b", SECOND + 20 * MS, SECOND + 500 * MS))
+    assert [at_ns for at_ns in transfer.sent["a"] if at_ns > SECOND] == [SECOND + 200 * MS]
+    assert [at_ns for at_ns in transfer.sent["b"] if at_ns > SECOND] == [SECOND + 500 * MS]
 
 
-def test_a_sender_finds_its_receiver_again_by_the_timer_that_doubles() -> None:
-    """Sent at 2 s and again after 0.2, 0.4, 0.8 and 1.6 s: the last copy, of 5 s, finds the receiver on."""
-    found = Disturbed([0, 2 * SECOND], NodeLoss("b", SECOND, 5 * SECOND))
-    assert [at_ns for at_ns in found.sent["a"] if at_ns > SECOND] == [
+def test_a_sender_reaches_its_receiver_again_with_exponential_backoff() -> None:
+    """Sent at 2 s and again after 0.2, 0.4, 0.8 and 1.6 s: the last copy, at 5 s, reaches the receiver."""
+    transfer = DisturbedTransfer([0, 2 * SECOND], NodeLoss("b", SECOND, 5 * SECOND))
+    assert [at_ns for at_ns in transfer.sent["a"] if at_ns > SECOND] == [
         2 * SECOND + tenths * 100 * MS for tenths in (0, 2, 6, 14, 30)
     ]
-    assert found.arrived_ns[1] == 5 * SECOND + DELAY_NS
+    assert transfer.arrived_ns[1] == 5 * SECOND + DELAY_NS
 
 
-def test_a_stream_waits_while_a_jammer_passes_by_and_then_goes_on() -> None:
-    """An agent drives past the sender with it: within 10 m the sender finds the channel taken, and sends nothing."""
-    near_m = 10.0
+def test_a_stream_pauses_while_a_jammer_passes_and_then_continues() -> None:
+    """An agent with a jammer passes the sender: within 10 m the sender finds the channel busy and does not send."""
+    blocked_m = 10.0
     power_dbm = ENERGY_DETECTION_DBM + 40.18 + 30.0
     net = RadioNetwork(wifi("ab"), "ab", transports={"tcp": Tcp}, disturbances=[Jammer(power_dbm, 0, agent="j")])
     messages = [Packet(number, "a", "b", 1000, ("f", number), 0, 0, "tcp") for number in range(6000)]
     arrived_ns: list[int] = []
     numbers: list[int] = []
-    off: list[int] = []
-    # At 10 m/s, told each 100 ms: from 35 m on one side to 35 m on the other, within 10 m from 2.5 to 4.5 s.
+    arrivals_while_jammed: list[int] = []
+    # At 10 m/s, in steps of 100 ms: from 35 m on one side to 35 m on the other, within 10 m from 2.5 to 4.5 s.
     for step in range(71):
         east_m = step - 35.0
         states = standing({"a": (0.0, 0.0, 1.0), "b": (0.0, 20.0, 1.0), "j": (east_m, 0.0, 1.0)})
         now_ns = (step + 1) * 100 * MS
         arrivals, drops = net.advance(now_ns, messages if step == 0 else [], states)
         assert not drops
-        if abs(east_m) < near_m:
-            off.append(len(arrivals))
+        if abs(east_m) < blocked_m:
+            arrivals_while_jammed.append(len(arrivals))
         numbers += [arrival.packet_id for arrival in arrivals]
         arrived_ns += [arrival.at_ns for arrival in arrivals]
-    # What the radio had begun when the jammer came near still arrives.
-    assert sum(off) <= 1
+    # A frame that the radio had started when the jammer came near still arrives.
+    assert sum(arrivals_while_jammed) <= 1
     before, after = (
         len([at_ns for at_ns in arrived_ns if low <= at_ns < high])
         for low, high in ((0, 2_500 * MS), (4_600 * MS, 7_100 * MS))
@@ -90,4 +90,4 @@ def test_a_stream_waits_while_a_jammer_passes_by_and_then_goes_on() -> None:
     assert before > 500
     assert after > 500
     assert numbers == list(range(len(numbers)))
-    assert all(one <= other for one, other in pairwise(arrived_ns))
+    assert all(earlier <= later for earlier, later in pairwise(arrived_ns))

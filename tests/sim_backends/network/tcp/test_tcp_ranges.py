@@ -16,13 +16,13 @@ def test_ranges_are_sets_of_numbers(added: Sequence[tuple[int, int]], before: in
         new = {number for part in ranges.add(first, end) for number in range(*part)}
         assert new == set(range(first, end)) - numbers
         numbers |= new
-    kept = list(ranges)
-    assert {number for part in kept for number in range(*part)} == numbers
-    # They are in order, and neither overlap nor touch.
-    assert all(one[1] < other[0] for one, other in pairwise(kept))
+    stored = list(ranges)
+    assert {number for part in stored for number in range(*part)} == numbers
+    # They are sorted and neither overlap nor touch.
+    assert all(earlier[1] < later[0] for earlier, later in pairwise(stored))
     for number in range(80):
-        around = ranges.around(number)
-        assert (around is not None) == (number in numbers)
-        assert around is None or around in kept
-    ranges.forget_before(before)
-    assert list(ranges) == [part for part in kept if part[1] > before]
+        containing_range = ranges.containing(number)
+        assert (containing_range is not None) == (number in numbers)
+        assert containing_range is None or containing_range in stored
+    ranges.remove_before(before)
+    assert list(ranges) == [part for part in stored if part[1] > before]

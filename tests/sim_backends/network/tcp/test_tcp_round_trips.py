@@ -1,4 +1,4 @@
-"""The timeout, worked out by hand from the equations of RFC 6298."""
+"""The retransmission timeout, compared with the equations of RFC 6298."""
 
 import pytest
 from hypothesis import given
@@ -25,7 +25,7 @@ def test_the_timeout_follows_the_equations() -> None:
     assert round_trips.timeout_ns == 310_937_500
 
 
-def test_the_variance_is_no_less_than_the_clock_shows() -> None:
+def test_the_variance_term_is_at_least_the_clock_granularity() -> None:
     round_trips = RoundTrips(TcpOptions(clock_ns=10 * MS))
     for _ in range(100):
         round_trips.sample(300 * MS)
@@ -39,7 +39,7 @@ def test_the_timeout_has_bounds(round_trip_ms: int, timeout_ms: int) -> None:
     assert round_trips.timeout_ns == timeout_ms * MS
 
 
-def test_it_doubles_until_a_sample_comes() -> None:
+def test_the_timeout_doubles_until_the_next_sample() -> None:
     round_trips = RoundTrips(TcpOptions())
     round_trips.sample(100 * MS)
     backed_off_ms = []
@@ -52,7 +52,7 @@ def test_it_doubles_until_a_sample_comes() -> None:
 
 
 @given(st.lists(st.integers(1, 10**10), min_size=1, max_size=50))
-def test_whole_nanoseconds_stay_beside_the_real_equations(samples_ns: list[int]) -> None:
+def test_integer_arithmetic_stays_close_to_the_real_equations(samples_ns: list[int]) -> None:
     round_trips = RoundTrips(TcpOptions(least_timeout_ns=1, clock_ns=1))
     smoothed, variation = float(samples_ns[0]), samples_ns[0] / 2
     for count, sample_ns in enumerate(samples_ns):

@@ -1,4 +1,4 @@
-"""A sender on a wire whose losses are written down: when it sends what, and how wide its window is, on paper."""
+"""A sender on a scripted wire: times of transmissions and window sizes, compared with results computed by hand."""
 
 import math
 from collections import Counter
@@ -24,11 +24,11 @@ SECOND = 1000 * MS
 DELAY_NS = 10 * MS
 ROUND_TRIP_NS = 2 * DELAY_NS
 MSS = TcpOptions().segment_bytes
-EVERY = TcpOptions(segments_per_ack=1, congestion="newreno")
+ACK_EACH_SEGMENT = TcpOptions(segments_per_ack=1, congestion="newreno")
 
 
 class Transfer:
-    """Messages of a full segment each, all written at the beginning, and what came of them."""
+    """Messages of a full segment each, all written at the start, and their results."""
 
     def __init__(
         self,
@@ -48,11 +48,13 @@ class Transfer:
         self.wire.run(until_ns)
 
     def sent(self, *, times: int | None = None) -> list[tuple[int, int]]:
-        """Return when each segment of data was sent, and which it was of the stream; `times` only those."""
+        """Return time and number of each transmitted data segment; with `times` only those retransmitted so many
+        times.
+        """
         return [
-            (one.at_ns, one.packet.body[1].number)
-            for one in self.wire.transmitted
-            if one.packet.body[1].length and times in {None, one.packet.body[1].times}
+            (transmission.at_ns, transmission.packet.body[1].number)
+            for transmission in self.wire.transmitted
+            if transmission.packet.body[1].length and times in {None, transmission.packet.body[1].times}
         ]
 
     def events(self, event: str) -> list[TcpSample]:
@@ -60,7 +62,7 @@ class Transfer:
 
 
 def losing_data(numbers: Collection[int], *, times: int = 1) -> Script:
-    """Return the script that loses these segments of the stream the first so many times."""
+    """Return a script that loses the first transmissions of these segments of the stream."""
 
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         segment: Segment = packet.body[1]
@@ -80,17 +82,17 @@ def test_slow_start_doubles_the_window_per_round_trip(per_ack: int, congestion: 
     assert per_round == rounds | {8 * ROUND_TRIP_NS: 2000 - sum(rounds.values())}
 
 
-def test_reno_counts_acks_where_it_is_told_to() -> None:
-    # RFC 5681 opens by a segment per ACK: with an ACK for every second segment, by half.
+def test_reno_counts_acks_if_configured() -> None:
+    # RFC 5681 increases the window by a segment per ACK: with an ACK for every second segment, by half.
     options = TcpOptions(initial_window_segments=16, bytes_counted_segments=1)
     transfer = Transfer(1000, options, until_ns=5 * ROUND_TRIP_NS)
     per_round = Counter(at_ns for at_ns, _ in transfer.sent())
     assert list(per_round.values())[:4] == [16, 24, 36, 54]
 
 
-def test_a_line_is_filled_at_its_rate() -> None:
+def test_a_link_is_used_at_its_full_rate() -> None:
     transfer = Transfer(3000, TcpOptions(), rate_bit_s=20_000_000)
-    # 20 Mbit/s for 20 ms are 33 segments; slow start is past that long before the thousandth.
+    # 20 Mbit/s for 20 ms are 33 segments; slow start is over long before the thousandth.
     arrivals_ns = list(transfer.wire.delivered.values())
     assert arrivals_ns[-1] - arrivals_ns[1000] == 1999 * 1500 * 8 * 50
 
@@ -99,9 +101,9 @@ def test_a_line_is_filled_at_its_rate() -> None:
 @pytest.mark.parametrize(
     "lost", [{70}, {70, 71}, {70, 90}, set(range(70, 100)), set(range(70, 146, 2)), set(range(70, 108)), {70, 147}]
 )
-def test_losses_in_a_window_are_mended_in_one_round_trip(congestion: str, lost: set[int]) -> None:
-    # The segments 70 to 149 are one window, sent at once; so are the ACKs of what arrives of it. RFC 6937 sends no
-    # more than arrives after the first two, so that all of half a window but two can be mended in that time.
+def test_losses_in_a_window_are_repaired_in_one_round_trip(congestion: str, lost: set[int]) -> None:
+    # The segments 70 to 149 are one window, sent together; so are the ACKs of those that arrive. RFC 6937 sends no
+    # more than arrives after the first two, so all of half a window but two can be repaired in that time.
     options = TcpOptions(segments_per_ack=1, congestion=congestion)  # type: ignore[arg-type]
     transfer = Transfer(150, options, script=losing_data(lost))
     sent_ns = 4 * ROUND_TRIP_NS
@@ -111,63 +113,64 @@ def test_losses_in_a_window_are_mended_in_one_round_trip(congestion: str, lost: 
     assert len(transfer.events("loss")) == 1
     assert not transfer.events("timeout")
     assert transfer.wire.delivered[149] == sent_ns + ROUND_TRIP_NS + DELAY_NS
-    # Flight was 80 segments and what was acknowledged of them before: the window closes by half, or to 7 tenths.
+    # The flight was 80 segments minus those acknowledged before: the window is reduced to half, or to 7 tenths.
     flight = 80 - (min(lost) - 70)
     assert transfer.events("loss")[0].window_bytes == flight * MSS * {"newreno": 5, "cubic": 7}[congestion] // 10
 
 
-def test_two_more_segments_are_sent_before_a_loss_is_certain() -> None:
-    # RFC 3042: of ten segments the first is lost; each of the first two ACKs of others lets one more go.
-    transfer = Transfer(100, EVERY, script=losing_data({0}), rate_bit_s=12_000_000)
-    acks = [one.packet for one in transfer.wire.transmitted if one.packet.body[1].sacks]
+def test_limited_transmit_sends_two_segments_before_a_loss_is_detected() -> None:
+    # RFC 3042: the first of ten segments is lost; each of the first two ACKs of others allows one more.
+    transfer = Transfer(100, ACK_EACH_SEGMENT, script=losing_data({0}), rate_bit_s=12_000_000)
+    acks = [transmission.packet for transmission in transfer.wire.transmitted if transmission.packet.body[1].sacks]
     assert [packet.size_bytes for packet in acks[:2]] == [64, 64]
-    # SYN and SYN-ACK take 40 us each beside the delays, an ACK of 52 bytes goes before the data, a segment takes 1 ms
-    # and an ACK of 64 bytes 64 * 8 / 12 us.
-    begun_ns = ROUND_TRIP_NS + 80_000
-    first_ns = begun_ns + 34_667 + 2 * MS + DELAY_NS + 42_667 + DELAY_NS
-    heard_ns = [first_ns + number * MS for number in range(3)]
-    sent = [(at_ns, number) for at_ns, number in transfer.sent() if at_ns > begun_ns][:3]
-    assert sent == list(zip(heard_ns, [10, 11, 0], strict=True))
-    # They do not count where the window is halved (RFC 5681, 3.2, step 2).
+    # SYN and SYN-ACK take 40 us each in addition to the delays, an ACK of 52 bytes precedes the data, a segment takes
+    # 1 ms and an ACK of 64 bytes 64 * 8 / 12 us.
+    start_ns = ROUND_TRIP_NS + 80_000
+    first_ack_ns = start_ns + 34_667 + 2 * MS + DELAY_NS + 42_667 + DELAY_NS
+    ack_times_ns = [first_ack_ns + number * MS for number in range(3)]
+    sent = [(at_ns, number) for at_ns, number in transfer.sent() if at_ns > start_ns][:3]
+    assert sent == list(zip(ack_times_ns, [10, 11, 0], strict=True))
+    # They do not count when the window is halved (RFC 5681, 3.2, step 2).
     assert transfer.events("loss")[0].window_bytes == 5 * MSS
 
 
-def test_what_is_not_lost_is_not_sent_again_when_it_comes_late() -> None:
-    # Two later ones overtake it (RFC 5681: three would make it lost).
+def test_a_segment_overtaken_by_two_others_is_not_sent_again() -> None:
+    # Two later segments overtake it (RFC 5681: three would make it lost).
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         return (2 * MS + 1,) if packet.body[1].number == 20 and packet.body[1].length else (0,)
 
-    transfer = Transfer(60, EVERY, script=script, rate_bit_s=12_000_000)
+    transfer = Transfer(60, ACK_EACH_SEGMENT, script=script, rate_bit_s=12_000_000)
     assert len(transfer.sent()) == 60
     assert not transfer.events("loss")
 
 
 @pytest.mark.parametrize("times", [1, 2, 3, 5])
-def test_the_last_segment_is_sent_again_by_the_timer_that_doubles(times: int) -> None:
+def test_the_last_segment_is_retransmitted_with_exponential_backoff(times: int) -> None:
     transfer = Transfer(5, TcpOptions(), script=losing_data({4}, times=times))
     assert transfer.wire.delivered[3] == ROUND_TRIP_NS + DELAY_NS
-    # The timer of 200 ms begins with the last ACK, which the fourth segment brings at once, as the second of two.
-    heard_ns = 2 * ROUND_TRIP_NS
-    again_ns = [heard_ns + (2**count - 1) * 200 * MS for count in range(1, times + 1)]
-    assert [at_ns for at_ns, number in transfer.sent() if number == 4][1:] == again_ns
-    assert transfer.wire.delivered[4] == again_ns[-1] + DELAY_NS
+    # The timer of 200 ms starts with the last ACK, which the fourth segment, as the second of two, causes
+    # immediately.
+    ack_times_ns = 2 * ROUND_TRIP_NS
+    retransmissions_ns = [ack_times_ns + (2**count - 1) * 200 * MS for count in range(1, times + 1)]
+    assert [at_ns for at_ns, number in transfer.sent() if number == 4][1:] == retransmissions_ns
+    assert transfer.wire.delivered[4] == retransmissions_ns[-1] + DELAY_NS
     assert [sample.window_bytes for sample in transfer.events("timeout")] == [MSS] * times
 
 
-def test_after_a_timeout_slow_start_sends_again_only_what_did_not_arrive() -> None:
-    # All of a window but its last two segments is lost: no three that show it.
+def test_after_a_timeout_slow_start_retransmits_only_missing_segments() -> None:
+    # All segments of a window but the last two are lost, so there are no three later ones that indicate the loss.
     lost = set(range(30, 68))
-    transfer = Transfer(70, EVERY, script=losing_data(lost))
+    transfer = Transfer(70, ACK_EACH_SEGMENT, script=losing_data(lost))
     assert len(transfer.events("timeout")) == 1
     assert not transfer.events("loss")
     assert Counter(number for _, number in transfer.sent()) == Counter({n: 1 + (n in lost) for n in range(70)})
-    begun_ns = transfer.events("timeout")[0].at_ns
-    per_round = Counter((at_ns - begun_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.sent(times=1))
+    start_ns = transfer.events("timeout")[0].at_ns
+    per_round = Counter((at_ns - start_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.sent(times=1))
     assert per_round == {0: 1, 1: 2, 2: 4, 3: 8, 4: 16, 5: 7}
 
 
-def test_what_is_lost_again_waits_for_the_timer_again() -> None:
-    # RFC 6675, 5.1: after a timeout no loss is seen by SACK before all that was sent until then is acknowledged.
+def test_a_repeatedly_lost_segment_waits_for_another_timeout() -> None:
+    # RFC 6675, 5.1: after a timeout no loss is detected by SACK until all data sent before is acknowledged.
     lost = set(range(30, 68))
 
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
@@ -175,67 +178,67 @@ def test_what_is_lost_again_waits_for_the_timer_again() -> None:
         times = 2 if segment.number == 31 else 1 if segment.number in lost else 0
         return () if segment.length and segment.times < times else (0,)
 
-    transfer = Transfer(70, EVERY, script=script)
+    transfer = Transfer(70, ACK_EACH_SEGMENT, script=script)
     assert len(transfer.events("timeout")) == 2
     assert not transfer.events("loss")
     assert max(Counter(number for _, number in transfer.sent(times=1)).values()) == 1
 
 
 @pytest.mark.parametrize("congestion", ["newreno", "cubic-rfc9438"])
-def test_after_a_timeout_what_a_sack_reported_before_opens_no_window(
+def test_after_a_timeout_bytes_reported_by_earlier_sacks_do_not_open_the_window(
     congestion: Literal["newreno", "cubic-rfc9438"],
 ) -> None:
     """RFC 3465, 2.3: the ACK that fills the gap covers 20 segments, of which 19 had left the network before."""
-    options = replace(EVERY, congestion=congestion, initial_window_segments=20)
+    options = replace(ACK_EACH_SEGMENT, congestion=congestion, initial_window_segments=20)
     transfer = Transfer(200, options, script=losing_data({0}, times=2))
     (timeout,) = transfer.events("timeout")
-    after = next(sample for sample in transfer.events("ack") if sample.at_ns > timeout.at_ns)
-    assert (timeout.window_bytes, after.window_bytes) == (MSS, 2 * MSS)
+    first_ack = next(sample for sample in transfer.events("ack") if sample.at_ns > timeout.at_ns)
+    assert (timeout.window_bytes, first_ack.window_bytes) == (MSS, 2 * MSS)
 
 
 def test_only_the_first_timeout_of_several_lowers_the_threshold() -> None:
-    # RFC 5681, 3.1: ten segments were under way, of which half, and not the one that is sent again.
-    transfer = Transfer(10, EVERY, script=losing_data(range(10), times=3))
+    # RFC 5681, 3.1: half of the ten segments in flight at the first timeout, not of the one that is sent again.
+    transfer = Transfer(10, ACK_EACH_SEGMENT, script=losing_data(range(10), times=3))
     assert [sample.threshold_bytes for sample in transfer.events("timeout")[:3]] == [5 * MSS] * 3
 
 
-def test_a_filled_gap_is_acknowledged_at_once() -> None:
-    # RFC 5681, 4.2, though it is a single segment.
+def test_a_filled_gap_is_acknowledged_immediately() -> None:
+    # RFC 5681, 4.2, even for a single segment.
     transfer = Transfer(5, TcpOptions(), script=losing_data({0}))
-    assert [one.at_ns for one in transfer.wire.transmitted][-1] == transfer.wire.delivered[4]
+    assert [transmission.at_ns for transmission in transfer.wire.transmitted][-1] == transfer.wire.delivered[4]
 
 
 def test_an_ack_of_two_echoes_the_timestamp_of_the_first() -> None:
-    # RFC 7323, 4.2 (1): so that the measured round trip has the whole delay of the ACK in it, here 30 ms.
+    # RFC 7323, 4.2 (1): the measured round trip includes the whole ACK delay, here 30 ms.
     samples: list[TcpSample] = []
     wire = ScriptedWire(DELAY_NS)
     wire.transports["tcp"] = Tcp(wire, log=samples.append)
     for number, at_ns in enumerate([0, 30 * MS]):
         wire.send_at(SECOND + at_ns, Packet(number, "a", "b", 100, ("f", number), 0, 0, "tcp"))
     wire.run()
-    # The handshake took the first message's time: it leaves 20 ms later, 10 ms before the second.
+    # The first message waits for the handshake: it is sent 20 ms later, 10 ms before the second.
     assert samples[-1].round_trip_ns == (7 * 20 * MS + (10 + 20) * MS) // 8
 
 
-def test_an_ack_is_kept_back_for_40_ms_or_a_second_segment() -> None:
+def test_an_ack_is_delayed_by_40_ms_or_until_a_second_segment() -> None:
     wire = ScriptedWire(DELAY_NS)
     transport = wire.transports["tcp"] = Tcp(wire)
     times_ns = [0, 300 * MS, 300 * MS + 5 * MS]
     for number, at_ns in enumerate(times_ns):
         wire.send_at(at_ns, Packet(number, "a", "b", 100, ("f", number), at_ns, at_ns, "tcp"))
     wire.run()
-    acks_ns = [one.at_ns for one in wire.transmitted if one.packet.source == "b"][1:]
+    acks_ns = [transmission.at_ns for transmission in wire.transmitted if transmission.packet.source == "b"][1:]
     assert acks_ns == [3 * DELAY_NS + 40 * MS, times_ns[2] + DELAY_NS]
     assert transport is wire.transports["tcp"]
 
 
-def test_a_measured_round_trip_has_the_delay_of_the_ack_in_it() -> None:
+def test_a_measured_round_trip_includes_the_ack_delay() -> None:
     transfer = Transfer(1, TcpOptions())
-    # From the handshake 20 ms, then one of 60 ms: 7/8 20 + 1/8 60 (RFC 6298, RFC 7323).
+    # From the handshake 20 ms, then a sample of 60 ms: 7/8 20 + 1/8 60 (RFC 6298, RFC 7323).
     assert transfer.samples[-1].round_trip_ns == 25 * MS
 
 
-def test_nagle_keeps_small_segments_back_while_others_are_under_way() -> None:
+def test_nagle_delays_small_segments_while_others_are_in_flight() -> None:
     def arrivals_ns(options: TcpOptions) -> list[int]:
         wire = ScriptedWire(DELAY_NS)
         wire.transports["tcp"] = Tcp(wire, options)
@@ -245,19 +248,19 @@ def test_nagle_keeps_small_segments_back_while_others_are_under_way() -> None:
         return list(wire.delivered.values())[1:]
 
     assert arrivals_ns(TcpOptions()) == [510 * MS, 511 * MS, 512 * MS]
-    # The ACK of the first is kept back for 40 ms; then the other two go together.
+    # The ACK of the first is delayed by 40 ms; then the other two are sent together.
     assert arrivals_ns(TcpOptions(nagle=True)) == [510 * MS, 570 * MS, 570 * MS]
 
 
-def test_the_receivers_window_bounds_what_is_under_way() -> None:
+def test_the_receive_window_limits_the_bytes_in_flight() -> None:
     transfer = Transfer(500, TcpOptions(receive_window_bytes=25 * MSS))
     per_round = Counter(at_ns for at_ns, _ in transfer.sent())
-    # 25, but for one that waits for a second one to be acknowledged with.
+    # 25, minus one segment that waits for a second one before it is acknowledged.
     assert list(per_round.values())[:5] == [10, 20, 25, 24, 24]
 
 
-@pytest.mark.parametrize(("restart", "at_once"), [(True, 10), (False, 40)])
-def test_the_window_falls_back_after_silence(*, restart: bool, at_once: int) -> None:
+@pytest.mark.parametrize(("restart", "burst"), [(True, 10), (False, 40)])
+def test_the_window_is_reset_after_an_idle_period(*, restart: bool, burst: int) -> None:
     transfer = Transfer(70, TcpOptions(restart_after_idle=restart))
     wire = transfer.wire
     wire.run(5 * SECOND)
@@ -265,10 +268,10 @@ def test_the_window_falls_back_after_silence(*, restart: bool, at_once: int) -> 
         wire.transports["tcp"].send(Packet(number, "a", "b", MSS, ("f", number), 0, 0, "tcp"))
     wire.run()
     per_round = Counter(at_ns for at_ns, _ in transfer.sent())
-    assert per_round[5 * SECOND] == at_once
+    assert per_round[5 * SECOND] == burst
 
 
-def test_a_window_that_a_program_does_not_fill_does_not_open() -> None:
+def test_the_window_does_not_grow_if_the_program_does_not_use_it() -> None:
     wire = ScriptedWire(DELAY_NS)
     samples: list[TcpSample] = []
     wire.transports["tcp"] = Tcp(wire, log=samples.append)
@@ -279,53 +282,55 @@ def test_a_window_that_a_program_does_not_fill_does_not_open() -> None:
 
 
 @pytest.mark.parametrize(("lost", "window"), [(1, 10), (2, 1)])
-def test_more_than_one_lost_syn_begins_with_one_segment(lost: int, window: int) -> None:
+def test_more_than_one_lost_syn_reduces_the_initial_window_to_one_segment(lost: int, window: int) -> None:
     transfer = Transfer(50, TcpOptions(), script=losing({"a": range(lost)}))
     assert Counter(at_ns for at_ns, _ in transfer.sent())[(2**lost - 1) * SECOND + ROUND_TRIP_NS] == window
 
 
 @pytest.mark.parametrize("period", [300, 1200])
-def test_renos_sawtooth_carries_what_mathis_says(period: int) -> None:
+def test_renos_sawtooth_has_the_throughput_of_mathis(period: int) -> None:
     # Mathis, Semke, Mahdavi, Ott, "The macroscopic behavior of the TCP congestion avoidance algorithm", CCR 27(3),
-    # 1997: sqrt(3/2) / sqrt(p) segments per round trip. It is up to a tenth less, as windows are whole segments and
-    # stand for the round trip of a recovery, which is one of about W/2 + 1.
+    # 1997: sqrt(3/2) / sqrt(p) segments per round trip. The result is up to a tenth less, because windows are whole
+    # segments and do not grow in the round trip of a recovery, which is one of about W/2 + 1.
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         segment: Segment = packet.body[1]
-        first = segment.length and not segment.times
-        return () if first and segment.number % period == period - 1 else (0,)
+        is_first_transmission = segment.length and not segment.times
+        return () if is_first_transmission and segment.number % period == period - 1 else (0,)
 
     expected = math.sqrt(1.5 * period)
-    options = replace(EVERY, receive_window_bytes=round(2 * expected) * MSS)
+    options = replace(ACK_EACH_SEGMENT, receive_window_bytes=round(2 * expected) * MSS)
     transfer = Transfer(19 * period, options, script=script)
-    begun_ns, ended_ns = (transfer.wire.delivered[losses * period] for losses in (6, 18))
-    carried = 12 * period * ROUND_TRIP_NS / (ended_ns - begun_ns)
-    assert 0.9 * expected < carried < expected
+    start_ns, end_ns = (transfer.wire.delivered[losses * period] for losses in (6, 18))
+    per_round_trip = 12 * period * ROUND_TRIP_NS / (end_ns - start_ns)
+    assert 0.9 * expected < per_round_trip < expected
 
 
 @pytest.mark.parametrize("congestion", ["cubic", "cubic-rfc9438"])
-def test_cubic_follows_its_curve_by_the_acks_it_gets(congestion: Literal["cubic", "cubic-rfc9438"]) -> None:
-    # A receive window of 200 segments lets the window stand at that until a loss.
+def test_cubic_follows_its_curve_with_acks_over_a_link(congestion: Literal["cubic", "cubic-rfc9438"]) -> None:
+    # The receive window of 200 segments limits the window until the loss.
     options = TcpOptions(segments_per_ack=1, receive_window_bytes=200 * MSS, congestion=congestion)
     delay_ns, until_ns = 50 * MS, 6 * SECOND
     transfer = Transfer(20_000, options, script=losing_data({1500}), delay_ns=delay_ns, until_ns=until_ns)
     (loss,) = transfer.events("loss")
     assert loss.window_bytes == 140 * MSS
-    at_the_end = {sample.at_ns: sample.window_bytes / MSS for sample in transfer.samples if sample.at_ns > loss.at_ns}
-    begun_ns = min(at_ns for at_ns, window in at_the_end.items() if window > 140)
-    assert begun_ns <= loss.at_ns + 4 * delay_ns
+    windows_after_loss = {
+        sample.at_ns: sample.window_bytes / MSS for sample in transfer.samples if sample.at_ns > loss.at_ns
+    }
+    start_ns = min(at_ns for at_ns, window in windows_after_loss.items() if window > 140)
+    assert start_ns <= loss.at_ns + 4 * delay_ns
     plateau_s = (0.3 * 200 / 0.4) ** (1 / 3)
-    for at_ns, window in at_the_end.items():
-        # The ACKs of a round trip bring the window to where the curve is a round trip later (RFC 9438, 4.2).
-        at_s = (at_ns + 2 * delay_ns - begun_ns) / SECOND
+    for at_ns, window in windows_after_loss.items():
+        # The ACKs of a round trip move the window to the value of the curve one round trip later (RFC 9438, 4.2).
+        at_s = (at_ns + 2 * delay_ns - start_ns) / SECOND
         if 1 < at_s < plateau_s - 0.5:
             assert window == pytest.approx(
                 0.4 * (at_s - plateau_s) ** 3 + 200, rel=0.01 if congestion == "cubic-rfc9438" else 0.02
             )
 
 
-def whole_segments_sawtooth(period: int) -> float:
-    """Return segments per round trip of a window that opens by 8/15 of a segment per round trip and closes to 0.7."""
-    window, credit, carried, rounds = 10, 0.0, 0, 0
+def integer_sawtooth(period: int) -> float:
+    """Return segments per round trip of a window that grows by 8/15 of a segment per round trip, with factor 0.7."""
+    window, credit, per_round_trip, rounds = 10, 0.0, 0, 0
     for _ in range(100):
         acknowledged = 0
         while acknowledged < period:
@@ -334,28 +339,28 @@ def whole_segments_sawtooth(period: int) -> float:
             credit += 8 / 15
             if credit >= 1:
                 window, credit = window + 1, credit - 1
-        # The window rests in the round trip of the recovery, and is whole segments.
+        # The window does not grow in the round trip of the recovery, and is a whole number of segments.
         window, credit = math.floor(0.7 * window), 0.0
-        carried, rounds = carried + acknowledged + window, rounds + 1
-    return carried / rounds
+        per_round_trip, rounds = per_round_trip + acknowledged + window, rounds + 1
+    return per_round_trip / rounds
 
 
 @pytest.mark.parametrize("period", [30, 100, 200])
-def test_linux_cubic_carries_what_its_estimate_of_reno_does(period: int) -> None:
+def test_linux_cubic_has_the_throughput_of_its_reno_estimate(period: int) -> None:
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         segment: Segment = packet.body[1]
-        first = segment.length and not segment.times
-        return () if first and segment.number % period == period - 1 else (0,)
+        is_first_transmission = segment.length and not segment.times
+        return () if is_first_transmission and segment.number % period == period - 1 else (0,)
 
     transfer = Transfer(100 * period, TcpOptions(segments_per_ack=1), script=script, delay_ns=20 * MS)
-    begun_ns, ended_ns = (transfer.wire.delivered[losses * period] for losses in (20, 90))
-    carried = 70 * period * 40 * MS / (ended_ns - begun_ns)
-    # The estimate is looked at every 1/32 s, three quarters of the round trip here, so that each step comes late.
-    assert 0.75 < carried / whole_segments_sawtooth(period) < 0.95
+    start_ns, end_ns = (transfer.wire.delivered[losses * period] for losses in (20, 90))
+    per_round_trip = 70 * period * 40 * MS / (end_ns - start_ns)
+    # The estimate is updated every 1/32 s, three quarters of the round trip here, so each step is late.
+    assert 0.75 < per_round_trip / integer_sawtooth(period) < 0.95
 
 
-def test_linux_finds_a_segment_that_is_lost_again_within_a_round_trip() -> None:
-    # RFC 8985: what was sent after it has arrived, a round trip later. RFC 6675 waits for the timer.
+def test_linux_detects_a_lost_retransmission_within_a_round_trip() -> None:
+    # RFC 8985: a segment that was sent later has arrived, a round trip later. RFC 6675 waits for the timer.
     transfer = Transfer(2000, TcpOptions(segments_per_ack=1), script=losing_data({70}, times=3))
     assert not transfer.events("timeout")
     assert len(transfer.events("loss")) == 1
@@ -364,8 +369,8 @@ def test_linux_finds_a_segment_that_is_lost_again_within_a_round_trip() -> None:
     assert all(later - earlier <= 2 * ROUND_TRIP_NS for earlier, later in pairwise(sent_ns))
 
 
-def test_linux_finds_a_loss_that_two_later_segments_show_after_a_quarter_of_a_round_trip() -> None:
-    # RFC 8985, 6.2: the reordering window is a quarter of the shortest round trip while fewer than three arrived.
+def test_linux_detects_a_loss_by_two_later_segments_after_a_quarter_of_a_round_trip() -> None:
+    # RFC 8985, 6.2: the reordering window is a quarter of the minimum round trip while fewer than three have arrived.
     transfer = Transfer(10, TcpOptions(segments_per_ack=1), script=losing_data({7}))
     sent_ns = [at_ns for at_ns, number in transfer.sent() if number == 7]
     assert sent_ns == [ROUND_TRIP_NS, 2 * ROUND_TRIP_NS + ROUND_TRIP_NS // 4]
@@ -373,7 +378,7 @@ def test_linux_finds_a_loss_that_two_later_segments_show_after_a_quarter_of_a_ro
 
 
 @given(lost=st.sets(st.integers(0, 90), max_size=30), control=st.sampled_from(get_args(Congestion)))
-def test_in_order_nothing_is_sent_again_that_was_not_lost(lost: set[int], control: Congestion) -> None:
+def test_without_reordering_only_lost_segments_are_sent_again(lost: set[int], control: Congestion) -> None:
     options = TcpOptions(segments_per_ack=1, congestion=control)
     transfer = Transfer(100, options, script=losing_data(lost), rate_bit_s=20_000_000)
     assert {number for _, number in transfer.sent(times=1)} == lost

@@ -1,4 +1,4 @@
-"""TCP as programs see it: messages in order, once, complete, or dropped with a reason; and nothing hangs."""
+"""TCP as a transport of programs: messages arrive in order, once and complete, or are dropped with a reason."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,8 +20,10 @@ SECOND = 1000 * MS
 DELAY_NS = 10 * MS
 
 
-def message(number: int, *, size_bytes: int = 100, flow: str = "f", source: str = "a", to: str = "b") -> Packet:
-    return Packet(number, source, to, size_bytes, (flow, number), 0, 0, "tcp")
+def message(
+    number: int, *, size_bytes: int = 100, flow: str = "f", source: str = "a", destination: str = "b"
+) -> Packet:
+    return Packet(number, source, destination, size_bytes, (flow, number), 0, 0, "tcp")
 
 
 def carry(wire: ScriptedWire, packets: Sequence[Packet], options: TcpOptions | None = None) -> None:
@@ -31,7 +33,7 @@ def carry(wire: ScriptedWire, packets: Sequence[Packet], options: TcpOptions | N
         transport.send(packet)
 
 
-def test_a_message_takes_the_handshake_and_its_own_way() -> None:
+def test_a_message_takes_the_handshake_and_one_delay() -> None:
     wire = ScriptedWire(DELAY_NS)
     carry(wire, [message(0)])
     wire.run()
@@ -47,13 +49,13 @@ def test_packets_have_the_sizes_of_linux() -> None:
     wire = ScriptedWire(DELAY_NS)
     carry(wire, [message(0, size_bytes=2000)])
     wire.run()
-    sizes = [one.packet.size_bytes for one in wire.transmitted]
+    sizes = [transmission.packet.size_bytes for transmission in wire.transmitted]
     # SYN and SYN-ACK with 20 bytes of options, ACK, a full segment, the rest, and one ACK for both.
     assert sizes == [60, 60, 52, 1500, 2000 - 1448 + 52, 52]
 
 
 @pytest.mark.parametrize(("lost", "arrives_s"), [(1, 1), (2, 3), (3, 7), (6, 63)])
-def test_a_syn_is_sent_again_after_1_3_7_seconds(lost: int, arrives_s: int) -> None:
+def test_a_syn_is_retransmitted_after_1_3_7_seconds(lost: int, arrives_s: int) -> None:
     wire = ScriptedWire(DELAY_NS, script=losing({"a": range(lost)}))
     carry(wire, [message(0)])
     wire.run()
@@ -72,7 +74,7 @@ def test_a_connection_that_never_opens_drops_its_messages_and_the_next_one_opens
 
 
 def test_a_connection_is_given_up_after_15_timeouts() -> None:
-    # SYN and ACK pass, and one message; then nothing does any more.
+    # SYN, ACK and one message arrive; all later packets of the sender are lost.
     wire = ScriptedWire(DELAY_NS, script=losing({"a": range(3, 1000)}))
     carry(wire, [message(0)])
     wire.run(SECOND)
@@ -84,7 +86,7 @@ def test_a_connection_is_given_up_after_15_timeouts() -> None:
     assert wire.dropped == {1: "tcp: not acknowledged, sent 16 times"}
 
 
-def test_what_was_delivered_is_not_dropped_when_only_acks_are_lost() -> None:
+def test_delivered_messages_are_not_dropped_if_only_acks_are_lost() -> None:
     wire = ScriptedWire(DELAY_NS, script=losing({"b": range(1, 1000)}))
     carry(wire, [message(0)], TcpOptions(retries=2))
     wire.run()
@@ -107,7 +109,7 @@ def test_a_late_segment_of_a_connection_that_was_given_up_is_ignored() -> None:
     assert wire.delivered == {1: late_ns - SECOND + 3 * DELAY_NS}
 
 
-def test_a_late_copy_of_a_syn_does_not_begin_the_stream_anew() -> None:
+def test_a_late_copy_of_a_syn_does_not_restart_the_stream() -> None:
     wire = ScriptedWire(DELAY_NS, script=lambda packet, *_: (0, 500 * MS) if packet.body[1].syn else (0,))
     carry(wire, [message(0)])
     wire.run(SECOND)
@@ -116,32 +118,37 @@ def test_a_late_copy_of_a_syn_does_not_begin_the_stream_anew() -> None:
     assert wire.delivered == {0: 3 * DELAY_NS, 1: SECOND + DELAY_NS}
 
 
-def test_flows_have_connections_of_their_own() -> None:
+def test_flows_have_separate_connections() -> None:
     wire = ScriptedWire(
         DELAY_NS, script=lambda packet, *_: () if packet.identity[0].startswith("f 0 syn 0") else (0,)
     )
     carry(
         wire,
-        [message(0), message(1, flow="g"), message(2, flow="g", source="b", to="a"), message(3, flow="h", to="c")],
+        [
+            message(0),
+            message(1, flow="g"),
+            message(2, flow="g", source="b", destination="a"),
+            message(3, flow="h", destination="c"),
+        ],
     )
     wire.run()
     assert wire.delivered == {0: SECOND + 3 * DELAY_NS} | dict.fromkeys((1, 2, 3), 3 * DELAY_NS)
 
 
-@pytest.mark.parametrize(("back_of", "delays"), [("f", 1), ("g", 3), (None, 3)])
-def test_what_goes_back_on_an_open_connection_needs_no_handshake(back_of: str | None, delays: int) -> None:
+@pytest.mark.parametrize(("reverse_of", "delays"), [("f", 1), ("g", 3), (None, 3)])
+def test_the_reverse_direction_of_an_open_connection_needs_no_handshake(reverse_of: str | None, delays: int) -> None:
     wire = ScriptedWire(DELAY_NS)
     carry(wire, [message(0)])
     wire.run()
     sent_ns = wire.now_ns
     tcp = wire.transports["tcp"]
     assert isinstance(tcp, Tcp)
-    tcp.send(message(1, flow="back", source="b", to="a"), back_of=back_of)
+    tcp.send(message(1, flow="back", source="b", destination="a"), reverse_of=reverse_of)
     wire.run()
     assert wire.delivered[1] == sent_ns + delays * DELAY_NS
 
 
-def test_what_goes_back_on_an_open_connection_knows_its_round_trip() -> None:
+def test_the_reverse_direction_of_an_open_connection_uses_its_round_trip() -> None:
     wire = ScriptedWire(
         DELAY_NS, script=lambda packet, *_: () if packet.identity[0].startswith("back 0 data 0") else (0,)
     )
@@ -150,61 +157,65 @@ def test_what_goes_back_on_an_open_connection_knows_its_round_trip() -> None:
     sent_ns = wire.now_ns
     tcp = wire.transports["tcp"]
     assert isinstance(tcp, Tcp)
-    tcp.send(message(1, flow="back", source="b", to="a"), back_of="f")
+    tcp.send(message(1, flow="back", source="b", destination="a"), reverse_of="f")
     wire.run()
-    # Without it the first timeout would be 1 s (RFC 6298, 2.1).
+    # Without the known round trip the first timeout would be 1 s (RFC 6298, 2.1).
     assert wire.delivered[1] == sent_ns + 200 * MS + DELAY_NS
 
 
-@pytest.mark.parametrize("wrong", [message(7, size_bytes=0), message(7, to="a")])
-def test_a_message_that_no_stream_carries_is_refused(wrong: Packet) -> None:
+@pytest.mark.parametrize("invalid", [message(7, size_bytes=0), message(7, destination="a")])
+def test_an_invalid_message_is_rejected(invalid: Packet) -> None:
     with pytest.raises(ConfigurationError, match="packet 7 of flow f: TCP cannot carry"):
-        carry(ScriptedWire(DELAY_NS), [wrong])
+        carry(ScriptedWire(DELAY_NS), [invalid])
 
 
-def test_every_packet_is_drawn_for_by_itself() -> None:
+def test_every_packet_has_separate_draws() -> None:
     wire = ScriptedWire(DELAY_NS, rate_bit_s=10_000_000, script=losing({"a": {0, 9, 30, 31}, "b": {0, 5}}))
     carry(wire, [message(number, size_bytes=1 + 977 * number) for number in range(40)])
     wire.run()
     assert len(wire.delivered) == 40
-    identities = [(one.packet.source, one.packet.identity) for one in wire.transmitted]
+    identities = [(transmission.packet.source, transmission.packet.identity) for transmission in wire.transmitted]
     assert len(set(identities)) == len(identities)
 
 
-def test_the_same_event_in_two_runs_has_the_same_draws() -> None:
-    """One message of another size at the end, and other losses: the segments before are the same ones."""
+def test_equal_packets_in_two_runs_have_equal_draws() -> None:
+    """With an additional message at the end and other losses, the segments before it have the same draws."""
     packets = [message(number, size_bytes=5000) for number in range(20)]
-    one = ScriptedWire(DELAY_NS)
-    carry(one, packets)
-    other = ScriptedWire(DELAY_NS, script=losing({"a": {4, 5, 40}}))
-    carry(other, [*packets, message(20)])
+    base_wire = ScriptedWire(DELAY_NS)
+    carry(base_wire, packets)
+    changed_wire = ScriptedWire(DELAY_NS, script=losing({"a": {4, 5, 40}}))
+    carry(changed_wire, [*packets, message(20)])
 
     def sent(wire: ScriptedWire) -> dict[int, tuple[str, int]]:
         wire.run()
-        data = [each.packet for each in wire.transmitted if each.packet.source == "a" and each.packet.body[1].length]
-        return {each.body[1].first: each.identity for each in reversed(data)}
+        data = [
+            transmission.packet
+            for transmission in wire.transmitted
+            if transmission.packet.source == "a" and transmission.packet.body[1].length
+        ]
+        return {packet.body[1].first: packet.identity for packet in reversed(data)}
 
-    first, second = sent(one), sent(other)
+    first, second = sent(base_wire), sent(changed_wire)
     assert first == {number: second[number] for number in first}
 
 
-fates = st.lists(st.sampled_from([(), (0,), (0,), (0, 0), (3 * MS,), (25 * MS,), (0, 300 * MS)]), max_size=60)
+deliveries = st.lists(st.sampled_from([(), (0,), (0,), (0, 0), (3 * MS,), (25 * MS,), (0, 300 * MS)]), max_size=60)
 
 
-def following(forth: Sequence[Sequence[int]], back: Sequence[Sequence[int]]) -> Script:
-    """Return the script by which one packet after the other fares as is written, and all later ones arrive."""
+def scripted(forward: Sequence[Sequence[int]], reverse: Sequence[Sequence[int]]) -> Script:
+    """Return a script that treats packets in order as given; all later packets arrive."""
 
     def script(packet: IpPacket, _: str, number: int) -> Sequence[int]:
-        written = forth if packet.source == "a" else back
-        return written[number] if number < len(written) else (0,)
+        script_of_direction = forward if packet.source == "a" else reverse
+        return script_of_direction[number] if number < len(script_of_direction) else (0,)
 
     return script
 
 
 @settings(max_examples=150)
 @given(
-    forth=fates,
-    back=fates,
+    forward=deliveries,
+    reverse=deliveries,
     sizes=st.lists(st.integers(1, 9000), min_size=1, max_size=30),
     pauses=st.lists(st.integers(0, 400 * MS), min_size=30, max_size=30),
     options=st.builds(
@@ -217,40 +228,40 @@ def following(forth: Sequence[Sequence[int]], back: Sequence[Sequence[int]]) -> 
         segments_per_ack=st.integers(1, 3),
     ),
 )
-def test_whatever_is_lost_reordered_or_doubled_the_stream_arrives_in_order_once_or_is_given_up(
-    forth: Sequence[Sequence[int]],
-    back: Sequence[Sequence[int]],
+def test_the_stream_arrives_in_order_once_or_is_given_up_after_any_loss_reordering_or_duplication(
+    forward: Sequence[Sequence[int]],
+    reverse: Sequence[Sequence[int]],
     sizes: Sequence[int],
     pauses: Sequence[int],
     options: TcpOptions,
 ) -> None:
-    wire = ScriptedWire(DELAY_NS, rate_bit_s=20_000_000, script=following(forth, back))
+    wire = ScriptedWire(DELAY_NS, rate_bit_s=20_000_000, script=scripted(forward, reverse))
     transport = wire.transports["tcp"] = Tcp(wire, options)
     at_ns = 0
     for number, size_bytes in enumerate(sizes):
         at_ns += pauses[number]
         wire.send_at(at_ns, message(number, size_bytes=size_bytes))
-    # The wire itself complains about what is delivered twice, or after it was dropped.
+    # The wire itself raises an error if a packet is delivered twice, or after it was dropped.
     while len(wire.delivered) + len(wire.dropped) < len(sizes):
         next_ns = wire.next_event_ns()
-        assert next_ns is not None, "it hangs"
+        assert next_ns is not None, "the connection hangs"
         wire.run(next_ns)
     wire.run()
     for connection in transport._connections.values():
-        board = connection._sender.board
-        assert (len(board), board.pipe_bytes, len(board._arrived)) == (0, 0, 0)
+        scoreboard = connection._sender.scoreboard
+        assert (len(scoreboard), scoreboard.pipe_bytes, len(scoreboard._arrived)) == (0, 0, 0)
         assert connection._sender._timer.due_ns is None
         assert connection._sender._reordering_timer.due_ns is None
     assert list(wire.delivered) == sorted(wire.delivered)
     assert all(reason.startswith("tcp: not ") for reason in wire.dropped.values())
-    if options.retries == 15:  # 60 losses at most, and the longest silence is 15 of them
+    if options.retries == 15:  # at most 60 losses, and giving up takes 15 consecutive ones
         assert not wire.dropped or "connected" in next(iter(wire.dropped.values()))
-    # The same again is the same.
-    again = ScriptedWire(DELAY_NS, rate_bit_s=20_000_000, script=following(forth, back))
-    again.transports["tcp"] = Tcp(again, replace(options))
+    # An identical second run gives identical results.
+    repeated = ScriptedWire(DELAY_NS, rate_bit_s=20_000_000, script=scripted(forward, reverse))
+    repeated.transports["tcp"] = Tcp(repeated, replace(options))
     at_ns = 0
     for number, size_bytes in enumerate(sizes):
         at_ns += pauses[number]
-        again.send_at(at_ns, message(number, size_bytes=size_bytes))
-    again.run()
-    assert again.transmitted == wire.transmitted
+        repeated.send_at(at_ns, message(number, size_bytes=size_bytes))
+    repeated.run()
+    assert repeated.transmitted == wire.transmitted

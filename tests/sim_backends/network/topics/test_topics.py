@@ -1,4 +1,4 @@
-"""Publish-subscribe against closed forms, exchanges worked out by hand, and what CycloneDDS did when it was tried."""
+"""Publish-subscribe, compared with closed forms, exchanges computed by hand, and measurements of CycloneDDS."""
 
 import math
 from collections import Counter
@@ -33,10 +33,10 @@ KEEP_ALL = Qos(history="keep_all")
 DELAY_NS = MS // 10
 PERIOD_NS = 10 * MS
 SCAN_BYTES = 2940
-"""A LaserScan of 360 beams, as `rosbags` and CycloneDDS serialize it."""
+"""Size of a LaserScan of 360 beams, as serialized by `rosbags` and CycloneDDS."""
 
 
-def published(
+def publish_samples(
     qos: Qos,
     count: int,
     *,
@@ -56,7 +56,7 @@ def published(
 
 
 def losing_frames(probability: float, seed: int = 1) -> Script:
-    """Lose frames, of which an IP packet takes as many as Ethernet needs for it, independently of each other."""
+    """Return a script that loses Ethernet frames independently; an IP packet needs one or more of them."""
     draws = PacketDraws(seed, "frames")
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
@@ -66,9 +66,12 @@ def losing_frames(probability: float, seed: int = 1) -> Script:
     return script
 
 
-def said(wire: ScriptedWire) -> list[tuple[int, str, tuple[Submessage, ...]]]:
-    """Return when who said what."""
-    return [(one.at_ns, one.packet.source, one.packet.body.submessages) for one in wire.transmitted]
+def messages(wire: ScriptedWire) -> list[tuple[int, str, tuple[Submessage, ...]]]:
+    """Return time, source and submessages of each message."""
+    return [
+        (transmission.at_ns, transmission.packet.source, transmission.packet.body.submessages)
+        for transmission in wire.transmitted
+    ]
 
 
 @pytest.mark.parametrize(
@@ -79,7 +82,7 @@ def said(wire: ScriptedWire) -> list[tuple[int, str, tuple[Submessage, ...]]]:
         # All of a LaserScan in one DATA_FRAG, whose header has 32 bytes more.
         ((Data(Sample(SCAN_BYTES, 0), 0, 3, 3, 1344),), 12 + 36 + SCAN_BYTES),
         ((Data(Sample(SCAN_BYTES, 0), 2, 1, 3, 1344),), 36 + SCAN_BYTES - 2 * 1344),
-        # What goes to one end names its participant by INFO_DST with 16 bytes.
+        # Messages for one end contain its participant in an INFO_DST of 16 bytes.
         ((AckNack(7, (), 1),), 16 + 4 + 4 + 4 + 8 + 4 + 4),
         ((AckNack(7, (7, 9), 1),), 16 + 4 + 4 + 4 + 8 + 4 + 4 + 4),
         ((AckNack(7, (7, 39), 1),), 16 + 4 + 4 + 4 + 8 + 4 + 8 + 4),
@@ -88,27 +91,27 @@ def said(wire: ScriptedWire) -> list[tuple[int, str, tuple[Submessage, ...]]]:
         ((Heartbeat(1, 1, 1, final=False, directed=True),), 16 + 4 + 4 + 4 + 8 + 8 + 4),
     ],
 )
-def test_sizes_are_those_of_the_specification(submessages: tuple[Submessage, ...], size_bytes: int) -> None:
+def test_message_sizes_follow_the_specification(submessages: tuple[Submessage, ...], size_bytes: int) -> None:
     assert ip_bytes(submessages) == 20 + 8 + 20 + size_bytes
 
 
 def test_one_sample_takes_two_messages() -> None:
-    """Nothing was written before, so the heartbeat behind the sample asks at once, and is answered at once."""
-    wire = published(KEEP_LAST, 1)
+    """Nothing was written before, so the heartbeat after the sample requires a response, which is immediate."""
+    wire = publish_samples(KEEP_LAST, 1)
     assert wire.delivered == {0: DELAY_NS}
-    (sent_ns, by, (data, heartbeat)), answer = said(wire)
-    assert (sent_ns, by, type(data)) == (0, "a", Data)
+    (sent_ns, source, (data, heartbeat)), response = messages(wire)
+    assert (sent_ns, source, type(data)) == (0, "a", Data)
     assert heartbeat == Heartbeat(1, 1, 1, final=False, directed=False)
-    assert answer == (DELAY_NS, "b", (AckNack(2, (), 1),))
+    assert response == (DELAY_NS, "b", (AckNack(2, (), 1),))
 
 
-def test_a_stream_is_acknowledged_at_its_beginning_and_at_its_end() -> None:
-    wire = published(Qos(depth=20), 20)
-    # The first sample asks; later ones follow within 80 ms of each other and ask for nothing.
-    final = [submessage.final for _, _, (*_, submessage) in said(wire) if isinstance(submessage, Heartbeat)]
+def test_a_stream_is_acknowledged_at_its_start_and_end() -> None:
+    wire = publish_samples(Qos(depth=20), 20)
+    # The first sample's heartbeat requires a response; later samples follow within 80 ms and require none.
+    final = [submessage.final for _, _, (*_, submessage) in messages(wire) if isinstance(submessage, Heartbeat)]
     assert final == [False] + 19 * [True] + [False]
-    # The alarm of the first sample's heartbeat rings every 100 ms, and at 300 ms the last sample is 110 ms old.
-    assert said(wire)[-2:] == [
+    # The timer set by the first sample's heartbeat fires every 100 ms, and at 300 ms the last sample is 110 ms old.
+    assert messages(wire)[-2:] == [
         (300 * MS, "a", (Heartbeat(2, 20, 21, final=False, directed=False),)),
         (300 * MS + DELAY_NS, "b", (AckNack(21, (), 2),)),
     ]
@@ -116,34 +119,36 @@ def test_a_stream_is_acknowledged_at_its_beginning_and_at_its_end() -> None:
     assert list(wire.delivered) == list(range(20))
 
 
-def test_a_lost_sample_is_asked_for_by_the_next_ones_heartbeat() -> None:
-    wire = published(KEEP_LAST, 4, script=losing({"a": {1}}), size_bytes=100)
+def test_a_lost_sample_is_requested_after_the_next_heartbeat() -> None:
+    wire = publish_samples(KEEP_LAST, 4, script=losing({"a": {1}}), size_bytes=100)
     reported_ns = 2 * PERIOD_NS + DELAY_NS
-    assert [entry for entry in said(wire) if reported_ns <= entry[0] < 3 * PERIOD_NS] == [
+    assert [entry for entry in messages(wire) if reported_ns <= entry[0] < 3 * PERIOD_NS] == [
         (reported_ns, "b", (AckNack(2, (2,), 2),)),
-        (reported_ns + DELAY_NS, "a", (*said(wire)[2][2][:1], Heartbeat(2, 3, 4, final=False, directed=True))),
+        (reported_ns + DELAY_NS, "a", (*messages(wire)[2][2][:1], Heartbeat(2, 3, 4, final=False, directed=True))),
         (reported_ns + 2 * DELAY_NS, "b", (AckNack(4, (), 3),)),
     ]
-    # What came after it waited for it.
+    # Later samples waited for it.
     assert wire.delivered[1] == wire.delivered[2] == reported_ns + 2 * DELAY_NS
     assert list(wire.delivered) == [0, 1, 2, 3]
 
 
-def test_a_copy_of_a_request_is_not_answered() -> None:
+def test_a_duplicate_request_is_ignored() -> None:
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
         return {("b", 1): (), ("a", 1): (0, DELAY_NS)}.get((receiver, number), (0,))
 
-    wire = published(KEEP_LAST, 4, script=script, size_bytes=100)
-    repeated = [one for one in wire.transmitted if "again" in one.packet.identity[0]]
-    assert [one.packet.identity for one in repeated] == [("scan data0 again2", 1)]
+    wire = publish_samples(KEEP_LAST, 4, script=script, size_bytes=100)
+    repeated = [transmission for transmission in wire.transmitted if "again" in transmission.packet.identity[0]]
+    assert [transmission.packet.identity for transmission in repeated] == [("scan data0 again2", 1)]
 
 
-def test_a_large_sample_comes_back_first_by_one_fragment_then_by_those_that_lack() -> None:
-    wire = published(KEEP_LAST, 3, script=losing({"a": {1}}))
-    kinds = [[type(one) for one in message] for at_ns, _, message in said(wire) if at_ns > 2 * PERIOD_NS]
+def test_a_large_sample_is_repaired_first_by_one_fragment_then_by_the_missing_ones() -> None:
+    wire = publish_samples(KEEP_LAST, 3, script=losing({"a": {1}}))
+    kinds = [
+        [type(submessage) for submessage in message] for at_ns, _, message in messages(wire) if at_ns > 2 * PERIOD_NS
+    ]
     assert kinds[:7] == [
         [AckNack],
-        # The fragment leaves no room for the heartbeat below 1456 bytes.
+        # With the fragment the heartbeat would exceed 1456 bytes.
         [Data],
         [Heartbeat],
         [AckNack, NackFrag],
@@ -154,56 +159,56 @@ def test_a_large_sample_comes_back_first_by_one_fragment_then_by_those_that_lack
     assert wire.delivered[1] == 2 * PERIOD_NS + 5 * DELAY_NS
 
 
-PUSHED_OUT = "pushed out of the writer's history before it was acknowledged"
+EVICTED = "pushed out of the writer's history before it was acknowledged"
 
 
-def test_samples_that_the_history_has_no_room_for_are_lost() -> None:
-    """Of eight samples the second to the fourth are lost, and so is the request for the fourth; two are kept."""
-    wire = published(Qos(depth=2), 8, script=losing({"a": {1, 2, 3}, "b": {1}}), size_bytes=100)
-    assert wire.dropped == dict.fromkeys((1, 2, 3), PUSHED_OUT)
+def test_samples_evicted_from_the_history_are_lost() -> None:
+    """The second to the fourth of eight samples and the request for the fourth are lost; the history keeps two."""
+    wire = publish_samples(Qos(depth=2), 8, script=losing({"a": {1, 2, 3}, "b": {1}}), size_bytes=100)
+    assert wire.dropped == dict.fromkeys((1, 2, 3), EVICTED)
     assert list(wire.delivered) == [0, 4, 5, 6, 7]
-    # The fifth waits for the fourth until the sixth one's heartbeat says that this one is gone.
+    # The fifth sample waits until the sixth one's heartbeat reports that the fourth is no longer available.
     assert wire.delivered[4] == wire.delivered[5] == 5 * PERIOD_NS + DELAY_NS
 
 
-def test_what_is_asked_for_and_gone_is_told_by_a_gap() -> None:
-    """The request for the second sample takes 15 ms longer, and in between the fourth pushes that out."""
+def test_a_request_for_an_evicted_sample_is_answered_by_a_gap() -> None:
+    """The request for the second sample is delayed by 15 ms, in which the fourth sample evicts it."""
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
         return {("b", 1): (), ("a", 1): (15 * MS,)}.get((receiver, number), (0,))
 
-    wire = published(Qos(depth=2), 4, script=script, size_bytes=100)
-    asked_ns = 2 * PERIOD_NS + DELAY_NS
-    assert (asked_ns, "b", (AckNack(2, (2,), 2),)) in said(wire)
-    told = (Gap(2, 3), Heartbeat(3, 4, 5, final=False, directed=True))
-    assert (asked_ns + 15 * MS + DELAY_NS, "a", told) in said(wire)
-    assert wire.dropped == {1: PUSHED_OUT}
+    wire = publish_samples(Qos(depth=2), 4, script=script, size_bytes=100)
+    requested_ns = 2 * PERIOD_NS + DELAY_NS
+    assert (requested_ns, "b", (AckNack(2, (2,), 2),)) in messages(wire)
+    response = (Gap(2, 3), Heartbeat(3, 4, 5, final=False, directed=True))
+    assert (requested_ns + 15 * MS + DELAY_NS, "a", response) in messages(wire)
+    assert wire.dropped == {1: EVICTED}
 
 
 @pytest.mark.parametrize("loss", [0.05, 0.2])
 @pytest.mark.parametrize(("size_bytes", "frames"), [(100, 1), (SCAN_BYTES, 3), (20_000, 15)])
-def test_best_effort_loses_what_the_link_loses(loss: float, size_bytes: int, frames: int) -> None:
+def test_best_effort_has_the_loss_of_the_link(loss: float, size_bytes: int, frames: int) -> None:
     count = 1000
-    wire = published(BEST_EFFORT, count, script=losing_frames(loss), size_bytes=size_bytes)
+    wire = publish_samples(BEST_EFFORT, count, script=losing_frames(loss), size_bytes=size_bytes)
     expected = 1 - (1 - loss) ** frames
     lost = len(wire.dropped)
     assert lost + len(wire.delivered) == count
     assert abs(lost / count - expected) < 4 * math.sqrt(expected * (1 - expected) / count)
     assert Counter(wire.dropped.values()) == {"lost by script": lost}
-    assert all(type(one) is Data for _, _, message in said(wire) for one in message)
+    assert all(type(submessage) is Data for _, _, message in messages(wire) for submessage in message)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.6])
 def test_reliable_keep_all_loses_nothing(loss: float) -> None:
-    wire = published(KEEP_ALL, 100, script=losing_frames(loss), size_bytes=500)
+    wire = publish_samples(KEEP_ALL, 100, script=losing_frames(loss), size_bytes=500)
     assert list(wire.delivered) == list(range(100))
     assert not wire.dropped
 
 
 @pytest.mark.parametrize(
-    ("qos", "loss", "cyclonedds", "within"),
+    ("qos", "loss", "cyclonedds", "tolerance"),
     [
-        # Of 1000 LaserScans at 100 Hz; what the program of that measurement got, and how far ours may be from it.
+        # Received of 1000 LaserScans at 100 Hz with real CycloneDDS, and the tolerated difference.
         (BEST_EFFORT, 0.05, 867, 30),
         (BEST_EFFORT, 0.2, 524, 45),
         (KEEP_LAST, 0.05, 967, 15),
@@ -212,93 +217,107 @@ def test_reliable_keep_all_loses_nothing(loss: float) -> None:
         (KEEP_ALL, 0.2, 1000, 0),
     ],
 )
-def test_as_many_samples_arrive_as_with_cyclonedds(qos: Qos, loss: float, cyclonedds: int, within: int) -> None:
-    arrived = len(published(qos, 1000, script=losing_frames(loss)).delivered)
-    assert abs(arrived - cyclonedds) <= within
+def test_as_many_samples_arrive_as_with_cyclonedds(qos: Qos, loss: float, cyclonedds: int, tolerance: int) -> None:
+    arrived = len(publish_samples(qos, 1000, script=losing_frames(loss)).delivered)
+    assert abs(arrived - cyclonedds) <= tolerance
 
 
-def test_a_blocked_writer_drops_what_waited_too_long() -> None:
-    """Nothing is acknowledged; below the mark of 30,720 bytes are 10 samples, and another goes beyond it."""
+def test_a_blocked_writer_drops_samples_after_max_blocking_time() -> None:
+    """Nothing is acknowledged; 10 samples fit below the watermark of 30,720 bytes, and the 11th exceeds it."""
     qos = Qos(history="keep_all", max_blocking_ns=50 * MS)
     timing = RtpsTiming(most_high_bytes=30_720)
-    wire = published(qos, 40, script=lambda packet, *_: (), timing=timing, until_ns=SECOND)
+    wire = publish_samples(qos, 40, script=lambda packet, *_: (), timing=timing, until_ns=SECOND)
     reason = "the writer was blocked for longer than max_blocking_time"
     assert Counter(wire.dropped.values()) == {reason: 40 - 11}
-    assert wire.next_event_ns() is not None, "something is unacknowledged"
+    assert wire.next_event_ns() is not None, "there are unacknowledged samples"
 
 
-def test_samples_of_many_datagrams_come_whole() -> None:
-    """A camera's image takes 75 messages of 10 fragments, and more fragments than one bitmap of 256 names."""
-    wire = published(KEEP_LAST, 1, script=losing({"a": {*range(50), 80, 81}}), size_bytes=1_000_000)
+def test_samples_of_many_datagrams_arrive_complete() -> None:
+    """A camera image takes 75 messages of 10 fragments, more fragments than a bitmap of 256 can contain."""
+    wire = publish_samples(KEEP_LAST, 1, script=losing({"a": {*range(50), 80, 81}}), size_bytes=1_000_000)
     assert list(wire.delivered) == [0]
-    asked = [one for _, _, message in said(wire) for one in message if isinstance(one, NackFrag)]
-    assert max(len(one.missing) for one in asked) == 256
-    assert all(one.packet.size_bytes <= 14_720 + 28 for one in wire.transmitted)
+    requests = [
+        submessage for _, _, message in messages(wire) for submessage in message if isinstance(submessage, NackFrag)
+    ]
+    assert max(len(request.missing) for request in requests) == 256
+    assert all(transmission.packet.size_bytes <= 14_720 + 28 for transmission in wire.transmitted)
 
 
-Fate = Sequence[int]
-FATES = st.lists(
+DeliveryDelays = Sequence[int]
+DELIVERIES = st.lists(
     st.one_of(st.just(()), st.just((0,)), st.lists(st.integers(0, 30 * MS), min_size=1, max_size=3)), max_size=120
 )
 
 
-def by_fates(fates: Sequence[Fate]) -> Script:
-    """Let packets meet these fates one after the other, from whomever; from then on all arrive."""
-    left = iter(fates)
-    return lambda *_: next(left, (0,))
+def scripted(deliveries: Sequence[DeliveryDelays]) -> Script:
+    """Return a script that delivers packets of both ends in order as given; all later packets arrive."""
+    remaining = iter(deliveries)
+    return lambda *_: next(remaining, (0,))
 
 
 @given(
-    FATES, st.integers(1, 30), st.sampled_from([100, SCAN_BYTES, 15_000]), st.sampled_from([KEEP_ALL, Qos(depth=2)])
+    DELIVERIES,
+    st.integers(1, 30),
+    st.sampled_from([100, SCAN_BYTES, 15_000]),
+    st.sampled_from([KEEP_ALL, Qos(depth=2)]),
 )
-def test_whatever_happens_to_messages_samples_come_in_order_and_once(
-    fates: Sequence[Fate], count: int, size_bytes: int, qos: Qos
+def test_samples_arrive_in_order_and_once_after_any_losses(
+    deliveries: Sequence[DeliveryDelays], count: int, size_bytes: int, qos: Qos
 ) -> None:
-    wire = published(qos, count, script=by_fates(fates), size_bytes=size_bytes)
+    wire = publish_samples(qos, count, script=scripted(deliveries), size_bytes=size_bytes)
     assert list(wire.delivered) == sorted(wire.delivered)
-    # The wire refuses a second fate of a sample; each has one.
+    # The wire raises an error for a second result of a sample; each sample has one.
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(count))
     if qos is KEEP_ALL:
         assert not wire.dropped
 
 
-@given(FATES, st.integers(1, 30), st.sampled_from([100, 15_000]))
-def test_best_effort_comes_in_order_and_once(fates: Sequence[Fate], count: int, size_bytes: int) -> None:
-    wire = published(BEST_EFFORT, count, script=by_fates(fates), size_bytes=size_bytes)
+@given(DELIVERIES, st.integers(1, 30), st.sampled_from([100, 15_000]))
+def test_best_effort_samples_arrive_in_order_and_once(
+    deliveries: Sequence[DeliveryDelays], count: int, size_bytes: int
+) -> None:
+    wire = publish_samples(BEST_EFFORT, count, script=scripted(deliveries), size_bytes=size_bytes)
     assert list(wire.delivered) == sorted(wire.delivered)
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(count))
     assert set(wire.dropped.values()) <= {"lost by script", "overtaken by a later sample"}
 
 
-@given(FATES, st.integers(1, 10))
-def test_something_is_planned_while_anything_is_unacknowledged(fates: Sequence[Fate], count: int) -> None:
-    """Step by step, until the writer has heard that its last sample arrived."""
-    wire = published(KEEP_ALL, count, script=by_fates(fates), until_ns=0)
-    heard = 0
+@given(DELIVERIES, st.integers(1, 10))
+def test_an_event_is_scheduled_while_samples_are_unacknowledged(
+    deliveries: Sequence[DeliveryDelays], count: int
+) -> None:
+    """Run from event to event until the writer has received the acknowledgement of its last sample."""
+    wire = publish_samples(KEEP_ALL, count, script=scripted(deliveries), until_ns=0)
+    acknowledged = 0
     topics = wire.transports["topic"]
     receive = topics.receive
 
-    def listening(host: str, packet: IpPacket) -> None:
-        nonlocal heard
+    def recording_receive(host: str, packet: IpPacket) -> None:
+        nonlocal acknowledged
         message: RtpsMessage = packet.body
-        heard = max([heard, *(one.base - 1 for one in message.submessages if isinstance(one, AckNack))])
+        acknowledged = max(
+            [
+                acknowledged,
+                *(submessage.base - 1 for submessage in message.submessages if isinstance(submessage, AckNack)),
+            ]
+        )
         receive(host, packet)
 
-    topics.receive = listening  # type: ignore[method-assign]
-    while heard < count:
+    topics.receive = recording_receive  # type: ignore[method-assign]
+    while acknowledged < count:
         next_ns = wire.next_event_ns()
         assert next_ns is not None
         wire.run(next_ns)
 
 
-def test_bad_quality_of_service_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="history of 0 samples"):
+def test_invalid_quality_of_service_is_rejected() -> None:
+    with pytest.raises(ConfigurationError, match="depth of 0 samples"):
         Qos(depth=0)
     with pytest.raises(ConfigurationError, match="keep_some"):
         Qos(history="keep_some")  # type: ignore[arg-type]
 
 
-def test_a_flow_that_no_topic_is_known_for_is_refused() -> None:
+def test_an_unknown_flow_is_rejected() -> None:
     wire = ScriptedWire(0)
     topics = Topics(wire, {"scan": TopicFlow("a", "b")}, discovery=None)
     with pytest.raises(ConfigurationError, match="'scam'") as error:

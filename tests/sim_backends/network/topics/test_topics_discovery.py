@@ -1,4 +1,4 @@
-"""Discovery without a master: who finds whom and when, beside what CycloneDDS did, and what is lost until then."""
+"""Discovery without a master: matching times compared with CycloneDDS, and samples lost before matching."""
 
 import statistics
 from collections import Counter
@@ -21,10 +21,10 @@ from tests.helpers.scripted_wire import Script, ScriptedWire
 DELAY_NS = MS // 10
 
 
-def two(
+def two_participants(
     script: Script | None = None, *, discovery: DiscoveryTiming | None = None, qos: Qos | None = None
 ) -> ScriptedWire:
-    """Return a wire on which a publishes to b, once they have found each other."""
+    """Return a wire on which a publishes to b after they have discovered each other."""
     wire = ScriptedWire(DELAY_NS, script=script, hosts=("a", "b"))
     flows = {"scan": TopicFlow("a", "b", qos or Qos())}
     wire.transports["topic"] = Topics(wire, flows, discovery=discovery or DiscoveryTiming())
@@ -42,15 +42,15 @@ def session(wire: ScriptedWire) -> TopicSession:
     return topics._sessions["scan"]
 
 
-def run_until_found(wire: ScriptedWire) -> None:
-    ends = session(wire)
-    while not (ends.writer.matched and ends.reader.matched):
+def run_until_matched(wire: ScriptedWire) -> None:
+    topic_session = session(wire)
+    while not (topic_session.writer.matched and topic_session.reader.matched):
         wire.run(wire.next_event_ns())
         assert wire.now_ns < 1000 * SECOND
 
 
-def cut(*spans_ns: tuple[int, int], sources: str = "ab") -> tuple[Script, list[ScriptedWire]]:
-    """Lose what these hosts send in these spans of time; the wire is to be put into the list."""
+def losing_in(*spans_ns: tuple[int, int], sources: str = "ab") -> tuple[Script, list[ScriptedWire]]:
+    """Return a script that loses packets of these hosts in these spans of time, and a list for its wire."""
     wires: list[ScriptedWire] = []
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
@@ -60,36 +60,42 @@ def cut(*spans_ns: tuple[int, int], sources: str = "ab") -> tuple[Script, list[S
     return script, wires
 
 
-def test_announcements_are_those_of_the_schedule() -> None:
-    """At 0, 0.1, 8.1 and 16.1 s to everybody; and each answers the other four times."""
-    wire = two()
+def test_announcements_follow_the_schedule() -> None:
+    """At 0, 0.1, 8.1 and 16.1 s as multicast; and each participant responds to the other four times."""
+    wire = two_participants()
     wire.run(20 * SECOND)
-    announced = [
-        (one.at_ns, one.packet.destination) for one in wire.transmitted if isinstance(one.packet.body, Announcement)
+    announcements = [
+        (transmission.at_ns, transmission.packet.destination)
+        for transmission in wire.transmitted
+        if isinstance(transmission.packet.body, Announcement)
     ]
-    assert [at_ns for at_ns, to in announced if to is None] == sorted(2 * [0, 100 * MS, 8_100 * MS, 16_100 * MS])
-    assert Counter(to for _, to in announced) == {None: 8, "a": 4, "b": 4}
-    assert {one.packet.size_bytes for one in wire.transmitted if isinstance(one.packet.body, Announcement)} == {
-        SPDP_BYTES
-    }
+    assert [at_ns for at_ns, destination in announcements if destination is None] == sorted(
+        2 * [0, 100 * MS, 8_100 * MS, 16_100 * MS]
+    )
+    assert Counter(destination for _, destination in announcements) == {None: 8, "a": 4, "b": 4}
+    assert {
+        transmission.packet.size_bytes
+        for transmission in wire.transmitted
+        if isinstance(transmission.packet.body, Announcement)
+    } == {SPDP_BYTES}
 
 
-def test_who_is_found_is_asked_within_milliseconds() -> None:
-    """An announcement, a heartbeat 1 ms after it, a request, and the endpoint, of which each takes the delay."""
-    wire = two()
-    run_until_found(wire)
+def test_participants_match_within_milliseconds() -> None:
+    """An announcement, a heartbeat 1 ms after it, a request, and the endpoint; each takes the delay."""
+    wire = two_participants()
+    run_until_matched(wire)
     assert wire.now_ns == MS + 4 * DELAY_NS
 
 
-def test_what_is_published_before_matching_goes_nowhere() -> None:
-    wire = two()
+def test_samples_published_before_matching_are_dropped() -> None:
+    wire = two_participants()
     publish(wire, [0, MS, 2 * MS])
     wire.run(SECOND)
     assert wire.dropped == dict.fromkeys((0, 1), "not matched yet")
     assert list(wire.delivered) == [2]
 
 
-def test_best_effort_to_who_has_not_matched_goes_nowhere() -> None:
+def test_best_effort_samples_to_an_unmatched_reader_are_dropped() -> None:
     wire = ScriptedWire(DELAY_NS)
     topics = wire.transports["topic"] = Topics(
         wire, {"scan": TopicFlow("a", "b", Qos("best_effort"))}, discovery=None
@@ -100,7 +106,7 @@ def test_best_effort_to_who_has_not_matched_goes_nowhere() -> None:
     assert wire.dropped == {0: "not matched yet"}
 
 
-def test_without_discovery_nothing_is_sent_but_samples() -> None:
+def test_without_discovery_only_samples_are_sent() -> None:
     wire = ScriptedWire(DELAY_NS, hosts=("a", "b"))
     wire.transports["topic"] = Topics(wire, {"scan": TopicFlow("a", "b")}, discovery=None)
     assert wire.next_event_ns() is None
@@ -109,16 +115,16 @@ def test_without_discovery_nothing_is_sent_but_samples() -> None:
     assert (len(wire.transmitted), wire.delivered) == (2, {0: DELAY_NS})
 
 
-def test_who_is_not_heard_of_for_a_lease_is_gone_and_found_again() -> None:
-    script, wires = cut((20 * SECOND, 60 * SECOND))
-    wire = two(script)
+def test_a_participant_is_removed_after_its_lease_and_discovered_again() -> None:
+    script, wires = losing_in((20 * SECOND, 60 * SECOND))
+    wire = two_participants(script)
     wires.append(wire)
     publish(wire, [at_ns * SECOND for at_ns in (10, 25, 50, 75)])
-    run_until_found(wire)
+    run_until_matched(wire)
     wire.run(50 * SECOND - 1)
     assert not session(wire).writer.matched
     assert not session(wire).reader.matched
-    # The last that was heard of b was the announcement of 16.1 s, so 26.1 s is when the second sample is given up.
+    # The last packet received from b was the announcement at 16.1 s, so the second sample is given up at 26.1 s.
     assert wire.dropped == {1: "the subscriber's lease ran out"}
     wire.run(80 * SECOND)
     assert wire.dropped == {1: "the subscriber's lease ran out", 2: "not matched yet"}
@@ -126,19 +132,23 @@ def test_who_is_not_heard_of_for_a_lease_is_gone_and_found_again() -> None:
 
 
 @pytest.mark.parametrize("sources", ["a", "b"])
-def test_who_is_forgotten_by_one_side_only_is_found_again(sources: str) -> None:
-    """The other hears everything meanwhile and has nothing new to tell, so it must be asked."""
-    script, wires = cut((20 * SECOND, 60 * SECOND), sources=sources)
-    wire = two(script)
+def test_a_participant_removed_on_one_side_only_is_discovered_again(sources: str) -> None:
+    """The other side still receives everything and has no new endpoints, so the data must be requested."""
+    script, wires = losing_in((20 * SECOND, 60 * SECOND), sources=sources)
+    wire = two_participants(script)
     wires.append(wire)
     publish(wire, [*(number * SECOND for number in range(1, 100))])
     wire.run(60 * SECOND)
-    ends = session(wire)
-    forgot, knows = (ends.reader, ends.writer) if sources == "a" else (ends.writer, ends.reader)
-    assert (forgot.matched, knows.matched) == (False, True)
+    topic_session = session(wire)
+    unmatched_end, matched_end = (
+        (topic_session.reader, topic_session.writer)
+        if sources == "a"
+        else (topic_session.writer, topic_session.reader)
+    )
+    assert (unmatched_end.matched, matched_end.matched) == (False, True)
     wire.run(120 * SECOND)
-    assert ends.writer.matched
-    assert ends.reader.matched
+    assert topic_session.writer.matched
+    assert topic_session.reader.matched
     assert wire.delivered.keys() >= set(range(70, 99))
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(99))
 
@@ -148,17 +158,17 @@ def losing_with(probability: float, seed: int) -> Script:
     return lambda packet, *_: (0,) if draws.draw(packet.identity) >= probability else ()
 
 
-def found_after_s(loss: float, period_ns: int, seed: int) -> float:
-    """Return how long after b starts, at some time between announcements of a, both endpoints are matched."""
+def matching_time_s(loss: float, period_ns: int, seed: int) -> float:
+    """Return the time from the start of b, between announcements of a, until both endpoints are matched."""
     starts_ns = 5 * SECOND + seed * 41 * MS
     discovery = DiscoveryTiming(period_ns=period_ns, starts_ns={"b": starts_ns})
-    wire = two(losing_with(loss, seed), discovery=discovery)
-    run_until_found(wire)
+    wire = two_participants(losing_with(loss, seed), discovery=discovery)
+    run_until_matched(wire)
     return (wire.now_ns - starts_ns) / 1e9
 
 
 @pytest.mark.parametrize(
-    ("loss", "period_ns", "median_s", "tries"),
+    ("loss", "period_ns", "median_s", "measurements"),
     [
         (0.2, 8 * SECOND, 0.45, 10),
         (0.5, 8 * SECOND, 8.0, 6),
@@ -166,49 +176,63 @@ def found_after_s(loss: float, period_ns: int, seed: int) -> float:
         (0.5, SECOND // 2, 1.1, 6),
     ],
 )
-def test_finding_takes_as_long_as_with_cyclonedds(loss: float, period_ns: int, median_s: float, tries: int) -> None:
-    """A median that was measured over a few tries lies where 99 % of medians of as many of ours lie."""
-    ours_s = [found_after_s(loss, period_ns, seed) for seed in range(60)]
+def test_discovery_takes_as_long_as_with_cyclonedds(
+    loss: float, period_ns: int, median_s: float, measurements: int
+) -> None:
+    """The median measured with real programs must be within the 99 % range of medians of as many simulated runs."""
+    simulated_s = [matching_time_s(loss, period_ns, seed) for seed in range(60)]
     generator = np.random.Generator(np.random.PCG64(1))
-    medians_s = np.median(generator.choice(ours_s, size=(2000, tries)), axis=1)
+    medians_s = np.median(generator.choice(simulated_s, size=(2000, measurements)), axis=1)
     low_s, high_s = np.quantile(medians_s, [0.005, 0.995])
-    # The real programs take some 30 ms more even without loss.
-    assert low_s <= median_s <= high_s + 0.03, f"ours has a median of {statistics.median(ours_s):.2f} s"
+    # The real programs take some 30 ms more, even without loss.
+    assert low_s <= median_s <= high_s + 0.03, f"the simulated median is {statistics.median(simulated_s):.2f} s"
 
 
 @given(st.lists(st.booleans(), max_size=80), st.integers(0, 20 * SECOND))
-def test_whatever_is_lost_they_find_each_other_at_last(lost: Sequence[bool], starts_ns: int) -> None:
-    left = iter(lost)
-    wire = two(lambda *_: () if next(left, False) else (0,), discovery=DiscoveryTiming(starts_ns={"b": starts_ns}))
-    run_until_found(wire)
-    found_ns = wire.now_ns
-    # Longer than a lease, so that whatever is left to be lost has been.
-    publish(wire, [found_ns + number * SECOND for number in range(60)])
-    wire.run(found_ns + 100 * SECOND)
+def test_participants_match_after_any_losses(losses: Sequence[bool], starts_ns: int) -> None:
+    remaining = iter(losses)
+    wire = two_participants(
+        lambda *_: () if next(remaining, False) else (0,), discovery=DiscoveryTiming(starts_ns={"b": starts_ns})
+    )
+    run_until_matched(wire)
+    matched_ns = wire.now_ns
+    # Longer than a lease, so that all scripted losses have occurred.
+    publish(wire, [matched_ns + number * SECOND for number in range(60)])
+    wire.run(matched_ns + 100 * SECOND)
     assert wire.delivered.keys() >= set(range(40, 60))
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(60))
 
 
-def test_heartbeats_for_several_participants_go_together() -> None:
-    """Whoever is announced gets one by itself; as long as nobody answers, those on whole periods are multicast."""
+def test_heartbeats_for_several_participants_share_a_message() -> None:
+    """The first heartbeat after an announcement is separate; without responses, later ones at whole periods are
+    multicast.
+    """
     hosts = ("a", "b", "c")
     wire = ScriptedWire(DELAY_NS, hosts=hosts, script=lambda packet, *_: (0,) if packet.destination is None else ())
-    flows = {one + other: TopicFlow(one, other) for one in hosts for other in hosts if one != other}
+    flows = {source + peer: TopicFlow(source, peer) for source in hosts for peer in hosts if source != peer}
     wire.transports["topic"] = Topics(wire, flows)
     wire.run(450 * MS)
-    beats = [
-        (one.at_ns, one.packet.source, set(one.packet.body.by_peer), one.packet.size_bytes)
-        for one in wire.transmitted
-        if isinstance(one.packet.body, SharedHeartbeats)
+    shared_heartbeats = [
+        (
+            transmission.at_ns,
+            transmission.packet.source,
+            set(transmission.packet.body.by_peer),
+            transmission.packet.size_bytes,
+        )
+        for transmission in wire.transmitted
+        if isinstance(transmission.packet.body, SharedHeartbeats)
     ]
-    # In a message with the headers of IP, UDP and RTPS, one for each of five built-in topics.
-    assert sorted(beats) == [
+    # A message has the headers of IP, UDP and RTPS, and one heartbeat for each of five built-in topics.
+    assert sorted(shared_heartbeats) == [
         (at_ns * MS, host, {*hosts} - {host}, 28 + 20 + 5 * 32) for at_ns in (200, 300, 400) for host in hosts
     ]
-    alone = [one for one in wire.transmitted if one.packet.identity[0].endswith(" heartbeat")]
-    assert {(one.at_ns, one.packet.source, one.packet.destination) for one in alone} == {
-        (DELAY_NS + MS, one, other) for one in hosts for other in hosts if one != other
-    }
+    separate_heartbeats = [
+        transmission for transmission in wire.transmitted if transmission.packet.identity[0].endswith(" heartbeat")
+    ]
+    assert {
+        (transmission.at_ns, transmission.packet.source, transmission.packet.destination)
+        for transmission in separate_heartbeats
+    } == {(DELAY_NS + MS, source, peer) for source in hosts for peer in hosts if source != peer}
 
 
 SPANS = st.lists(
@@ -218,29 +242,29 @@ SPANS = st.lists(
 
 @settings(max_examples=20)
 @given(SPANS)
-def test_after_whatever_outages_they_find_each_other_again(spans: Sequence[tuple[int, int, str]]) -> None:
-    """Outages of one way or both, longer or shorter than a lease, one after the other or at once."""
+def test_participants_match_again_after_any_outages(spans: Sequence[tuple[int, int, str]]) -> None:
+    """Outages in one or both directions, shorter or longer than a lease, separate or overlapping."""
     wires: list[ScriptedWire] = []
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
         now_s = wires[0].now_ns / SECOND
-        out = any(begin <= now_s < begin + length and packet.source in sources for begin, length, sources in spans)
-        return () if out else (0,)
+        is_out = any(begin <= now_s < begin + length and packet.source in sources for begin, length, sources in spans)
+        return () if is_out else (0,)
 
-    wire = two(script)
+    wire = two_participants(script)
     wires.append(wire)
     publish(wire, [number * SECOND for number in range(200)])
     wire.run(260 * SECOND)
-    # After the last outage a lease and a period pass at most until the next announcement, and a retry.
+    # After the last outage, at most a lease, a period until the next announcement, and a retry are needed.
     assert wire.delivered.keys() >= set(range(180, 200))
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(200))
     assert list(wire.delivered) == sorted(wire.delivered)
 
 
-def test_many_participants_all_find_each_other() -> None:
+def test_many_participants_all_match() -> None:
     hosts = [f"robot{number}" for number in range(6)]
     flows: Mapping[str, TopicFlow] = {
-        f"{one} {other}": TopicFlow(one, other) for one in hosts for other in hosts if one != other
+        f"{source} {peer}": TopicFlow(source, peer) for source in hosts for peer in hosts if source != peer
     }
     wire = ScriptedWire(DELAY_NS, hosts=hosts, script=losing_with(0.1, 1))
     topics = wire.transports["topic"] = Topics(wire, flows)

@@ -17,8 +17,8 @@ STATES = standing({"ugv": (0.0, 0.0, 1.0), "uav": (20.0, 0.0, 5.0), "other": (10
 PERIOD_NS, COUNT = 20 * MS, 150
 
 
-def carried(protocol: str, *, relay: str | None = None, disturbances: tuple[Disturbance, ...] = ()) -> Outcome:
-    """Return what becomes of messages of 3 s from ugv to other, of which each takes two frames."""
+def run_messages(protocol: str, *, relay: str | None = None, disturbances: tuple[Disturbance, ...] = ()) -> Outcome:
+    """Return the results of messages over 3 s from ugv to other; each message takes two frames."""
     topic = TopicFlow("ugv", "other", Qos(history="keep_all"))
     net = network(
         wifi(NAMES),
@@ -40,19 +40,19 @@ def carried(protocol: str, *, relay: str | None = None, disturbances: tuple[Dist
 
 @pytest.mark.parametrize("relay", [None, "uav"])
 @pytest.mark.parametrize("protocol", ["topic", "ros1"])
-def test_all_arrives_once_the_ends_have_found_each_other(protocol: str, relay: str | None) -> None:
-    one = carried(protocol, relay=relay)
-    before = len(one.dropped)
-    assert set(one.dropped.values()) <= {"not matched yet", "no subscriber is connected"}
-    assert 0 < before < 20
-    assert [number for _, number in one.arrived] == list(range(before, COUNT))
-    assert one == carried(protocol, relay=relay), "twice the same"
+def test_all_messages_arrive_after_matching(protocol: str, relay: str | None) -> None:
+    result = run_messages(protocol, relay=relay)
+    dropped_count = len(result.dropped)
+    assert set(result.dropped.values()) <= {"not matched yet", "no subscriber is connected"}
+    assert 0 < dropped_count < 20
+    assert [number for _, number in result.arrived] == list(range(dropped_count, COUNT))
+    assert result == run_messages(protocol, relay=relay), "runs are reproducible"
 
 
 @pytest.mark.parametrize("protocol", ["topic", "ros1"])
-def test_what_a_short_outage_stops_comes_after_it(protocol: str) -> None:
-    cut = LinkCut("ugv", "other", 1000 * MS, 2000 * MS)
-    one = carried(protocol, disturbances=(cut,))
-    assert len(one.arrived) + len(one.dropped) == COUNT
-    assert not any(1010 * MS < at_ns <= 2000 * MS for at_ns in one.arrived.values())
-    assert max(one.dropped)[1] < 50
+def test_messages_delayed_by_a_short_outage_arrive_after_it(protocol: str) -> None:
+    link_cut = LinkCut("ugv", "other", 1000 * MS, 2000 * MS)
+    result = run_messages(protocol, disturbances=(link_cut,))
+    assert len(result.arrived) + len(result.dropped) == COUNT
+    assert not any(1010 * MS < at_ns <= 2000 * MS for at_ns in result.arrived.values())
+    assert max(result.dropped)[1] < 50
