@@ -85,7 +85,7 @@ ONE_IMPORTER = {
     "pydantic_core": "fieldkit/config/schema.py",
     # Two formats, one of each: CSV is read into columns, columns are written as Parquet. Simulators, which
     # may import neither, record tables of their own.
-    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/tables.py",
+    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/packet_tables.py",
     # Trials' messages, those of recordings of the co-simulation, and what is left of bags that are cut off.
     "mcap": "fieldkit/bags/salvage.py fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
     # Trials and simulations draw different things; what they look like is `report.theme`'s.

@@ -6,8 +6,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.cosim.programs.pings import REPLY
-from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.programs.senders import REPLY
+from sim_backends.cosim.run_record import Fate, Run
 
 NEVER: Final = -1
 """Value of a time that does not exist, for example the arrival time of a lost packet."""

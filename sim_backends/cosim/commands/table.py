@@ -9,7 +9,7 @@ from fieldkit.cli.display import working
 from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import progress_reporter
+from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, filled
 from sim_backends.cosim.studies.agreement import Agreement
 from sim_backends.cosim.studies.flow_samples import flow_samples

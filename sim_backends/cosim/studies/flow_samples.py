@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 
 from sim_backends.cosim.columns import round_trips_s
-from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.run_record import Fate, Run
+from sim_backends.cosim.scenario.agent_plans import PingTraffic
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.traffic import PingTraffic
 from sim_backends.cosim.studies.seeds import Task, run_many
 
 UNDER_WAY = "under way when the run ended"

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fieldkit.core.model import Scenario as Sight
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
+from sim_backends.cosim.policies.window_policies import SlidingWindow
 from sim_backends.cosim.studies.agreement import Agreement, Printed, agreement
 from sim_backends.cosim.studies.flow_samples import FlowSample, Setup
 from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean

@@ -8,9 +8,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from fieldkit.core.model import Scenario as Sight
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.policies.velocity_aware import VelocityAware
+from sim_backends.cosim.policies.window_policies import EventDriven, SlidingWindow, VelocityAware
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.flow_samples import Setup

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import pytest
 
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.digest import EventDigest
-from sim_backends.cosim.interrupts import between_windows
-from sim_backends.cosim.observer import Window
+from sim_backends.cosim.commands.execution import between_windows
+from sim_backends.cosim.run_record import EventDigest, Window
 from sim_backends.world.motion import State
 
 INTERRUPTED_WINDOW = 7

@@ -5,15 +5,17 @@ from collections.abc import Callable
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, did_you_mean
-from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.policies.time_stepped import TimeStepped
-from sim_backends.cosim.policies.variable_stepped import VariableStepped
-from sim_backends.cosim.policies.velocity_aware import VelocityAware
-from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.policies.window_policies import (
+    EventDriven,
+    Scheduled,
+    SlidingWindow,
+    TimeStepped,
+    VariableStepped,
+    VelocityAware,
+    VelocityAwareRaw,
+)
 
 POLICIES: Final[dict[str, Callable[..., SyncPolicy]]] = {
     kind.name: kind

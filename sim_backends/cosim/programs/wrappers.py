@@ -1,4 +1,4 @@
-"""Programs whose computer has a wrong clock: it determines their timers and time stamps."""
+"""Programs that wrap other programs: several on one agent, outages, and clocks with an error."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,6 +8,84 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.federates import Action, Program, next_send_ns
 from sim_backends.network.packets import Received
 from sim_backends.world.motion import State
+
+
+class CombinedProgram:
+    """Combines programs of one agent: each wakes at its own times, and all receive all datagrams.
+
+    Args:
+        programs: The programs; if several steer at the same time, the command of the last one applies.
+    """
+
+    def __init__(self, programs: Sequence[Program]) -> None:
+        self._programs = tuple(programs)
+
+    def next_wake_ns(self) -> int | None:
+        """Return the earliest time of any program."""
+        times_ns = (program.next_wake_ns() for program in self._programs)
+        return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
+
+    def next_send_ns(self) -> int | None:
+        """Return the earliest time before which no program sends."""
+        times_ns = (next_send_ns(program) for program in self._programs)
+        return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
+
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Wake the programs that are due, or all if a datagram has arrived."""
+        actions = [
+            program.wake(now_ns, own_state, received)
+            for program in self._programs
+            if received or _is_due(program, now_ns)
+        ]
+        commands = [action.command for action in actions if action.command is not None]
+        datagrams = tuple(datagram for action in actions for datagram in action.datagrams)
+        return Action(datagrams, commands[-1] if commands else None)
+
+
+def _is_due(program: Program, now_ns: int) -> bool:
+    wake_ns = program.next_wake_ns()
+    return wake_ns is not None and wake_ns <= now_ns
+
+
+class Outage:
+    """A program that is off for a time: it receives and sends nothing, and its body gets a command to stop.
+
+    When it is on again, it continues as if all its packets in that time had been lost.
+
+    Args:
+        program: The program.
+        begin_ns: Time when it goes off.
+        end_ns: Time when it is on again; None for never.
+        stop: Command that stops the body; None if there is no body to stop.
+    """
+
+    def __init__(self, program: Program, begin_ns: int, end_ns: int | None, stop: Any = None) -> None:  # noqa: ANN401
+        self._program = program
+        self._begin_ns = begin_ns
+        self._end_ns = end_ns
+        self._stop = stop
+        self._is_stopped = False
+
+    def next_wake_ns(self) -> int | None:
+        """Return the program's next time; before the body has been stopped, at the latest the beginning."""
+        wake_ns = self._program.next_wake_ns()
+        return wake_ns if self._is_stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
+
+    def next_send_ns(self) -> int | None:
+        """Return the program's next time of sending."""
+        return next_send_ns(self._program)
+
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Wake the program; during the outage, discard its action, and stop the body once."""
+        is_off = self._begin_ns <= now_ns and (self._end_ns is None or now_ns < self._end_ns)
+        if not is_off:
+            return self._program.wake(now_ns, own_state, received)
+        wake_ns = self._program.next_wake_ns()
+        if wake_ns is not None and wake_ns <= now_ns:
+            self._program.wake(now_ns, own_state, ())
+        command, self._is_stopped = None if self._is_stopped else self._stop, True
+        return Action(command=command)
+
 
 _BILLION: Final = 10**9
 
