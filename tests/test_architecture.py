@@ -100,7 +100,7 @@ ONE_IMPORTER = {
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # What the drone says, and, in a process of its own, what a log of it holds.
-    "pymavlink": "fieldkit/measure/motion/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
+    "pymavlink": "fieldkit/measure/motion/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",
     "lz4": "fieldkit/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",

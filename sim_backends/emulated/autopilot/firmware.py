@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from sim_backends.emulated.autopilot.battery import Battery
 from sim_backends.emulated.autopilot.failsafes import Failsafes
 from sim_backends.emulated.autopilot.modes import Mode
+from sim_backends.emulated.autopilot.onboard_estimates import Battery
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameter, Parameters
 
 

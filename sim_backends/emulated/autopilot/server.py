@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sim_backends.emulated.ros.helm import Helm
+from sim_backends.emulated.ros.own_motion import Helm
 
 if TYPE_CHECKING:
     from sim_backends.emulated.autopilot.autopilot import Autopilot
-    from sim_backends.emulated.autopilot.port import Frame
+    from sim_backends.emulated.autopilot.mavlink_frames import Frame
 
 _TICK_NS: Final = 20_000_000
 """Interval of flight steps while there are clients, or while the drone flies."""
@@ -58,7 +58,7 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
     Args:
         drone: Settings of the drone.
         motion: The file of the paths that the lab assigns (`own_motion.append_path`).
-        steered: The file in which the robot records its motion (`helm.Helm`).
+        steered: The file in which the robot records its motion (`own_motion.Helm`).
         ready: Created when the port is open.
 
     Raises:

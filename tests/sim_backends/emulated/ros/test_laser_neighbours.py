@@ -16,9 +16,8 @@ from fieldkit.core.model import Vector
 from fieldkit.ros.types import shipped
 from sim_backends.emulated.provisioning import neighbour
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.laser import LaserTarget
+from sim_backends.emulated.ros.laser import LaserTarget, Neighbour, Neighbourhood, PlacesWriter
 from sim_backends.emulated.ros.messages import LASER_NOISE_M, LASER_SCAN, Sensor, Source
-from sim_backends.emulated.ros.neighbours import Neighbour, Neighbourhood, PlacesWriter
 from sim_backends.emulated.ros.own_motion import OwnMotion
 
 NAMES = ("own", "other", "third")
