@@ -1,8 +1,8 @@
-"""Compare middlewares on a lossy radio: `python -m benchmarks.middleware [--figures docs/studies] [--page PAGE]`.
+"""Compare middlewares on a lossy radio: `python -m benchmarks.studies.middleware [--figures FOLDER] [--page PAGE]`.
 
-As root. Six campaigns of benchmarks/middleware/ run in parallel, because a repeat mostly waits; `--only` selects some
-of them, `--full` those that last hours. Stop it at any time: the same command continues where it stopped. Then it
-prints the tables of docs/studies/middleware.md, or writes them into PAGE, and draws its figures.
+As root. Six campaigns of benchmarks/studies/middleware/ run in parallel, because a repeat mostly waits; `--only`
+selects some of them, `--full` those that last hours. Stop it at any time: the same command continues where it
+stopped. Then it prints the tables of docs/studies/middleware.md, or writes them into PAGE, and draws its figures.
 
 Two repeats, as in the campaigns, show only large differences. On a quiet machine `--repeats 12` measures each place
 twelve times, in about two and a half hours. Then the intervals treat the repeat as the independent unit.
@@ -21,19 +21,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from benchmarks import middleware_page
-from benchmarks.middleware_cells import BYTES, CAMPAIGNS, MiddlewareCell, MiddlewareFindings, read
+from benchmarks.studies import middleware_page
+from benchmarks.studies.middleware_cells import BYTES, CAMPAIGNS, MiddlewareCell, MiddlewareFindings, read
 from fieldkit.core import files
 from fieldkit.report import figures
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.theme import Style
 
 LAB: Final = Path(__file__).with_name("middleware")
-ROOT: Final = LAB.parents[1]
+ROOT: Final = LAB.parents[2]
 ROS2: Final = ROOT / ".ros2" / "bin" / "python"
 """A real ROS 2, as installed by `.ci/install --dev`."""
-BEGIN: Final = "<!-- written by benchmarks.middleware: from here -->"
-END: Final = "<!-- written by benchmarks.middleware: to here -->"
+BEGIN: Final = "<!-- written by benchmarks.studies.middleware: from here -->"
+END: Final = "<!-- written by benchmarks.studies.middleware: to here -->"
 
 STYLES: Final[dict[str, Style]] = {
     "CycloneDDS": Style("blue", "o"),

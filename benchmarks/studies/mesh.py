@@ -1,4 +1,4 @@
-"""Time that a mesh takes to heal: `python -m benchmarks.mesh --out FOLDER [--figure FILE.svg]`, as root.
+"""Time that a mesh takes to heal: `python -m benchmarks.studies.mesh --out FOLDER [--figure FILE.svg]`, as root.
 
 Trials of four layouts and two hello intervals on emulated robots without fading, with five repeats each, run in
 sequence unless FOLDER already has them; 2 hours in all. Then a table of `rtt_gap_s`, with the bound of 13.7 hello
@@ -54,7 +54,7 @@ class Layout:
 
     Attributes:
         label: Its description.
-        procedure: Name of the procedure; those that do not ship are in `benchmarks/mesh`.
+        procedure: Name of the procedure; those that do not ship are in `benchmarks/studies/mesh`.
         distance: Distance from sender to receiver.
         others: Further roles.
         away_s: Time for which the only path is interrupted; 0 if there is another path.

@@ -1,8 +1,8 @@
-"""The paper's field trial on emulated robots: `python -m benchmarks.field_shape [--figures FOLDER]`, as root.
+"""The paper's field trial on emulated robots: `python -m benchmarks.studies.field_shape [--figures FOLDER]`, as root.
 
-Four campaigns (benchmarks/lawn/: two topologies, with line of sight and behind the wall) run in parallel, because a
-repeat mostly waits; 640 repeats take 21 to 25 minutes. You can stop it at any time: the same command continues. At
-the end it prints the table of docs/studies/field-shape.md and draws its two figures.
+Four campaigns (benchmarks/studies/lawn/: two topologies, with line of sight and behind the wall) run in parallel,
+because a repeat mostly waits; 640 repeats take 21 to 25 minutes. You can stop it at any time: the same command
+continues. At the end it prints the table of docs/studies/field-shape.md and draws its two figures.
 """
 
 import argparse

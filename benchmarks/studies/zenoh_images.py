@@ -1,9 +1,9 @@
-"""Losses of images of 1 MB over Zenoh, per repeat: `python -m benchmarks.zenoh_images [--rounds N] [--page P]`.
+"""Losses of 1 MB images over Zenoh, per repeat: `python -m benchmarks.studies.zenoh_images [--rounds N] [--page P]`.
 
 As root. Two emulated robots of a separate lab, 20 m apart. The agent of the step `topics` is compared with a plain
-pair of Zenoh sessions on the same robots (benchmarks/zenoh_plain.py, which imports nothing of fieldkit), with several
-settings; each round runs all of them in turn. Losses of this stream are bimodal, so each repeat is printed and no
-mean.
+pair of Zenoh sessions on the same robots (benchmarks/studies/zenoh_plain.py, which imports nothing of fieldkit), with
+several settings; each round runs all of them in turn. Losses of this stream are bimodal, so each repeat is printed
+and no mean.
 
 A repeat takes 11 s, a round of six settings about 70 s.
 """
@@ -21,16 +21,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.middleware import LAB, ROOT
+from benchmarks.studies.middleware import LAB, ROOT
 from fieldkit.core import files
 from fieldkit.measure.transfers import topic_log
 from fieldkit.ros import topics, tuning
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 
-BEGIN: Final = "<!-- written by benchmarks.zenoh_images: from here -->"
-END: Final = "<!-- written by benchmarks.zenoh_images: to here -->"
-PLAIN: Final = ROOT / "benchmarks" / "zenoh_plain.py"
+BEGIN: Final = "<!-- written by benchmarks.studies.zenoh_images: from here -->"
+END: Final = "<!-- written by benchmarks.studies.zenoh_images: to here -->"
+PLAIN: Final = ROOT / "benchmarks" / "studies" / "zenoh_plain.py"
 BYTES: Final = 1_000_000
 RATE_HZ: Final = 2.0
 SAMPLES: Final = 16

@@ -1,4 +1,4 @@
-"""Results of the campaigns of benchmarks/middleware/, by middleware, size, distance and number of robots."""
+"""Results of the campaigns of benchmarks/studies/middleware/, by middleware, size, distance and number of robots."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from benchmarks.middleware_cells import MiddlewareCell
+from benchmarks.studies.middleware_cells import MiddlewareCell
 from fieldkit.analysis.statistics import wilsons
 
 TOGETHER_S: Final = 0.5

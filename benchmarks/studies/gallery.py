@@ -1,4 +1,4 @@
-"""Pictures of docs/gallery.md, from stored trials: `python -m benchmarks.gallery [--out docs/gallery]`.
+"""Pictures of docs/gallery.md, from stored trials: `python -m benchmarks.studies.gallery [--out docs/gallery]`.
 
 Makes a report of the trials in `TRIALS` and saves parts of it as pictures with Debian's Chromium. Needs
 neither root nor a network.

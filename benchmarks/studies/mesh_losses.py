@@ -1,4 +1,4 @@
-"""Time that a mesh takes to find another path: `python -m benchmarks.mesh_losses [--losses N]`, as root.
+"""Time that a mesh takes to find another path: `python -m benchmarks.studies.mesh_losses [--losses N]`, as root.
 
 Three labs run at the same time: a path of three hops with an alternative of four, without and with fading, and with
 an alternative of three with fading. In each lab the sender's next hop is switched off until the receiver answers a
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from benchmarks.mesh import BOUND_HELLOS
+from benchmarks.studies.mesh import BOUND_HELLOS
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
