@@ -25,8 +25,8 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.lab.protocol import LabRobot
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.nodes import EmulatedRobot, running_robots
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.world.world import load_world
 

@@ -15,9 +15,9 @@ from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import LinkError, RobotError, TestbedLostError
 from fieldkit.lab.protocol import LabRobot
 from sim_backends.emulated import placement
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.medium.framing import ETHERNET, IP
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
 from sim_backends.emulated.provisioning import LAPTOP_NAME, KeyPair, RobotKey, robot_spec

@@ -16,15 +16,12 @@ from fieldkit.config.schema import (
     Length,
     Speed,
     Strict,
-    pattern_field,
 )
+from fieldkit.config.site import RobotName
 from sim_backends.cosim.programs.senders import REPLY
 from sim_backends.world.obstacles import Coordinate, Real
 
-Name = Annotated[
-    str,
-    pattern_field(r"^[a-z][a-z0-9-]{0,30}$", "a name: small letters, digits and -, a small letter first, 31 at most"),
-]
+Name = RobotName
 """The name of an agent, or of an entry of the traffic."""
 
 

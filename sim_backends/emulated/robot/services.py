@@ -13,7 +13,7 @@ from typing import Final
 
 from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
 from fieldkit.remote.command import with_environment
-from sim_backends.emulated.autopilot import server as autopilot
+from sim_backends.emulated.autopilot import mavlink_server as autopilot
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.robot import base_process, network, ssh_server
 from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, STATE, RobotSpec

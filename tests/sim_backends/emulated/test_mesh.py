@@ -19,8 +19,8 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.lab.protocol import LabRobot
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import requirements
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.nodes import Laptop, RunningRobots, running_robots
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME
 from sim_backends.emulated.robot import network
 from sim_backends.emulated.robot.spec import USER

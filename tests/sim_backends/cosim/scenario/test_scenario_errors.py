@@ -80,7 +80,7 @@ WRONG = [
     ("leader: one", "leader: noone", 14, "no agent 'noone'; did you mean 'one'"),
     ("leader: one", "leader: [one, three]", 12, "two follows three and receives no states of it; add to the traffic"),
     ("distance: 2m", "distance: 0m", 15, "greater than 0"),
-    ("from: one, to: two", "from: one, to: twö", 18, "'twö' is not a name: small letters"),
+    ("from: one, to: two", "from: one, to: twö", 18, "'twö' is not a name of at most 31 lower-case letters"),
     ("from: one, to: two", "from: one, to: tow", 18, "no agent 'tow'; did you mean 'two'"),
     ("from: one, to: two", "from: one, to: one", 18, "one sends to itself"),
     ("from: one, to: two", "from: one, to: []", 18, "at least 1 item"),

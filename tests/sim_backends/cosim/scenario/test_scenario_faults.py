@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_backends.cosim.columns import NEVER, columns, round_trips_s
 from sim_backends.cosim.commands.results import recoveries
 from sim_backends.cosim.federates import UnansweredError
+from sim_backends.cosim.packet_columns import NEVER, columns, round_trips_s
 from sim_backends.cosim.recording import packet_tables
 from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build

@@ -16,9 +16,9 @@ from fieldkit.config.site import Site
 from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
 from sim_backends.emulated import placement
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered
 from sim_backends.emulated.nodes import RunningRobots, running_robots
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
