@@ -181,6 +181,5 @@ ARDUCOPTER: Final = Firmware(
     fix_type=_d.GPS_FIX_TYPE_RTK_FIXED,
     guided_holds=True,
     lifts_off=False,
-    lands_anywhere=True,
     first_item=1,
 )

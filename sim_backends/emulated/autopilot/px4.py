@@ -161,6 +161,5 @@ PX4: Final = Firmware(
     fix_type=_d.GPS_FIX_TYPE_3D_FIX,
     guided_holds=False,
     lifts_off=True,
-    lands_anywhere=False,
     first_item=0,
 )
