@@ -24,9 +24,9 @@ from typing import Final
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.policies.window_policies import SlidingWindow
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.network.packets import Packet, Received

@@ -20,7 +20,7 @@ from typing import Final
 from benchmarks.medium import PAYLOAD_BYTES, RADIO, quantile
 from benchmarks.swarm import swarm
 from fieldkit.core.model import DelayParts
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.options import RadioOptions

@@ -17,7 +17,7 @@ from typing import Final
 from benchmarks.medium import RADIO
 from benchmarks.namespaces import Namespace
 from fieldkit.core.model import Vector
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world
 

@@ -29,9 +29,9 @@ from benchmarks.namespaces import Namespace
 from fieldkit.core.model import Lateness, Role, Topology
 from fieldkit.measure.evidence.lateness import quantile_ns
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.emulated_options import RosChoice
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot
-from sim_backends.emulated.options import RosChoice
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import World

@@ -86,7 +86,7 @@ ONE_IMPORTER = {
     "pydantic_core": "fieldkit/config/schema.py",
     # One module per format: CSV is read into columns, columns are written as Parquet. Simulators, which may import
     # neither, write their own tables.
-    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/tables.py",
+    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/packet_tables.py",
     # Messages of trials, messages of co-simulation recordings, and recovery of truncated bags.
     "mcap": "fieldkit/bags/salvage.py fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
     # Trials and simulations draw different figures; `report.theme` defines their style.
@@ -101,7 +101,7 @@ ONE_IMPORTER = {
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # Messages of the drone, and, in a separate process, reading its log.
-    "pymavlink": "fieldkit/measure/motion/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
+    "pymavlink": "fieldkit/measure/motion/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",
     "lz4": "fieldkit/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",

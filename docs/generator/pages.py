@@ -21,11 +21,10 @@ from fieldkit.core.columns import Column, DifferenceRow, EstimateRow, declared
 from fieldkit.steps.base import Step, step_types
 from fieldkit.trial.columns import installed
 from fieldkit.trial.procedure import Procedure
+from sim_backends.cosim.scenario.agent_plans import MotionPlan, Traffic
 from sim_backends.cosim.scenario.faults import Fault
-from sim_backends.cosim.scenario.motions import MotionPlan
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.traffic import Traffic
-from sim_backends.emulated.options import EmulatedOptions
+from sim_backends.emulated.emulated_options import EmulatedOptions
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / "reference"
 _MARKS: Final = "`[]` means each item of a list, `*` each name of a mapping. Values: [quantities](../values.md)."

@@ -4,8 +4,14 @@ import heapq
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from sim_backends.cosim.federate_errors import FederateError, federate_error, seconds_text
-from sim_backends.cosim.federates import PhysicsFederate, Program, next_send_ns
+from sim_backends.cosim.federates import (
+    FederateError,
+    PhysicsFederate,
+    Program,
+    federate_error,
+    next_send_ns,
+    seconds_text,
+)
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 

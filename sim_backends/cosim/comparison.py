@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.cosim.geometry import position_error_m
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.packet_ledger import position_error_m
+from sim_backends.cosim.run_record import Run
 from sim_backends.radio.random_streams import PacketIdentity
 
 Floats = NDArray[np.float64]

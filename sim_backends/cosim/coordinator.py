@@ -11,14 +11,10 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents, Sent
-from sim_backends.cosim.digest import EventDigest
-from sim_backends.cosim.federate_errors import federate_error, seconds_text
-from sim_backends.cosim.federates import NetworkFederate, check_physics, check_states
-from sim_backends.cosim.geometry import fixed_emitters_m, transmitters
-from sim_backends.cosim.ledger import PacketLedger
-from sim_backends.cosim.observer import Window, WindowObserver
-from sim_backends.cosim.policies.base import LookingAhead, Pair, PolicyError, Situation, SyncPolicy
-from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.federates import NetworkFederate, check_physics, check_states, federate_error, seconds_text
+from sim_backends.cosim.packet_ledger import PacketLedger, fixed_emitters_m, transmitters
+from sim_backends.cosim.policies.sync_policy import LookingAhead, Pair, PolicyError, Situation, SyncPolicy
+from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
 from sim_backends.cosim.wall_time import WallTime
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.dead_reckoning import DeadReckoned

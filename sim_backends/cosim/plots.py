@@ -21,8 +21,15 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from fieldkit.core.text import sanitized
 from fieldkit.report.theme import CYCLE, LIGHT, METADATA, SETTINGS, Colour, Format, Marker
-from sim_backends.cosim.from_above import ObstacleOutline, last_heading
-from sim_backends.cosim.label_placement import LabelBox, Point, curve_boxes, place_labels, stack_labels
+from sim_backends.cosim.plot_layout import (
+    LabelBox,
+    ObstacleOutline,
+    Point,
+    curve_boxes,
+    last_heading,
+    place_labels,
+    stack_labels,
+)
 
 _FONT_POINTS: Final = 8.0
 """Font size that IEEE requires."""

@@ -17,7 +17,7 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.ros.ports import MAX_DOMAIN
-from sim_backends.emulated.options import EmulatedOptions, Ros2Options, RosChoice, load_options
+from sim_backends.emulated.emulated_options import EmulatedOptions, Ros2Options, RosChoice, load_options
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
     LAPTOP_NAME,
@@ -157,7 +157,7 @@ class EmulatedBackend:
     @contextmanager
     def open_lab(self, *, seed: int, sink: Sink) -> "Iterator[Lab]":
         """Implement `LabBackend.open_lab`."""
-        from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
+        from sim_backends.emulated import interactive_lab  # noqa: PLC0415 (as in `open`)
 
         if self._site.control is Control.RADIO:
             sink(Note("control: radio applies to trials; in a lab SSH bypasses the radio and reaches every robot"))
@@ -165,20 +165,20 @@ class EmulatedBackend:
         ros = self._checked_ros(members)
         _check_bridges(members, ros)
         sink(PhaseStarted("start robots"))
-        with lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
+        with interactive_lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
             yield up
 
     def overview(self) -> "Overview":
         """Implement `LabBackend.overview`, without shadowing, which depends on the seed."""
-        from sim_backends.emulated import lab, placement  # noqa: PLC0415 (as in `open`)
+        from sim_backends.emulated import interactive_lab, placement  # noqa: PLC0415 (as in `open`)
 
         members = self._members()
-        return lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
+        return interactive_lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
 
     def _members(self) -> "dict[str, LabRobot]":
-        from sim_backends.emulated import lab  # noqa: PLC0415 (as in `open`)
+        from sim_backends.emulated import interactive_lab  # noqa: PLC0415 (as in `open`)
 
-        members = lab.members_of(self._site, self._document, self._addresses)
+        members = interactive_lab.members_of(self._site, self._document, self._addresses)
         self._check_profiles(members)
         return members
 

@@ -13,7 +13,7 @@ from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Move, Placement, Role, TrackPoint, Vector
 from sim_backends.emulated import placement as places
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
 from sim_backends.emulated.provisioning import RobotKey
 from sim_backends.emulated.ros.steered import Steered

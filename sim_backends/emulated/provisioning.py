@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Final, Self, TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.emulated.options import AS_THIS_MACHINE, EmulatedOptions, RosChoice, uses_debian_ros
+from sim_backends.emulated.emulated_options import AS_THIS_MACHINE, EmulatedOptions, RosChoice, uses_debian_ros
 from sim_backends.emulated.robot.spec import ANTENNA_M, LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros import static_frames
-from sim_backends.emulated.ros.laser import LaserTarget
+from sim_backends.emulated.ros.laser import LaserTarget, Neighbour
 from sim_backends.emulated.ros.messages import GENERATORS, LASER_SCAN, Definition, Sensor
-from sim_backends.emulated.ros.neighbours import Neighbour
 from sim_backends.world.shapes import Cylinder, Shape
 from sim_backends.world.world import World
 

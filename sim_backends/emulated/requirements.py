@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.emulated.options import RosChoice, uses_debian_ros
+from sim_backends.emulated.emulated_options import RosChoice, uses_debian_ros
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import PATH
 from sim_backends.emulated.robot import network, rootfs, services

@@ -26,13 +26,12 @@ from fieldkit.core.prompts import DONE, UNATTENDED, Answer, Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
 from sim_backends.emulated import placement as places
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.mobility import Mobility
-from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node
-from sim_backends.emulated.options import EmulatedOptions, MeshOptions, RosChoice
+from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node, RunningRobots, running_robots
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey
 from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.world.world import World
 
 _IP_PROTOCOL: Final = {Protocol.TCP: socket.IPPROTO_TCP, Protocol.UDP: socket.IPPROTO_UDP}

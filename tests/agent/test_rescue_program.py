@@ -17,7 +17,7 @@ from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.guidance import SetPoint
+from sim_backends.emulated.autopilot.flight import SetPoint
 from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.px4 import PX4
 from tests.helpers import drones

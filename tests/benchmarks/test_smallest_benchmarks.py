@@ -9,15 +9,15 @@ from tests.helpers.smallest import CASES, run_module, run_smallest
 
 NOT_RUN = {
     "firmware_flights": "needs simulated firmware, not available in CI; test_firmware_flights.py tests its rows",
-    "gallery": "run by tests/e2e/test_gallery.py",
+    "studies.gallery": "run by tests/e2e/test_gallery.py",
     "wifi_vm": "builds a virtual machine of Debian packages, which takes 8 minutes or more to boot",
 }
 """Benchmarks that need more than CI has, with their tests; only their help is printed here."""
 
-PARTS = {"bash_peer", "footprint", "lifetimes", "middleware_cells", "middleware_page", "namespaces", "own_time"} | {
-    "pandas_peer",
-    "slow_links",
-    "zenoh_plain",
+PARTS = {"bash_peer", "footprint", "lifetimes", "namespaces", "own_time", "pandas_peer", "slow_links"} | {
+    "studies.middleware_cells",
+    "studies.middleware_page",
+    "studies.zenoh_plain",
 }
 """Modules that other benchmarks import or start."""
 
@@ -36,6 +36,7 @@ def test_a_benchmark_that_does_not_run_here_prints_its_help(name: str) -> None:
 
 def test_every_module_runs_or_is_used_by_others() -> None:
     modules = {path.stem for path in (ROOT / "benchmarks").glob("*.py")}
+    modules |= {f"studies.{path.stem}" for path in (ROOT / "benchmarks" / "studies").glob("*.py")}
     assert set(CASES) | set(NOT_RUN) | PARTS == modules
     texts = [
         path.read_text(encoding="utf-8")
@@ -43,4 +44,4 @@ def test_every_module_runs_or_is_used_by_others() -> None:
         for path in (ROOT / folder).rglob("*.py")
     ]
     for name in PARTS:
-        assert sum(name in text for text in texts) > 1, f"nothing uses benchmarks/{name}.py"
+        assert sum(name.split(".")[-1] in text for text in texts) > 1, f"nothing uses benchmarks.{name}"

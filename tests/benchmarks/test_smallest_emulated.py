@@ -9,7 +9,16 @@ from tests.helpers.smallest import CASES, run_smallest
 pytestmark = pytest.mark.emulated
 
 ON_NAMESPACES = ("layers", "medium", "moves", "swarm", "tcp_vs_kernel")
-ON_ROBOTS = ("emane", "field_shape", "mesh", "mesh_losses", "middleware", "stop", "trial_overhead", "zenoh_images")
+ON_ROBOTS = (
+    "emane",
+    "stop",
+    "studies.field_shape",
+    "studies.mesh",
+    "studies.mesh_losses",
+    "studies.middleware",
+    "studies.zenoh_images",
+    "trial_overhead",
+)
 ON_LOOPBACK = ("bridge",)
 
 

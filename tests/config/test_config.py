@@ -14,7 +14,7 @@ from fieldkit.core.model import Role
 from fieldkit.steps.kinds.ping import Payloads
 from fieldkit.trial.procedure import Procedure, load_procedure
 from sim_backends.cosim.scenario.schema import PhysicsOptions, PolicyChoice
-from sim_backends.emulated.options import EmulatedOptions
+from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.radio.options import RadioOptions
 from tests.helpers.paths import ROOT
 

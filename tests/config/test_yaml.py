@@ -14,7 +14,7 @@ from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
-from sim_backends.emulated.options import EmulatedOptions
+from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.world.world import World
 from tests.helpers.paths import DATA, ROOT
 

@@ -1,10 +1,10 @@
-"""The pictures of docs/gallery.md are those that benchmarks.gallery generates."""
+"""The pictures of docs/gallery.md are those that benchmarks.studies.gallery generates."""
 
 from pathlib import Path
 
 import pytest
 
-from benchmarks import gallery
+from benchmarks.studies import gallery
 from tests.helpers.paths import ROOT
 
 PICTURES = ROOT / "docs" / "gallery"

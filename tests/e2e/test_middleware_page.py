@@ -5,8 +5,8 @@ import re
 import pytest
 from scipy import stats
 
-from benchmarks import middleware, middleware_page
-from benchmarks.middleware_cells import MiddlewareFindings
+from benchmarks.studies import middleware, middleware_page
+from benchmarks.studies.middleware_cells import MiddlewareFindings
 from tests.helpers.paths import ROOT
 
 PAGE = ROOT / "docs" / "studies" / "middleware.md"

@@ -10,11 +10,11 @@ import numpy as np
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Program
-from sim_backends.cosim.policies.base import SyncPolicy
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.programs.follow import FollowAtHeadway
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.programs.several import CombinedProgram
-from sim_backends.cosim.programs.velocity_profile import SpeedOscillation
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.programs.way_points import SpeedOscillation
+from sim_backends.cosim.programs.wrappers import CombinedProgram
 from sim_backends.cosim.studies.intervals import Floats
 from sim_backends.network.disc import Disc
 from sim_backends.physics.bodies import Bodies

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import common as d
 
 from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.mavlink import Message
+from sim_backends.emulated.autopilot.mavlink_frames import Message
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameters
 from sim_backends.emulated.autopilot.px4 import PX4
 from sim_backends.physics.ground import Ground

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.policies.base import SyncPolicy
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.run import Run
-from sim_backends.cosim.scenario.policies import make_policy
+from sim_backends.cosim.policies.registry import make_policy
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.run_record import Run
 from sim_backends.network.disc import Disc
 from sim_backends.physics.paths import Paths
 from sim_backends.radio.random_streams import RandomStream

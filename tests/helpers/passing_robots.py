@@ -7,12 +7,12 @@ from pathlib import Path
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.observer import Window, WindowObserver
-from sim_backends.cosim.policies.base import SyncPolicy
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.policies.window_policies import SlidingWindow
+from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder
+from sim_backends.cosim.run_record import Window, WindowObserver
 from sim_backends.network.disc import Disc
 from sim_backends.network.ip import Fragment
 from sim_backends.network.wire import IpPacket

@@ -259,7 +259,7 @@ def _short_row(module: ModuleType, folder: Path) -> None:
     """Reduce `mesh` to the loss of one of three robots for a second."""
     source = folder / "mesh"
     source.mkdir()
-    shutil.copy(ROOT / "benchmarks" / "mesh" / "box.yaml", source)
+    shutil.copy(ROOT / "benchmarks" / "studies" / "mesh" / "box.yaml", source)
     (source / "mesh_small.yaml").write_text(_ROW, encoding="utf-8")
     replace(module, "HERE", folder)
     replace(module, "HELLOS_S", (1,))
@@ -286,13 +286,13 @@ CASES: Final[Mapping[str, Smallest]] = {
     "cosim_speed": Smallest("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy"),
     "cosim_vs_ns3": Smallest("", shrink=_one_link),
     "emane": Smallest("--rounds 1", {"ROBOTS": 2, "PINGS": 3}, shrink=_one_radio, emulated=True),
-    "field_shape": Smallest("--out FOLDER/lab --repeats 1", shrink=_one_trial, emulated=True),
+    "studies.field_shape": Smallest("--out FOLDER/lab --repeats 1", shrink=_one_trial, emulated=True),
     "layers": Smallest("--rounds 1 --packets 20", {"PINGS": 5, "STATIONS": (2,)}, shrink=_one_layer, emulated=True),
     "ledger": Smallest("--repeats 3"),
     "medium": Smallest("--rounds 1 --seconds 1 --probes 20", shrink=_slow_iperf, emulated=True),
-    "mesh": Smallest("--out FOLDER/lab --repeats 1", shrink=_short_row, emulated=True),
-    "mesh_losses": Smallest("--losses 1", shrink=_short_detour, emulated=True),
-    "middleware": Smallest("--out FOLDER/lab --only dds --repeats 1", shrink=_one_stream, emulated=True),
+    "studies.mesh": Smallest("--out FOLDER/lab --repeats 1", shrink=_short_row, emulated=True),
+    "studies.mesh_losses": Smallest("--losses 1", shrink=_short_detour, emulated=True),
+    "studies.middleware": Smallest("--out FOLDER/lab --only dds --repeats 1", shrink=_one_stream, emulated=True),
     "moves": Smallest("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
     "pcap": Smallest("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 400}),
     "radio_vs_ns3": Smallest("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}, shrink=_without_ns3),
@@ -304,7 +304,9 @@ CASES: Final[Mapping[str, Smallest]] = {
     "telemetry": Smallest("--seconds 0.5", {"SLOWER": (1,)}, shrink=_stand_in_iw),
     "topics": Smallest("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "LASTS_S": 1.0, "BURST_S": 0.1}),
     "trial_overhead": Smallest("--rounds 1 --record 1s --round-trips 0s", emulated=True),
-    "zenoh_images": Smallest("--rounds 1", {"SAMPLES": 2, "BYTES": 10_000}, shrink=_one_setting, emulated=True),
+    "studies.zenoh_images": Smallest(
+        "--rounds 1", {"SAMPLES": 2, "BYTES": 10_000}, shrink=_one_setting, emulated=True
+    ),
 }
 """The minimal run of each benchmark that the tests run."""
 

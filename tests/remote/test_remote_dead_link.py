@@ -18,7 +18,7 @@ from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.world.world import load_world
 from tests.helpers.host import descendants

@@ -21,10 +21,8 @@ from fieldkit.measure.captures.packets import ACK, NOT_CAPTURED, SYN, Packets
 from fieldkit.measure.evidence.host import Counters
 from fieldkit.measure.evidence.iperf3 import IperfTest
 from fieldkit.measure.transfers.load import LoadFlow
+from fieldkit.measure.transfers.load_streams import COOKIE_BYTES
 from fieldkit.measure.transfers.streams import LONGEST_BYTES
-
-COOKIE_BYTES: Final = 37
-"""Length of the cookie at the start of each TCP connection of the client (iperf_api.h, COOKIE_SIZE)."""
 
 EARLY_NS: Final = 300_000_000
 LATE_NS: Final = 500_000_000

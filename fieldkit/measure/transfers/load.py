@@ -10,6 +10,7 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Ints
 from fieldkit.measure.captures.ip import TCP, UDP
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
+from fieldkit.measure.transfers.load_streams import COOKIE_BYTES
 from fieldkit.measure.transfers.streams import Connections
 
 COLUMNS: Final = columns(
@@ -34,10 +35,6 @@ COLUMNS: Final = columns(
         NEGATIVE_LOSS_BOUNDS,
     ),
 )
-
-_COOKIE_BYTES: Final = 37
-"""Length of the cookie at the start of each TCP connection of a test, sent before its data (iperf_api.h,
-COOKIE_SIZE)."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,7 @@ def _loss(flow: LoadFlow, sent: list[Packets], received: list[Packets]) -> float
 def _rate(flow: LoadFlow, received: list[Packets]) -> float | None:
     """Return the rate of received payload, each byte once; None if it cannot be computed."""
     udp = flow.protocol is Protocol.UDP
-    data = [packets if udp else packets.where(packets.tcp_payload_bytes > _COOKIE_BYTES) for packets in received]
+    data = [packets if udp else packets.where(packets.tcp_payload_bytes > COOKIE_BYTES) for packets in received]
     times_ns: Ints = np.concatenate([packets.time_ns for packets in data]) if data else np.array([], dtype=np.int64)
     start_s, end_s = flow.window_s
     if not len(times_ns) or (times_ns == NO_TIME).any() or end_s <= start_s:

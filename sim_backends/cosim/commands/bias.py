@@ -9,13 +9,12 @@ from typing import Final
 from fieldkit.cli.display import show_note, working
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import progress_reporter
+from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
-from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.bias import Bias, biases
-from sim_backends.cosim.studies.outcomes import outcomes
+from sim_backends.cosim.studies.shootout import Bias, biases, outcomes
 
 LABELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
     {"loss": ("packets lost (%)", 100.0), "delay_s": ("delay (ms)", 1e3), "apart_m": ("agents apart (m)", 1.0)}
@@ -50,9 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
     for name, failure in all_outcomes.failures.items():
         show_note(f"{name}: {failure}")
     if draw is not None:
-        from sim_backends.cosim.commands import figures  # noqa: PLC0415 (importing matplotlib takes half a second)
+        from sim_backends.cosim.commands import plot  # noqa: PLC0415 (importing matplotlib takes half a second)
 
-        draw(figures.bias_of_policies(by_policy))
+        draw(plot.bias_of_policies(by_policy))
     return 0
 
 

@@ -11,11 +11,11 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import progress_reporter
+from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, filled, number
-from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.bounds import BoundCost, FixedCost, bound_cost, fixed_cost, longest_for_all

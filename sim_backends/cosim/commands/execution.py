@@ -1,24 +1,54 @@
-"""Runs of a scenario, one per seed, with progress reports."""
+"""Runs of a scenario, one per seed, with progress reports; SIGINT stops a run between two windows."""
 
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import partial
+from types import FrameType
 
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Sink
-from sim_backends.cosim.commands.clock import progress_reporter
-from sim_backends.cosim.commands.folder import RunFolder
 from sim_backends.cosim.commands.results import SeedResult, seed_result
-from sim_backends.cosim.interrupts import between_windows
+from sim_backends.cosim.commands.run_folder import RunFolder
+from sim_backends.cosim.commands.settings import progress_reporter
+from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.recording.manifest import RunSettings
-from sim_backends.cosim.recording.recorder import RunRecorder
-from sim_backends.cosim.recording.samples import StateSamples
+from sim_backends.cosim.recording.recorder import RunRecorder, StateSamples
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.stalls import DEADLINE_S
 from sim_backends.cosim.studies.formation import has_followers
 from sim_backends.cosim.studies.seeds import Task, as_completed_tasks
+from sim_backends.cosim.wall_time import DEADLINE_S
+
+
+@contextmanager
+def between_windows(coordinator: Coordinator) -> Iterator[None]:
+    """Let SIGINT raise `KeyboardInterrupt` as soon as no window is being hashed and recorded.
+
+    Outside the main thread, or if SIGINT has another handler, nothing changes.
+
+    Args:
+        coordinator: The coordinator of the run.
+    """
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if coordinator.is_committing:
+            coordinator.is_interrupted = True
+        else:
+            signal.default_int_handler(number, frame)
+
+    coordinator.is_committing = coordinator.is_interrupted = False
+    signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def simulate(

@@ -8,8 +8,8 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.printing import print_text
 from fieldkit.core.text import json_text
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
+from sim_backends.cosim.policies.registry import POLICIES
 from sim_backends.cosim.scenario.loading import load_scenario, scenario_files
-from sim_backends.cosim.scenario.policies import POLICIES
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 _SCENARIO: Final = (SheetColumn("scenario", "scenario", ""), SheetColumn("summary", "summary", ""))

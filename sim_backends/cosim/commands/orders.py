@@ -11,13 +11,13 @@ from fieldkit.cli.display import show_note, working
 from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import progress_reporter
+from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.policies.base import PolicyError, SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
+from sim_backends.cosim.policies.registry import POLICIES, make_policy
+from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
 from sim_backends.cosim.scenario.build import build
-from sim_backends.cosim.scenario.policies import POLICIES, make_policy
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.local_errors import (
     MEASURES,
@@ -63,9 +63,9 @@ def run(arguments: argparse.Namespace) -> int:
     for name, failure in failures.items():
         show_note(f"{name}: {failure}")
     if draw is not None:
-        from sim_backends.cosim.commands import figures  # noqa: PLC0415 (importing matplotlib takes half a second)
+        from sim_backends.cosim.commands import plot  # noqa: PLC0415 (importing matplotlib takes half a second)
 
-        draw(figures.error_against_window(by_policy))
+        draw(plot.error_against_window(by_policy))
     return 0
 
 

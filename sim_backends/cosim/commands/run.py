@@ -9,9 +9,8 @@ from fieldkit.cli.display import show_note, working
 from fieldkit.core.printing import print_text
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate_all
-from sim_backends.cosim.commands.folder import RunFolder
-from sim_backends.cosim.commands.followers import FORMATION, formation_values
-from sim_backends.cosim.commands.results import SeedResult
+from sim_backends.cosim.commands.results import FORMATION, SeedResult, formation_values
+from sim_backends.cosim.commands.run_folder import RunFolder
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, number, show_all
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario

@@ -9,12 +9,12 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count, parse_quantity
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import progress_reporter
+from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number
-from sim_backends.cosim.policies.base import SyncPolicy
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.policies.registry import make_policy
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
-from sim_backends.cosim.scenario.policies import make_policy
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.satisfaction import Satisfaction, satisfy
 

@@ -1,7 +1,8 @@
-"""Applies the options of a command to a scenario."""
+"""Applies the options of a command to a scenario, and reports the progress of its runs."""
 
 import argparse
 import inspect
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -10,13 +11,35 @@ from fieldkit.cli.display import show_note
 from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, shell_command
+from fieldkit.core.events import Progress, Sink
 from fieldkit.core.units import format_count, parse_duration_s
 from fieldkit.report.theme import Format, format_of
+from sim_backends.cosim.policies.registry import POLICIES, make_policy
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.phases import commensurate_events, incommensurate_window_s
-from sim_backends.cosim.scenario.policies import POLICIES, make_policy
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.stalls import DEADLINE_S
+from sim_backends.cosim.wall_time import DEADLINE_S
+
+
+def progress_reporter(sink: Sink, unit: str = "runs") -> Callable[[str, float, float], None]:
+    """Return a function that reports progress to a sink; its arguments are the activity, the total and the part done.
+
+    The time left is estimated from the time since the first call for the same activity.
+
+    Args:
+        sink: Receives the events.
+        unit: Unit of total and part.
+    """
+    started_s: dict[str, float] = {}
+
+    def report(activity: str, total: float, done: float) -> None:
+        now_s = time.monotonic()
+        spent_s = now_s - started_s.setdefault(activity, now_s)
+        left_s = spent_s * (total / done - 1) if done and spent_s else None
+        sink(Progress(activity, done, total, unit, left_s))
+
+    return report
+
 
 ENOUGH_SEEDS: Final = 20
 """Each seed draws one phase; the mean over 20 phases has a standard error of 7 % of a window."""

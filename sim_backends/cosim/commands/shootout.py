@@ -10,17 +10,16 @@ from fieldkit.cli.display import show_note, working
 from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import bias, bound, orders, settings
-from sim_backends.cosim.commands.clock import progress_reporter
-from sim_backends.cosim.commands.followers import FORMATION, formation_values
+from sim_backends.cosim.commands.results import FORMATION, formation_values
+from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.comparison import Errors
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import formation, has_followers
-from sim_backends.cosim.studies.outcomes import outcomes
-from sim_backends.cosim.studies.shootout import Row, rows
+from sim_backends.cosim.studies.shootout import Row, outcomes, rows
 
 COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
@@ -76,14 +75,14 @@ def run(arguments: argparse.Namespace) -> int:
         if (note := _exceeded_bound(scenario, row)) is not None:
             show_note(note)
     if draw is not None:
-        from sim_backends.cosim.commands import figures  # noqa: PLC0415 (importing matplotlib takes half a second)
+        from sim_backends.cosim.commands import plot  # noqa: PLC0415 (importing matplotlib takes half a second)
 
         panel = None
         if has_followers(scenario):
             longest_s = windows_s[-1]
             longest_rows = (row for window_s, row in all_rows if window_s == longest_s)
-            panel = figures.growth(longest_rows, f"{longest_s * 1e3:g} ms")
-        draw(figures.error_against_cost(figures.cost_points(row for _, row in all_rows), panel))
+            panel = plot.growth(longest_rows, f"{longest_s * 1e3:g} ms")
+        draw(plot.error_against_cost(plot.cost_points(row for _, row in all_rows), panel))
     return 0
 
 

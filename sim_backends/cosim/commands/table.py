@@ -9,12 +9,11 @@ from fieldkit.cli.display import working
 from fieldkit.core.printing import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.clock import progress_reporter
+from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, filled
-from sim_backends.cosim.studies.agreement import Agreement
-from sim_backends.cosim.studies.flow_samples import flow_samples
 from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims
-from sim_backends.cosim.studies.paper_tables import PaperCell, PaperRow, paper_table
+from sim_backends.cosim.studies.paper_setups import flow_samples
+from sim_backends.cosim.studies.paper_tables import Agreement, PaperCell, PaperRow, paper_table
 
 _TITLES: Final = {
     "1": "table 1, masterless, UGV to UGV",

@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.core.model import Vector
-from sim_backends.cosim.policies.base import Pair, PolicyError, Situation, window_ns
+from sim_backends.cosim.policies.sync_policy import Pair, PolicyError, Situation, window_ns
 from sim_backends.world.motion import STILL, State
 
 Floats = NDArray[np.float64]

@@ -24,8 +24,7 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.programs.beats import PERIOD_NS, NeverSends, PeriodicTimer
-from sim_backends.cosim.programs.way_points import drive_towards
+from sim_backends.cosim.programs.way_points import PERIOD_NS, NeverSends, PeriodicTimer, drive_towards
 from sim_backends.network.packets import Received
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.dead_reckoning import moved_on

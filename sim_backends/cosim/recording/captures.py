@@ -1,14 +1,157 @@
-"""The packet captures of robots as pcap files (draft-ietf-opsawg-pcap), in nanoseconds of simulated time."""
+"""A capture per robot, with the internet headers of its packets."""
 
 import os
 import struct
 from collections.abc import Sequence
 from io import FileIO
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Final
 
-from sim_backends.cosim.recording.internet import IpEncoder
-from sim_backends.network.ip import Fragment
+from sim_backends.network.ip import HEADER_BYTES, Fragment
+from sim_backends.network.tcp.connection import ConnectionName
+from sim_backends.network.tcp.segments import Segment
+from sim_backends.network.wire import IpPacket
+
+_TCP, _UDP = 6, 17
+_FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
+_MULTICAST: Final = IPv4Address("239.255.0.1").packed
+"""Destination of packets for all hosts: the multicast group of DDS discovery (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
+_TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
+"""Ports of DDS: of the first participant of a host, and of discovery (DDSI-RTPS 2.5, 9.6.1.1)."""
+_FIRST_PORT: Final = 40_000
+"""Destination port of the first flow; each further flow has the next."""
+_FIRST_EPHEMERAL_PORT: Final = 50_000
+"""Source port of the first flow: a dynamic port (RFC 6335, section 6), of which tcpdump decodes 49152 specially."""
+_PORTS: Final = 9_000
+"""Number of ports after which they are reused."""
+
+_IP: Final = struct.Struct(">BBHHHBBH4s4s")
+_UDP_HEADER: Final = struct.Struct(">HHHH")
+_TCP_HEADER: Final = struct.Struct(">HHIIBBHHH")
+_SYN, _PUSH, _ACK = 0x02, 0x08, 0x10
+_MORE_FRAGMENTS: Final = 0x2000
+_WINDOW_SCALE: Final = 7
+"""Linux's value for a receive buffer of 6 MiB."""
+_MSS: Final = 1460
+
+
+class IpEncoder:
+    """Encodes fragments as the bytes of IP packets.
+
+    Args:
+        names: The hosts; the first is 10.0.0.1, each further one has the next address.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.addresses = {name: IPv4Address(_FIRST_HOST + number) for number, name in enumerate(names)}
+        self._packed: dict[str | None, bytes] = {name: address.packed for name, address in self.addresses.items()}
+        self._packed[None] = _MULTICAST
+        self._flows: dict[object, int] = {}
+
+    def encode(self, fragment: Fragment, max_bytes: int) -> bytes:
+        """Return the first bytes of an IP packet, or of a fragment of one.
+
+        Args:
+            fragment: The fragment.
+            max_bytes: Largest number of bytes.
+        """
+        packet = fragment.packet
+        protocol, transport_header = self._transport(packet)
+        begin = fragment.offset_bytes
+        carried = transport_header[begin : begin + fragment.size_bytes - HEADER_BYTES]
+        more = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
+        words = (
+            0x45,
+            0,
+            fragment.size_bytes,
+            fragment.ip_id & 0xFFFF,
+            more | begin // 8,
+            64,
+            protocol,
+        )
+        ends = self._packed[packet.source], self._packed[packet.destination]
+        header = _IP.pack(*words, _checksum(_IP.pack(*words, 0, *ends)), *ends)
+        data_bytes = min(fragment.size_bytes, max_bytes) - HEADER_BYTES - len(carried)
+        return (header + carried + bytes(max(data_bytes, 0)))[:max_bytes]
+
+    def _transport(self, packet: IpPacket) -> tuple[int, bytes]:
+        """Return the number of the transport protocol, and the transport header."""
+        length = packet.size_bytes - HEADER_BYTES
+        if isinstance(packet.body, tuple):
+            name, segment = packet.body
+            protocol, header = _TCP, self._tcp(packet, name, segment)
+            checksum_offset = 16
+        else:
+            protocol, header = _UDP, _UDP_HEADER.pack(*self._udp_ports(packet), length, 0)
+            checksum_offset = 6
+        pseudo = self._packed[packet.source] + self._packed[packet.destination] + struct.pack(">HH", protocol, length)
+        # Zeros as data add nothing to a checksum. A sum of 0 is sent as all ones (RFC 768); for TCP both are valid.
+        checksum = _checksum(pseudo + header) or 0xFFFF
+        return protocol, header[:checksum_offset] + struct.pack(">H", checksum) + header[checksum_offset + 2 :]
+
+    def _flow_number(self, flow: object) -> int:
+        return self._flows.setdefault(flow, len(self._flows)) % _PORTS
+
+    def _udp_ports(self, packet: IpPacket) -> tuple[int, int]:
+        if packet.transport == "topic":
+            return _TOPIC_PORT, _DISCOVERY_PORT if packet.destination is None else _TOPIC_PORT
+        # Only with UDP itself the identity names a flow; other transports number their own packets.
+        ends = packet.transport, packet.source, packet.destination
+        number = self._flow_number(packet.identity[0] if packet.transport == "udp" else ends)
+        return _FIRST_EPHEMERAL_PORT + number, _FIRST_PORT + number
+
+    def _tcp(self, packet: IpPacket, name: ConnectionName, segment: Segment) -> bytes:
+        number = self._flow_number(name)
+        ports = _FIRST_EPHEMERAL_PORT + number, _FIRST_PORT + number
+        options = _syn_options(segment) if segment.syn else _options(segment)
+        flags = (_SYN if segment.syn else 0) | (_PUSH if segment.length else 0)
+        flags |= 0 if segment.acknowledges is None else _ACK
+        # The window of a SYN is not scaled (RFC 7323, section 2.2).
+        window = segment.window_bytes >> (0 if segment.syn else _WINDOW_SCALE)
+        return (
+            _TCP_HEADER.pack(
+                *(ports if packet.source == name.source else ports[::-1]),
+                segment.first & 0xFFFFFFFF,
+                (segment.acknowledges or 0) & 0xFFFFFFFF,
+                (20 + len(options)) // 4 << 4,
+                flags,
+                min(window, 0xFFFF),
+                0,
+                0,
+            )
+            + options
+        )
+
+
+def _timestamps(segment: Segment) -> bytes:
+    return struct.pack(">BBII", 8, 10, _ms(segment.sent_ns), _ms(segment.echoes_ns or 0))
+
+
+def _ms(at_ns: int) -> int:
+    return at_ns // 1_000_000 & 0xFFFFFFFF
+
+
+def _syn_options(segment: Segment) -> bytes:
+    """Return the options MSS, SACK permitted, timestamps and window scale, in the order of Linux."""
+    return struct.pack(">BBHBB", 2, 4, _MSS, 4, 2) + _timestamps(segment) + bytes((1, 3, 3, _WINDOW_SCALE))
+
+
+def _options(segment: Segment) -> bytes:
+    options = b"\1\1" + _timestamps(segment)
+    if segment.sacks:
+        blocks = [edge & 0xFFFFFFFF for block in segment.sacks for edge in block]
+        options += struct.pack(f">BBBB{len(blocks)}I", 1, 1, 5, 2 + 4 * len(blocks), *blocks)
+    return options
+
+
+def _checksum(data: bytes) -> int:
+    """Return the internet checksum (RFC 1071) of an even number of bytes in which the checksum field is 0."""
+    total: int = sum(struct.unpack(f">{len(data) // 2}H", data))
+    while total >> 16:
+        total = (total & 0xFFFF) + (total >> 16)
+    return ~total & 0xFFFF
+
 
 _NANOSECONDS_MAGIC: Final = 0xA1B23C4D
 _LINKTYPE_RAW: Final = 101

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Final
 from mcap.writer import CompressionType, Writer
 
 from sim_backends.cosim.recording.replay import Recording
-from sim_backends.cosim.run import Fate
+from sim_backends.cosim.run_record import Fate
 
 Json = Mapping[str, Any]
 Message = tuple[int, str, Json]

@@ -1,9 +1,9 @@
-"""The recorder: an observer that writes a run into a folder, in parts that survive a kill of the process."""
+"""Records a run while it runs: tables in parts, captures, `run.json`, and samples of the true states."""
 
 import errno
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -11,8 +11,7 @@ from types import TracebackType
 from typing import Final, Self
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.observer import Window
-from sim_backends.cosim.recording import tables
+from sim_backends.cosim.recording import packet_tables
 from sim_backends.cosim.recording.captures import Captures
 from sim_backends.cosim.recording.manifest import (
     RunEnding,
@@ -22,10 +21,66 @@ from sim_backends.cosim.recording.manifest import (
     versions,
     write_manifest,
 )
-from sim_backends.cosim.recording.samples import EVERY_NS, Sampling
-from sim_backends.cosim.recording.state import RecordingState, state_rows
+from sim_backends.cosim.recording.packet_tables import RecordingState, state_rows
+from sim_backends.cosim.run_record import IpObserver, Window, WindowObserver
 from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
+
+EVERY_NS: Final = 100_000_000
+
+
+class Sampling:
+    """Selects the ends of windows at which states are recorded.
+
+    Args:
+        every_ns: Sampling interval, in simulated nanoseconds.
+    """
+
+    def __init__(self, every_ns: int = EVERY_NS) -> None:
+        self._every_ns = every_ns
+        self._due_ns = every_ns
+
+    def is_due(self, end_ns: int) -> bool:
+        """Return True if the states at the end of this window are recorded; called once per window, in order."""
+        if end_ns < self._due_ns:
+            return False
+        self._due_ns = (end_ns // self._every_ns + 1) * self._every_ns
+        return True
+
+
+class StateSamples:
+    """An observer that keeps the sampled states of a recording in memory, and forwards all calls to a recorder.
+
+    Args:
+        recorder: The recorder, or None.
+
+    Attributes:
+        states: Time in nanoseconds, agent, state, as `Recording.states`.
+        log_ip: The recorder's method; missing if the recorder does not accept IP packets.
+    """
+
+    log_ip: Callable[[int, str, Fragment], None]
+
+    def __init__(self, recorder: WindowObserver | None = None) -> None:
+        self._recorder = recorder
+        self._sampling = Sampling()
+        self.states: list[tuple[int, str, State]] = []
+        if isinstance(recorder, IpObserver):
+            self.log_ip = recorder.log_ip
+
+    def begin(self, states: Mapping[str, State]) -> None:
+        """Add the states at time 0."""
+        self.states += [(0, name, state) for name, state in states.items()]
+        if self._recorder is not None:
+            self._recorder.begin(states)
+
+    def window(self, window: Window) -> None:
+        """Add the states at the end of a window if they are due."""
+        if self._sampling.is_due(window.end_ns):
+            self.states += [(window.end_ns, name, state) for name, state in window.states.items()]
+        if self._recorder is not None:
+            self._recorder.window(window)
+
 
 _MAX_WINDOWS: Final = 50_000
 """Largest number of windows in a part, because a part is in memory until it is written."""
@@ -87,7 +142,7 @@ class RunRecorder:
             RecordingError: The folder cannot be written.
         """
         try:
-            for table in tables.TABLES:
+            for table in packet_tables.TABLES:
                 (self._folder / table).mkdir(parents=True)
             self._lock.enter_context(recording_lock(self._folder))
             self._allocate_reserve()
@@ -209,9 +264,9 @@ class RunRecorder:
         written: list[Path] = []
         try:
             for table, table_rows in rows.items():
-                path = tables.part_path(table, state.parts)
+                path = packet_tables.part_path(table, state.parts)
                 written.append(self._folder / path)
-                state.checksums[path] = tables.write_part(self._folder, table, state.parts, table_rows)
+                state.checksums[path] = packet_tables.write_part(self._folder, table, state.parts, table_rows)
         except OSError:
             for unfinished in written:  # to free their space
                 with suppress(OSError):

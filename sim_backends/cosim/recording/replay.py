@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from fieldkit.core.errors import EvidenceError
-from sim_backends.cosim.digest import EventDigest
-from sim_backends.cosim.recording import tables
+from sim_backends.cosim.recording import packet_tables
 from sim_backends.cosim.recording.manifest import RUN_AGAIN, RunManifest, read_manifest
-from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.run_record import EventDigest, Fate, Run
 from sim_backends.network.packets import Packet
 from sim_backends.world.motion import State
 
@@ -40,7 +39,9 @@ def read_recording(folder: Path) -> Recording:
     manifest = read_manifest(folder)
     _check_parts(folder, manifest)
     parts = sum(1 for _ in (folder / "windows").glob("*.parquet"))
-    windows, packets, states = (tables.read_parts(folder, table, parts) for table in ("windows", "packets", "states"))
+    windows, packets, states = (
+        packet_tables.read_parts(folder, table, parts) for table in ("windows", "packets", "states")
+    )
     fates = [_fate(dict(zip(packets, row, strict=True))) for row in zip(*packets.values(), strict=True)]
     run = Run(windows_ns=windows["end_ns"])
     run.fates = {fate.packet.identity: fate for fate in sorted(fates, key=lambda fate: fate.packet.packet_id)}
@@ -66,7 +67,7 @@ def read_recording(folder: Path) -> Recording:
 def _check_parts(folder: Path, manifest: RunManifest) -> None:
     for path, checksum in manifest.parts.items():
         try:
-            is_same = tables.checksum(folder / path) == checksum
+            is_same = packet_tables.checksum(folder / path) == checksum
         except OSError as error:
             raise EvidenceError(
                 f"the recording was truncated: this part cannot be read: {error.strerror}",

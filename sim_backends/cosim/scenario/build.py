@@ -5,18 +5,15 @@ from dataclasses import dataclass
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator, Progress
 from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
-from sim_backends.cosim.observer import WindowObserver
-from sim_backends.cosim.policies.base import SyncPolicy
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.policies.registry import make_policy
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.run_record import Run, WindowObserver
+from sim_backends.cosim.scenario.agent_setup import bodies, controllers, programs, stops
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.faults import StalledFederateFault
 from sim_backends.cosim.scenario.networks import radio_network
-from sim_backends.cosim.scenario.policies import make_policy
-from sim_backends.cosim.scenario.programs import programs
-from sim_backends.cosim.scenario.robots import bodies
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.steering import controllers, stops
-from sim_backends.cosim.stalls import DEADLINE_S, Stall, stalled
+from sim_backends.cosim.wall_time import DEADLINE_S, Stall, stalled
 from sim_backends.physics.bodies import Bodies
 from sim_backends.world.world import load_world
 

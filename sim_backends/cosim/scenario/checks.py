@@ -1,19 +1,131 @@
-"""Checks of a scenario that need more than its file: its world, its robots, this machine."""
+"""Checks of a scenario that need more than its file: its world, its robots and their speeds, this machine."""
 
+import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from itertools import pairwise
+from pathlib import Path
+from typing import Final, NamedTuple
 
 from fieldkit.config.schema import Location
 from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.model import Vector
 from fieldkit.core.units import format_bytes
-from sim_backends.cosim.scenario import memory
-from sim_backends.cosim.scenario.motions import FollowPlan, StationKeepingPlan
-from sim_backends.cosim.scenario.robots import antennas, bodies, limits, robots
+from sim_backends.cosim.scenario.agent_plans import (
+    FollowPlan,
+    LegPlan,
+    StationKeepingPlan,
+    VelocityProfilePlan,
+    WayPointsPlan,
+)
+from sim_backends.cosim.scenario.agent_setup import antennas, bodies, limits, path_points_m, robots
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.speeds import excesses
 from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.differential_drive import DriveLimits
 from sim_backends.physics.quadrotor import QuadrotorLimits
 from sim_backends.world.world import World
+
+PACKET_BYTES: Final = 1200
+"""Size of the record of a packet: 1000 to 1130 bytes were measured over 20,000 packets of `baylands`."""
+WINDOW_BYTES: Final = 40
+"""Size of the record of a window: an integer and its entry in a list."""
+PAIR_BYTES: Final = 1600
+"""Largest memory of the radio per pair of stations: 1540 to 1660 bytes were measured with 100 to 300 stations."""
+EVENTS_PER_PACKET: Final = 10
+"""Largest number of windows per packet if each network event ends a window; 7 were measured with `baylands`."""
+
+MEMINFO: Final = Path("/proc/meminfo")
+
+
+def needed_bytes(scenario: CosimScenario) -> int:
+    """Return the approximate maximum memory that a run needs for its record and its radio, with any policy."""
+    packets = sum(traffic.packets(scenario.duration) for traffic in scenario.traffic)
+    windows = scenario.duration / scenario.physics.step + packets * EVENTS_PER_PACKET
+    return round(packets * PACKET_BYTES + windows * WINDOW_BYTES) + radio_bytes(scenario)
+
+
+def radio_bytes(scenario: CosimScenario) -> int:
+    """Return the approximate maximum memory of the radio, which is proportional to the number of pairs of agents."""
+    return 0 if scenario.radio.fixed else math.comb(len(scenario.agents), 2) * PAIR_BYTES
+
+
+def available_bytes() -> int | None:
+    """Return the available memory of this machine; None if the system does not report it."""
+    try:
+        lines = MEMINFO.read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+
+
+Limits = DriveLimits | QuadrotorLimits
+
+
+class Demand(NamedTuple):
+    """A speed or rate that a motion requires, and the limit of the body.
+
+    Attributes:
+        location: Keys of the value.
+        quantity: Name of the quantity, with its article.
+        value: The required value.
+        limit: The largest value that the body reaches.
+        unit: Unit of both.
+    """
+
+    location: Location
+    quantity: str
+    value: float
+    limit: float
+    unit: str
+
+
+_ROUNDING = 1e-9
+
+
+def excesses(motion: object, start_m: Vector, limits: Limits) -> Iterator[Demand]:
+    """Yield the demands of a motion that exceed the limits of a body.
+
+    Args:
+        motion: The motion of an agent in its scenario.
+        start_m: Its start position, metres east, north, up.
+        limits: The limits of its body.
+    """
+    for demand in _demands(motion, start_m, limits):
+        if demand.value > demand.limit * (1 + _ROUNDING):
+            yield demand
+
+
+def _demands(motion: object, start_m: Vector, limits: Limits) -> Iterator[Demand]:
+    if isinstance(motion, WayPointsPlan):
+        yield Demand(("speed",), "a speed", motion.speed, limits.speed_m_s, "m/s")
+        if isinstance(limits, QuadrotorLimits):
+            yield from _climbs(motion, start_m, limits)
+    elif isinstance(motion, VelocityProfilePlan):
+        for number, leg in enumerate(motion.legs):
+            for demand in _leg_demands(leg, limits):
+                yield demand._replace(location=("legs", number, *demand.location))
+
+
+def _leg_demands(leg: LegPlan, limits: Limits) -> Iterator[Demand]:
+    yield Demand(("speed",), "a speed", abs(leg.speed), limits.speed_m_s, "m/s")
+    if isinstance(limits, QuadrotorLimits):
+        yield _climb(("climb_m_s",), float(leg.climb_m_s), limits)
+    else:
+        limit_deg_s = math.degrees(limits.turn_rad_s)
+        yield Demand(("turn_deg_s",), "a rate of turn", abs(float(leg.turn_deg_s)), limit_deg_s, "deg/s")
+
+
+def _climbs(motion: WayPointsPlan, start_m: Vector, limits: QuadrotorLimits) -> Iterator[Demand]:
+    for here_m, there_m in pairwise([start_m, *path_points_m(motion, start_m)]):
+        length_m = math.dist(here_m, there_m)
+        if length_m:
+            yield _climb(("speed",), motion.speed * (there_m[2] - here_m[2]) / length_m, limits)
+
+
+def _climb(location: Location, up_m_s: float, limits: QuadrotorLimits) -> Demand:
+    down_limit_m_s, up_limit_m_s = limits.climb_m_s
+    if up_m_s < 0:
+        return Demand(location, "a sink rate", -up_m_s, down_limit_m_s, "m/s")
+    return Demand(location, "a climb rate", up_m_s, up_limit_m_s, "m/s")
 
 
 class ScenarioProblem(NamedTuple):
@@ -130,13 +242,13 @@ def _speeds(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
 
 
 def _memory(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
-    needed, available = memory.needed_bytes(scenario), memory.available_bytes()
+    needed, available = needed_bytes(scenario), available_bytes()
     if available is not None and needed > available:
         message = (
             f"{scenario.duration:g} s of {len(scenario.agents):,} agents would need {format_bytes(needed)} of "
             f"memory, and {format_bytes(available)} are available"
         )
-        if memory.radio_bytes(scenario) > available:
+        if radio_bytes(scenario) > available:
             yield ScenarioProblem(("agents",), message, "use fewer agents")
             return
         largest = max(scenario.traffic, key=lambda traffic: traffic.packets(scenario.duration), default=None)

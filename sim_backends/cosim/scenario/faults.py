@@ -6,7 +6,7 @@ from typing_extensions import override
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Strict
-from sim_backends.cosim.scenario.names import Name
+from sim_backends.cosim.scenario.agent_plans import Name
 from sim_backends.world.obstacles import Place, Real
 
 

@@ -1,14 +1,45 @@
-"""Scenarios by name, or by the path of a file."""
+"""Scenarios by name or by the path of a file, and the JSON schema of scenario files for editors."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.config import catalog, schema
+from fieldkit.config.meanings import attributes, description, without_links
+from fieldkit.config.schema import Strict
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.world.world import load_world
+
+
+def editor_schema() -> dict[str, Any]:
+    """Return the JSON schema (draft 2020-12) of a scenario file, with the meaning of each key."""
+    whole = CosimScenario.model_json_schema()
+    models = {model.__name__: model for model in _models(Strict)}
+    for part in (whole, *whole["$defs"].values()):
+        model = models.get(part["title"])
+        if model is None:
+            continue  # an enumeration
+        part["description"] = without_links(description(model))
+        meanings = attributes(model)
+        for key, value in part["properties"].items():
+            value.pop("title", None)
+            value["description"] = without_links(meanings[key])
+            if not isinstance(value.get("default"), str) and "string" in _types(value):
+                value.pop("default", None)  # it is a number in SI units, but files have texts with units
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole}
+
+
+def _models(base: type[Strict]) -> Iterator[type[Strict]]:
+    for model in base.__subclasses__():
+        yield model
+        yield from _models(model)
+
+
+def _types(value: dict[str, Any]) -> set[str]:
+    return {str(variant.get("type")) for variant in (value, *value.get("anyOf", ()))}
+
 
 _SHIPPED: Final = Path(__file__).parent / "scenarios"
 

@@ -5,11 +5,11 @@ from functools import partial
 from typing import Final
 
 from fieldkit.core.model import Topology
-from sim_backends.cosim.observer import IpObserver, WindowObserver
+from sim_backends.cosim.run_record import IpObserver, WindowObserver
+from sim_backends.cosim.scenario.agent_plans import QosOptions, Traffic
+from sim_backends.cosim.scenario.agent_setup import antennas
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault
-from sim_backends.cosim.scenario.robots import antennas
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.traffic import QosOptions, Traffic
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory

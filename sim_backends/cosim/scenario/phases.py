@@ -9,10 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from sim_backends.cosim.programs.beats import PERIOD_NS
-from sim_backends.cosim.scenario.motions import FollowPlan
+from sim_backends.cosim.programs.way_points import PERIOD_NS
+from sim_backends.cosim.scenario.agent_plans import BagTraffic, FollowPlan
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.scenario.traffic import BagTraffic
 
 MAX_PHASES: Final = 10
 """The mean over 10 evenly distributed phases is wrong by at most a twentieth of a window."""

@@ -9,12 +9,10 @@ from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length,
 from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
-from sim_backends.cosim.programs.beats import PERIOD_NS
+from sim_backends.cosim.policies.registry import POLICIES
+from sim_backends.cosim.programs.way_points import PERIOD_NS
+from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
-from sim_backends.cosim.scenario.motions import FollowPlan, MotionPlan, StandingPlan
-from sim_backends.cosim.scenario.names import Name
-from sim_backends.cosim.scenario.policies import POLICIES
-from sim_backends.cosim.scenario.traffic import StreamTraffic, Traffic
 from sim_backends.network.tcp.options import Congestion
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.obstacles import Place, Real

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from sim_backends.cosim.comparison import delay_added_s
-from sim_backends.cosim.geometry import position_error_m
-from sim_backends.cosim.policies.base import SyncPolicy
+from sim_backends.cosim.packet_ledger import position_error_m
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.policies.window_policies import Scheduled
+from sim_backends.cosim.run_record import Run
 
 _TOLERANCE: Final = 1.02
 """The search for a window stops when a window that is longer by this factor exceeds the bound."""

@@ -1,18 +1,173 @@
-"""How well the followers of a scenario keep their positions."""
+"""How well followers keep their positions, and how convoys react to the leader."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
-from sim_backends.cosim.scenario.motions import FollowPlan
-from sim_backends.cosim.scenario.robots import limits
+from sim_backends.cosim.federates import PhysicsFederate
+from sim_backends.cosim.scenario.agent_plans import FollowPlan
+from sim_backends.cosim.scenario.agent_setup import limits
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies import convoy
 from sim_backends.cosim.studies.intervals import Floats
-from sim_backends.cosim.studies.tracks import Tracks
 from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.world.motion import State
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Positions of agents over time.
+
+    Attributes:
+        names: The agents.
+        times_s: Times, shape (times,).
+        places_m: Positions in metres east, north, up, shape (times, agents, 3).
+    """
+
+    names: Sequence[str]
+    times_s: Floats
+    places_m: Floats
+
+    def distances_m(self, other: "Tracks") -> Floats:
+        """Return the distance of each agent from its position in another run, shape (common times, agents)."""
+        shorter = min(len(self.times_s), len(other.times_s))
+        distances_m: Floats = np.linalg.norm(self.places_m[:shorter] - other.places_m[:shorter], axis=2)
+        return distances_m
+
+
+def tracks_of(states: Iterable[tuple[int, str, State]]) -> Tracks:
+    """Return the tracks of recorded states; each of their times must have the states of all agents.
+
+    Args:
+        states: Time in nanoseconds, agent, state, in the order of time.
+    """
+    by_time: dict[int, dict[str, State]] = {}
+    for at_ns, name, state in states:
+        by_time.setdefault(at_ns, {})[name] = state
+    return _tracks(np.array([*by_time], dtype=np.float64) / 1e9, [*by_time.values()])
+
+
+def _tracks(times_s: Floats, samples: Sequence[Mapping[str, State]]) -> Tracks:
+    names = tuple(samples[0]) if samples else ()
+    places_m = [[states[name].position_m for name in names] for states in samples]
+    return Tracks(names, times_s, np.array(places_m, dtype=np.float64).reshape(len(samples), len(names), 3))
+
+
+class SampledPhysics:
+    """Physics whose states are sampled at equal intervals, which does not change the motion.
+
+    Args:
+        physics: The physics.
+        interval_ns: Sampling interval; it is rounded up to whole steps of the physics.
+    """
+
+    def __init__(self, physics: PhysicsFederate, interval_ns: int) -> None:
+        self._physics = physics
+        self._interval_ns = -(-interval_ns // physics.step_ns) * physics.step_ns
+        self._next_ns = 0
+        self._samples: list[Mapping[str, State]] = []
+        self.step_ns = physics.step_ns
+        self.limits_m_s2 = physics.limits_m_s2
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        """Advance the physics, and take the samples that are due."""
+        while self._next_ns <= to_ns:
+            self._samples.append(self._physics.advance(self._next_ns, commands))
+            self._next_ns += self._interval_ns
+            commands = {}
+        return self._physics.advance(to_ns, commands)
+
+    @property
+    def tracks(self) -> Tracks:
+        """The samples so far."""
+        times_s = np.arange(len(self._samples), dtype=np.float64) * (self._interval_ns / 1e9)
+        return _tracks(times_s, self._samples)
+
+
+def speeds_m_s(times_s: Floats, places_m: Floats) -> Floats:
+    """Return the speeds of vehicles, by central differences.
+
+    Args:
+        times_s: Times, shape (times,).
+        places_m: Positions in metres east, north, up, shape (times, vehicles, 3).
+
+    Returns:
+        Shape (times, vehicles).
+    """
+    speeds: Floats = np.linalg.norm(np.gradient(places_m, times_s, axis=0), axis=-1)
+    return speeds
+
+
+def spacing_errors_m(times_s: Floats, places_m: Floats, standstill_m: float, headway_s: float) -> Floats:
+    """Return how much the gap before each follower exceeds the desired one, which is `standstill_m + headway_s v`.
+
+    Args:
+        times_s: Times, shape (times,).
+        places_m: Positions of the vehicles in their order in the row, shape (times, vehicles, 3).
+        standstill_m: Desired gap at standstill.
+        headway_s: Time headway.
+
+    Returns:
+        Shape (times, vehicles - 1).
+    """
+    gaps_m = np.linalg.norm(np.diff(places_m, axis=1), axis=-1)
+    errors: Floats = gaps_m - standstill_m - headway_s * speeds_m_s(times_s, places_m)[:, 1:]
+    return errors
+
+
+def station_errors_m(places_m: Floats, station_m: Floats, above_m: float) -> Floats:
+    """Return the distance of a drone from its station, which is `above_m` above the centre of the vehicles.
+
+    Args:
+        places_m: Positions of the vehicles, shape (times, vehicles, 3).
+        station_m: Positions of the drone, shape (times, 3).
+        above_m: Height of its station above them.
+
+    Returns:
+        Shape (times,).
+    """
+    errors: Floats = np.linalg.norm(station_m - places_m.mean(axis=1) - (0.0, 0.0, above_m), axis=-1)
+    return errors
+
+
+def amplifications(signals: Floats) -> Floats:
+    """Return the amplification of a signal by each vehicle: the ratio of its L2 norm to that of the vehicle ahead.
+
+    A convoy is string stable if no ratio is above 1 for any motion of the first vehicle: then a disturbance decays
+    along the row (Ploeg, van de Wouw and Nijmeijer, "Lp string stability of cascaded systems", IEEE Trans. Control
+    Syst. Technol. 22, 2014). The mean of each signal is subtracted; pass whole periods of a periodic signal.
+
+    Args:
+        signals: For example speeds, accelerations, or spacing errors, shape (times, vehicles).
+
+    Returns:
+        Shape (vehicles - 1,); nan behind a vehicle whose signal does not change.
+    """
+    norms = np.linalg.norm(signals - signals.mean(axis=0), axis=0)
+    ratios: Floats = norms[1:] / np.where(norms[:-1] > 0, norms[:-1], math.nan)
+    return ratios
+
+
+def gain(rate_rad_s: Floats, *, delay_s: float, headway_s: float, gain_per_s: float) -> Floats:
+    """Return |Gamma(jw)| of `programs.follow.FollowAtHeadway`; the formula is in that module.
+
+    Args:
+        rate_rad_s: Angular frequencies w, shape (n,).
+        delay_s: Delay of received states.
+        headway_s: Time headway.
+        gain_per_s: Rate at which an error of the distance decays.
+    """
+    s = 1j * rate_rad_s
+    extrapolated = s + gain_per_s * (1 + delay_s * s)
+    magnitude: Floats = np.abs(extrapolated / ((headway_s * s + 1) * (s + gain_per_s)))
+    return magnitude
+
+
+def longest_delay_s(headway_s: float, gain_per_s: float) -> float:
+    """Return the longest delay with which a row of `FollowAtHeadway` is string stable: sup |Gamma(jw)| is 1."""
+    return (math.hypot(1.0, headway_s * gain_per_s) - 1) / gain_per_s
 
 
 @dataclass(frozen=True)
@@ -64,10 +219,10 @@ def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
         leaders = _places_m(tracks, plan.motion.leader)
         follower = _places_m(tracks, [name])
         if isinstance(limits(plan.robot), QuadrotorLimits):
-            station.append(convoy.station_errors_m(leaders, follower[:, 0], plan.motion.distance))
+            station.append(station_errors_m(leaders, follower[:, 0], plan.motion.distance))
         else:
             row = np.concatenate([leaders, follower], axis=1)
-            errors_m = convoy.spacing_errors_m(tracks.times_s, row, plan.motion.distance, plan.motion.headway)
+            errors_m = spacing_errors_m(tracks.times_s, row, plan.motion.distance, plan.motion.headway)
             spacing.append(errors_m[:, 0])
             ratios += _ratios(tracks.times_s, row)
     return Formation(*_mean_and_max(spacing), *_mean_and_max(station), max(ratios, default=math.nan))
@@ -92,8 +247,8 @@ def _places_m(tracks: Tracks, names: Sequence[str]) -> Floats:
 
 
 def _ratios(times_s: Floats, row_m: Floats) -> Iterator[float]:
-    accelerations_m_s2: Floats = np.gradient(convoy.speeds_m_s(times_s, row_m), times_s, axis=0)
-    ratios = convoy.amplifications(accelerations_m_s2)
+    accelerations_m_s2: Floats = np.gradient(speeds_m_s(times_s, row_m), times_s, axis=0)
+    ratios = amplifications(accelerations_m_s2)
     return (float(ratio) for ratio in ratios if not math.isnan(ratio))
 
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.geometry import position_error_m
-from sim_backends.cosim.policies.base import SyncPolicy
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.packet_ledger import position_error_m
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.policies.window_policies import EventDriven
+from sim_backends.cosim.run_record import Fate, Run
 from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State

@@ -11,12 +11,19 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fieldkit.core.model import Scenario as Sight
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.studies.agreement import Agreement, Printed, agreement
-from sim_backends.cosim.studies.flow_samples import FlowSample, Setup
+from sim_backends.cosim.policies.window_policies import SlidingWindow
 from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean
-from sim_backends.cosim.studies.paper_setups import Changes, master_based, masterless, the_flow
-from sim_backends.cosim.studies.printed_values import CLAIMS, DISTANCES_M, FIXED, MASTER, PRINTED
+from sim_backends.cosim.studies.paper_setups import Changes, FlowSample, Setup, master_based, masterless, the_flow
+from sim_backends.cosim.studies.paper_tables import (
+    CLAIMS,
+    DISTANCES_M,
+    FIXED,
+    MASTER,
+    PRINTED,
+    Agreement,
+    Printed,
+    agreement,
+)
 
 ADAPTIVE: Final = "adaptive"
 """The paper's own system, which is compared with `FIXED` and `MASTER`."""

@@ -1,19 +1,124 @@
-"""The setups that reproduce the paper's simulations: shipped scenarios, and the changes for each row of a table.
+"""The simulations of the paper, and the samples of their flows over seeds."""
 
-Values that the paper does not state are those of the scenario's file and of the default radio: docs/studies/paper.md.
-"""
-
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import Any, Final
 
+import numpy as np
+
 from fieldkit.core.model import Scenario as Sight
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.policies.velocity_aware import VelocityAware
+from sim_backends.cosim.packet_columns import round_trips_s
+from sim_backends.cosim.policies.window_policies import EventDriven, SlidingWindow, VelocityAware
+from sim_backends.cosim.run_record import Fate, Run
+from sim_backends.cosim.scenario.agent_plans import PingTraffic
+from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.flow_samples import Setup
+from sim_backends.cosim.studies.seeds import Task, run_many
+
+UNDER_WAY = "under way when the run ended"
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A scenario and the policy with which it is run.
+
+    Attributes:
+        scenario: The scenario.
+        policy: Name of the sync policy.
+    """
+
+    scenario: CosimScenario
+    policy: str
+
+
+@dataclass(frozen=True)
+class FlowSample:
+    """The packets of a flow in one run; for a ping, its requests.
+
+    Attributes:
+        sent: Number of packets.
+        arrived: Number of them that arrived, or were replied to, before the run ended.
+        delay_sum_s: Sum of their delays, from sending to arrival as the receiver counts it, or of round trips; nan if
+            none arrived, so that it is not mistaken for a fast transmission.
+        reasons: Number of the other packets by the reason why they did not arrive.
+    """
+
+    sent: int
+    arrived: int
+    delay_sum_s: float
+    reasons: Mapping[str, int]
+
+    @property
+    def loss(self) -> float:
+        """Share of the packets that did not arrive; nan without packets."""
+        return 1 - self.arrived / self.sent if self.sent else np.nan
+
+    @property
+    def delay_mean_s(self) -> float:
+        """Mean delay of packets that arrived; nan if none did."""
+        return self.delay_sum_s / self.arrived if self.arrived else np.nan
+
+
+def flow_samples(
+    setups: Mapping[str, Setup],
+    seeds: Sequence[int],
+    *,
+    workers: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> dict[str, list[dict[str, FlowSample]]]:
+    """Return, for each setup and each seed in order, a sample of each flow.
+
+    Args:
+        setups: The setups by name.
+        seeds: Seeds of the random draws.
+        workers: As for `run_many`.
+        progress: As for `run_many`.
+
+    Raises:
+        FieldkitError: A run failed.
+    """
+    tasks = [Task(setup.policy, seed, name) for name, setup in setups.items() for seed in seeds]
+    samples = run_many(partial(_sample, dict(setups)), tasks, workers=workers, progress=progress)
+    by_setup: dict[str, list[dict[str, FlowSample]]] = {name: [] for name in setups}
+    for task, sample in zip(tasks, samples, strict=True):
+        by_setup[task.setup].append(sample)
+    return by_setup
+
+
+def _sample(setups: Mapping[str, Setup], task: Task) -> dict[str, FlowSample]:
+    scenario = setups[task.setup].scenario
+    run = build(scenario, policy=task.policy, seed=task.seed).run()
+    return {
+        flow: _round_trips(run, flow) if isinstance(traffic, PingTraffic) else _deliveries(run, flow)
+        for traffic in scenario.traffic
+        for flow in traffic.flows
+    }
+
+
+def _deliveries(run: Run, flow: str) -> FlowSample:
+    fates = _fates(run, flow)
+    delays_ns = [fate.counted_ns - fate.packet.sent_ns for fate in fates if fate.counted_ns is not None]
+    return _flow_sample(len(fates), [delay_ns / 1e9 for delay_ns in delays_ns], fates)
+
+
+def _round_trips(run: Run, flow: str) -> FlowSample:
+    trips_s = round_trips_s(run, flow)
+    answered_s = trips_s[np.isfinite(trips_s)]
+    return _flow_sample(len(trips_s), answered_s.tolist(), _fates(run, flow))
+
+
+def _fates(run: Run, flow: str) -> list[Fate]:
+    return [fate for (name, _), fate in run.fates.items() if name == flow]
+
+
+def _flow_sample(sent: int, delays_s: Sequence[float], fates: Sequence[Fate]) -> FlowSample:
+    reasons = Counter(fate.reason or UNDER_WAY for fate in fates if fate.arrived_ns is None)
+    return FlowSample(sent, len(delays_s), sum(delays_s) if delays_s else np.nan, dict(reasons))
+
 
 Changes = Mapping[str, Any]
 """Changes of a scenario's file, as for `load_scenario`."""

@@ -1,22 +1,164 @@
-"""The paper's tables of delay and loss: the setup of each row, and its comparison with the printed numbers.
+"""The tables of the paper: its printed values, and their agreement with our runs."""
 
-A row of tables 1 to 3 is one transmission of 10 s of accelerometer data. Its delay is the sum of the delays of its
-packets, as the paper defines its "average delay" (section "Simulation Results"); its loss is the share of packets
-that did not arrive.
-"""
-
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
+from enum import StrEnum
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from sim_backends.cosim.studies.agreement import Agreement, Printed, agreement
-from sim_backends.cosim.studies.flow_samples import FlowSample, Setup
+from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.studies.intervals import IntervalEstimate, mean
-from sim_backends.cosim.studies.paper_setups import RADIOS, master_based, masterless, mesh, the_flow
-from sim_backends.cosim.studies.printed_values import DISTANCES_M, EMANE, PRINTED
+from sim_backends.cosim.studies.paper_setups import (
+    RADIOS,
+    FlowSample,
+    Setup,
+    master_based,
+    masterless,
+    mesh,
+    the_flow,
+)
+
+
+class Agreement(StrEnum):
+    """The relation of a measured number to a printed one."""
+
+    AGREES = "agrees"
+    ABOVE = "above"
+    BELOW = "below"
+    NOTHING = "no value"
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A number as it was printed.
+
+    Attributes:
+        text: Its digits, in the printed unit.
+        per_si: Factor from SI units to the printed unit: 100 for %, 1000 for ms.
+        step: Precision of numbers of its kind; if empty, that of its last digit.
+    """
+
+    text: str
+    per_si: int = 1
+    step: str = ""
+
+    @property
+    def value(self) -> float:
+        """The number, in SI units."""
+        return float(Decimal(self.text) / self.per_si)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """The smallest and the largest number, in SI units, that would be printed with this text."""
+        exponent = Decimal(self.text).as_tuple().exponent
+        assert isinstance(exponent, int)  # not infinity or nan
+        step = Decimal(self.step) if self.step else Decimal(1).scaleb(exponent)
+        low, high = Decimal(self.text) - step / 2, Decimal(self.text) + step / 2
+        return float(low / self.per_si), float(high / self.per_si)
+
+
+def agreement(printed: Printed, ours: IntervalEstimate) -> Agreement:
+    """Return the relation of an estimate to a printed number, both in SI units.
+
+    They agree if the printed number, at its precision, is within the interval of the estimate, or if the value of the
+    estimate rounds to it.
+    """
+    if math.isnan(ours.value):
+        return Agreement.NOTHING
+    low, high = printed.bounds
+    if max(ours.value, _or_value(ours.high, ours.value)) < low:
+        return Agreement.BELOW
+    if min(ours.value, _or_value(ours.low, ours.value)) > high:
+        return Agreement.ABOVE
+    return Agreement.AGREES
+
+
+def _or_value(bound: float, value: float) -> float:
+    return value if math.isnan(bound) else bound
+
+
+DISTANCES_M: Final = (20, 40, 60, 80, 100)
+"""The distances of every table."""
+
+
+class PrintedColumns(NamedTuple):
+    """Two columns of a table: a number for each of `DISTANCES_M`.
+
+    Attributes:
+        delays_s: Sums of delays.
+        losses: Shares lost.
+    """
+
+    delays_s: tuple[Printed, ...]
+    losses: tuple[Printed, ...]
+
+
+def _columns(delays_s: str, losses_percent: str) -> PrintedColumns:
+    """Return columns from their digits.
+
+    A delay of `1` is printed in columns with values such as `0.8`, and means `1.0`. All 40 losses are multiples of
+    10 %, which is taken as their precision.
+    """
+    return PrintedColumns(
+        tuple(Printed(text, step="" if "." in text else "0.1") for text in delays_s.split()),
+        tuple(Printed(text, per_si=100, step="10") for text in losses_percent.split()),
+    )
+
+
+PRINTED: Final[Mapping[str, Mapping[tuple[Sight, str], PrintedColumns]]] = MappingProxyType(
+    {
+        # Section "Simulation Results", table `ugv`: masterless, UGV to UGV.
+        "1": {
+            (Sight.LOS, "topic"): _columns("0.01 0.1 0.4 0.4 0.6", "0 0 0 10 10"),
+            (Sight.NLOS, "topic"): _columns("0.2 0.5 0.8 1 1", "0 10 10 20 30"),
+        },
+        # Section "Simulation Results", table `uav`: masterless, UGV to UAV.
+        "2": {
+            (Sight.LOS, "topic"): _columns("0.1 0.2 0.2 0.5 0.6", "0 10 10 20 30"),
+            (Sight.NLOS, "topic"): _columns("0.5 0.7 0.8 1.3 1.6", "0 20 20 60 90"),
+        },
+        # Section "Discussion", table `ros1`: master-based, UGV to UGV.
+        "3": {
+            (Sight.LOS, "ros1-udp"): _columns("0.01 0.08 0.42 0.46 0.5", "0 0 10 30 40"),
+            (Sight.LOS, "ros1"): _columns("0.01 0.1 0.48 0.6 0.8", "0 0 10 10 20"),
+            (Sight.NLOS, "ros1-udp"): _columns("0.18 0.4 0.54 0.96 1", "10 30 50 60 60"),
+            (Sight.NLOS, "ros1"): _columns("0.2 0.5 0.8 1 1.4", "10 10 30 40 50"),
+        },
+    }
+)
+"""The columns by table, and by line of sight and protocol."""
+
+EMANE: Final[Mapping[str, tuple[Printed, Printed]]] = MappingProxyType(
+    {
+        "before": (Printed("5.377", per_si=1000), Printed("0", per_si=100)),
+        "after": (Printed("54.309", per_si=1000), Printed("0", per_si=100)),
+    }
+)
+"""Section "Discussion": mean round trip and share lost of 100 pings, before and after node 10 moved."""
+
+FIXED: Final = "fixed window"
+"""The paper's own system with a window that does not adapt."""
+MASTER: Final = "master-based"
+"""ROS 1, by TCP."""
+
+CLAIMS: Final[Mapping[tuple[str, str], tuple[Printed, Printed]]] = MappingProxyType(
+    {
+        # Abstract and conclusion.
+        (FIXED, "all"): (Printed("-12", per_si=100), Printed("-10", per_si=100)),
+        # Abstract and introduction.
+        (MASTER, "all"): (Printed("-12", per_si=100), Printed("-10", per_si=100)),
+        # Sections "Simulation Results" and "Discussion".
+        (MASTER, Sight.LOS): (Printed("-20", per_si=100), Printed("-10", per_si=100)),
+        (MASTER, Sight.NLOS): (Printed("-40", per_si=100), Printed("-20", per_si=100)),
+    }
+)
+"""Relative change of delay, and change of loss in percentage points, by compared system and lines."""
+
 
 TABLES: Final = (*PRINTED, "emane")
 

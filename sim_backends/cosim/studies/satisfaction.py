@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_backends.cosim.comparison import Errors, errors, lost_share
-from sim_backends.cosim.policies.base import PolicyError, SyncPolicy
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
+from sim_backends.cosim.policies.window_policies import EventDriven
+from sim_backends.cosim.run_record import Run
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,178 @@
-"""All policies on one scenario: the error and the cost of each."""
+"""What each sync policy costs and how wrong it is, with one seed or in distribution over seeds."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Final, Protocol
 
 import numpy as np
 
-from sim_backends.cosim.comparison import Errors, mean_errors
-from sim_backends.cosim.studies.formation import NO_FORMATION, Formation, mean_formation
-from sim_backends.cosim.studies.intervals import Floats
-from sim_backends.cosim.studies.outcomes import Outcomes
-from sim_backends.cosim.studies.tracks import Tracks
+from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.comparison import Errors, errors, lost_share, mean_errors
+from sim_backends.cosim.policies.sync_policy import PolicyError
+from sim_backends.cosim.policies.window_policies import EventDriven
+from sim_backends.cosim.run_record import Run
+from sim_backends.cosim.studies.formation import NO_FORMATION, Formation, SampledPhysics, Tracks, mean_formation
+from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, mean, repeats_needed
+from sim_backends.cosim.studies.seeds import Task, run_many
+
+SAMPLING_NS = 100_000_000
+"""Interval at which the positions of agents are sampled."""
+
+
+class Simulated(Protocol):
+    """A scenario that is ready to run, as `scenario.build.Simulation`."""
+
+    agents: Agents
+
+    def run(self) -> Run:
+        """Simulate until the scenario's end."""
+        ...
+
+
+Make = Callable[[str, int], Simulated]
+"""Builds the scenario for the name of a policy and a seed."""
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """The outcome of a run.
+
+    Attributes:
+        run: The record.
+        tracks: The sampled positions of agents.
+    """
+
+    run: Run
+    tracks: Tracks
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """The outcomes of all runs of a scenario.
+
+    Attributes:
+        seeds: The seeds.
+        reference: Outcomes with the exact reference, by seed.
+        runs: Outcomes by policy, including the reference, and by seed; runs that failed are missing.
+        failures: The error of each policy that failed, with the first seed for which it did.
+    """
+
+    seeds: Sequence[int]
+    reference: Mapping[int, RunOutcome]
+    runs: Mapping[str, Mapping[int, RunOutcome]]
+    failures: Mapping[str, PolicyError]
+
+    def errors(self, policy: str, seed: int) -> Errors:
+        """Return the errors of one run relative to the reference with the same seed."""
+        reference, outcome = self.reference[seed], self.runs[policy][seed]
+        return errors(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
+
+
+def outcomes(
+    make: Make,
+    policies: Sequence[str],
+    seeds: Sequence[int],
+    *,
+    workers: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Outcomes:
+    """Run a scenario with each policy and each seed, including the exact reference.
+
+    Args:
+        make: Builds the scenario; it must be picklable.
+        policies: Names of policies.
+        seeds: The seeds.
+        workers: As for `run_many`.
+        progress: As for `run_many`.
+
+    Raises:
+        FieldkitError: A run failed for another reason than that its policy had no window.
+    """
+    names = [EventDriven.name, *(name for name in policies if name != EventDriven.name)]
+    tasks = [Task(name, seed) for name in names for seed in seeds]
+    results = run_many(partial(_outcome, make), tasks, workers=workers, progress=progress)
+    runs: dict[str, dict[int, RunOutcome]] = {name: {} for name in names}
+    failures: dict[str, PolicyError] = {}
+    for task, result in zip(tasks, results, strict=True):
+        if isinstance(result, PolicyError):
+            failures.setdefault(task.policy, result)
+        else:
+            runs[task.policy][task.seed] = result
+    return Outcomes(tuple(seeds), runs[EventDriven.name], runs, failures)
+
+
+def _outcome(make: Make, task: Task) -> RunOutcome | PolicyError:
+    simulated = make(task.policy, task.seed)
+    sampled = SampledPhysics(simulated.agents.physics, SAMPLING_NS)
+    simulated.agents.physics = sampled
+    try:
+        return RunOutcome(simulated.run(), sampled.tracks)
+    except PolicyError as error:
+        return error
+
+
+def delay_s(outcome: RunOutcome) -> float:
+    """Return the mean delay of packets that arrived, as their receivers count it; nan if none arrived."""
+    delays_ns = [
+        fate.counted_ns - fate.packet.sent_ns for fate in outcome.run.fates.values() if fate.counted_ns is not None
+    ]
+    return sum(delays_ns) / len(delays_ns) / 1e9 if delays_ns else math.nan
+
+
+def mean_separation_m(outcome: RunOutcome) -> float:
+    """Return the mean distance between agents over time and all pairs; nan for a single agent."""
+    places_m = outcome.tracks.places_m
+    first, second = np.triu_indices(places_m.shape[1], k=1)
+    if not len(first):
+        return math.nan
+    return float(np.linalg.norm(places_m[:, first] - places_m[:, second], axis=2).mean())
+
+
+MEASURES: Final[Mapping[str, Callable[[RunOutcome], float]]] = {
+    "loss": lambda outcome: lost_share(outcome.run),
+    "delay_s": delay_s,
+    "apart_m": mean_separation_m,
+}
+"""The compared measures, by name."""
+
+
+@dataclass(frozen=True)
+class Bias:
+    """The bias of one measure with one policy, over seeds.
+
+    Attributes:
+        values: The measure for each seed, in order; nan if a run has none.
+        mean: Their mean.
+        bias: Mean of the differences from the reference with the same seed.
+        deviation: Standard deviation of these differences.
+        seeds_needed: Number of seeds needed to detect the bias; None if the bias is 0 or unknown.
+    """
+
+    values: Floats
+    mean: IntervalEstimate
+    bias: IntervalEstimate
+    deviation: float
+    seeds_needed: int | None
+
+
+def biases(outcomes: Outcomes) -> dict[str, dict[str, Bias]]:
+    """Return the bias of each measure for each policy that could be run with all seeds."""
+    complete = [name for name, runs in outcomes.runs.items() if len(runs) == len(outcomes.seeds)]
+    return {
+        policy: {name: _bias(outcomes, policy, measure) for name, measure in MEASURES.items()} for policy in complete
+    }
+
+
+def _bias(outcomes: Outcomes, policy: str, measure: Callable[[RunOutcome], float]) -> Bias:
+    values = np.array([measure(outcomes.runs[policy][seed]) for seed in outcomes.seeds])
+    differences = values - np.array([measure(outcomes.reference[seed]) for seed in outcomes.seeds])
+    finite = differences[np.isfinite(differences)]
+    bias = mean(finite)
+    deviation = float(finite.std(ddof=1)) if len(finite) > 1 else math.nan
+    needed = None if math.isnan(deviation) else repeats_needed(bias.value, deviation)
+    return Bias(values, mean(values[np.isfinite(values)]), bias, deviation, needed)
 
 
 @dataclass(frozen=True)

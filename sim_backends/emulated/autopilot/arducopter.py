@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from sim_backends.emulated.autopilot.battery import FLIGHT_S, FULL_V, Battery
 from sim_backends.emulated.autopilot.failsafes import ArduCopterFailsafes
 from sim_backends.emulated.autopilot.firmware import Firmware, StreamGroup
-from sim_backends.emulated.autopilot.mavlink import COMMON_CAPABILITIES, EKF_STATUS_REPORT, dialect
+from sim_backends.emulated.autopilot.mavlink_frames import COMMON_CAPABILITIES, EKF_STATUS_REPORT, dialect
 from sim_backends.emulated.autopilot.modes import Mode
+from sim_backends.emulated.autopilot.onboard_estimates import FLIGHT_S, FULL_V, Battery
 from sim_backends.emulated.autopilot.parameters import (
     FlightLimits,
     Parameter,
@@ -181,6 +181,5 @@ ARDUCOPTER: Final = Firmware(
     fix_type=_d.GPS_FIX_TYPE_RTK_FIXED,
     guided_holds=True,
     lifts_off=False,
-    lands_anywhere=True,
     first_item=1,
 )

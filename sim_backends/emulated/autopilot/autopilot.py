@@ -4,18 +4,23 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from sim_backends.emulated.autopilot import mavlink, services
+from sim_backends.emulated.autopilot import mavlink_frames, microservices
 from sim_backends.emulated.autopilot.commands import Commands, int_in
 from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.guidance import SetPoint
-from sim_backends.emulated.autopilot.mavlink import AUTOPILOT_COMPONENT, AVAILABLE_MODES, Message, dialect
+from sim_backends.emulated.autopilot.flight import SetPoint
+from sim_backends.emulated.autopilot.mavlink_frames import (
+    AUTOPILOT_COMPONENT,
+    AVAILABLE_MODES,
+    Address,
+    Frame,
+    MavlinkPort,
+    Message,
+    dialect,
+)
+from sim_backends.emulated.autopilot.microservices import MissionTransfer, ParameterService, Streams
+from sim_backends.emulated.autopilot.mission_plan import Item, fault, goal_m
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameters
-from sim_backends.emulated.autopilot.plan import Item, fault, goal_m
-from sim_backends.emulated.autopilot.port import Address, Frame, MavlinkPort
-from sim_backends.emulated.autopilot.services import ParameterService
-from sim_backends.emulated.autopilot.streams import Streams
 from sim_backends.emulated.autopilot.telemetry import Telemetry
-from sim_backends.emulated.autopilot.transfer import MissionTransfer
 from sim_backends.emulated.autopilot.vehicle import Vehicle
 from sim_backends.physics.collisions import Footprint
 from sim_backends.physics.quadrotor import QuadrotorLimits
@@ -75,7 +80,7 @@ class Autopilot:
             now_ns: Time of reception.
         """
         self._now_ns = now_ns
-        for message in mavlink.read(datagram):
+        for message in mavlink_frames.read(datagram):
             if not self._port.register(sender, message, now_ns):
                 continue
             if message.get_type() == "HEARTBEAT":
@@ -119,7 +124,7 @@ class Autopilot:
                     self._streams.set_default(kind, self._parameters[name], self._now_ns)
 
     def _is_for_us(self, message: Message) -> bool:
-        system, component = mavlink.addressee(message)
+        system, component = mavlink_frames.addressee(message)
         return system in {_ALL, self._system} and component in {_ALL, AUTOPILOT_COMPONENT}
 
     def _fault(self, item: Item) -> int:
@@ -151,7 +156,7 @@ class Autopilot:
         elif kind in {"SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT"}:
             self._accept_set_point(message)
         else:
-            yield from services.answers(message, now_ns)
+            yield from microservices.answers(message, now_ns)
 
     def _request_streams(self, message: Message) -> None:
         """Set the rate parameters of the requested groups of messages; rate 0 stops them. PX4 has no groups."""
@@ -220,7 +225,7 @@ class Autopilot:
 _QUESTIONS: Final = frozenset({dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_GET_MESSAGE_INTERVAL})
 _REQUESTS: Final = {
     dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-    dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION: mavlink.PROTOCOL_VERSION,
+    dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION: mavlink_frames.PROTOCOL_VERSION,
     dialect.MAV_CMD_GET_HOME_POSITION: dialect.MAVLINK_MSG_ID_HOME_POSITION,
 }
 """Commands that request one message."""

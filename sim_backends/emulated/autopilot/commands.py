@@ -4,10 +4,10 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from sim_backends.emulated.autopilot.mavlink import Message, dialect
+from sim_backends.emulated.autopilot.mavlink_frames import Message, dialect
+from sim_backends.emulated.autopilot.mission_plan import goal_m
 from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.parameters import Parameters
-from sim_backends.emulated.autopilot.plan import goal_m
 from sim_backends.emulated.autopilot.vehicle import Refused, Vehicle
 
 FORCE: Final = 21196

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from sim_backends.emulated.autopilot.battery import Battery
 from sim_backends.emulated.autopilot.failsafes import Failsafes
 from sim_backends.emulated.autopilot.modes import Mode
+from sim_backends.emulated.autopilot.onboard_estimates import Battery
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameter, Parameters
 
 
@@ -52,7 +52,6 @@ class Firmware:
         fix_type: GPS_FIX_TYPE with a good receiver.
         guided_holds: True if it holds its position in the mode of set-points when set-points are missing.
         lifts_off: True if set-points make it lift off.
-        lands_anywhere: True if it accepts LAND and RTL on the ground.
         first_item: Number of the first item of a mission that is flown; ArduPilot's item 0 is home.
     """
 
@@ -79,7 +78,6 @@ class Firmware:
     fix_type: int
     guided_holds: bool
     lifts_off: bool
-    lands_anywhere: bool
     first_item: int
 
     @property

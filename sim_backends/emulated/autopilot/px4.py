@@ -2,11 +2,11 @@
 
 from typing import Final
 
-from sim_backends.emulated.autopilot.battery import FLIGHT_S, FULL_V, Battery
 from sim_backends.emulated.autopilot.failsafes import Px4Failsafes
 from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.mavlink import COMMON_CAPABILITIES, dialect
+from sim_backends.emulated.autopilot.mavlink_frames import COMMON_CAPABILITIES, dialect
 from sim_backends.emulated.autopilot.modes import Mode
+from sim_backends.emulated.autopilot.onboard_estimates import FLIGHT_S, FULL_V, Battery
 from sim_backends.emulated.autopilot.parameters import (
     FlightLimits,
     Parameter,
@@ -161,6 +161,5 @@ PX4: Final = Firmware(
     fix_type=_d.GPS_FIX_TYPE_3D_FIX,
     guided_holds=False,
     lifts_off=True,
-    lands_anywhere=False,
     first_item=0,
 )

@@ -5,12 +5,12 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot import mavlink
-from sim_backends.emulated.autopilot.battery import CELLS
-from sim_backends.emulated.autopilot.mavlink import Message, dialect
+from sim_backends.emulated.autopilot import mavlink_frames
+from sim_backends.emulated.autopilot.mavlink_frames import Message, dialect
+from sim_backends.emulated.autopilot.mission_plan import degrees_e7
 from sim_backends.emulated.autopilot.modes import LANDING, Mode
+from sim_backends.emulated.autopilot.onboard_estimates import CELLS
 from sim_backends.emulated.autopilot.parameters import Parameters
-from sim_backends.emulated.autopilot.plan import degrees_e7
 from sim_backends.emulated.autopilot.vehicle import Vehicle
 from sim_backends.physics.body import GRAVITY_M_S2
 
@@ -63,18 +63,18 @@ class Telemetry:
             d.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self._autopilot_version,
             d.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             d.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
-            mavlink.PROTOCOL_VERSION: mavlink.protocol_version,
+            mavlink_frames.PROTOCOL_VERSION: mavlink_frames.protocol_version,
             **(self._ardupilot_makers() if ardupilot else self._px4_makers()),
         }
         """Maker per message id; a maker returns None while its message is not available."""
-        self.streamed_only: Final = frozenset({mavlink.EKF_STATUS_REPORT})
+        self.streamed_only: Final = frozenset({mavlink_frames.EKF_STATUS_REPORT})
         """Messages that have a rate, but are not sent on request."""
 
     def _ardupilot_makers(self) -> dict[int, Callable[[], Message | None]]:
         return {
             dialect.MAVLINK_MSG_ID_RAW_IMU: self._raw_imu,
             dialect.MAVLINK_MSG_ID_TIMESYNC: self._timesync,
-            mavlink.EKF_STATUS_REPORT: lambda: mavlink.ekf_status_report(self._vehicle.estimate.flags),
+            mavlink_frames.EKF_STATUS_REPORT: lambda: mavlink_frames.ekf_status_report(self._vehicle.estimate.flags),
         }
 
     def _px4_makers(self) -> dict[int, Callable[[], Message | None]]:
@@ -84,7 +84,7 @@ class Telemetry:
             dialect.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
             dialect.MAVLINK_MSG_ID_ODOMETRY: self._odometry,
             dialect.MAVLINK_MSG_ID_PING: self._ping,
-            mavlink.COMPONENT_METADATA: lambda: mavlink.component_metadata(self._boot_ms, _METADATA),
+            mavlink_frames.COMPONENT_METADATA: lambda: mavlink_frames.component_metadata(self._boot_ms, _METADATA),
         }
 
     def available_modes(self, index: float) -> list[Message]:
@@ -92,7 +92,7 @@ class Telemetry:
         firmware = self._vehicle.firmware
         count = len(firmware.names)
         return [
-            mavlink.available_modes(count, number, _STANDARD.get(mode, 0), firmware.modes[mode], name)
+            mavlink_frames.available_modes(count, number, _STANDARD.get(mode, 0), firmware.modes[mode], name)
             for number, (mode, name) in enumerate(firmware.names.items(), 1)
             if index in {0, number}
         ]

@@ -10,18 +10,14 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot.battery import Battery
-from sim_backends.emulated.autopilot.estimate import PositionEstimate
-from sim_backends.emulated.autopilot.failsafes import Reaction, VehicleState
-from sim_backends.emulated.autopilot.fence import Fence
+from sim_backends.emulated.autopilot.failsafes import Fence, Reaction, VehicleState
 from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe, stop_m
-from sim_backends.emulated.autopilot.guidance import NEAR_M, Guidance, SetPoint
-from sim_backends.emulated.autopilot.mavlink import dialect
-from sim_backends.emulated.autopilot.mission import Mission
+from sim_backends.emulated.autopilot.flight import NEAR_M, STEP_NS, Airframe, Guidance, SetPoint, stop_m
+from sim_backends.emulated.autopilot.mavlink_frames import dialect
+from sim_backends.emulated.autopilot.mission_plan import Item, Mission
 from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode
+from sim_backends.emulated.autopilot.onboard_estimates import Battery, PositionEstimate
 from sim_backends.emulated.autopilot.parameters import Parameters
-from sim_backends.emulated.autopilot.plan import Item
 from sim_backends.physics.collisions import Footprint
 from sim_backends.physics.quadrotor import QuadrotorLimits
 

@@ -19,12 +19,11 @@ from typing import Final, Self
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium.air_log import AirLog
-from sim_backends.emulated.medium.flows import FlowDelays
 from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing
-from sim_backends.emulated.medium.ports import MediumStats, Port, pack_links, pack_stats, rounded_up
+from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, pack_links, pack_stats, rounded_up
 from sim_backends.emulated.medium.timerfd import Timer
-from sim_backends.emulated.process import ipc
-from sim_backends.emulated.process.ipc import Message
+from sim_backends.emulated.process import worker
+from sim_backends.emulated.process.worker import Message
 from sim_backends.radio.delay import PACKET, processing_ns
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
@@ -207,7 +206,7 @@ class Medium:
     def _serve(self) -> bool:
         """Answer one request; return False if the owner has closed the socket."""
         deadline = Deadline.after(_OWNER_TIMEOUT_S)
-        received = ipc.receive(self._channel, deadline)
+        received = worker.receive(self._channel, deadline)
         if received is None:
             return False
         request, descriptors = received
@@ -215,7 +214,7 @@ class Medium:
             reply = self._answer(request, descriptors)
         except (KeyError, TypeError, ValueError) as error:
             reply = {"error": f"{type(error).__name__}: {error}"}
-        ipc.send(self._channel, reply, deadline)
+        worker.send(self._channel, reply, deadline)
         return True
 
     def _answer(self, request: Message, descriptors: list[int]) -> Message:

@@ -1,19 +1,79 @@
-"""Worker processes of the lab: each serves one request at a time and stops with the process that started it."""
+"""Worker processes of the lab: their interpreter, their messages, and their start and stop."""
 
+import array
+import json
 import os
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError, TestbedLostError
-from sim_backends.emulated.process import interpreter, ipc
-from sim_backends.emulated.process.ipc import Message
+
+PROJECT: Final = Path(__file__).resolve().parents[3]
+"""Folder from which Python imports this package."""
+
+
+def command(module: str) -> list[str]:
+    """Return the command that runs a module of this package, with `PYTHONPATH` set to `PROJECT`.
+
+    Neither the working directory nor the user's site-packages can shadow modules of this package.
+    """
+    return [sys.executable, "-P", "-s", "-m", module]
+
+
+LINE_LIMIT_BYTES: Final = 8 << 20
+DESCRIPTORS: Final = 2
+"""Maximum number of file descriptors in one message."""
+
+Message = dict[str, Any]
+
+
+def send(channel: socket.socket, message: Message, deadline: Deadline, descriptors: Sequence[int] = ()) -> None:
+    """Send one message, with copies of file descriptors.
+
+    Raises:
+        OSError: The peer has closed the socket, or did not receive the message before the deadline.
+        ValueError: The message is longer than `LINE_LIMIT_BYTES`.
+    """
+    line = json.dumps(message).encode() + b"\n"
+    if len(line) > LINE_LIMIT_BYTES:
+        raise ValueError(f"a message of {len(line)} bytes is longer than {LINE_LIMIT_BYTES}")
+    rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))] if descriptors else []
+    channel.settimeout(deadline.remaining_s)
+    sent = channel.sendmsg([line], rights)
+    channel.settimeout(deadline.remaining_s)
+    channel.sendall(line[sent:])
+
+
+def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[int]] | None:
+    """Return the next message and its file descriptors, or None if the peer has closed the socket.
+
+    Raises:
+        OSError: The message was not complete by the deadline, or the connection broke.
+        ValueError: The line is too long or not JSON.
+    """
+    line = bytearray()
+    descriptors: list[int] = []
+    while not line.endswith(b"\n"):
+        channel.settimeout(deadline.remaining_s)
+        data, received, _, _ = socket.recv_fds(channel, 1 << 16, DESCRIPTORS, socket.MSG_CMSG_CLOEXEC)
+        descriptors += received
+        if not data:
+            return None
+        line += data
+        if len(line) > LINE_LIMIT_BYTES:
+            raise ValueError(f"a message is longer than {LINE_LIMIT_BYTES} bytes")
+    message: Message = json.loads(line)
+    return message, descriptors
+
 
 REPLY_S: Final = 15.0
 
@@ -49,7 +109,7 @@ class Worker:
         self._lock = threading.Lock()
         self._channel, theirs = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process; `close` closes it)
-        python = interpreter.command(module)
+        python = command(module)
         argv = ["setpriv", "--pdeathsig", "KILL", "--", *within, *python, str(theirs.fileno()), *words]
         try:
             self._process = subprocess.Popen(
@@ -64,7 +124,7 @@ class Worker:
                     "PATH": PATH,
                     "HOME": home,
                     "LANG": "C.UTF-8",
-                    "PYTHONPATH": str(interpreter.PROJECT),
+                    "PYTHONPATH": str(PROJECT),
                     "OPENBLAS_NUM_THREADS": "1",  # numpy would start a busy thread per core
                 },
                 cwd="/",
@@ -96,8 +156,8 @@ class Worker:
         # The wait is never shorter than REPLY_S: a late reply would be taken for the reply to the next request.
         deadline = Deadline.after(max(timeout_s, REPLY_S))
         try:
-            ipc.send(self._channel, message, deadline, descriptors)
-            received = ipc.receive(self._channel, deadline)
+            send(self._channel, message, deadline, descriptors)
+            received = receive(self._channel, deadline)
         except (OSError, ValueError) as error:
             self._channel.close()
             raise self._gone(_ENDED if isinstance(error, ConnectionError) else str(error)) from error

@@ -1,31 +1,131 @@
-"""Init process of an emulated robot, or of the laptop: PID 1 in its namespaces.
+"""Init process of an emulated robot, or of the laptop: PID 1 in its namespaces, with the supervisor of its services.
 
 It executes the lab's requests from the control socket that it inherits: one JSON line per request and one per reply,
 in strict alternation. When the lab exits, the socket reaches its end, this process exits, and the kernel kills all
 processes in the namespaces.
 """
 
+import contextlib
 import os
 import select
 import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
-from sim_backends.emulated.process import ipc
-from sim_backends.emulated.process.ipc import Message
-from sim_backends.emulated.robot import babeld, mounts, network, rootfs, services
+from sim_backends.emulated.process import worker
+from sim_backends.emulated.process.worker import Message
+from sim_backends.emulated.robot import mounts, network, rootfs, services
 from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
-from sim_backends.emulated.robot.supervisor import Supervisor
 from sim_backends.emulated.ros import own_motion
-from sim_backends.emulated.ros.neighbours import Neighbourhood
+from sim_backends.emulated.ros.laser import Neighbourhood
 from sim_backends.emulated.ros.own_motion import AssignedPath
+
+RESTART_S: Final = 0.1
+"""Delay before a service that exited is restarted; the default of systemd's RestartSec."""
+
+_POLL_S: Final = 0.005
+_HALT_S: Final = 5.0
+_LOG_TAIL: Final = 3
+
+
+class Supervisor:
+    """Starts services, restarts them when they exit, and reaps all children, including orphans."""
+
+    def __init__(self) -> None:
+        self._running: dict[int, Service] = {}
+        self._exit_codes: dict[str, int] = {}
+        self._due: list[tuple[float, Service]] = []
+
+    def start(self, service: Service) -> None:
+        """Start a service.
+
+        Raises:
+            OSError: The program is missing.
+        """
+        self._running[service.launch(_log(service))] = service
+
+    def wait_ready(self, service: Service, deadline: Deadline) -> None:
+        """Return when a service is ready.
+
+        Raises:
+            RobotError: It exited, or was not ready by the deadline; the message has the end of its log.
+        """
+        while not service.ready():
+            self.reap()
+            if service.name in self._exit_codes:
+                raise RobotError(
+                    f"{service.name} exited with status {self._exit_codes[service.name]}: {_tail(service)}"
+                )
+            if deadline.expired:
+                raise RobotError(f"{service.name} was not ready in time: {_tail(service)}")
+            time.sleep(_POLL_S)
+
+    def reap(self) -> None:
+        """Reap every child that has exited, including orphans."""
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                return
+            if pid == 0:
+                return
+            service = self._running.pop(pid, None)
+            if service is not None:
+                self._exit_codes[service.name] = os.waitstatus_to_exitcode(status)
+                self._due.append((time.monotonic() + RESTART_S, service))
+
+    def restart(self) -> float | None:
+        """Restart each service that is due; return the seconds until the next one is due, or None.
+
+        Raises:
+            OSError: The program is missing.
+        """
+        while self._due and self._due[0][0] <= time.monotonic():
+            self.start(self._due.pop(0)[1])
+        return max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
+
+    def halt(self) -> None:
+        """Kill every process of the robot except this one; services are not restarted.
+
+        Raises:
+            RobotError: A process does not exit.
+        """
+        with contextlib.suppress(ProcessLookupError):  # there are no other processes
+            os.kill(-1, signal.SIGKILL)
+        deadline = Deadline.after(_HALT_S)
+        while _has_children():
+            self.reap()
+            if deadline.expired:
+                raise RobotError("a process does not exit", remedy="start the lab again")
+            time.sleep(_POLL_S)
+        self._exit_codes.clear()
+        self._due.clear()
+
+
+def _has_children() -> bool:
+    try:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    except ChildProcessError:
+        return False
+    return True
+
+
+def _log(service: Service) -> Path:
+    return Path(STATE, f"{service.name}.log")
+
+
+def _tail(service: Service) -> str:
+    lines = _log(service).read_text(encoding="utf-8", errors="replace").splitlines()
+    return " / ".join(lines[-_LOG_TAIL:]) or "its log is empty"
+
 
 START_S: Final = 30.0
 """Timeout for the start of a robot's programs; Debian's ROS takes a few seconds on a busy machine."""
@@ -63,7 +163,7 @@ class Init:
                 is_connected = self._serve()
 
     def _serve(self) -> bool:
-        received = ipc.receive(self._channel, Deadline.after(_MESSAGE_S))
+        received = worker.receive(self._channel, Deadline.after(_MESSAGE_S))
         if received is None:
             return False
         request, received_fds = received
@@ -75,7 +175,7 @@ class Init:
             reply = {"error": error.what, "remedy": error.remedy}
         except (OSError, subprocess.SubprocessError) as error:
             reply = {"error": f"{request['do']}: {error}", "remedy": ""}
-        ipc.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
+        worker.send(self._channel, reply, Deadline.after(_MESSAGE_S), descriptors)
         for fd in (*received_fds, *descriptors):
             os.close(fd)
         return True
@@ -136,7 +236,7 @@ def _open_radio(request: Message) -> int:
     interface, address, hello_s = request["interface"], request["address"], request["guest_hello_s"]
     fd = network.bring_up(interface, address, mesh=request["mesh"])
     if hello_s is not None:
-        services.spawn(babeld.guest_command(interface, address, hello_s), {}, Path(os.devnull))
+        services.spawn(network.guest_command(interface, address, hello_s), {}, Path(os.devnull))
     return fd
 
 

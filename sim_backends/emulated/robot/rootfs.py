@@ -11,7 +11,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Final
 
-from sim_backends.emulated.process import interpreter
+from sim_backends.emulated.process import worker
 from sim_backends.emulated.robot import mounts, ssh_server
 from sim_backends.emulated.robot.spec import HOME, STATE, Netcat, RobotSpec
 
@@ -173,8 +173,8 @@ def setup_script(spec: RobotSpec, path: Path) -> str:
 
 def module_command(module: str) -> str:
     """Return the script that runs a module as a command of the robot; `exec` keeps the process id for signals."""
-    command = shlex.join(interpreter.command(module))
-    return f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(interpreter.PROJECT))} exec {command} "$@"\n'
+    command = shlex.join(worker.command(module))
+    return f'#!/bin/sh\nPYTHONPATH={shlex.quote(str(worker.PROJECT))} exec {command} "$@"\n'
 
 
 def _ros_programs(setup: Path) -> Path:

@@ -24,10 +24,10 @@ from fieldkit.agent.middleware import Network, Publisher, Topic
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES, QosProfile
 from fieldkit.ros.types import Distribution, MessageTypes
-from sim_backends.emulated.robot import services, twists
+from sim_backends.emulated.robot import base_process, services
 from sim_backends.emulated.robot.spec import Ros2Spec
 from sim_backends.emulated.ros import offered_qos, static_frames
-from sim_backends.emulated.ros.listener import Listener
+from sim_backends.emulated.ros.tcpros import Listener
 
 _POLL_S: Final = 0.1
 """Polling interval for subscribers; ROS 2's own recorder polls for new publishers as often."""
@@ -95,7 +95,7 @@ class Ros2Relay:
 
         def send(data: bytes, _: int) -> None:
             with contextlib.suppress(OSError, SerdeError):  # no process receives it, or it is not a Twist
-                channel.sendto(bytes(types.ros2.cdr_to_ros1(data, kind)), str(twists.CHANNEL))
+                channel.sendto(bytes(types.ros2.cdr_to_ros1(data, kind)), str(base_process.CHANNEL))
 
         self._middleware.subscribe(self._topic(topic, kind, PROFILES["default"]), send)
 

@@ -19,7 +19,7 @@ import roslib.message  # type: ignore[import-not-found]
 import rospy
 
 from fieldkit.core.deadline import Deadline
-from sim_backends.emulated.robot import services, twists
+from sim_backends.emulated.robot import base_process, services
 from sim_backends.emulated.ros import tcpros
 
 _MASTER_S: Final = 20.0
@@ -99,9 +99,9 @@ def _relay_velocities(topic: str) -> None:
 
     def send(message: Any) -> None:  # noqa: ANN401 (rospy has no types)
         linear, angular = message.linear, message.angular
-        words = twists.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+        words = base_process.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
         with contextlib.suppress(OSError):
-            channel.sendto(words, str(twists.CHANNEL))
+            channel.sendto(words, str(base_process.CHANNEL))
 
     rospy.Subscriber(topic, roslib.message.get_message_class("geometry_msgs/Twist"), send, queue_size=1)
 

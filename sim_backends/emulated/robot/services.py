@@ -13,12 +13,12 @@ from typing import Final
 
 from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
 from fieldkit.remote.command import with_environment
-from sim_backends.emulated.autopilot import server as autopilot
-from sim_backends.emulated.process import interpreter
-from sim_backends.emulated.robot import babeld, base, network, ssh_server
+from sim_backends.emulated.autopilot import mavlink_server as autopilot
+from sim_backends.emulated.process import worker
+from sim_backends.emulated.robot import base_process, network, ssh_server
 from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, static_frames, tcpros
-from sim_backends.emulated.ros.neighbours import Neighbourhood
+from sim_backends.emulated.ros.laser import Neighbourhood
 
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
@@ -137,10 +137,10 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
     if spec.mavlink_port is not None:
         result.append(_motion_service("autopilot", partial(autopilot.serve, _drone(spec, spec.mavlink_port))))
     if spec.base is not None:
-        result.append(_motion_service("base", partial(base.serve, spec.base)))
+        result.append(_motion_service("base", partial(base_process.serve, spec.base)))
     if spec.mesh_hello_s is not None:
-        argv = babeld.command(spec.interface, spec.address, spec.mesh_hello_s)
-        result.append(_program("babeld", argv, {}, babeld.PID.exists))
+        argv = network.command(spec.interface, spec.address, spec.mesh_hello_s)
+        result.append(_program("babeld", argv, {}, network.PID.exists))
     if spec.ros == "debian":
         result += _debian_ros(spec, (*spec.registered, *([static_frames.TOPIC] if frames else [])))
     if spec.bridge:
@@ -167,7 +167,7 @@ def _motion_service(name: str, serve: Callable[..., None]) -> Service:
 def _debian_ros(spec: RobotSpec, topics: Sequence[str]) -> Iterator[Service]:
     """Yield the robot's ROS master, if it runs one, and the node that publishes `topics` there."""
     # Debian's interpreter, because rospy is installed for it.
-    variables = spec.ros1_environment | {"PYTHONPATH": str(interpreter.PROJECT)}
+    variables = spec.ros1_environment | {"PYTHONPATH": str(worker.PROJECT)}
     if spec.runs_master:
         yield _master(spec, variables)
     relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), _velocities(spec), *topics)
@@ -221,8 +221,8 @@ def _bridge_is_up() -> bool:
 
 
 def _ros2_program(name: str, *words: str) -> Service:
-    argv = (*interpreter.command(_ROS2), *words)
-    return _program(name, argv, {"PYTHONPATH": str(interpreter.PROJECT)}, ready_file(name).exists)
+    argv = (*worker.command(_ROS2), *words)
+    return _program(name, argv, {"PYTHONPATH": str(worker.PROJECT)}, ready_file(name).exists)
 
 
 def ready_file(name: str) -> Path:

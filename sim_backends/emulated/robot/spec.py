@@ -4,9 +4,8 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
 from fieldkit.core.model import ROS_MASTER_PORT
-from sim_backends.emulated.ros.laser import LaserTarget
+from sim_backends.emulated.ros.laser import LaserTarget, Neighbour
 from sim_backends.emulated.ros.messages import Definition, Sensor, Template
-from sim_backends.emulated.ros.neighbours import Neighbour
 
 SshServer = Literal["openssh", "dropbear"]
 Userland = Literal["gnu", "busybox"]

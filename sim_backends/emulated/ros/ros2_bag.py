@@ -32,7 +32,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from fieldkit.ros.qos import QosProfile
 from fieldkit.ros.types import Distribution, MessageTypes
 from sim_backends.emulated.ros import offered_qos, tcpros
-from sim_backends.emulated.ros.listener import Header, Listener, type_of
+from sim_backends.emulated.ros.tcpros import Header, Listener, type_of
 
 # Polling interval of the original for new publishers.
 _TICK_S: Final = 0.1

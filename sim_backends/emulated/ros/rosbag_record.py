@@ -12,7 +12,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Writer
 
 from sim_backends.emulated.ros import tcpros
-from sim_backends.emulated.ros.listener import Header, Listener, type_of
+from sim_backends.emulated.ros.tcpros import Header, Listener, type_of
 
 # Polling interval of the original for its end and for new publishers.
 _TICK_S: Final = 0.25

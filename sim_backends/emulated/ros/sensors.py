@@ -205,7 +205,7 @@ def publish(
         targets: Laser targets in the robot's world.
         moving: Returns the laser targets that move: other robots, where they are now.
         motion: The file of the paths that the lab assigns (`own_motion.append_path`).
-        steered: The file in which the robot records how it steers itself (`helm.Helm`).
+        steered: The file in which the robot records how it steers itself (`own_motion.Helm`).
         ready: Created when every topic can be subscribed to.
 
     Raises:

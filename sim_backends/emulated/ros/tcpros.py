@@ -1,12 +1,18 @@
-"""Framing of TCPROS, the protocol of ROS 1 nodes (wiki.ros.org/ROS/TCPROS), here over a Unix socket per topic.
+"""TCPROS, the protocol of ROS 1 nodes, over a Unix socket per topic: its framing, and a subscriber.
 
-Every packet is its length in 4 bytes, little-endian, and its payload. The first packet in each direction is the
-connection header, a sequence of fields `name=value`, each with its length; each later one is a serialized message.
-Only the standard library is imported, because Debian's Python imports this module too.
+Source: wiki.ros.org/ROS/TCPROS. Every packet is its length in 4 bytes, little-endian, and its payload. The first
+packet in each direction is the connection header, a sequence of fields `name=value`, each with its length; each later
+one is a serialized message. Only the standard library is imported, because Debian's Python imports this module too.
 """
 
+import contextlib
+import re
+import selectors
+import signal
+import socket
 import struct
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -98,3 +104,129 @@ class PacketSplitter:
             payload = bytes(self._buffer[LENGTH_BYTES:end])
             del self._buffer[:end]
             yield payload
+
+
+_CHUNK: Final = 1 << 16
+_TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
+
+Header = Mapping[str, str]
+"""Connection header of a publisher: `topic`, `type`, `md5sum`, `message_definition`, `callerid`, `latching`."""
+
+
+@dataclass
+class _Subscription:
+    """Connection to the publisher of one topic."""
+
+    topic: str
+    stream: socket.socket
+    packets: PacketSplitter = field(default_factory=PacketSplitter)
+    header: Header | None = None
+
+
+class Listener:
+    """Subscribes to wanted topics once they are published; SIGINT and SIGTERM interrupt its waits.
+
+    A publisher that violates TCPROS is disconnected for good; the other topics continue.
+
+    Attributes:
+        wanted: Topics to subscribe to.
+        stopped_by: The signal that was received, or None.
+    """
+
+    def __init__(self) -> None:
+        self.wanted: set[str] = set()
+        self.stopped_by: int | None = None
+        self._subscriptions: dict[str, _Subscription] = {}
+        self._invalid: set[str] = set()
+        self._selector = selectors.DefaultSelector()
+        self._stop_on_signals()
+
+    def subscribe(self) -> None:
+        """Connect to every wanted topic that has a publisher now."""
+        for topic in sorted(self.wanted - self._subscriptions.keys() - self._invalid):
+            stream = socket.socket(socket.AF_UNIX)
+            try:
+                stream.connect(str(socket_path(topic)))
+            except OSError:
+                stream.close()  # it has no publisher yet
+                continue
+            with contextlib.suppress(OSError):  # a publisher that has exited is noticed when the stream is read
+                stream.sendall(request("/record", topic))
+            self._subscriptions[topic] = _Subscription(topic, stream)
+            self._selector.register(stream, selectors.EVENT_READ, self._subscriptions[topic])
+
+    def unsubscribe(self, topic: str) -> None:
+        """Disconnect from a topic until the next `subscribe`; does nothing if it is not connected."""
+        if topic in self._subscriptions:
+            stream = self._subscriptions.pop(topic).stream
+            self._selector.unregister(stream)
+            stream.close()
+
+    def events(self, within_s: float) -> Iterator[tuple[Header, bytes | None]]:
+        """Yield what arrives within a time: (header, None) once per publisher, then (header, message)."""
+        for key, _ in self._selector.select(within_s):
+            if isinstance(key.data, _Subscription):
+                yield from self._read(key.data)
+
+    def _read(self, subscription: _Subscription) -> Iterator[tuple[Header, bytes | None]]:
+        data = b""
+        with contextlib.suppress(ConnectionResetError):
+            data = subscription.stream.recv(_CHUNK)
+        if not data:
+            self.unsubscribe(subscription.topic)
+            return
+        subscription.packets.feed(data)
+        try:
+            yield from self._packets(subscription)
+        except ValueError:
+            self._invalid.add(subscription.topic)
+            self.unsubscribe(subscription.topic)
+
+    def _packets(self, subscription: _Subscription) -> Iterator[tuple[Header, bytes | None]]:
+        """Yield the content of complete packets.
+
+        Raises:
+            ValueError: A packet is malformed, or the header is not that of this topic.
+        """
+        for payload in subscription.packets:
+            if subscription.topic not in self._subscriptions:
+                return
+            if subscription.header is None:
+                subscription.header = _header(payload, subscription.topic)
+                yield subscription.header, None
+            else:
+                yield subscription.header, payload
+
+    def _stop_on_signals(self) -> None:
+        receiver, signals = socket.socketpair()
+        signals.setblocking(False)
+        signal.set_wakeup_fd(signals.detach())
+        self._selector.register(receiver, selectors.EVENT_READ)
+
+        def stop(number: int, _: object) -> None:
+            self.stopped_by = number
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, stop)
+        signal.pthread_sigmask(signal.SIG_SETMASK, [])
+
+
+def _header(payload: bytes, topic: str) -> Header:
+    """Return the connection header of a publisher.
+
+    Raises:
+        ValueError: A required field is missing, or the header is that of another topic.
+    """
+    header = unpack_header(payload)
+    missing = {"topic", "type", "md5sum", "message_definition"} - header.keys()
+    if missing or header["topic"] != topic or not _TYPE.fullmatch(header["type"]):
+        raise ValueError(f"not the header of a publisher of {topic}")
+    latching = header.get("latching", "0")
+    if latching not in {"0", "1"}:
+        raise ValueError(f"latching is {latching!r}")
+    return {"callerid": "", **header, "latching": latching}
+
+
+def type_of(header: Header) -> str:
+    """Return the message type of a publisher in the notation of rosbags, `package/msg/Name`."""
+    return header["type"].replace("/", "/msg/")

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.scenario.policies import POLICIES, make_policy
+from sim_backends.cosim.policies.registry import POLICIES, make_policy
+from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Received
 from sim_backends.world.motion import State

@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.digest import EventDigest
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.observer import Window, WindowObserver
-from sim_backends.cosim.policies.base import Situation
-from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.policies.sync_policy import Situation
+from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
 from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.world.motion import State
 

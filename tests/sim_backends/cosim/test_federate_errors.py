@@ -10,15 +10,20 @@ import pytest
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.federate_errors import FederateError, UnansweredError
-from sim_backends.cosim.federates import Action, NetworkFederate, PhysicsFederate, Program
-from sim_backends.cosim.observer import WindowObserver
-from sim_backends.cosim.policies.base import Situation, SyncPolicy
+from sim_backends.cosim.federates import (
+    Action,
+    FederateError,
+    NetworkFederate,
+    PhysicsFederate,
+    Program,
+    UnansweredError,
+)
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.stalls import Stall, stalled
+from sim_backends.cosim.policies.sync_policy import Situation, SyncPolicy
+from sim_backends.cosim.policies.window_policies import EventDriven, SlidingWindow
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.run_record import WindowObserver
+from sim_backends.cosim.wall_time import Stall, stalled
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
 from sim_backends.physics.paths import Paths

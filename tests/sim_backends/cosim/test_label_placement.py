@@ -5,7 +5,7 @@ from itertools import combinations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.cosim.label_placement import LabelBox, place_labels, stack_labels
+from sim_backends.cosim.plot_layout import LabelBox, place_labels, stack_labels
 
 BOUNDS = LabelBox(0.0, 0.0, 240.0, 180.0)
 INSIDE = st.tuples(st.floats(0, 240), st.floats(0, 180))

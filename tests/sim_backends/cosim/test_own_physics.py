@@ -9,8 +9,8 @@ import pytest
 from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.comparison import errors
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.scenario.policies import POLICIES
+from sim_backends.cosim.policies.registry import POLICIES
+from sim_backends.cosim.policies.window_policies import Scheduled
 from sim_backends.cosim.studies.local_errors import local_errors
 from sim_backends.world.motion import State
 from tests.helpers.paths import ROOT

@@ -14,21 +14,22 @@ from hypothesis import strategies as st
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.comparison import Spread, errors
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.federate_errors import FederateError
-from sim_backends.cosim.federates import Action
-from sim_backends.cosim.geometry import position_error_m
-from sim_backends.cosim.policies.base import PolicyError, Situation, SyncPolicy
+from sim_backends.cosim.federates import Action, FederateError
+from sim_backends.cosim.packet_ledger import position_error_m
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.policies.time_stepped import TimeStepped
-from sim_backends.cosim.policies.variable_stepped import VariableStepped
-from sim_backends.cosim.policies.velocity_aware import VelocityAware
-from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.run import Run
-from sim_backends.cosim.windows import Windows
+from sim_backends.cosim.policies.sync_policy import PolicyError, Situation, SyncPolicy
+from sim_backends.cosim.policies.window_policies import (
+    EventDriven,
+    Scheduled,
+    SlidingWindow,
+    TimeStepped,
+    VariableStepped,
+    VelocityAware,
+    VelocityAwareRaw,
+    Windows,
+)
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.run_record import Run
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.physics.paths import Paths

@@ -10,12 +10,12 @@ from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.comparison import errors
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.observer import WindowObserver
-from sim_backends.cosim.policies.base import PolicyError, Situation
-from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.sync_policy import PolicyError, Situation
+from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
+from sim_backends.cosim.run_record import WindowObserver
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.physics.paths import Paths

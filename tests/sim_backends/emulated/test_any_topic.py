@@ -15,7 +15,7 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
 

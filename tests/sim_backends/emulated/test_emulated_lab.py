@@ -29,8 +29,8 @@ from fieldkit.remote.ssh import SshShell
 from fieldkit.ros.types import shipped
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.nodes import EmulatedRobot
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed

@@ -21,10 +21,10 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.ros.types import shipped
-from sim_backends.emulated import options, placement, requirements
+from sim_backends.emulated import emulated_options, placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
-from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
 from sim_backends.emulated.provisioning import KeyPair, definition, robot_spec
 from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.ros import messages, tcpros
@@ -204,10 +204,10 @@ class TestRequirements:
         assert caught.value.remedy.endswith("iputils-ping openssh-server")
 
     def test_ros_is_debian_s_where_it_is_installed(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.setattr(options, "ROS_FILES", (str(tmp_path),))
+        monkeypatch.setattr(emulated_options, "ROS_FILES", (str(tmp_path),))
         assert requirements.ros_in_use(RosChoice.AUTO) is RosChoice.DEBIAN
         assert requirements.ros_in_use(RosChoice.BUILTIN) is RosChoice.BUILTIN
-        monkeypatch.setattr(options, "ROS_FILES", (str(tmp_path / "nothing"),))
+        monkeypatch.setattr(emulated_options, "ROS_FILES", (str(tmp_path / "nothing"),))
         assert requirements.ros_in_use(RosChoice.AUTO) is RosChoice.BUILTIN
         with pytest.raises(ConfigurationError, match="not installed"):
             requirements.ros_in_use(RosChoice.DEBIAN)

@@ -20,7 +20,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from sim_backends.emulated import requirements, testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import EmulatedOptions, RobotOptions, RosChoice, load_options
+from sim_backends.emulated.emulated_options import EmulatedOptions, RobotOptions, RosChoice, load_options
 from sim_backends.emulated.provisioning import KeyPair
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed

@@ -19,8 +19,8 @@ from fieldkit.lab import answers
 from fieldkit.lab.protocol import Destination
 from fieldkit.report import figures
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.lab import members_of, overview
-from sim_backends.emulated.options import EmulatedOptions
+from sim_backends.emulated.emulated_options import EmulatedOptions
+from sim_backends.emulated.interactive_lab import members_of, overview
 from sim_backends.emulated.placement import moved_m, square_m
 from sim_backends.world.shapes import Box, Cylinder, Solids
 from sim_backends.world.world import World, load_world

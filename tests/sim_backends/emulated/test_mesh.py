@@ -19,12 +19,11 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.lab.protocol import LabRobot
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import requirements
-from sim_backends.emulated.nodes import Laptop
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
+from sim_backends.emulated.nodes import Laptop, RunningRobots, running_robots
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME
-from sim_backends.emulated.robot import babeld
+from sim_backends.emulated.robot import network
 from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.startup import RunningRobots, running_robots
 from sim_backends.emulated.testbed import laptop_on_air
 from sim_backends.world.world import load_world
 from tests.helpers.labs import BOX
@@ -157,7 +156,7 @@ def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first: SshShell) ->
 
 
 def test_the_laptop_announces_only_itself() -> None:
-    settings = babeld.guest_command("wlan0", "10.42.0.254/24", HELLO_S)
+    settings = network.guest_command("wlan0", "10.42.0.254/24", HELLO_S)
     assert [word for word in settings if word.startswith("out ")] == ["out ip 10.42.0.254/32 allow", "out deny"]
 
 

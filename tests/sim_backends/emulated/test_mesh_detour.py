@@ -16,7 +16,7 @@ from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.procedure import load_procedure
 from sim_backends.emulated import testbed
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.world.world import load_world
 from tests.helpers.labs import BOX

@@ -15,7 +15,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Leg, Move, Placement, Role, Scenario, Topology, Vector
 from fieldkit.core.units import parse_distance
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.mobility import STEP_M, Mobility
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.ros.own_motion import AssignedPath

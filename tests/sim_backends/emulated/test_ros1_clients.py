@@ -19,7 +19,7 @@ from fieldkit.remote.command import with_environment
 from fieldkit.ros.types import shipped
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.ros.messages import LASER_NOISE_M, LASER_RANGE_M
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.world.world import load_world

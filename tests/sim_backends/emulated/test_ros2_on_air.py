@@ -26,7 +26,7 @@ from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
-from sim_backends.emulated.options import EmulatedOptions, RosChoice, load_options
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot import services
 from sim_backends.emulated.ros import offered_qos

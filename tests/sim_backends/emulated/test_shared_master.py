@@ -18,7 +18,7 @@ from fieldkit.steps import ros_master
 from fieldkit.steps.scene import CommandResult, Need, Scene
 from sim_backends.emulated import requirements, testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot import services
 from sim_backends.emulated.testbed import EmulatedTestbed

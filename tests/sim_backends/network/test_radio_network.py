@@ -11,13 +11,10 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.policies.base import SyncPolicy
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.policies.variable_stepped import VariableStepped
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.policies.window_policies import EventDriven, Scheduled, SlidingWindow, VariableStepped
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.run_record import Run
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Arrival, Drop, Packet

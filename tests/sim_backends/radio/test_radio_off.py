@@ -14,8 +14,8 @@ from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Top
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.medium.client import MediumClient
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world

@@ -28,8 +28,8 @@ from fieldkit.trial.check import software
 from fieldkit.trial.running import bridges
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
-from sim_backends.emulated.startup import running_robots
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
+from sim_backends.emulated.nodes import running_robots
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.options import RadioOptions
 from sim_backends.world.world import load_world

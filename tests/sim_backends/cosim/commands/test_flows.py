@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fieldkit.measure.transfers.delay import jitter_s
-from sim_backends.cosim.commands.flows import flow_results
-from sim_backends.cosim.run import Fate, Run
+from sim_backends.cosim.commands.results import flow_results
+from sim_backends.cosim.run_record import Fate, Run
 from sim_backends.network.packets import Packet
 from sim_backends.world.motion import State
 

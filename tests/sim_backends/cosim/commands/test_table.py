@@ -8,10 +8,9 @@ import math
 import pytest
 
 from sim_backends.cosim.commands import table
-from sim_backends.cosim.studies.agreement import Printed
 from sim_backends.cosim.studies.intervals import IntervalEstimate
 from sim_backends.cosim.studies.paper_claims import Claim
-from sim_backends.cosim.studies.paper_tables import PaperCell, PaperRow
+from sim_backends.cosim.studies.paper_tables import PaperCell, PaperRow, Printed
 
 NAN = math.nan
 LOSS = PaperCell(Printed("10", 100, "10"), IntervalEstimate(0.07, 0.065, 0.075), 3)

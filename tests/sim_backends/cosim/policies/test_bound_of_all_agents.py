@@ -15,11 +15,11 @@ from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.comparison import errors
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.geometry import position_error_m
-from sim_backends.cosim.policies.base import PolicyError
+from sim_backends.cosim.packet_ledger import position_error_m
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.policies.sync_policy import PolicyError
+from sim_backends.cosim.policies.window_policies import Scheduled
+from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.paths import Paths

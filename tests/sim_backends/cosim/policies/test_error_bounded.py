@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.geometry import position_error_m
-from sim_backends.cosim.policies.base import PolicyError, Situation
+from sim_backends.cosim.packet_ledger import position_error_m
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
+from sim_backends.cosim.policies.sync_policy import PolicyError, Situation
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.physics.bodies import Bodies

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.federates import Action, Program
-from sim_backends.cosim.programs.clocks import AgentClock, Clocked
-from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.programs.wrappers import AgentClock, Clocked
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 

@@ -9,11 +9,11 @@ from fieldkit.core.model import Vector
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Program
-from sim_backends.cosim.policies.event_driven import EventDriven
+from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.programs.follow import FollowAtHeadway, HoldStation
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.programs.several import CombinedProgram
-from sim_backends.cosim.programs.velocity_profile import ProfileLeg, VelocityProfile
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.programs.way_points import ProfileLeg, VelocityProfile
+from sim_backends.cosim.programs.wrappers import CombinedProgram
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Received
 from sim_backends.physics.bodies import Bodies

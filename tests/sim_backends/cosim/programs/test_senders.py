@@ -8,12 +8,18 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from sim_backends.cosim.federates import Action, Program
-from sim_backends.cosim.programs.bags import BagMessage, Playback, pieces, recorded
-from sim_backends.cosim.programs.outages import Outage
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.programs.pings import EchoRequester, EchoResponder, PingRequest
-from sim_backends.cosim.programs.several import CombinedProgram
-from sim_backends.cosim.scenario.traffic import BagTraffic
+from sim_backends.cosim.programs.senders import (
+    BagMessage,
+    EchoRequester,
+    EchoResponder,
+    Periodic,
+    PingRequest,
+    Playback,
+    pieces,
+    recorded,
+)
+from sim_backends.cosim.programs.wrappers import CombinedProgram, Outage
+from sim_backends.cosim.scenario.agent_plans import BagTraffic
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.motion import State

@@ -6,7 +6,7 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.federate_errors import FederateError
+from sim_backends.cosim.federates import FederateError
 from sim_backends.cosim.programs.way_points import DriveThrough
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive

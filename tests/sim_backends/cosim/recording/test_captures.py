@@ -17,10 +17,9 @@ from scapy.utils import PcapReader
 from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.recording.captures import Captures
-from sim_backends.cosim.recording.internet import IpEncoder
+from sim_backends.cosim.policies.window_policies import EventDriven
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.recording.captures import Captures, IpEncoder
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.network.ip import Fragment

@@ -12,11 +12,11 @@ from jsonschema import Draft202012Validator
 from mcap.reader import make_reader
 
 from fieldkit.export.schemas import TRANSFORMS
-from sim_backends.cosim.policies.time_stepped import TimeStepped
+from sim_backends.cosim.policies.window_policies import TimeStepped
 from sim_backends.cosim.recording.mcap import write_mcap
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import Recording, read_recording
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.run_record import Run
 from sim_backends.world.motion import State
 from tests.helpers.passing_robots import ABOUT, MS, passing_robots
 

@@ -21,19 +21,21 @@ from scapy.utils import RawPcapReader
 
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from sim_backends.cosim.comparison import errors
-from sim_backends.cosim.federate_errors import FederateError
-from sim_backends.cosim.policies.base import Situation, SyncPolicy
+from sim_backends.cosim.federates import FederateError
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.policies.time_stepped import TimeStepped
-from sim_backends.cosim.policies.velocity_aware import VelocityAware
-from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
-from sim_backends.cosim.recording import tables
+from sim_backends.cosim.policies.sync_policy import Situation, SyncPolicy
+from sim_backends.cosim.policies.window_policies import (
+    EventDriven,
+    Scheduled,
+    TimeStepped,
+    VelocityAware,
+    VelocityAwareRaw,
+)
+from sim_backends.cosim.recording import packet_tables
 from sim_backends.cosim.recording.manifest import RunEnding, read_manifest, write_manifest
 from sim_backends.cosim.recording.recorder import RecordingError, RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from tests.helpers.passing_robots import ABOUT, MS, passing_robots
@@ -253,7 +255,7 @@ def damage(folder: Path, column: str, *, forge: bool) -> None:
     pq.write_table(table.set_column(place, field, pa.array(values, field.type)), path)
     if forge:
         manifest = read_manifest(folder)
-        parts = {**manifest.parts, str(path.relative_to(folder)): tables.checksum(path)}
+        parts = {**manifest.parts, str(path.relative_to(folder)): packet_tables.checksum(path)}
         write_manifest(folder, replace(manifest, parts=parts))
 
 
@@ -275,7 +277,7 @@ def test_the_digest_alone_detects_a_changed_event(tmp_path: Path, recorded: Path
 
 @settings(max_examples=25)
 @given(
-    table=st.sampled_from(tables.TABLES),
+    table=st.sampled_from(packet_tables.TABLES),
     which=st.integers(0),
     at=st.integers(0),
     how=st.sampled_from(["cut", "gone", "flip"]),

@@ -7,9 +7,8 @@ import pytest
 
 from fieldkit.config import schema
 from fieldkit.config.meanings import attributes
-from sim_backends.cosim.scenario.editor_schema import editor_schema
 from sim_backends.cosim.scenario.faults import JammerFault
-from sim_backends.cosim.scenario.loading import scenario_files
+from sim_backends.cosim.scenario.loading import editor_schema, scenario_files
 
 SCHEMA = editor_schema()
 

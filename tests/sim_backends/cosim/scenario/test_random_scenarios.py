@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.policies.base import PolicyError
+from sim_backends.cosim.policies.registry import POLICIES
+from sim_backends.cosim.policies.sync_policy import PolicyError
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
-from sim_backends.cosim.scenario.policies import POLICIES
 
 NAMES = ("one", "two", "three", "four")
 UNTIL_NS = 30_000_000

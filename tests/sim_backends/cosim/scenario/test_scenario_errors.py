@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.scenario import memory
+from sim_backends.cosim.scenario import checks
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.physics import known
@@ -80,7 +80,7 @@ WRONG = [
     ("leader: one", "leader: noone", 14, "no agent 'noone'; did you mean 'one'"),
     ("leader: one", "leader: [one, three]", 12, "two follows three and receives no states of it; add to the traffic"),
     ("distance: 2m", "distance: 0m", 15, "greater than 0"),
-    ("from: one, to: two", "from: one, to: twö", 18, "'twö' is not a name: small letters"),
+    ("from: one, to: two", "from: one, to: twö", 18, "'twö' is not a name of at most 31 lower-case letters"),
     ("from: one, to: two", "from: one, to: tow", 18, "no agent 'tow'; did you mean 'two'"),
     ("from: one, to: two", "from: one, to: one", 18, "one sends to itself"),
     ("from: one, to: two", "from: one, to: []", 18, "at least 1 item"),
@@ -236,16 +236,16 @@ def test_a_run_that_needs_too_much_memory_is_refused_with_both_sizes(
 ) -> None:
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemTotal:  8 kB\nMemAvailable:    1000 kB\n", encoding="ascii")
-    monkeypatch.setattr(memory, "MEMINFO", meminfo)
+    monkeypatch.setattr(checks, "MEMINFO", meminfo)
     # 10 Hz for 2 s and a bag of 100 packets are 120 packets of 1200 bytes; 2000 windows and 10 per packet have 40
     # bytes each; and there are three pairs of agents.
-    assert memory.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
+    assert checks.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
     error = refused(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
     assert "2 s of 3 agents would need 3.4 MB of memory, and 1.0 MB are available" in error.what
     assert "choose a shorter duration, or send less: one-stream alone has 2,000 packets" in error.remedy
     assert error.where.endswith(":4")
-    monkeypatch.setattr(memory, "MEMINFO", tmp_path / "none")
-    assert memory.available_bytes() is None
+    monkeypatch.setattr(checks, "MEMINFO", tmp_path / "none")
+    assert checks.available_bytes() is None
 
 
 def test_too_many_agents_for_the_memory_are_refused_before_they_are_built(
@@ -255,7 +255,7 @@ def test_too_many_agents_for_the_memory_are_refused_before_they_are_built(
     agents = "".join(f"  n{number}: {{robot: turtlebot3_burger, at_m: [0, 0]}}\n" for number in range(300))
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemAvailable:    70200 kB\n", encoding="ascii")
-    monkeypatch.setattr(memory, "MEMINFO", meminfo)
+    monkeypatch.setattr(checks, "MEMINFO", meminfo)
     # 44,850 pairs need 72 MB. If the bodies were built, the error would be that all are in one place.
     error = refused(f"{text}{agents}  one: {rest}", tmp_path)
     assert "2 s of 303 agents would need 73 MB of memory, and 72 MB are available" in error.what

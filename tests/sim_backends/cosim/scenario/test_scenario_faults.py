@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_backends.cosim.columns import NEVER, columns, round_trips_s
-from sim_backends.cosim.federate_errors import UnansweredError
-from sim_backends.cosim.recording import tables
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.commands.results import recoveries
+from sim_backends.cosim.federates import UnansweredError
+from sim_backends.cosim.packet_columns import NEVER, columns, round_trips_s
+from sim_backends.cosim.recording import packet_tables
+from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
-from sim_backends.cosim.scenario.recovery import recoveries
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 SCENARIO = """\
@@ -209,7 +209,7 @@ def test_a_run_has_a_row_per_packet(run_of: RunOf) -> None:
         "flow number source destination protocol size_bytes sent_ns enters_ns arrived_ns counted_ns late_ns reason"
     )
     assert set(table) == set(names.split())
-    assert set(table) <= set(tables._SCHEMAS["packets"].names), "the columns of the recorded file"
+    assert set(table) <= set(packet_tables._SCHEMAS["packets"].names), "the columns of the recorded file"
     assert {len(column) for column in table.values()} == {len(run.fates)}
     for row, ((flow, number), fate) in enumerate(run.fates.items()):
         assert (table["flow"][row], table["number"][row]) == (flow, number)

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from sim_backends.cosim import build, load_scenario
+from sim_backends.cosim.policies.registry import POLICIES
 from sim_backends.cosim.scenario.loading import scenario_files
-from sim_backends.cosim.scenario.policies import POLICIES
 from tests.helpers.paths import ROOT
 
 SECOND_NS = 1_000_000_000

@@ -6,9 +6,9 @@ import pytest
 
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.policies.base import SyncPolicy
-from sim_backends.cosim.programs.periodic import Periodic
-from sim_backends.cosim.run import Run
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.studies.bounds import FixedCost, bound_cost, longest_for_all
 from sim_backends.network.disc import Disc
 from sim_backends.physics.paths import Paths

@@ -5,13 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from sim_backends.cosim.policies.base import SyncPolicy
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.policies.time_stepped import TimeStepped
-from sim_backends.cosim.policies.variable_stepped import VariableStepped
-from sim_backends.cosim.studies import convoy
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.policies.window_policies import (
+    EventDriven,
+    Scheduled,
+    SlidingWindow,
+    TimeStepped,
+    VariableStepped,
+)
+from sim_backends.cosim.studies import formation
 from sim_backends.cosim.studies.intervals import Floats
 from tests.helpers.convoys import STANDSTILL_M, positions_m
 
@@ -22,26 +24,28 @@ PERIOD_S = math.tau / RATE_RAD_S
 def test_the_limit_of_string_stability_is_where_the_gain_exceeds_one() -> None:
     rates = np.geomspace(1e-3, 1e3, 2000)
     for headway_s, gain_per_s in ((0.3, 2.0), (1.0, 1.0), (0.5, 0.2)):
-        limit_s = convoy.longest_delay_s(headway_s, gain_per_s)
+        limit_s = formation.longest_delay_s(headway_s, gain_per_s)
         for delay_s in (0.0, 0.5 * limit_s, 0.99 * limit_s):
-            gains = convoy.gain(rates, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s)
+            gains = formation.gain(rates, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s)
             assert gains.max() <= 1 + 1e-12
         for delay_s in (1.01 * limit_s, 2 * limit_s):
-            assert convoy.gain(rates, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s).max() > 1 + 1e-9
+            assert formation.gain(rates, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s).max() > 1 + 1e-9
 
 
 @pytest.mark.parametrize(("delay_s", "stable"), [(0.04, True), (0.3, False)])
 def test_a_row_amplifies_as_its_transfer_function_predicts(delay_s: float, stable: bool) -> None:
     """On both sides of the limit, which is at 83 ms."""
-    assert (delay_s < convoy.longest_delay_s(HEADWAY_S, GAIN_PER_S)) == stable
+    assert (delay_s < formation.longest_delay_s(HEADWAY_S, GAIN_PER_S)) == stable
     settled_s = 3 * PERIOD_S
     times_s, places = positions_m(
         EventDriven(), delay_s=delay_s, headway_s=HEADWAY_S, followers=2, seconds=settled_s + PERIOD_S
     )
-    speeds = convoy.speeds_m_s(times_s, places)[times_s >= settled_s]
-    ratios = convoy.amplifications(speeds)
+    speeds = formation.speeds_m_s(times_s, places)[times_s >= settled_s]
+    ratios = formation.amplifications(speeds)
     # A state is sent every 10 ms, and a command is held for 10 ms: half of each adds to the delay.
-    expected = convoy.gain(np.array([RATE_RAD_S]), delay_s=delay_s + 0.01, headway_s=HEADWAY_S, gain_per_s=GAIN_PER_S)
+    expected = formation.gain(
+        np.array([RATE_RAD_S]), delay_s=delay_s + 0.01, headway_s=HEADWAY_S, gain_per_s=GAIN_PER_S
+    )
     assert ratios == pytest.approx([expected[0]] * 2, rel=0.01)
     assert all((ratio <= 1) == stable for ratio in ratios)
 
@@ -59,7 +63,7 @@ def test_the_position_error_of_a_closed_loop_grows_with_the_window() -> None:
             for window_s in (0.011, 0.043, 0.17)
         ]
         assert 0 < errors_m[0] < errors_m[1] < errors_m[2]
-    spacing_m = convoy.spacing_errors_m(times_s, reference, STANDSTILL_M, 0.5)
+    spacing_m = formation.spacing_errors_m(times_s, reference, STANDSTILL_M, 0.5)
     # 1 - Gamma (h s + 1), which is about d s^2 / (s + k), times the 0.1 m by which the leader's position oscillates.
     expected_m = 0.1 * 0.0537 * RATE_RAD_S**2 / math.hypot(RATE_RAD_S, GAIN_PER_S)
     assert np.abs(spacing_m[times_s > 2]).max() == pytest.approx(expected_m, rel=0.2)
@@ -70,10 +74,10 @@ def test_measures_of_a_known_row() -> None:
     lead = np.stack([2 * times_s, 0 * times_s, 0 * times_s], axis=-1)
     behind = lead - np.array([5.0, 0.0, 0.0])
     places = np.stack([lead, behind], axis=1)
-    assert convoy.speeds_m_s(times_s, places) == pytest.approx(np.full((1001, 2), 2.0))
-    assert convoy.spacing_errors_m(times_s, places, 2.0, 1.0) == pytest.approx(np.full((1001, 1), 1.0))
+    assert formation.speeds_m_s(times_s, places) == pytest.approx(np.full((1001, 2), 2.0))
+    assert formation.spacing_errors_m(times_s, places, 2.0, 1.0) == pytest.approx(np.full((1001, 1), 1.0))
     station = lead + np.array([-2.5, 3.0, 14.0])
-    assert convoy.station_errors_m(places, station, 10.0) == pytest.approx(np.full(1001, 5.0))
+    assert formation.station_errors_m(places, station, 10.0) == pytest.approx(np.full(1001, 5.0))
     wave = np.sin(times_s)
-    assert convoy.amplifications(np.stack([wave, 0.5 * wave + 3, 0 * wave], axis=1)) == pytest.approx([0.5, 0.0])
-    assert np.isnan(convoy.amplifications(np.zeros((10, 2)))).all()
+    assert formation.amplifications(np.stack([wave, 0.5 * wave + 3, 0 * wave], axis=1)) == pytest.approx([0.5, 0.0])
+    assert np.isnan(formation.amplifications(np.zeros((10, 2)))).all()

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from sim_backends.cosim.scenario.loading import load_scenario
-from sim_backends.cosim.studies.formation import NO_FORMATION, Formation, formation, has_followers, mean_formation
-from sim_backends.cosim.studies.tracks import Tracks, tracks_of
+from sim_backends.cosim.studies.formation import (
+    NO_FORMATION,
+    Formation,
+    Tracks,
+    formation,
+    has_followers,
+    mean_formation,
+    tracks_of,
+)
 from sim_backends.world.motion import State
 
 TIMES_S = np.arange(0, 20.0, 0.1)

@@ -11,18 +11,20 @@ from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action, PhysicsFederate, Program
-from sim_backends.cosim.policies.base import SyncPolicy
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.policies.sliding_window import SlidingWindow
-from sim_backends.cosim.policies.time_stepped import TimeStepped
-from sim_backends.cosim.policies.variable_stepped import VariableStepped
-from sim_backends.cosim.policies.velocity_aware import VelocityAware
-from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
-from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.policies.window_policies import (
+    EventDriven,
+    Scheduled,
+    SlidingWindow,
+    TimeStepped,
+    VariableStepped,
+    VelocityAware,
+    VelocityAwareRaw,
+)
+from sim_backends.cosim.programs.senders import Periodic
+from sim_backends.cosim.studies.formation import SampledPhysics, Tracks
 from sim_backends.cosim.studies.local_errors import MEASURES, local_errors, low_discrepancy_times_ns, pooled
-from sim_backends.cosim.studies.tracks import SampledPhysics, Tracks
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.motion import State

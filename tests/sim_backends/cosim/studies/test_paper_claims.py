@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from fieldkit.core.model import Scenario as Sight
-from sim_backends.cosim.studies.agreement import Agreement
-from sim_backends.cosim.studies.flow_samples import FlowSample
 from sim_backends.cosim.studies.intervals import student
 from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims, delay_change
-from sim_backends.cosim.studies.paper_setups import the_flow
+from sim_backends.cosim.studies.paper_setups import FlowSample, the_flow
+from sim_backends.cosim.studies.paper_tables import Agreement
 
 NAN = math.nan
 SETUPS = claim_setups({"duration": "1s"})

@@ -3,9 +3,7 @@
 import pytest
 
 from sim_backends.cosim.comparison import lost_share
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.velocity_aware import VelocityAware
-from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
+from sim_backends.cosim.policies.window_policies import EventDriven, VelocityAware, VelocityAwareRaw
 from sim_backends.cosim.studies.satisfaction import satisfy
 from tests.helpers.moving_pair import PERIOD_NS, SPEED_M_S, moving_run
 

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from sim_backends.cosim.comparison import Errors, Spread, errors, mean_errors
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.studies.bias import biases
-from sim_backends.cosim.studies.outcomes import Outcomes, outcomes
-from sim_backends.cosim.studies.shootout import rows
+from sim_backends.cosim.policies.window_policies import EventDriven, Scheduled
+from sim_backends.cosim.studies.shootout import Outcomes, biases, outcomes, rows
 from tests.helpers.moving_pair import DELAY_NS, PAIR_END_NS, PERIOD_NS, SPEED_M_S, WINDOW_S, MovingPair, moving_run
 
 POLICIES = ["scheduled", "velocity_aware_raw", "event_driven", "variable_stepped", "time_stepped"]

@@ -5,12 +5,9 @@ import pytest
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.comparison import Spread, errors, lost_share
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.policies.base import PolicyError, SyncPolicy
-from sim_backends.cosim.policies.event_driven import EventDriven
-from sim_backends.cosim.policies.scheduled import Scheduled
-from sim_backends.cosim.policies.variable_stepped import VariableStepped
-from sim_backends.cosim.policies.velocity_aware_raw import VelocityAwareRaw
-from sim_backends.cosim.programs.periodic import Periodic
+from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
+from sim_backends.cosim.policies.window_policies import EventDriven, Scheduled, VariableStepped, VelocityAwareRaw
+from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.studies.local_errors import local_errors
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.physics.paths import Paths

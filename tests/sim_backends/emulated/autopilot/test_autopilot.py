@@ -10,10 +10,9 @@ from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
-from sim_backends.emulated.autopilot.mavlink import Message
-from sim_backends.emulated.autopilot.mission import REPEATS
+from sim_backends.emulated.autopilot.mavlink_frames import Message
+from sim_backends.emulated.autopilot.mission_plan import REPEATS, degrees_e7
 from sim_backends.emulated.autopilot.parameters import FlightLimits
-from sim_backends.emulated.autopilot.plan import degrees_e7
 from tests.helpers.ground_station import HOME_M, SYSTEM, GroundStation
 
 OK = d.MAV_RESULT_ACCEPTED

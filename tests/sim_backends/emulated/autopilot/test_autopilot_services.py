@@ -8,10 +8,10 @@ from pymavlink.dialects.v20 import common as d
 from pymavlink.dialects.v20 import development
 from pymavlink.quaternion import Quaternion
 
-from sim_backends.emulated.autopilot import mavlink
+from sim_backends.emulated.autopilot import mavlink_frames
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.plan import degrees_e7
+from sim_backends.emulated.autopilot.mission_plan import degrees_e7
 from sim_backends.emulated.autopilot.px4 import PX4
 from tests.helpers.ground_station import HOME_M, SYSTEM, GroundStation
 
@@ -65,12 +65,12 @@ def test_messages_that_pymavlink_lacks_have_the_right_checksums() -> None:
         ],
         "COMPONENT_METADATA": [("uint32_t", "time_boot_ms", 0), ("uint32_t", "file_crc", 0), ("char", "uri", 100)],
     }
-    for message in (mavlink.protocol_version(), mavlink.component_metadata(1, "mftp://x")):
+    for message in (mavlink_frames.protocol_version(), mavlink_frames.component_metadata(1, "mftp://x")):
         frame = fields_of(message)
         crc = d.x25crc(frame[1:-2])
         crc.accumulate(bytes([checksum_extra(message.get_type(), definitions[message.get_type()])]))
         assert int.from_bytes(frame[-2:], "little") == crc.crc
-    frame = fields_of(mavlink.available_modes(9, 2, 4, 0x05040000, "Return"))
+    frame = fields_of(mavlink_frames.available_modes(9, 2, 4, 0x05040000, "Return"))
     (mode,) = development.MAVLink(None).parse_buffer(frame)
     assert (mode.number_modes, mode.mode_index, mode.standard_mode) == (9, 2, 4)
     assert (mode.custom_mode, mode.mode_name) == (0x05040000, "Return")
@@ -97,8 +97,8 @@ class Raw(GroundStation):
         (d.MAVLINK_MSG_ID_RAW_IMU, DENIED, OK),
         (d.MAVLINK_MSG_ID_ODOMETRY, OK, FAILED),
         (d.MAVLINK_MSG_ID_ALTITUDE, OK, FAILED),
-        (mavlink.PROTOCOL_VERSION, OK, OK),
-        (mavlink.COMPONENT_METADATA, OK, FAILED),
+        (mavlink_frames.PROTOCOL_VERSION, OK, OK),
+        (mavlink_frames.COMPONENT_METADATA, OK, FAILED),
         (d.MAVLINK_MSG_ID_AUTOPILOT_VERSION, OK, OK),
         (12_345, DENIED, FAILED),
     ],
@@ -114,10 +114,10 @@ def test_messages_on_request(kind: int, px4: int, ardupilot: int) -> None:
 def test_each_mode_is_listed(firmware: Firmware) -> None:
     gcs = Raw(firmware=firmware)
     gcs.wait(1)
-    result, kinds = gcs.answers(mavlink.AVAILABLE_MODES, 0)
-    assert (result, kinds) == (OK, [mavlink.AVAILABLE_MODES] * len(firmware.names))
-    assert gcs.answers(mavlink.AVAILABLE_MODES, 1) == (OK, [mavlink.AVAILABLE_MODES])
-    assert gcs.answers(mavlink.AVAILABLE_MODES, 200)[0] != OK
+    result, kinds = gcs.answers(mavlink_frames.AVAILABLE_MODES, 0)
+    assert (result, kinds) == (OK, [mavlink_frames.AVAILABLE_MODES] * len(firmware.names))
+    assert gcs.answers(mavlink_frames.AVAILABLE_MODES, 1) == (OK, [mavlink_frames.AVAILABLE_MODES])
+    assert gcs.answers(mavlink_frames.AVAILABLE_MODES, 200)[0] != OK
 
 
 def test_attitude_and_acceleration_agree_in_flight() -> None:

@@ -11,8 +11,8 @@ from pymavlink.dialects.v20 import ardupilotmega as d
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.mission_plan import Item
 from sim_backends.emulated.autopilot.modes import RETURNING
-from sim_backends.emulated.autopilot.plan import Item
 from sim_backends.emulated.autopilot.px4 import PX4
 from tests.helpers.ground_station import HOME_M, SYSTEM, GroundStation
 

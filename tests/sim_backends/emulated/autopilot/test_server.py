@@ -21,7 +21,7 @@ DATAGRAMS: Final = 3_000
 PROGRAM: Final = """
 import sys
 from pathlib import Path
-from sim_backends.emulated.autopilot.server import Drone, serve
+from sim_backends.emulated.autopilot.mavlink_server import Drone, serve
 from sim_backends.world.world import load_world
 
 port, folder = int(sys.argv[1]), Path(sys.argv[2])

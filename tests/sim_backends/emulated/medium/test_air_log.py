@@ -16,7 +16,7 @@ from fieldkit.config.profiles import Radio
 from fieldkit.measure.captures import pcap
 from sim_backends.emulated.medium import air_log
 from sim_backends.emulated.medium.air_log import AirLog
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.options import RadioOptions

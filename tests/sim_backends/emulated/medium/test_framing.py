@@ -13,9 +13,9 @@ from scapy.layers.inet6 import IPv6
 from scapy.layers.l2 import ARP, Ether
 
 from fieldkit.config.profiles import Radio
-from sim_backends.emulated.medium.client import MediumClient
 from sim_backends.emulated.medium.framing import ETHERNET, NO_ROBOT, mac_of
 from sim_backends.emulated.medium.framing import IP as BARE
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.options import RadioOptions
 
 OWN = IPv4Interface("10.42.0.1/24")

@@ -7,7 +7,7 @@ from ipaddress import IPv4Address
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.emulated.medium.flows import FlowDelays
+from sim_backends.emulated.medium.ports import FlowDelays
 from sim_backends.radio.delay import PACKET, QUEUING_NS
 from tests.helpers.captures import RECEIVER, SENDER, datagram, ipv4
 

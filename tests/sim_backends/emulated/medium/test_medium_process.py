@@ -20,7 +20,7 @@ from fieldkit.config.profiles import Radio
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.core.model import DelayParts, Vector
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.robot.network import open_tun
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
@@ -367,7 +367,7 @@ def test_a_killed_medium_raises_an_error() -> None:
 
 OWN_A_MEDIUM = """
 import time
-from sim_backends.emulated.medium.client import MediumClient
+from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 medium = MediumClient(RadioOptions(), seed=1)

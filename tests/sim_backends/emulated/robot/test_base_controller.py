@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.emulated.robot import twists
+from sim_backends.emulated.robot import base_process
 from sim_backends.emulated.robot.base_controller import STEP_NS, TIMEOUT_NS, BaseController
 from sim_backends.emulated.robot.spec import Base
 from sim_backends.emulated.ros.own_motion import OwnMotion
@@ -79,6 +79,6 @@ def test_a_reset_robot_is_at_rest_at_the_new_place() -> None:
 
 
 def test_velocities_are_packed_exactly_and_other_datagrams_are_ignored() -> None:
-    assert twists.unpack(twists.pack(0.25, 1.0, 2.0, 3.0, 4.0, -0.5)) == (0.25, -0.5)
-    assert twists.unpack(b"") is None
-    assert twists.unpack(bytes(twists.BYTES + 1)) is None
+    assert base_process.unpack(base_process.pack(0.25, 1.0, 2.0, 3.0, 4.0, -0.5)) == (0.25, -0.5)
+    assert base_process.unpack(b"") is None
+    assert base_process.unpack(bytes(base_process.BYTES + 1)) is None

@@ -27,7 +27,7 @@ from fieldkit.steps.variants import Recorder, Tool
 from fieldkit.trial.check import tools
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
-from sim_backends.emulated.options import EmulatedOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
 

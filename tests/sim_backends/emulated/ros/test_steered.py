@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.emulated.ros import own_motion
-from sim_backends.emulated.ros.helm import Helm
-from sim_backends.emulated.ros.own_motion import AssignedPath, Odometer
+from sim_backends.emulated.ros.own_motion import AssignedPath, Helm, Odometer
 from sim_backends.emulated.ros.steered import SILENT_NS, Steered, SteeredRecord
 
 S = 10**9

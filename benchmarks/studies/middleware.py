@@ -1,0 +1,358 @@
+"""Compare middlewares on a lossy radio: `python -m benchmarks.studies.middleware [--figures FOLDER] [--page PAGE]`.
+
+As root. Six campaigns of benchmarks/studies/middleware/ run in parallel, because a repeat mostly waits; `--only`
+selects some of them, `--full` those that last hours. Stop it at any time: the same command continues where it
+stopped. Then it prints the tables of docs/studies/middleware.md, or writes them into PAGE, and draws its figures.
+
+Two repeats, as in the campaigns, show only large differences. On a quiet machine `--repeats 12` measures each place
+twelve times, in about two and a half hours. Then the intervals treat the repeat as the independent unit.
+`--from-page docs/studies/middleware.md --figures docs/studies` draws the figures only from the tables of the page.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from benchmarks.studies import middleware_page
+from benchmarks.studies.middleware_cells import BYTES, CAMPAIGNS, MiddlewareCell, MiddlewareFindings, read
+from fieldkit.core import files
+from fieldkit.report import figures
+from fieldkit.report.charts import Chart, Panel, Series
+from fieldkit.report.theme import Style
+
+LAB: Final = Path(__file__).with_name("middleware")
+ROOT: Final = LAB.parents[2]
+ROS2: Final = ROOT / ".ros2" / "bin" / "python"
+"""A real ROS 2, as installed by `.ci/install --dev`."""
+BEGIN: Final = "<!-- written by benchmarks.studies.middleware: from here -->"
+END: Final = "<!-- written by benchmarks.studies.middleware: to here -->"
+
+STYLES: Final[dict[str, Style]] = {
+    "CycloneDDS": Style("blue", "o"),
+    "CycloneDDS, tuned": Style("blue", "o", "dashed"),
+    "Fast DDS": Style("orange", "D"),
+    "Fast DDS, tuned": Style("orange", "D", "dashed"),
+    "Zenoh": Style("red", "s"),
+    "Zenoh, tuned": Style("red", "s", "dashed"),
+    "ROS 1": Style("green", "^"),
+    "ROS 1, tuned": Style("green", "^", "dashed"),
+}
+KINDS: Final = {"best effort": "best effort", "reliable": "reliable"}
+SIZES: Final = {100: "100 B", 1_000: "1 kB", 10_000: "10 kB", 100_000: "100 kB", 1_000_000: "1 MB"}
+DODGE_M: Final = 1.1
+"""Offset between series at the same distance, so that they do not overlap."""
+MARGIN_M: Final = 7.0
+ROBOTS_DODGE: Final = 0.06
+"""Offset between series at the same number of robots."""
+
+
+def lab(folder: Path, repeats: int | None = None) -> None:
+    """Copy the lab's files into a folder if they are missing: a started campaign keeps its files.
+
+    Args:
+        folder: The folder.
+        repeats: Number of repeats for separate campaigns, or None for the number in the files.
+    """
+    robots = folder / "robots"
+    robots.mkdir(parents=True, exist_ok=True)
+    for source in LAB.glob("*.yaml"):
+        if not (folder / source.name).exists():
+            shutil.copy(source, folder)
+        if (
+            repeats
+            and source.stem in CAMPAIGNS
+            and not (new_file := folder / f"{campaign_name(source.stem, repeats)}.yaml").exists()
+        ):
+            text = source.read_text(encoding="utf-8")
+            text = re.sub(r"(?m)^name: .*$", f"name: {campaign_name(source.stem, repeats)}", text)
+            new_file.write_text(re.sub(r"(?m)^repeats: .*$", f"repeats: {repeats}", text), encoding="utf-8")
+    (robots / "ros2_burger.yaml").write_text(ros2_robot(), encoding="utf-8")
+
+
+def campaign_name(campaign: str, repeats: int | None) -> str:
+    """Return the name of a campaign with a separate number of repeats: `dds-12`."""
+    return f"{campaign}-{repeats}" if repeats else campaign
+
+
+def ros2_robot() -> str:
+    """Return the profile of a robot of the lab that has a real ROS 2."""
+    text = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    for old, new in (
+        ("name: turtlebot3_burger", "name: ros2_burger"),
+        ("variant: ros1", "variant: ros2"),
+        ("  ping: ping", f"  ping: ping\n  python: {ROS2}"),
+    ):
+        if old not in text:
+            raise ValueError(f"the profile of a TurtleBot no longer contains {old!r}")
+        text = text.replace(old, new, 1)
+    return text
+
+
+def run(folder: Path, names: Sequence[str]) -> None:
+    """Run or continue campaigns, each with a log file; report those that failed.
+
+    Repeats whose packets were late on a busy machine are void; the valid ones still count.
+    """
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    running = []
+    for name in names:
+        site = "ros2-lab.yaml" if "ros2" in name else "fieldkit.yaml"
+        command = (sys.executable, "-m", "fieldkit", "campaign", f"{name}.yaml", "--site", site)
+        with (folder / f"{name}.log").open("a", encoding="utf-8") as log:
+            running.append(subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log))
+    for name, process in zip(names, running, strict=True):
+        if process.wait() != 0:
+            print(f"{name}: exit code {process.returncode}, see {folder / name}.log", file=sys.stderr)
+
+
+def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:
+    """Return a chart of two robots: a row of panels per size, best effort on the left and reliable on the right."""
+    pairs = [cell for cell in findings.cells if cell.robots == 2]
+    distances_m = [cell.distance_m for cell in pairs] or [0.0]
+    panels = []
+    for size in BYTES:
+        for kind, quality in KINDS.items():
+            series = []
+            for rank, label in enumerate(STYLES):
+                series_cells = [
+                    cell for cell in pairs if (cell.kind, cell.middleware, cell.size_bytes) == (kind, label, size)
+                ]
+                shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
+                series.append(_series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], drawn))
+            panel = drawn.panel(f"{SIZES[size]}, {quality}{_counted(pairs, size)}", "distance (m)", series)
+            panels.append(replace(panel, left=min(distances_m) - MARGIN_M, right=max(distances_m) + MARGIN_M))
+    return Chart(name=name, title=name, caption="", panels=panels)
+
+
+def by_robots(findings: MiddlewareFindings) -> Chart:
+    """Return a chart of loss and delay by the number of robots that publish to one."""
+    panels = []
+    for drawn in (LOST, LATE):
+        for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
+            for size in sorted({cell.size_bytes for cell in _comparable(findings, metres)}):
+                size_cells = [cell for cell in _comparable(findings, metres) if cell.size_bytes == size]
+                numbers = sorted({cell.robots for cell in size_cells})
+                series = [
+                    _series(
+                        label,
+                        [
+                            (cell.robots + ROBOTS_DODGE * rank, cell)
+                            for cell in size_cells
+                            if cell.middleware == label
+                        ],
+                        drawn,
+                    )
+                    for rank, label in enumerate(STYLES)
+                ]
+                panel = drawn.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
+                panels.append(replace(panel, x_ticks=[(number, str(number)) for number in numbers]))
+    return Chart(name="middleware-robots", title="", caption="", panels=panels)
+
+
+def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "DrawnFigure") -> Series:
+    """Return the points of a middleware with their intervals; no line joins them, as intervals are too wide."""
+    measured = sorted(((x, cell) for x, cell in points if drawn.value(cell) is not None), key=lambda pair: pair[0])
+    ends = [drawn.interval(cell) for _, cell in measured]
+    return Series(
+        label,
+        STYLES[label],
+        [x for x, _ in measured],
+        [drawn.value(cell) or 0.0 for _, cell in measured],
+        low=[low for low, _ in ends],
+        high=[high for _, high in ends],
+        join="none",
+    )
+
+
+def _counted(cells: Sequence[MiddlewareCell], size: int) -> str:
+    """Return the number of samples and repeats of each point of a size: `, n = 80 (2 repeats)`."""
+    counts = sorted({(cell.samples, cell.repeats) for cell in cells if cell.size_bytes == size})
+    if not counts or not counts[-1][0]:
+        return ""
+    least, most = counts[0], counts[-1]
+    number = f"{least[0]}-{most[0]}" if least[0] != most[0] else str(most[0])
+    return f", n = {number} ({most[1]} repeats)"
+
+
+def _comparable(findings: MiddlewareFindings, distance_m: float) -> list[MiddlewareCell]:
+    """Return the cells of several robots at a distance, and those of two robots with the same settings."""
+    at_distance = [cell for cell in findings.cells if cell.distance_m == distance_m and cell.kind == "reliable"]
+    settings = {(cell.middleware, cell.size_bytes) for cell in at_distance if cell.robots > 2}
+    return [cell for cell in at_distance if (cell.middleware, cell.size_bytes) in settings]
+
+
+def _lost(cell: MiddlewareCell) -> float | None:
+    return None if cell.loss is None else 100 * cell.loss
+
+
+def _lost_interval(cell: MiddlewareCell) -> tuple[float | None, float | None]:
+    low, high = (None if end is None else 100 * end for end in (cell.loss_low, cell.loss_high))
+    return low, high
+
+
+def _no_interval(_cell: MiddlewareCell) -> tuple[None, None]:
+    return None, None
+
+
+def _late(cell: MiddlewareCell) -> float | None:
+    return None if cell.delay_p95_s is None else 1e3 * cell.delay_p95_s
+
+
+@dataclass(frozen=True)
+class DrawnFigure:
+    """A figure of cells for panels.
+
+    Attributes:
+        y_label: Its name and unit.
+        value: Returns its value of a cell.
+        interval: Returns its 95 % interval of a cell, if there is one.
+        bottom: Lower end of its axis.
+        top: Upper end of its axis.
+        log: True for a logarithmic axis.
+    """
+
+    y_label: str
+    value: Callable[[MiddlewareCell], float | None]
+    interval: Callable[[MiddlewareCell], tuple[float | None, float | None]]
+    bottom: float
+    top: float
+    log: bool = False
+
+    def panel(self, title: str, x_label: str, series: Sequence[Series]) -> Panel:
+        """Return a panel of series of this figure."""
+        return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
+
+
+LOST: Final = DrawnFigure("samples lost (%)", _lost, _lost_interval, 0.0, 100.0)
+LATE: Final = DrawnFigure("delay, 95 % (ms)", _late, _no_interval, 1.0, 10_000.0, log=True)
+
+
+BIMODAL: Final = " *"
+BIMODAL_NOTE: Final = (
+    "`*`: not a rate. The loss is bimodal: a repeat loses few or nearly all "
+    "([every repeat](middleware-link.md#images-over-zenoh-every-repeat))."
+)
+
+
+def tables(findings: MiddlewareFindings, conditions: str) -> Iterator[str]:
+    """Yield the lines for docs/studies/middleware.md."""
+    yield conditions
+    yield ""
+    yield "Two robots: samples lost, and the delay of the others (95 %); - if clocks are not comparable."
+    yield BIMODAL_NOTE
+    yield ""
+    pairs = [cell for cell in findings.cells if cell.robots == 2]
+    yield from _table(pairs, "distance_m", lambda metres: f"{metres:g} m", _loss_and_delay)
+    yield ""
+    yield "Best effort, samples lost (and `1 - (1 - p)^n` of the n packets of a sample of which a share p was lost):"
+    yield ""
+    fragmented = [cell for cell in pairs if cell.expected_loss is not None and cell.size_bytes >= 10_000]
+    yield from _table(fragmented, "distance_m", lambda metres: f"{metres:g} m", _with_expected)
+    for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
+        yield ""
+        yield f"Robots that publish to one at {metres:g} m, all streams together; delay of the first:"
+        yield ""
+        yield from _table(_comparable(findings, metres), "robots", lambda number: f"{number} robots", _loss_and_delay)
+
+
+def _table(
+    cells: Sequence[MiddlewareCell], across: str, head: Callable[[float], str], text: Callable[[MiddlewareCell], str]
+) -> Iterator[str]:
+    columns = sorted({getattr(cell, across) for cell in cells})
+    yield "| " + " | ".join(["data", "kind", "middleware", *map(head, columns)]) + " |"
+    yield "| " + " | ".join(["---"] * (3 + len(columns))) + " |"
+    rows = {(cell.size_bytes, cell.kind, cell.middleware) for cell in cells}
+    for size, kind, name in sorted(rows, key=lambda row: (row[0], row[1], list(STYLES).index(row[2]))):
+        by_column = {
+            getattr(cell, across): cell
+            for cell in cells
+            if (cell.size_bytes, cell.kind, cell.middleware) == (size, kind, name)
+        }
+        texts = [text(by_column[column]) if column in by_column else "" for column in columns]
+        yield "| " + " | ".join([SIZES[size], kind, name, *texts]) + " |"
+
+
+def _loss_and_delay(cell: MiddlewareCell) -> str:
+    lost, late = _lost(cell), _late(cell)
+    if lost is None:
+        return "not found"
+    is_bimodal = (cell.middleware, cell.kind) == (
+        "Zenoh",
+        "reliable",
+    ) and cell.size_bytes >= middleware_page.IMAGE_BYTES
+    return f"{lost:.1f} %, " + ("-" if late is None else f"{late:.0f} ms") + BIMODAL * is_bimodal
+
+
+def _with_expected(cell: MiddlewareCell) -> str:
+    lost, expected = _lost(cell), cell.expected_loss
+    return "" if lost is None or expected is None else f"{lost:.0f} % ({100 * expected:.0f})"
+
+
+def write_tables(page: Path, lines: Sequence[str]) -> None:
+    """Write tables into a page, between its two markers.
+
+    Raises:
+        ValueError: It has no such markers.
+    """
+    text = page.read_text(encoding="utf-8")
+    before, after = text.index(BEGIN) + len(BEGIN), text.index(END)
+    files.write(page, "\n".join((text[:before], "", *lines, "", text[after:])).encode())
+
+
+def main() -> None:
+    """Run or continue the campaigns, print the tables or write them into the page, draw the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("middleware"), help="folder of the lab and its trials")
+    parser.add_argument("--figures", type=Path, help="write middleware-loss, -delay and -robots.svg there")
+    parser.add_argument("--page", type=Path, help="write the tables into this page")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--full", action="store_true", help="the campaigns that take hours")
+    size.add_argument("--repeats", type=int, help="repeats at each place, in separate campaigns")
+    parser.add_argument(
+        "--only", nargs="+", choices=CAMPAIGNS, default=CAMPAIGNS, help="run only these; all are read"
+    )
+    parser.add_argument("--no-run", action="store_true", help="read the existing results")
+    parser.add_argument("--from-page", type=Path, help="draw the figures from the tables of this page, run nothing")
+    options = parser.parse_args()
+    if options.from_page:
+        draw(MiddlewareFindings(middleware_page.cells(options.from_page), "", 0.0, 0.0), options.figures)
+        return
+    prefix = "full-" if options.full else ""
+    names = [f"{prefix}{campaign_name(name, options.repeats)}" for name in CAMPAIGNS]
+    if not options.no_run:
+        lab(options.out, options.repeats)
+        run(options.out, [f"{prefix}{campaign_name(name, options.repeats)}" for name in options.only])
+    findings = read(options.out, names)
+    conditions = (
+        f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.ended}; packets handed over late by "
+        f"up to {1e3 * findings.late_s:.1f} ms; load average {os.getloadavg()[2]:.1f} when this was written."
+    )
+    lines = list(tables(findings, conditions))
+    if options.page:
+        write_tables(options.page, lines)
+    else:
+        print("\n".join(lines))
+    if options.figures:
+        draw(findings, options.figures)
+
+
+def draw(findings: MiddlewareFindings, folder: Path) -> None:
+    """Write the figures of docs/studies/middleware.md into a folder."""
+    for chart in (
+        by_distance(findings, "middleware-loss", LOST),
+        by_distance(findings, "middleware-delay", LATE),
+        by_robots(findings),
+    ):
+        files.write(folder / f"{chart.name}.svg", figures.paper(chart, "svg"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""Tracks each packet from sending to delivery or drop, and the errors of the positions that the network assumed."""
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+from fieldkit.core.model import Vector
+from sim_backends.cosim.agents import Sent
+from sim_backends.cosim.federates import FederateError, seconds_text
+from sim_backends.cosim.run_record import Fate
+from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.world.dead_reckoning import DeadReckoned, moved_on
+from sim_backends.world.motion import STILL, State
+
+
+def transmitters(network: object) -> tuple[str, ...]:
+    """Return the agents that forward or interfere in a network, in addition to those that send and receive.
+
+    They are the value of the network's optional attribute `transmitters`.
+    """
+    names: Iterable[str] = getattr(network, "transmitters", ())
+    return tuple(sorted(names))
+
+
+def fixed_emitters_m(network: object) -> tuple[Vector, ...]:
+    """Return the positions of sources of interference that are not agents: the network's optional attribute."""
+    return tuple(getattr(network, "fixed_emitters_m", ()))
+
+
+def position_error_m(fate: Fate) -> float:
+    """Return the largest error, in metres, of the relative positions that the network assumed for a packet.
+
+    The positions are those of at least sender and receiver, at the time of sending.
+    """
+    if fate.position_error_m is not None:
+        return fate.position_error_m
+    return _max_distance_m(_offsets_m(fate.assumed, fate.true))
+
+
+def max_position_error_m(
+    assumed: Mapping[str, State], true: Sequence[State], names: Collection[str], *, has_fixed_emitters: bool
+) -> float:
+    """Return the largest error of the network's relative position of two agents.
+
+    Args:
+        assumed: States of the agents that the network assumes.
+        true: True states of the agents in `names`, in the same order.
+        names: The agents to include.
+        has_fixed_emitters: True to include a point that never moves, too.
+    """
+    offsets_m = _offsets_m([assumed[name] for name in names], true)
+    return _max_distance_m([*offsets_m, STILL] if has_fixed_emitters else offsets_m)
+
+
+def _offsets_m(assumed: Iterable[State], true: Iterable[State]) -> list[Vector]:
+    """Return the error vector of each assumed position."""
+    offsets_m = []
+    for assumed_state, true_state in zip(assumed, true, strict=True):
+        (e, n, u), (true_e, true_n, true_u) = assumed_state.position_m, true_state.position_m
+        offsets_m.append((e - true_e, n - true_n, u - true_u))
+    return offsets_m
+
+
+def _max_distance_m(offsets_m: Sequence[Vector]) -> float:
+    return max((math.dist(first, second) for first, second in combinations(offsets_m, 2)), default=0.0)
+
+
+class PacketLedger:
+    """Tracks each packet from its entry to its arrival or drop; an impossible report raises a `FederateError`.
+
+    Args:
+        fates: Receives the fate of every packet that enters the network, by flow and number.
+        step_ns: The physics step.
+        measured: Agents that the position error of every packet includes, besides its sender and receiver.
+        has_fixed_emitters: True if the position error includes a point that never moves.
+    """
+
+    def __init__(
+        self,
+        fates: dict[PacketIdentity, Fate],
+        step_ns: int,
+        measured: Iterable[str] = (),
+        *,
+        has_fixed_emitters: bool = False,
+    ) -> None:
+        self._fates = fates
+        self._step_ns = step_ns
+        self._measured = frozenset(measured)
+        self._has_fixed_emitters = has_fixed_emitters
+        self._under_way: dict[int, tuple[Fate, Any]] = {}
+        self._packets = 0
+
+    def enter(self, sent: Sent, enters_ns: int, assumed: Mapping[str, State]) -> Fate:
+        """Record a datagram as a packet that enters the network.
+
+        Args:
+            sent: The datagram, as its program sent it.
+            enters_ns: Time when it enters the network.
+            assumed: States that the network assumes throughout the window, or at its beginning (`DeadReckoned`).
+
+        Raises:
+            FederateError: Its destination is not an agent, or its flow already has a packet of this number.
+        """
+        at_ns, source, datagram, true = sent
+        destination = datagram.destination
+        if isinstance(assumed, DeadReckoned):
+            assumed = assumed.at(enters_ns)
+        if destination not in assumed:
+            raise FederateError(f"the program of {source} sent to {destination}, which is not an agent")
+        identity = datagram.flow, datagram.number
+        if identity in self._fates:
+            raise FederateError(
+                f"the program of {source} sent two packets of flow {datagram.flow} with the number {datagram.number}"
+            )
+        self._packets += 1
+        packet = Packet(
+            self._packets, source, destination, datagram.size_bytes, identity, at_ns, enters_ns, datagram.protocol
+        )
+        since_step_s = at_ns % self._step_ns / 1e9
+        ends = true[source], true[destination]
+        if since_step_s:
+            ends = moved_on(ends[0], since_step_s), moved_on(ends[1], since_step_s)
+        fate = Fate(packet, (assumed[source], assumed[destination]), ends)
+        if self._measured or self._has_fixed_emitters:
+            names = self._measured | {source, destination}
+            states = [moved_on(true[name], since_step_s) for name in names]
+            fate.position_error_m = max_position_error_m(
+                assumed, states, names, has_fixed_emitters=self._has_fixed_emitters
+            )
+        self._fates[identity] = fate
+        self._under_way[self._packets] = fate, datagram.payload
+        return fate
+
+    def arrive(self, arrival: Arrival, begin_ns: int, last_ns: int) -> tuple[Fate, Any]:
+        """Record an arrival in a window, and return the packet's fate and payload.
+
+        Raises:
+            FederateError: The packet is not under way, or the arrival is at another agent, before the packet entered
+                the network, or outside the window.
+        """
+        fate, payload = self._end(arrival.packet_id)
+        packet = fate.packet
+        if arrival.receiver != packet.destination:
+            raise FederateError(
+                f"the network delivered packet {packet.packet_id} for {packet.destination} to {arrival.receiver}"
+            )
+        if not max(begin_ns, packet.enters_ns) <= arrival.at_ns <= last_ns:
+            raise FederateError(
+                f"the network, asked to advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}, delivered "
+                f"packet {packet.packet_id}, which entered at {seconds_text(packet.enters_ns)}, at "
+                f"{seconds_text(arrival.at_ns)}"
+            )
+        fate.arrived_ns = arrival.at_ns
+        return fate, payload
+
+    def drop(self, drop: Drop) -> Fate:
+        """Record a packet that never arrives, and return its fate.
+
+        Raises:
+            FederateError: The packet is not under way.
+        """
+        fate, _ = self._end(drop.packet_id)
+        fate.reason = drop.reason or "dropped"
+        return fate
+
+    def _end(self, packet_id: int) -> tuple[Fate, Any]:
+        try:
+            return self._under_way.pop(packet_id)
+        except KeyError:
+            why = "which was reported before" if 0 < packet_id <= self._packets else "which it never got"
+            raise FederateError(f"the network reported the fate of packet {packet_id}, {why}") from None

@@ -1,0 +1,186 @@
+"""Layout of plots: outlines of obstacles seen from above, directions of travel, and places of labels."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+from sim_backends.world.obstacles import Raised, Ramp
+from sim_backends.world.shapes import Box
+from sim_backends.world.world import World
+
+Point = tuple[float, float]
+
+_FLOOR_M: Final = 0.01
+_ARROW_SHARE: Final = 0.04
+"""Length of an arrow, as a share of the diagonal of the rectangle that the path covers."""
+
+
+@dataclass(frozen=True)
+class ObstacleOutline:
+    """The outline of an obstacle, seen from above.
+
+    Attributes:
+        corners_m: Its corners, metres east and north.
+        is_light: True if robots on the ground may be within the outline: below a roof or a tree crown, or on higher
+            ground.
+    """
+
+    corners_m: Sequence[Point]
+    is_light: bool
+
+
+def outlines(world: World) -> Iterator[ObstacleOutline]:
+    """Yield the outline of each part of a world's obstacles, those of higher ground first."""
+    for obstacle in sorted(world.obstacles, key=lambda obstacle: not isinstance(obstacle, Raised | Ramp)):
+        for part in obstacle.parts():
+            shape = part.shape
+            height_m = shape.size_m[2] if isinstance(shape, Box) else shape.height_m
+            is_above = shape.top_m - height_m > _FLOOR_M
+            yield ObstacleOutline(shape.corners_m(), is_above or isinstance(obstacle, Raised | Ramp))
+
+
+def last_heading(path_m: Sequence[Point]) -> tuple[Point, Point] | None:
+    """Return both ends of an arrow at the end of a path, in the direction of travel; None if nothing moves."""
+    east_m, north_m = path_m[-1]
+    covered_m = math.hypot(*(max(axis) - min(axis) for axis in zip(*path_m, strict=True)))
+    for from_e, from_n in reversed(path_m):
+        back_m = math.dist((from_e, from_n), path_m[-1])
+        if back_m >= max(_ARROW_SHARE * covered_m, _FLOOR_M):
+            return (from_e, from_n), (east_m, north_m)
+    return None
+
+
+"""Position in typographic points (1/72 inch), from the lower left corner of the figure."""
+
+_DISTANCE_FACTOR = 1.3
+"""Factor by which the distance of a label from its point grows until it does not cover anything."""
+_MAX_STEPS = 12
+_OVERLAP_COST = 10.0
+"""Cost of any overlap, as a distance from the point in heights of the label."""
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class LabelBox:
+    """A rectangle, in typographic points.
+
+    Attributes:
+        left: Its left side.
+        bottom: Its lower side.
+        width: Its width.
+        height: Its height.
+    """
+
+    left: float
+    bottom: float
+    width: float
+    height: float
+
+    def overlap(self, other: "LabelBox") -> float:
+        """Return the area that both cover."""
+        width = min(self.left + self.width, other.left + other.width) - max(self.left, other.left)
+        height = min(self.bottom + self.height, other.bottom + other.height) - max(self.bottom, other.bottom)
+        return max(width, 0.0) * max(height, 0.0)
+
+    def gap(self, point: Point) -> float:
+        """Return the distance of a point from the rectangle, 0 inside."""
+        across = max(self.left - point[0], 0.0, point[0] - self.left - self.width)
+        up = max(self.bottom - point[1], 0.0, point[1] - self.bottom - self.height)
+        return math.hypot(across, up)
+
+    @property
+    def area(self) -> float:
+        """Its area."""
+        return self.width * self.height
+
+
+def place_labels(
+    anchors: Sequence[Sequence[Point]],
+    sizes: Sequence[tuple[float, float]],
+    bounds: LabelBox,
+    obstacles: Sequence[LabelBox],
+) -> list[tuple[Point, LabelBox]]:
+    """Return, for each label, the point that it belongs to and a box that overlaps as little as possible.
+
+    Args:
+        anchors: For each label, the points of its curve; the label may be next to any of them.
+        sizes: Width and height of each label.
+        bounds: The area in which labels may be.
+        obstacles: Boxes that labels must not cover: the points themselves, and lines.
+    """
+    placed: list[tuple[Point, LabelBox]] = []
+    for points, size in zip(anchors, sizes, strict=True):
+        covered = [*obstacles, *(box for _, box in placed)]
+        candidates = ((point, box) for point in points for box in _boxes_around(point, size))
+        placed.append(min(candidates, key=lambda candidate: _cost(candidate[1], candidate[0], bounds, covered)))
+    return placed
+
+
+def stack_labels(
+    anchors: Sequence[Point], sizes: Sequence[tuple[float, float]], left: float, bounds: LabelBox
+) -> list[LabelBox]:
+    """Return a box for each label, stacked in the order of their points, as close to the points' heights as possible.
+
+    Args:
+        anchors: The point of each label.
+        sizes: Width and height of each label.
+        left: Left side of all labels.
+        bounds: The area in which labels may be.
+    """
+    order = sorted(range(len(anchors)), key=lambda index: anchors[index][1])
+    bottoms: dict[int, float] = {}
+    free = bounds.bottom
+    for index in order:
+        bottoms[index] = max(anchors[index][1] - sizes[index][1] / 2, free)
+        free = bottoms[index] + sizes[index][1]
+    top = bounds.bottom + bounds.height
+    for index in reversed(order):  # move labels above the upper bound down again
+        bottoms[index] = min(bottoms[index], top - sizes[index][1])
+        top = bottoms[index]
+    return [LabelBox(left, bottoms[index], *sizes[index]) for index in range(len(anchors))]
+
+
+def _boxes_around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]:
+    x, y = point
+    width, height = size
+    away = height * 0.6
+    for _ in range(_MAX_STEPS):
+        for left, bottom in (
+            (x + away, y - height / 2),
+            (x - away - width, y - height / 2),
+            (x - width / 2, y + away),
+            (x - width / 2, y - away - height),
+            (x + away * 0.7, y + away * 0.7),
+            (x + away * 0.7, y - away * 0.7 - height),
+            (x - away * 0.7 - width, y + away * 0.7),
+            (x - away * 0.7 - width, y - away * 0.7 - height),
+        ):
+            yield LabelBox(left, bottom, width, height)
+        away *= _DISTANCE_FACTOR
+
+
+def _cost(box: LabelBox, point: Point, bounds: LabelBox, obstacles: Sequence[LabelBox]) -> float:
+    """Return the cost of a box: overlap weighs most, then the part outside the bounds, then the distance."""
+    covered = sum(box.overlap(other) for other in obstacles) / box.area
+    outside = 1 - box.overlap(bounds) / box.area
+    overlaps = (covered > 0) + (outside > _ROUNDING)
+    return _OVERLAP_COST * overlaps + 30 * (covered + 3 * outside) + box.gap(point) / box.height
+
+
+def curve_boxes(curves: Sequence[Sequence[Point]], half_width: float) -> Iterator[LabelBox]:
+    """Yield boxes that cover curves: squares of `2 half_width` around their markers, and along the lines between."""
+    for points in curves:
+        for x, y in _interpolated(points, half_width):
+            yield LabelBox(x - half_width, y - half_width, 2 * half_width, 2 * half_width)
+
+
+def _interpolated(points: Sequence[Point], step: float) -> Iterator[Point]:
+    """Yield the points of a polyline, and intermediate points at most a step apart."""
+    yield points[0]
+    for start, end in pairwise(points):
+        pieces = max(math.ceil(math.dist(start, end) / step), 1)
+        for piece in range(1, pieces + 1):
+            share = piece / pieces
+            yield start[0] + (end[0] - start[0]) * share, start[1] + (end[1] - start[1]) * share

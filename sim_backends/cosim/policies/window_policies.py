@@ -1,0 +1,225 @@
+"""The sync policies other than `error_bounded`, and ends of windows without accumulated rounding errors."""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from sim_backends.cosim.policies.sync_policy import PolicyError, Situation, window_ns
+
+_PER_NS: Final = 10**9
+"""Attoseconds per nanosecond. Rounding each window to half an attosecond adds up to 0.5 ns after 10^9 windows."""
+
+
+class Windows:
+    """Ends of windows whose lengths are not whole nanoseconds.
+
+    A window ends at the last whole nanosecond that the sum of all lengths so far has reached.
+    """
+
+    def __init__(self) -> None:
+        self._length_ns = 0.0
+        self._whole_ns = self._rest = self._carried = 0
+
+    def end_ns(self, begin_ns: int, length_ns: float) -> int:
+        """Return the end of a window of a length that begins at the end of the previous one."""
+        if length_ns != self._length_ns:
+            self._length_ns = length_ns
+            self._whole_ns, self._rest = divmod(round(length_ns * _PER_NS), _PER_NS)
+        self._carried += self._rest
+        if self._carried < _PER_NS:
+            return begin_ns + self._whole_ns
+        self._carried -= _PER_NS
+        return begin_ns + self._whole_ns + 1
+
+
+class FixedWindow:
+    """Windows of one length.
+
+    Args:
+        window_s: Their length in seconds; fractions of a nanosecond are carried over.
+
+    Raises:
+        PolicyError: It is not a positive time.
+    """
+
+    name: str
+    exact = False
+
+    def __init__(self, window_s: float) -> None:
+        self._window_ns = window_ns(self.name, window_s)
+        self._windows = Windows()
+
+    def next_window(self, situation: Situation) -> int:
+        """Return the end of the next window.
+
+        Raises:
+            PolicyError: The window is shorter than the step of the physics.
+        """
+        if self._window_ns < situation.physics_step_ns:
+            raise PolicyError(
+                f"a window of {self._window_ns:g} ns is shorter than the physics' own step of "
+                f"{situation.physics_step_ns} ns, so that nothing changes in it",
+                where=self.name,
+                remedy="use a longer window, or physics with a shorter step",
+            )
+        return self._windows.end_ns(situation.now_ns, self._window_ns)
+
+
+class TimeStepped(FixedWindow):
+    """Data is exchanged at thresholds only."""
+
+    name = "time_stepped"
+    defers_sends = True
+    uses_end_states = False
+    defers_arrivals = True
+
+
+class Scheduled(FixedWindow):
+    """Packets enter the network immediately, and leave it at samples."""
+
+    name = "scheduled"
+    defers_sends = False
+    uses_end_states = False
+    defers_arrivals = True
+
+
+class SlidingWindow(FixedWindow):
+    """The network follows the physics by one window."""
+
+    name = "sliding_window"
+    defers_sends = False
+    uses_end_states = True
+    defers_arrivals = False
+
+
+class EventDriven:
+    """A window lasts until the next event, of a program or in the network. This is the exact reference."""
+
+    name = "event_driven"
+    exact = True
+    defers_sends = False
+    uses_end_states = True
+    defers_arrivals = False
+
+    def next_window(self, situation: Situation) -> int | None:
+        """Return the time of the next event, or None if there are no more events."""
+        return situation.next_ns
+
+
+class VariableStepped:
+    """A window lasts until the next step of the physics or the next event, whichever is first."""
+
+    name = "variable_stepped"
+    exact = True
+    defers_sends = False
+    uses_end_states = True
+    defers_arrivals = False
+
+    def next_window(self, situation: Situation) -> int:
+        """Return the time of the next step or event."""
+        step_ns = situation.physics_step_ns
+        next_step_ns = (situation.now_ns // step_ns + 1) * step_ns
+        next_ns = situation.next_ns
+        return next_step_ns if next_ns is None else min(next_step_ns, next_ns)
+
+
+NS_PER_M_S = 1e6
+"""Change of the window per m/s: 1/1000 s."""
+
+
+class VelocityAwareRaw:
+    """The smallest window that the rule gives for any pair, from publisher to subscriber.
+
+    Args:
+        window_s: w, in seconds.
+
+    Raises:
+        PolicyError: It is not a positive time.
+    """
+
+    name = "velocity_aware_raw"
+    exact = False
+    defers_sends = False
+    uses_end_states = True
+    defers_arrivals = False
+
+    def __init__(self, window_s: float = 0.001) -> None:
+        self._window_ns = window_ns(self.name, window_s)
+        self._windows = Windows()
+        self._pair = "", ""
+
+    def next_window(self, situation: Situation) -> int:
+        """Return the end of the next window.
+
+        Raises:
+            PolicyError: The window that the rule gives for a pair is not a positive time.
+        """
+        speeds_m_s = {name: math.hypot(*state.velocity_m_s) for name, state in situation.states.items()}
+        length_ns, publisher, subscriber = min(
+            (
+                (
+                    self._window_ns + (speeds_m_s[publisher] - speeds_m_s[subscriber]) * NS_PER_M_S,
+                    publisher,
+                    subscriber,
+                )
+                for publisher, subscriber in situation.pairs
+            ),
+            default=(self._window_ns, "", ""),
+        )
+        if length_ns < 1:
+            raise PolicyError(
+                f"{publisher} publishes at {speeds_m_s[publisher]:g} m/s to {subscriber} at "
+                f"{speeds_m_s[subscriber]:g} m/s: w + (Vp - Vs)/1000 is {length_ns / 1e9:g} s, so that time "
+                f"{'stops' if length_ns >= 0 else 'runs backwards'}",
+                where=f"{self.name} at {situation.now_ns / 1e9:g} s",
+                remedy="use velocity_aware, which is the rule made safe",
+            )
+        self._pair = publisher, subscriber
+        return self._windows.end_ns(situation.now_ns, length_ns)
+
+    @property
+    def decided_by(self) -> str:
+        """Publisher and subscriber with the shortest window of the last one."""
+        return " to ".join(filter(None, self._pair))
+
+
+class VelocityAware:
+    """The smallest window that `w + |Vp - Vs| / 1000` gives for any pair, at least a step of the physics.
+
+    Args:
+        window_s: w, in seconds.
+        longest_s: Longest window, in seconds.
+
+    Raises:
+        PolicyError: One of them is not a positive time.
+    """
+
+    name = "velocity_aware"
+    exact = False
+    defers_sends = False
+    uses_end_states = True
+    defers_arrivals = False
+
+    def __init__(self, window_s: float = 0.001, longest_s: float = 0.1) -> None:
+        self._window_ns = window_ns(self.name, window_s)
+        self._longest_ns = window_ns(self.name, longest_s)
+        self._windows = Windows()
+        self._pair: Sequence[str] = ()
+
+    def next_window(self, situation: Situation) -> int:
+        """Return the end of the next window."""
+        states = situation.states
+        slowest_m_s, self._pair = min(
+            (
+                (math.dist(states[pair[0]].velocity_m_s, states[pair[1]].velocity_m_s), pair)
+                for pair in situation.pairs
+            ),
+            default=(math.inf, ()),
+        )
+        length_ns = min(self._window_ns + slowest_m_s * NS_PER_M_S, self._longest_ns)
+        return self._windows.end_ns(situation.now_ns, max(length_ns, situation.physics_step_ns))
+
+    @property
+    def decided_by(self) -> str:
+        """The pair with the lowest relative velocity in the last window."""
+        return " and ".join(self._pair)

@@ -1,0 +1,178 @@
+"""Programs that wrap other programs: several on one agent, outages, and clocks with an error."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.cosim.federates import Action, Program, next_send_ns
+from sim_backends.network.packets import Received
+from sim_backends.world.motion import State
+
+
+class CombinedProgram:
+    """Combines programs of one agent: each wakes at its own times, and all receive all datagrams.
+
+    Args:
+        programs: The programs; if several steer at the same time, the command of the last one applies.
+    """
+
+    def __init__(self, programs: Sequence[Program]) -> None:
+        self._programs = tuple(programs)
+
+    def next_wake_ns(self) -> int | None:
+        """Return the earliest time of any program."""
+        times_ns = (program.next_wake_ns() for program in self._programs)
+        return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
+
+    def next_send_ns(self) -> int | None:
+        """Return the earliest time before which no program sends."""
+        times_ns = (next_send_ns(program) for program in self._programs)
+        return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
+
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Wake the programs that are due, or all if a datagram has arrived."""
+        actions = [
+            program.wake(now_ns, own_state, received)
+            for program in self._programs
+            if received or _is_due(program, now_ns)
+        ]
+        commands = [action.command for action in actions if action.command is not None]
+        datagrams = tuple(datagram for action in actions for datagram in action.datagrams)
+        return Action(datagrams, commands[-1] if commands else None)
+
+
+def _is_due(program: Program, now_ns: int) -> bool:
+    wake_ns = program.next_wake_ns()
+    return wake_ns is not None and wake_ns <= now_ns
+
+
+class Outage:
+    """A program that is off for a time: it receives and sends nothing, and its body gets a command to stop.
+
+    When it is on again, it continues as if all its packets in that time had been lost.
+
+    Args:
+        program: The program.
+        begin_ns: Time when it goes off.
+        end_ns: Time when it is on again; None for never.
+        stop: Command that stops the body; None if there is no body to stop.
+    """
+
+    def __init__(self, program: Program, begin_ns: int, end_ns: int | None, stop: Any = None) -> None:  # noqa: ANN401
+        self._program = program
+        self._begin_ns = begin_ns
+        self._end_ns = end_ns
+        self._stop = stop
+        self._is_stopped = False
+
+    def next_wake_ns(self) -> int | None:
+        """Return the program's next time; before the body has been stopped, at the latest the beginning."""
+        wake_ns = self._program.next_wake_ns()
+        return wake_ns if self._is_stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
+
+    def next_send_ns(self) -> int | None:
+        """Return the program's next time of sending."""
+        return next_send_ns(self._program)
+
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Wake the program; during the outage, discard its action, and stop the body once."""
+        is_off = self._begin_ns <= now_ns and (self._end_ns is None or now_ns < self._end_ns)
+        if not is_off:
+            return self._program.wake(now_ns, own_state, received)
+        wake_ns = self._program.next_wake_ns()
+        if wake_ns is not None and wake_ns <= now_ns:
+            self._program.wake(now_ns, own_state, ())
+        command, self._is_stopped = None if self._is_stopped else self._stop, True
+        return Action(command=command)
+
+
+_BILLION: Final = 10**9
+
+
+@dataclass(frozen=True, slots=True)
+class AgentClock:
+    """A clock that is correct except during one interval.
+
+    Attributes:
+        begin_ns: Beginning of the interval.
+        end_ns: End of the interval, when the clock is set right again; None for never.
+        offset_ns: How far it is ahead at `begin_ns`; negative if it is behind.
+        rate_ppb: By how much it gains, in nanoseconds per second.
+
+    Raises:
+        ConfigurationError: The clock would stop or run backwards.
+    """
+
+    begin_ns: int = 0
+    end_ns: int | None = None
+    offset_ns: int = 0
+    rate_ppb: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rate_ppb <= -_BILLION:
+            raise ConfigurationError(
+                f"a clock that loses {-self.rate_ppb:,} ns per second stops or runs backwards, and no timer fires",
+                remedy="let it lose less than 10^9 ns per second",
+            )
+
+    def reading_ns(self, now_ns: int) -> int:
+        """Return its reading at a time."""
+        if now_ns < self.begin_ns or (self.end_ns is not None and now_ns >= self.end_ns):
+            return now_ns
+        return now_ns + self.offset_ns + (now_ns - self.begin_ns) * self.rate_ppb // _BILLION
+
+    def first_ns(self, shown_ns: int) -> int:
+        """Return the first time at which its reading is `shown_ns` or later."""
+        if shown_ns < self.begin_ns:
+            return shown_ns
+        # After n ns in the interval it has advanced by floor(n (1 + rate)): find the smallest sufficient n.
+        missing_ns = shown_ns - self.begin_ns - self.offset_ns
+        since_ns = max(-(-missing_ns * _BILLION // (_BILLION + self.rate_ppb)), 0)
+        wrong_until_ns = self.begin_ns + since_ns
+        if self.end_ns is None or wrong_until_ns < self.end_ns:
+            return wrong_until_ns
+        return max(shown_ns, self.end_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class _Stamped:
+    payload: Any
+    sent_ns: int
+
+
+class Clocked:
+    """A program whose only clock is its computer's, which also stamps its datagrams.
+
+    If the clock of one agent is wrong, the programs of all agents are wrapped, so that all can read the time stamps.
+
+    Args:
+        program: The program.
+        clock: The clock.
+    """
+
+    def __init__(self, program: Program, clock: AgentClock) -> None:
+        self._program = program
+        self._clock = clock
+
+    def next_wake_ns(self) -> int | None:
+        """Return the true time at which the program's timer fires."""
+        shown_ns = self._program.next_wake_ns()
+        return None if shown_ns is None else self._clock.first_ns(shown_ns)
+
+    def next_send_ns(self) -> int | None:
+        """Return the true time before which the program does not send."""
+        shown_ns = next_send_ns(self._program)
+        return None if shown_ns is None else self._clock.first_ns(shown_ns)
+
+    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        """Wake the program at the clock's reading, and stamp its datagrams with it."""
+        shown_ns = self._clock.reading_ns(now_ns)
+        action = self._program.wake(shown_ns, own_state, [self._unstamped(datagram) for datagram in received])
+        stamped = [replace(datagram, payload=_Stamped(datagram.payload, shown_ns)) for datagram in action.datagrams]
+        return Action(stamped, action.command)
+
+    def _unstamped(self, received: Received) -> Received:
+        stamped: _Stamped = received.payload
+        arrived_ns = self._clock.reading_ns(received.arrived_ns)
+        return Received(received.source, stamped.payload, stamped.sent_ns, arrived_ns)

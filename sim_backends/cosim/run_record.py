@@ -1,0 +1,186 @@
+"""The record of a run: the fate of every packet, the windows, the hash over all events; and its observers."""
+
+import hashlib
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import repeat
+from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
+
+from sim_backends.network.ip import Fragment
+from sim_backends.network.packets import Packet
+from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.world.motion import State
+
+
+@dataclass(slots=True)
+class Fate:
+    """The fate of a packet: arrived, dropped, or not decided yet.
+
+    Attributes:
+        packet: The packet, with the times when it was sent and when it entered the network.
+        assumed: States of source and destination that the network assumed when the packet entered.
+        true: True states of source and destination at the time of sending: those at the last physics step,
+            extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
+        arrived_ns: Time when the network delivered it, or None.
+        counted_ns: Time when its receiver got it, which depends on the policy: the window's end, or `arrived_ns`.
+        late_ns: How far the receiver had passed `counted_ns` already.
+        reason: Why it never arrived; empty if it arrived or is under way.
+        position_error_m: Largest error of the relative position that the network assumed for two of the agents that
+            matter for the packet; None if these are source and destination only (`geometry.position_error_m`).
+    """
+
+    packet: Packet
+    assumed: tuple[State, State]
+    true: tuple[State, State]
+    arrived_ns: int | None = None
+    counted_ns: int | None = None
+    late_ns: int = 0
+    reason: str = ""
+    position_error_m: float | None = field(default=None, compare=False)
+
+    @property
+    def is_decided(self) -> bool:
+        """True if it arrived, or never will."""
+        return self.arrived_ns is not None or bool(self.reason)
+
+
+def no_wall_s() -> dict[str, float]:
+    """Return the parts of the wall time, each 0."""
+    return {"agents": 0.0, "network": 0.0, "exchange": 0.0, "wait": 0.0}
+
+
+@dataclass
+class Run:
+    """The record of a run.
+
+    Attributes:
+        fates: The fate of every packet, by flow and number.
+        windows_ns: The ends of all windows.
+        wall_s: Wall time by part: agents, network, exchange, and wait, which is the time that federates only waited.
+        digest: Hash over every packet, arrival, drop and window, in order (`EventDigest`).
+    """
+
+    fates: dict[PacketIdentity, Fate] = field(default_factory=dict)
+    windows_ns: list[int] = field(default_factory=list)
+    wall_s: dict[str, float] = field(default_factory=no_wall_s)
+    digest: str = ""
+
+
+_EVENT: Final = struct.Struct("<cQQ")
+_PACKET: Final = struct.Struct("<QqqQQ")
+
+_HASHED_BYTES: Final = 1 << 15
+"""Events are hashed in blocks of this size, because hashing each window separately would take longer."""
+
+
+class EventDigest:
+    """Hashes windows in order: packets that entered the network, arrivals, drops, and the end of each window.
+
+    A window is hashed when it is over, so a run that stops within a window has the digest of the windows before.
+    States are not hashed: the last bit of a position may differ between two mathematical libraries, times may not.
+
+    Attributes:
+        quiet_ends_ns: Ends of the windows since the last window with packets. They are hashed together; for a window
+            without packets, a caller may append its end here.
+    """
+
+    def __init__(self) -> None:
+        self.quiet_ends_ns: list[int] = []
+        self._hash = hashlib.blake2b(digest_size=16)
+        self._events = bytearray()
+        self._windows = 0
+
+    def add_window(self, end_ns: int, entered: Iterable[Fate], ended: Iterable[Fate]) -> None:
+        """Hash a window.
+
+        Args:
+            end_ns: Its end.
+            entered: The fates of packets that entered the network, in order.
+            ended: The fates that were decided in the window, in order.
+        """
+        self._add_quiet_windows()
+        events = self._events
+        for fate in entered:
+            packet = fate.packet
+            flow, number = packet.identity
+            events += _PACKET.pack(packet.packet_id, number, packet.size_bytes, packet.sent_ns, packet.enters_ns)
+            events += f"{packet.source}\0{packet.destination}\0{flow}\0{packet.protocol}\0".encode()
+        for fate in ended:
+            if fate.arrived_ns is None:
+                events += _EVENT.pack(b"d", fate.packet.packet_id, end_ns)
+                events += fate.reason.encode()
+            else:
+                events += _EVENT.pack(b"a", fate.packet.packet_id, fate.arrived_ns)
+        self.quiet_ends_ns.append(end_ns)
+        if len(events) > _HASHED_BYTES:
+            self._hash.update(events)
+            events.clear()
+
+    def _add_quiet_windows(self) -> None:
+        """Append the ends of the quiet windows to the events."""
+        ends_ns = self.quiet_ends_ns
+        numbers = range(self._windows, self._windows + len(ends_ns))
+        self._events += b"".join(map(_EVENT.pack, repeat(b"w"), numbers, ends_ns))
+        self._windows += len(ends_ns)
+        ends_ns.clear()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "EventDigest":
+        other = EventDigest()
+        other.quiet_ends_ns = self.quiet_ends_ns.copy()
+        other._hash, other._events, other._windows = self._hash.copy(), self._events.copy(), self._windows
+        return other
+
+    def hexdigest(self) -> str:
+        """Return the hash over all windows so far, in hexadecimal."""
+        self._add_quiet_windows()
+        complete = self._hash.copy()
+        complete.update(self._events)
+        return complete.hexdigest()
+
+
+class Window(NamedTuple):
+    """The events of a window.
+
+    Attributes:
+        begin_ns: Its beginning.
+        end_ns: Its end.
+        decided_by: What determined its length, for example a pair of agents; empty if the policy does not report it.
+        entered: Fates of the packets that entered the network in it, in order. Most are not decided yet; the same
+            objects are in `ended` of a later window.
+        ended: Fates that were decided in it, in order.
+        states: States of the agents at its end.
+        assumed: States that the network assumed throughout it, or at its beginning if it extrapolates
+            (`DeadReckoned`).
+        wall_s: Wall time that it took, by part, as in `Run`.
+    """
+
+    begin_ns: int
+    end_ns: int
+    decided_by: str
+    entered: Sequence[Fate]
+    ended: Sequence[Fate]
+    states: Mapping[str, State]
+    assumed: Mapping[str, State]
+    wall_s: Mapping[str, float]
+
+
+class WindowObserver(Protocol):
+    """Observes a run. It must not change its arguments; the recorded wall time does not include its time."""
+
+    def begin(self, states: Mapping[str, State]) -> None:
+        """Receive the states of the agents at time 0, before the first window."""
+        ...
+
+    def window(self, window: Window) -> None:
+        """Receive a window, right after it has ended."""
+        ...
+
+
+@runtime_checkable
+class IpObserver(Protocol):
+    """An observer that also receives IP packets."""
+
+    def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
+        """Receive an IP packet, or a fragment of one, that an agent sent or that arrived at it."""
+        ...

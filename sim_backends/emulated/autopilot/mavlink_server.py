@@ -1,0 +1,166 @@
+"""UDP server of the autopilot: the process of an emulated drone that flies it and serves ground stations."""
+
+import contextlib
+import selectors
+import socket
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from sim_backends.emulated.ros.own_motion import Helm
+
+if TYPE_CHECKING:
+    from sim_backends.emulated.autopilot.autopilot import Autopilot
+    from sim_backends.emulated.autopilot.mavlink_frames import Frame
+
+_TICK_NS: Final = 20_000_000
+"""Interval of flight steps while there are clients, or while the drone flies."""
+
+_MAX_BYTES: Final = 65_536
+_BURST: Final = 64
+"""Datagrams received before the next flight step, so that a flood of datagrams does not stop the flight."""
+
+
+@dataclass(frozen=True)
+class Drone:
+    """Settings of an autopilot and its drone.
+
+    Attributes:
+        system: System id after power-on.
+        port: UDP port, on all addresses.
+        autopilot: `px4` or `ardupilot`.
+        profile: Name of the robot's profile, which determines its airframe.
+        max_speed_m_s: Maximum ground speed of the profile.
+        max_height_m: Maximum height above home; None if the profile does not limit it.
+        fence_m: Maximum distance from home; None if the profile does not limit it.
+        antenna_m: Height of the antenna, whose position the lab uses, above the lowest point of the drone.
+        world: World that it flies in, as JSON.
+        boot_s: Time from power-on until its position estimate has an origin.
+    """
+
+    system: int
+    port: int
+    autopilot: str
+    profile: str
+    max_speed_m_s: float
+    max_height_m: float | None
+    fence_m: float | None
+    antenna_m: float
+    world: str
+    boot_s: float = 0.0
+
+
+def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
+    """Serve forever.
+
+    Args:
+        drone: Settings of the drone.
+        motion: The file of the paths that the lab assigns (`own_motion.append_path`).
+        steered: The file in which the robot records its motion (`own_motion.Helm`).
+        ready: Created when the port is open.
+
+    Raises:
+        OSError: The port is in use.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint, selectors.DefaultSelector() as selector:
+        endpoint.bind(("", drone.port))
+        endpoint.setblocking(False)
+        selector.register(endpoint, selectors.EVENT_READ)
+        power_on_ns = time.monotonic_ns()
+        ready.touch()
+        selector.select()
+        autopilot, helm = _load(drone, motion, steered, power_on_ns)
+        while True:
+            helm.read_placement(time.monotonic_ns())
+            _exchange(autopilot, endpoint)
+            helm.write_motion()
+            selector.select(_wait_s(autopilot))
+
+
+def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple[Autopilot, DroneHelm]":
+    """Return the autopilot, which has been on since `power_on_ns`.
+
+    It is loaded when a client appears: the dialect needs 50 ms and 40 MB, the world as much, and most trials never
+    connect to the drone.
+    """
+    from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER  # noqa: PLC0415
+    from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
+    from sim_backends.emulated.autopilot.parameters import DEFAULT_M, FlightLimits  # noqa: PLC0415
+    from sim_backends.emulated.autopilot.px4 import PX4  # noqa: PLC0415
+    from sim_backends.physics.ground import Ground  # noqa: PLC0415
+    from sim_backends.physics.known import quadrotor  # noqa: PLC0415
+    from sim_backends.world.world import World  # noqa: PLC0415
+
+    world = World.model_validate_json(drone.world) if drone.world else None
+    autopilot = Autopilot(
+        firmware={"px4": PX4, "ardupilot": ARDUCOPTER}[drone.autopilot],
+        system=drone.system,
+        limits=FlightLimits(drone.max_speed_m_s, drone.max_height_m or DEFAULT_M[0], drone.fence_m or DEFAULT_M[1]),
+        airframe_limits=quadrotor(drone.profile),
+        obstacles=Ground(world, None).around,
+        now_ns=power_on_ns,
+        boot_s=drone.boot_s,
+    )
+    return autopilot, DroneHelm(autopilot, Helm(motion, steered, time.monotonic_ns()), drone.antenna_m)
+
+
+class DroneHelm:
+    """Reads where the lab puts the drone, and records where it flies.
+
+    Args:
+        autopilot: The autopilot of the drone.
+        helm: Helm of the robot.
+        antenna_m: Height of the antenna above the lowest point of the drone.
+    """
+
+    def __init__(self, autopilot: "Autopilot", helm: Helm, antenna_m: float) -> None:
+        self._vehicle = autopilot.vehicle
+        self._helm = helm
+        self._antenna_m = antenna_m
+        self._flew = False
+
+    def read_placement(self, now_ns: int) -> None:
+        """Restart at the place where the lab has put the drone, if it has."""
+        placement = self._helm.poll_placement(now_ns)
+        if placement is not None:
+            east_m, north_m, up_m = placement.place_m
+            self._vehicle.place((east_m, north_m, up_m - self._antenna_m), placement.heading_rad, now_ns)
+            self._flew = False
+
+    def write_motion(self) -> None:
+        """Record where the drone is while it flies, and once after it has come to rest."""
+        body = self._vehicle.body
+        if body.on_ground and not self._flew:
+            return
+        self._flew = not body.on_ground
+        east_m, north_m, up_m = body.place_m
+        antenna_m = (east_m, north_m, up_m + self._antenna_m)
+        self._helm.write(
+            body.now_ns, antenna_m, body.velocity_m_s, heading_rad=body.yaw_rad, turn_rad_s=body.turn_rad_s
+        )
+
+
+def _exchange(autopilot: "Autopilot", endpoint: socket.socket) -> None:
+    """Receive the pending datagrams, and send the frames that are due."""
+    with contextlib.suppress(BlockingIOError):
+        for _ in range(_BURST):
+            datagram, sender = endpoint.recvfrom(_MAX_BYTES)
+            _send(endpoint, autopilot.receive(datagram, sender, time.monotonic_ns()))
+    _send(endpoint, autopilot.advance(time.monotonic_ns()))
+
+
+def _send(endpoint: socket.socket, frames: "Iterable[Frame]") -> None:
+    for address, frame in frames:
+        # If the radio is off or full, or the client has exited, the datagram is lost, as on the air.
+        with contextlib.suppress(OSError):
+            endpoint.sendto(frame, address)
+
+
+def _wait_s(autopilot: "Autopilot") -> float | None:
+    """Return the maximum wait; without clients a drone on the ground waits for a datagram."""
+    vehicle = autopilot.vehicle
+    if autopilot.next_ns() is None and not vehicle.armed and vehicle.body.on_ground:
+        return None
+    return _TICK_NS / 1e9

@@ -1,0 +1,238 @@
+"""Mission of a vehicle: the uploaded items, the current one, and what the vehicle must do for it."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice, repeat
+from typing import Final
+
+from fieldkit.core.model import Vector
+from sim_backends.emulated.autopilot.failsafes import is_within
+from sim_backends.emulated.autopilot.flight import Airframe
+from sim_backends.emulated.autopilot.mavlink_frames import Message, dialect
+from sim_backends.emulated.ros.messages import EAST_RADIUS_M, NORTH_RADIUS_M
+
+MAX_ITEMS: Final = 500
+
+WAITS: Final = frozenset({dialect.MAV_CMD_NAV_WAYPOINT, dialect.MAV_CMD_NAV_LOITER_TIME, dialect.MAV_CMD_NAV_DELAY})
+"""Commands whose first parameter is the time to stay in seconds."""
+PLACED: Final = frozenset(
+    {
+        dialect.MAV_CMD_NAV_WAYPOINT,
+        dialect.MAV_CMD_NAV_LOITER_TIME,
+        dialect.MAV_CMD_NAV_TAKEOFF,
+        dialect.MAV_CMD_NAV_LAND,
+    }
+)
+FLOWN: Final = WAITS | PLACED | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, dialect.MAV_CMD_DO_CHANGE_SPEED}
+PASSED: Final = frozenset(
+    {
+        dialect.MAV_CMD_DO_MOUNT_CONTROL,
+        dialect.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE,
+        dialect.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
+    }
+)
+"""Commands for gimbals, which ground stations add to every plan; the drone has no gimbal and skips them."""
+
+_ABOVE_HOME: Final = (dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT, dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT)
+_ABOVE_SEA: Final = (dialect.MAV_FRAME_GLOBAL, dialect.MAV_FRAME_GLOBAL_INT)
+
+
+@dataclass(frozen=True)
+class Item:
+    """One item, as in MISSION_ITEM_INT.
+
+    Attributes:
+        frame: MAV_FRAME.
+        command: MAV_CMD.
+        parameters: First four parameters of the command.
+        x: Latitude, 1e-7 degrees.
+        y: Longitude, 1e-7 degrees.
+        z: Height in metres above the reference of the frame.
+        autocontinue: Its field as received.
+    """
+
+    frame: int
+    command: int
+    parameters: tuple[float, float, float, float]
+    x: int
+    y: int
+    z: float
+    autocontinue: int = 1
+
+
+def item_of(message: Message) -> Item:
+    """Return the item of a MISSION_ITEM_INT."""
+    parameters = (message.param1, message.param2, message.param3, message.param4)
+    return Item(message.frame, message.command, parameters, message.x, message.y, message.z, message.autocontinue)
+
+
+def goal_m(frame: int, x: int, y: int, z: float, home_m: Vector) -> Vector | None:
+    """Return a position of MAVLink in metres east, north, up of home; None for a frame that is not supported."""
+    if frame not in _ABOVE_HOME + _ABOVE_SEA or not math.isfinite(z):
+        return None
+    east_m, north_m = world_m(x, y)
+    up_m = z - (home_m[2] if frame in _ABOVE_SEA else 0.0)
+    return east_m - home_m[0], north_m - home_m[1], up_m
+
+
+def world_m(latitude_e7: int, longitude_e7: int) -> tuple[float, float]:
+    """Return a position in the world, metres east and north of its origin."""
+    return math.radians(longitude_e7 / 1e7) * EAST_RADIUS_M, math.radians(latitude_e7 / 1e7) * NORTH_RADIUS_M
+
+
+def degrees_e7(east_m: float, north_m: float) -> tuple[int, int]:
+    """Return latitude and longitude of a position in the world, 1e-7 degrees; the inverse of `world_m`."""
+    latitude, longitude = math.degrees(north_m / NORTH_RADIUS_M), math.degrees(east_m / EAST_RADIUS_M)
+    return round(latitude * 1e7), round(longitude * 1e7)
+
+
+def fault(item: Item, home_m: Vector, fence_m: tuple[float, float]) -> int:
+    """Return the fault of an item as MAV_MISSION_RESULT; ACCEPTED if it has none.
+
+    Args:
+        item: The item.
+        home_m: Home in the world.
+        fence_m: Maximum horizontal distance from home, and maximum height.
+    """
+    if item.command not in FLOWN | PASSED:
+        return int(dialect.MAV_MISSION_UNSUPPORTED)
+    has_no_position = item.command == dialect.MAV_CMD_NAV_LAND and item.x == item.y == 0
+    if item.command not in PLACED or has_no_position:
+        return int(dialect.MAV_MISSION_ACCEPTED)
+    goal = goal_m(item.frame, item.x, item.y, item.z, home_m)
+    if goal is None:
+        return int(dialect.MAV_MISSION_UNSUPPORTED_FRAME)
+    if item.command == dialect.MAV_CMD_NAV_TAKEOFF:  # straight up from where it is
+        goal = (0.0, 0.0, goal[2])
+    inside = is_within(goal, fence_m)
+    return int(dialect.MAV_MISSION_ACCEPTED if inside else dialect.MAV_MISSION_DENIED)
+
+
+REPEATS: Final = 10
+REPEAT_NS: Final = 1_000_000_000
+"""The last completed item is reported this many times again, at this interval, as in PX4: messages may be lost."""
+
+_BELOW_M: Final = -1.0
+"""Height of a landing point: below the ground, which stops the descent."""
+
+_RISEN_M: Final = 0.2
+"""The climb to the first item ends this far below its height."""
+
+
+class Mission:
+    """Items in their order.
+
+    Args:
+        first: Number of the first item that is flown; ArduPilot's item 0 is home.
+
+    Attributes:
+        items: The items as uploaded.
+        current: Number of the current item; that of the last one after the end.
+        speed_m_s: Ground speed that an item has set.
+    """
+
+    def __init__(self, first: int = 0) -> None:
+        self._first = first
+        self.items: tuple[Item, ...] = ()
+        self.current = 0
+        self.speed_m_s: float | None = None
+        self._done = False
+        self._reached: list[int] = []
+        self._again: Iterator[int] = iter(())
+        self._again_ns = 0
+        self._from_m: Vector | None = None  # position at the start of the current item
+        self._rises = False
+        self._arrived_ns: int | None = None
+
+    def load(self, items: tuple[Item, ...]) -> None:
+        """Load new items; the first is the current one."""
+        self.items, self.speed_m_s = items, None
+        self.set_current(0)
+
+    def begin(self) -> None:
+        """Continue at the current item, or start at the first if all are done."""
+        if self._done:
+            self.set_current(0)
+        self._enter()
+
+    def set_current(self, number: int) -> None:
+        """Make an item of this number the current one, as far as there is one."""
+        self.current, self._done = max(number, min(self._first, len(self.items) - 1), 0), False
+        self._reached, self._again = [], iter(())
+        self._enter()
+
+    def reached(self, now_ns: int) -> Iterator[int]:
+        """Yield the numbers of completed items that must be reported now; times must not decrease."""
+        if self._reached:
+            yield from self._reached
+            self._again, self._again_ns = repeat(self._reached[-1], REPEATS), now_ns + REPEAT_NS
+            self._reached = []
+        elif now_ns >= self._again_ns:
+            yield from islice(self._again, 1)
+            self._again_ns = now_ns + REPEAT_NS
+
+    def fly(self, body: Airframe, home_m: Vector, near_m: float) -> Vector | str:
+        """Return the point to fly to, relative to home (below it to land), or the name of the mode to change to.
+
+        Args:
+            body: State of motion of the vehicle.
+            home_m: Home in the world.
+            near_m: Radius within which a point is reached, unless the item has one.
+        """
+        while not self._done:
+            item = self.items[self.current]
+            if item.command == dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH:
+                self._next()
+                return "RTL"
+            if item.command == dialect.MAV_CMD_DO_CHANGE_SPEED:
+                self.speed_m_s = item.parameters[1] if item.parameters[1] > 0 else None
+            elif item.command not in PASSED:
+                if self._from_m is None:
+                    self._from_m, self._rises = body.position_m, body.on_ground
+                goal = self._goal_m(item, self._from_m, body, home_m, near_m)
+                if not self._is_complete(item, body, goal, near_m):
+                    return goal
+            self._next()
+        return "LOITER"
+
+    def _goal_m(self, item: Item, start_m: Vector, body: Airframe, home_m: Vector, near_m: float) -> Vector:
+        """Return the goal of an item; from the ground it first leads straight up."""
+        here_m = body.position_m
+        if item.command == dialect.MAV_CMD_NAV_DELAY:
+            return start_m
+        goal = goal_m(item.frame, item.x, item.y, item.z, home_m)
+        if goal is None or (item.command == dialect.MAV_CMD_NAV_LAND and item.x == item.y == 0):
+            goal = start_m  # a landing without a position; `fault` rejects all other items without one
+        if item.command == dialect.MAV_CMD_NAV_LAND:
+            is_above = math.dist(goal[:2], here_m[:2]) < near_m or body.on_ground
+            return *goal[:2], _BELOW_M if is_above else start_m[2]
+        self._rises = self._rises and here_m[2] < goal[2] - _RISEN_M
+        if self._rises or item.command == dialect.MAV_CMD_NAV_TAKEOFF:
+            return *start_m[:2], goal[2]
+        return goal
+
+    def _is_complete(self, item: Item, body: Airframe, goal: Vector, near_m: float) -> bool:
+        """Return True if the vehicle has been at the goal for as long as the item requires."""
+        if item.command == dialect.MAV_CMD_NAV_LAND:
+            return body.on_ground
+        wait_s, radius_m, _, _ = item.parameters
+        if item.command == dialect.MAV_CMD_NAV_WAYPOINT and radius_m > 0:
+            near_m = radius_m
+        if self._arrived_ns is None:
+            if self._rises or math.dist(goal, body.position_m) > near_m:
+                return False
+            self._arrived_ns = body.now_ns
+        must_wait = item.command in WAITS and wait_s > 0
+        return not must_wait or body.now_ns - self._arrived_ns >= wait_s * 1e9
+
+    def _next(self) -> None:
+        self._reached.append(self.current)
+        if self.current + 1 < len(self.items):
+            self.current += 1
+        else:
+            self._done = True
+        self._enter()
+
+    def _enter(self) -> None:
+        self._from_m, self._rises, self._arrived_ns = None, False, None

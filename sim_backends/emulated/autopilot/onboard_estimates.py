@@ -1,0 +1,118 @@
+"""Estimates on board of the emulated drone: its position, and the charge of its battery."""
+
+from typing import Final
+
+from fieldkit.core.model import Vector
+
+CELL_V: Final = (3.5, 4.2)
+"""Voltage of a lithium polymer cell, empty and full."""
+CELLS: Final = 3
+FULL_V: Final = CELLS * CELL_V[1]
+_HOVER_A: Final = 10.0
+_REST_A: Final = 0.5
+
+FLIGHT_S: Final = 15 * 60
+"""Flight time of a full charge."""
+
+
+class Battery:
+    """Charge of the battery, used up by flight; at rest it lasts longer by the ratio of the currents.
+
+    Attributes:
+        left: Remaining charge, from 0 to 1.
+        current_a: Current.
+        full_v: Voltage of the full battery (SIM_BATT_VOLTAGE of ArduPilot's simulator).
+        flight_s: Flight time of a full charge (SIM_BAT_DRAIN of PX4's simulator).
+        least: Minimum of `left` (SIM_BAT_MIN_PCT as a fraction).
+    """
+
+    def __init__(self, now_ns: int) -> None:
+        self._last_ns = now_ns
+        self.left = 1.0
+        self.current_a = _REST_A
+        self.full_v = FULL_V
+        self.flight_s = float(FLIGHT_S)
+        self.least = 0.0
+
+    def advance(self, now_ns: int, *, driven: bool) -> None:
+        """Use up the charge of the time since the last call."""
+        self.current_a = _HOVER_A if driven else _REST_A
+        used = (now_ns - self._last_ns) / 1e9 / self.flight_s * self.current_a / _HOVER_A
+        self.left, self._last_ns = max(min(self.least, self.left), self.left - used), now_ns
+
+    @property
+    def used_mah(self) -> float:
+        """Charge used so far."""
+        return (1 - self.left) * self.flight_s / 3.6 * _HOVER_A
+
+    @property
+    def voltage_v(self) -> float:
+        """Voltage of the battery, linear in the remaining charge."""
+        empty, full = CELL_V
+        return self.full_v * (empty + (full - empty) * self.left) / full
+
+
+_GOOD: Final = 831
+"""Flags of a good estimate: EKF_STATUS_FLAGS of ArduPilot, ESTIMATOR_STATUS_FLAGS of PX4; the bits are the same."""
+
+
+class PositionEstimate:
+    """The position estimate.
+
+    Args:
+        boot_s: Time from power-on until it has an origin.
+        starting_flags: Its flags until then.
+
+    Attributes:
+        booted_ns: Time of power-on or of the last reboot.
+        origin_m: Origin of the local frame in the world, metres east, north, up; None until the estimate is good.
+    """
+
+    def __init__(self, boot_s: float, starting_flags: int) -> None:
+        self._boot_ns = round(boot_s * 1e9)
+        self._starting_flags = starting_flags
+        self.booted_ns = 0
+        self.origin_m: Vector | None = None
+
+    def boot(self, now_ns: int) -> None:
+        """Restart the estimate."""
+        self.booted_ns, self.origin_m = now_ns, None
+
+    def advance(self, now_ns: int, place_m: Vector) -> bool:
+        """Set the origin to the position in the world when it is due; return True if it was set now."""
+        if self.origin_m is not None or self.is_starting(now_ns):
+            return False
+        self.origin_m = place_m
+        return True
+
+    def is_starting(self, now_ns: int) -> bool:
+        """Return True if the time until it has an origin has not passed."""
+        return now_ns - self.booted_ns < self._boot_ns
+
+    def has_fix(self, now_ns: int) -> bool:
+        """Return True if the GPS receiver has a fix, after half of that time."""
+        return self.origin_m is not None or now_ns - self.booted_ns >= self._boot_ns / 2
+
+    @property
+    def is_instant(self) -> bool:
+        """True if it has an origin immediately after power-on."""
+        return not self._boot_ns
+
+    @property
+    def flags(self) -> int:
+        """The flags that it reports."""
+        return self._starting_flags if self.origin_m is None else _GOOD
+
+    def to_local(self, world_m: Vector) -> Vector | None:
+        """Return a position in the world relative to the origin; None before there is an origin."""
+        if self.origin_m is None:
+            return None
+        east, north, up = (place - origin for place, origin in zip(world_m, self.origin_m, strict=True))
+        return east, north, up
+
+    def to_world(self, local_m: Vector) -> Vector | None:
+        """Return the position in the world of a point of the local frame; None before there is an origin."""
+        if self.origin_m is None:
+            return None
+        east, north, up = (place + origin for place, origin in zip(local_m, self.origin_m, strict=True))
+        return east, north, up

@@ -1,0 +1,197 @@
+"""Interactive lab: all robots of a site file are up, none has a role, and all of them communicate directly."""
+
+import socket
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from fieldkit.backends.registry import profiles_of
+from fieldkit.config.schema import Document
+from fieldkit.config.site import Site
+from fieldkit.core.model import Vector
+from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
+from sim_backends.emulated import placement
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
+from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered
+from sim_backends.emulated.nodes import RunningRobots, running_robots
+from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.ros.own_motion import AssignedPath
+from sim_backends.radio.world_channel import WorldChannel, antenna_of
+from sim_backends.world.motion import State
+from sim_backends.world.world import World
+
+
+class EmulatedLab:
+    """Running robots, in the middle of their world until they are moved.
+
+    Args:
+        members: The robots by name.
+        up: The running robots and their medium.
+        options: The lab's options.
+        world: The world around the robots.
+
+    Raises:
+        LinkError: The medium ended or did not answer.
+    """
+
+    def __init__(
+        self, members: Mapping[str, LabRobot], up: RunningRobots[str], options: EmulatedOptions, world: World
+    ) -> None:
+        self._up = up
+        self._options = options
+        self._world = world
+        self._places_m = placement.square_m(members, world)
+        self._path_starts_ns: dict[str, int] = {}
+        self._states: dict[str, State] = {}
+        # A separate thread follows robots that steer themselves.
+        self._lock = threading.RLock()
+        up.medium.place(self._places_m)
+        up.places.write(self._places_m)
+        for name in members:
+            self._put(name)
+        self.members = members
+        self.login = Login(USER, up.private_key, up.host_keys)
+
+    def connect(self, name: str, timeout_s: float) -> socket.socket:
+        """Implement `Lab.connect`."""
+        return self._up.robots[name].connect(timeout_s)
+
+    def programs(self, name: str) -> tuple[str, ...]:
+        """Implement `Lab.programs` from `/proc`, which also works for a robot that does not respond."""
+        return tuple(dict.fromkeys(_programs(self._up.robots[name].pid)))
+
+    def place_m(self, name: str) -> Vector:
+        """Implement `Lab.place_m`."""
+        with self._lock:
+            return self._places_m[name]
+
+    def move(self, name: str, to: Destination) -> Vector:
+        """Implement `Lab.move`."""
+        with self._lock:
+            place_m = placement.moved_m(self._places_m[name], to, self._world)
+            places_m = self._places_m | {name: place_m}
+            self._up.medium.place(places_m)
+            self._up.places.write(places_m)
+            self._places_m = places_m
+            self._put(name)
+            return place_m
+
+    def _put(self, name: str) -> None:
+        """Send a robot its new place; it faces east there."""
+        self._path_starts_ns[name] = start_ns = time.monotonic_ns()
+        self._up.robots[name].move(AssignedPath(start_ns, [self._places_m[name]], speed_m_s=1.0, facing_rad=0.0))
+
+    def watching(self) -> AbstractContextManager[object]:
+        """Return a context that keeps the medium up to date with robots that steer themselves."""
+        if not any(robot.spec.steers for robot in self._up.robots.values()):
+            return nullcontext()
+        return MotionThread(self._follow, "watch")
+
+    def _follow(self) -> float:
+        """Update the places of robots that steer themselves; return the seconds until the next update."""
+        with self._lock:
+            states = {
+                name: motion.state
+                if self.members[name].profile.mavlink is not None
+                else placement.on_ground(motion.state, self._world)
+                for name, motion in self_steered(self._up.robots, self._path_starts_ns).items()
+            }
+            if states != self._states:
+                self._states = states
+                self._places_m = self._places_m | {name: state.position_m for name, state in states.items()}
+                velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
+                self._up.medium.place(self._places_m, velocities_m_s=velocities_m_s)
+                self._up.places.write(self._places_m)
+        return WATCH_S
+
+    def overview(self) -> Overview:
+        """Implement `Lab.overview`."""
+        return overview(self.members, self._places_m, self._options, self._world)
+
+
+@contextmanager
+def bring_up(
+    members: Mapping[str, LabRobot], *, options: EmulatedOptions, world: World, ros: RosChoice, seed: int
+) -> Iterator[EmulatedLab]:
+    """Yield running robots in the middle of their world.
+
+    Raises:
+        FieldkitError: A robot or the medium did not start.
+    """
+    with running_robots(members, options=options, world=world, ros=ros, seed=seed) as up:
+        lab = EmulatedLab(members, up, options, world)
+        with lab.watching():
+            yield lab
+
+
+def members_of(site: Site, document: Document | None, addresses: Mapping[str, str]) -> dict[str, LabRobot]:
+    """Return the robots of a site file, by name.
+
+    Args:
+        site: The site file.
+        document: The document of the site file, for error messages with line numbers.
+        addresses: Radio address of each robot.
+
+    Raises:
+        ConfigurationError: A profile is missing or wrong.
+    """
+    roles: dict[str, list[str]] = {name: [] for name in site.robots}
+    for topology, cast in site.roles.items():
+        for role, name in cast.items():
+            roles[name].append(f"{role} ({topology})")
+    profiles = profiles_of(site, document, site.robots)
+    return {name: LabRobot(name, profile, addresses[name], tuple(roles[name])) for name, profile in profiles.items()}
+
+
+def overview(
+    members: Mapping[str, LabRobot], places_m: Mapping[str, Vector], options: EmulatedOptions, world: World
+) -> Overview:
+    """Return the map of the lab, computed without shadowing, which depends on the seed."""
+    antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
+    channel = WorldChannel(
+        0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world
+    )
+    channel.move(0, places_m)
+    names = list(members)
+    pairs = [] if options.radio.fixed else list(combinations(range(len(names)), 2))
+    first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
+    links = [
+        LabLink(
+            (names[first_index], names[second_index]),
+            min(channel.snr_db(first_index, second_index), channel.snr_db(second_index, first_index)),
+            channel.linked(first_index, second_index),
+            tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
+        )
+        for (first_index, second_index), crossed in zip(pairs, world.crossings(first, second), strict=True)
+    ]
+    parts = sorted(world.parts, key=lambda part: part.shape.top_m)
+    outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]
+    robots = {name: place_m[:2] for name, place_m in places_m.items()}
+    return Overview(world.name, world.area_m, outlines, robots, links)
+
+
+def _programs(robot_pid: int) -> Iterator[str]:
+    """Yield the name of each process of a robot except its init process."""
+    pending = [pid for first in _children(robot_pid) for pid in _children(first)]
+    while pending:
+        yield from filter(None, map(_name, pending))
+        pending = [child for pid in pending for child in _children(pid)]
+
+
+def _children(pid: int) -> list[int]:
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()]
+    except OSError:
+        return []  # the process has exited
+
+
+def _name(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""

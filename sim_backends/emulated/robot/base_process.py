@@ -1,0 +1,94 @@
+"""Process of the base of an emulated ground robot: receives velocities at a socket and drives the robot.
+
+The velocities are datagrams of six doubles, as in ROS's `Twist`. Relays that run under Debian's Python import this
+module, so it imports only the standard library and modules that do the same.
+"""
+
+import contextlib
+import select
+import socket
+import struct
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from sim_backends.emulated.robot.spec import STATE, Base
+from sim_backends.emulated.ros.own_motion import Helm
+
+if TYPE_CHECKING:
+    from sim_backends.emulated.robot.base_controller import BaseController
+
+_TICK_S: Final = 0.02
+
+
+def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
+    """Serve forever; while the robot is idle, the process sleeps.
+
+    Args:
+        base: Settings of the robot's base.
+        motion: The file of the paths that the lab assigns (`own_motion.append_path`).
+        steered: The file in which the robot records its motion (`own_motion.Helm`).
+        ready: Created when the base serves.
+
+    Raises:
+        OSError: The socket cannot be created.
+    """
+    CHANNEL.unlink(missing_ok=True)  # left by a process that was killed
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+        channel.bind(str(CHANNEL))
+        channel.setblocking(False)
+        helm = Helm(motion, steered, time.monotonic_ns())
+        ready.touch()
+        select.select([channel], [], [])
+        # The physics need numpy, which takes 20 MB; most robots of most trials are never driven.
+        from sim_backends.emulated.robot.base_controller import BaseController  # noqa: PLC0415
+
+        controller = BaseController(base, time.monotonic_ns())
+        while True:
+            select.select([channel], [], [], None if controller.is_idle else _TICK_S)
+            now_ns = time.monotonic_ns()
+            if (placement := helm.poll_placement(now_ns)) is not None:
+                controller.reset(placement)
+            _receive_velocities(channel, controller, now_ns)
+            controller.advance(now_ns)
+            _write_motion(helm, controller, now_ns)
+
+
+def _receive_velocities(channel: socket.socket, controller: "BaseController", now_ns: int) -> None:
+    """Receive the pending velocities; the last one is used."""
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            if (velocity := unpack(channel.recv(BYTES + 1))) is not None:
+                controller.set_velocity(now_ns, *velocity)
+
+
+def _write_motion(helm: Helm, controller: "BaseController", now_ns: int) -> None:
+    pose = controller.pose
+    helm.write(
+        now_ns,
+        pose.place_m,
+        pose.velocity_m_s,
+        heading_rad=pose.heading_rad,
+        turn_rad_s=pose.turn_rad_s,
+        wheels=controller.wheels,
+    )
+
+
+CHANNEL: Final = Path(STATE, "velocities")
+"""Socket at which the base receives velocities."""
+
+_TWIST: Final = struct.Struct("<6d")
+BYTES: Final = _TWIST.size
+
+
+def pack(*values: float) -> bytes:
+    """Return the datagram for metres per second along x, y, z, and radians per second about them."""
+    return _TWIST.pack(*values)
+
+
+def unpack(words: bytes) -> tuple[float, float] | None:
+    """Return forward speed and turn rate to the left, or None if the datagram has the wrong length."""
+    if len(words) != BYTES:
+        return None
+    ahead_m_s, _, _, _, _, turn_rad_s = _TWIST.unpack(words)
+    return ahead_m_s, turn_rad_s
