@@ -269,8 +269,8 @@ class Chaos:
         if "the same bytes" not in (rebuilt := fieldkit(lab, "rebuild", str(trial))).out:
             tally.problems.append(f"rebuild: {rebuilt.out} {rebuilt.err}")
         for role, shell in self._outside.testbed.shells.items():
-            if list_running := jobs.list_running(shell, Deadline.after(20)):
-                tally.problems.append(f"left on {role}: {list_running}")
+            if remaining := jobs.list_running(shell, Deadline.after(20)):
+                tally.problems.append(f"left on {role}: {remaining}")
 
 
 def _voids(trial: Path) -> list[Void]:

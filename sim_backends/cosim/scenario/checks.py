@@ -107,11 +107,13 @@ def _demands(motion: object, start_m: Vector, limits: Limits) -> Iterator[Demand
 
 def _leg_demands(leg: LegPlan, limits: Limits) -> Iterator[Demand]:
     yield Demand(("speed",), "a speed", abs(leg.speed), limits.speed_m_s, "m/s")
+    turn_deg_s = abs(float(leg.turn_deg_s))
     if isinstance(limits, QuadrotorLimits):
         yield _climb(("climb_m_s",), float(leg.climb_m_s), limits)
+        yield Demand(("turn_deg_s",), "a rate of turn", turn_deg_s, 0.0, "deg/s")  # it keeps its heading
     else:
-        limit_deg_s = math.degrees(limits.turn_rad_s)
-        yield Demand(("turn_deg_s",), "a rate of turn", abs(float(leg.turn_deg_s)), limit_deg_s, "deg/s")
+        yield Demand(("turn_deg_s",), "a rate of turn", turn_deg_s, math.degrees(limits.turn_rad_s), "deg/s")
+        yield Demand(("climb_m_s",), "a climb rate", abs(float(leg.climb_m_s)), 0.0, "m/s")
 
 
 def _climbs(motion: WayPointsPlan, start_m: Vector, limits: QuadrotorLimits) -> Iterator[Demand]:
