@@ -52,6 +52,36 @@ def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) 
     return packages | {name.partition(".")[0] for name in names} & LIBRARIES
 
 
+LINES_OF_A_DRY_RUN = 25_000
+"""Maximum of lines of fieldkit that a trial of the paper's procedure imports before robots are opened."""
+
+COUNT_LINES = """
+import sys
+from pathlib import Path
+from fieldkit.cli import main
+code = main(["trial", "los", "30ft", "--dry-run"])
+own = {n: m.__file__ for n, m in sys.modules.items() if n.split(".")[0] in {"fieldkit", "sim_backends"}}
+print(sum(Path(path).read_text(encoding="utf-8").count("\\n") for path in own.values() if path), *own)
+sys.exit(code)
+"""
+
+
+def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path) -> None:
+    done = subprocess.run(
+        (sys.executable, "-c", COUNT_LINES),
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=LIMIT_S,
+        check=True,
+    )
+    count, *names = done.stdout.splitlines()[-1].split()
+    kinds = {name for name in names if name.startswith("fieldkit.steps.kinds.")}
+    assert kinds == {f"fieldkit.steps.kinds.{kind}" for kind in ("capture", "ping", "record", "transfer")}
+    assert int(count) <= LINES_OF_A_DRY_RUN
+
+
 @pytest.mark.parametrize("words", ["--version", "--help"])
 def test_the_list_of_commands_imports_no_library(tmp_path: Path, words: str) -> None:
     assert imported(tmp_path, words) == set()

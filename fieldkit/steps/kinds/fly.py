@@ -25,8 +25,8 @@ from fieldkit.steps.flight_alarm import alarmed
 from fieldkit.steps.flight_rescue import FlightRescue
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.kinds.mavlink import MavlinkStep
-from fieldkit.steps.kinds.move import PathLeg
 from fieldkit.steps.lease import orders_file, run_inside
+from fieldkit.steps.legs import PathLeg
 from fieldkit.steps.link_need import link_need
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene

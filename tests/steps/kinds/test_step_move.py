@@ -18,7 +18,8 @@ from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Leg, Protocol, Role, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.steps.kinds.move import MoveStep, PathLeg
+from fieldkit.steps.kinds.move import MoveStep
+from fieldkit.steps.legs import PathLeg
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
