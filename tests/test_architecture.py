@@ -52,12 +52,25 @@ MAY_IMPORT = {
         "steps",
         "trial",
     },
+    "motion": {
+        "agent",
+        "backends",
+        "cli",
+        "config",
+        "lab",
+        "measure",
+        "remote",
+        "ros",
+        "steps",
+        "trial",
+    },  # by entry points
     "pytest": {"analysis", "api", "backends", "cli", "measure", "remote", "trial"},
 }
 # Measuring and computing must not even know how a file of a lab is read.
 LEAVES = {
     room: {
         "core.model",
+        "core.plugins",
         "core.units",
         "core.errors",
         "core.columns",
@@ -100,7 +113,7 @@ ONE_IMPORTER = {
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # What the drone says, and, in a process of its own, what a log of it holds.
-    "pymavlink": "fieldkit/measure/motion/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
+    "pymavlink": "fieldkit/motion/logs/tlog_reader.py sim_backends/emulated/autopilot/mavlink.py",
     "lz4": "fieldkit/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",

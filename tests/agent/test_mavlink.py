@@ -25,7 +25,7 @@ from pymavlink.dialects.v20 import common as d
 from fieldkit.agent import mavlink, mavlink_frames
 from fieldkit.agent.links import devices
 from fieldkit.agent.links.client import MessageRate
-from fieldkit.measure.motion import tlog
+from fieldkit.motion.logs import tlog
 from fieldkit.remote import agent
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from tests.helpers import drones

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.measure.motion import tlog
+from fieldkit.motion.logs import tlog
 from tests.helpers import drones
 from tests.helpers.paths import ROOT
 

@@ -7,8 +7,8 @@ import pytest
 
 from fieldkit.core.crosschecks import CheckOutcome
 from fieldkit.core.model import FaultKind
-from fieldkit.measure.motion import drive_log, fly_log
 from fieldkit.measure.transfers import recoveries, stalls
+from fieldkit.motion.logs import drive_log, fly_log
 from fieldkit.steps import base
 from fieldkit.trial import evidence_sources, store
 from fieldkit.trial.procedure import PlacedStep, load_procedure
