@@ -172,6 +172,14 @@ def test_imports_point_one_way(path: Path) -> None:
             assert own in {"__init__.py", "__main__.py"}, f"{path} is in no room"
 
 
+@pytest.mark.parametrize("folder", ["fieldkit", "sim_backends"])
+def test_only_entry_points_lead_to_motion(folder: str) -> None:
+    """`tests/e2e/test_motion_border.py` removes the package and runs tests of the harness."""
+    for path in modules(folder):
+        if not path.is_relative_to(ROOT / "fieldkit" / "motion"):
+            assert not any(name.startswith("fieldkit.motion") for name in imported(path)), path
+
+
 # A command that a package adds declares, shows and draws as fieldkit's own do (docs/add-a-command.md).
 COMMAND_SEAMS = (
     "fieldkit.cli.shared_arguments",

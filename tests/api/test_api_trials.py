@@ -88,6 +88,7 @@ def test_cells_can_be_grouped_by_source() -> None:
     assert sources == {str(path) for path in STORED}
 
 
+@pytest.mark.motion  # a stored trial has a step `move`
 @pytest.mark.parametrize("folder", STORED, ids=lambda path: path.name)
 def test_packets_count_as_the_trial_does(folder: Path) -> None:
     """The measures of a trial follow from its packets."""
@@ -204,6 +205,7 @@ def test_a_repeat_of_several_trials_needs_its_trial() -> None:
     assert f"{LOSSY.name}/udp-01" in caught.value.remedy
 
 
+@pytest.mark.motion
 def test_packets_without_unchanged_evidence_are_rejected(tmp_path: Path) -> None:
     shutil.copytree(LOSSY, trial := tmp_path / LOSSY.name)
     alone = shutil.copy(trial / store.TRIAL_CSV, tmp_path / "alone.csv")

@@ -39,6 +39,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         function.cache_clear()
 
 
+@pytest.mark.motion
 def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Install) -> None:
     install()
     assert list(step_types()) == [*BUILTIN, *MOTION]
@@ -48,6 +49,7 @@ def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Insta
         assert (step.__module__, step.__name__) == (f"fieldkit.steps.kinds.{kind}", f"{kind.capitalize()}Step")
 
 
+@pytest.mark.motion
 def test_kinds_of_packages_follow_by_name(install: Install) -> None:
     install(zoom="fieldkit.steps.kinds.ping:PingStep", load="fieldkit.steps.kinds.ping:PingStep")
     assert list(step_types()) == [*BUILTIN, "fly", "load", "mavlink", "move", "zoom"]
