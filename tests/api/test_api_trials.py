@@ -205,7 +205,6 @@ def test_a_repeat_of_several_trials_needs_its_trial() -> None:
     assert f"{LOSSY.name}/udp-01" in caught.value.remedy
 
 
-@pytest.mark.motion
 def test_packets_without_unchanged_evidence_are_rejected(tmp_path: Path) -> None:
     shutil.copytree(LOSSY, trial := tmp_path / LOSSY.name)
     alone = shutil.copy(trial / store.TRIAL_CSV, tmp_path / "alone.csv")

@@ -20,7 +20,7 @@ COPIED: Final = ("fieldkit", "sim_backends", "tests", "robots", "procedures", "p
 REMOVED: Final = ("fieldkit/motion", "tests/motion")
 HARNESS_TESTS: Final = (
     "tests/analysis/test_expectations.py",
-    "tests/api/test_api_trials.py",
+    "tests/campaign/test_campaign_plan.py",
     "tests/config/test_site_file.py",
     "tests/core/test_plugins.py",
     "tests/export/test_export_junit.py",
