@@ -52,23 +52,26 @@ def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) 
     return packages | {name.partition(".")[0] for name in names} & LIBRARIES
 
 
-LINES_OF_A_DRY_RUN = 25_000
-"""Maximum of lines of fieldkit that a trial of the paper's procedure imports before robots are opened."""
+MOST_LINES = {"--dry-run": 25_000, "--repeats 1 --record 1s --yes": 40_500}
+"""Maximum of own lines that a trial of the paper's procedure imports, by its options."""
 
 COUNT_LINES = """
 import sys
 from pathlib import Path
 from fieldkit.cli import main
-code = main(["trial", "los", "30ft", "--dry-run"])
+code = main(["trial", "los", "30ft", *sys.argv[1:]])
 own = {n: m.__file__ for n, m in sys.modules.items() if n.split(".")[0] in {"fieldkit", "sim_backends"}}
 print(sum(Path(path).read_text(encoding="utf-8").count("\\n") for path in own.values() if path), *own)
 sys.exit(code)
 """
 
 
-def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "options", ["--dry-run", pytest.param("--repeats 1 --record 1s --yes", marks=pytest.mark.emulated)]
+)
+def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, options: str) -> None:
     done = subprocess.run(
-        (sys.executable, "-c", COUNT_LINES),
+        (sys.executable, "-c", COUNT_LINES, *options.split()),
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
         stdout=subprocess.PIPE,
@@ -79,7 +82,8 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path) -> 
     count, *names = done.stdout.splitlines()[-1].split()
     kinds = {name for name in names if name.startswith("fieldkit.steps.kinds.")}
     assert kinds == {f"fieldkit.steps.kinds.{kind}" for kind in ("capture", "ping", "record", "transfer")}
-    assert int(count) <= LINES_OF_A_DRY_RUN
+    assert not any(name.startswith("fieldkit.motion") for name in names)
+    assert int(count) <= MOST_LINES[options]
 
 
 @pytest.mark.parametrize("words", ["--version", "--help"])
