@@ -2,6 +2,7 @@
 
 import gc
 import signal
+import sys
 from collections.abc import Iterator
 from typing import Final
 
@@ -10,7 +11,6 @@ from hypothesis import HealthCheck, settings
 
 from fieldkit.bags import contents
 from fieldkit.measure.evidence import bag
-from fieldkit.measure.motion import tlog
 from fieldkit.measure.positions import recorded
 from tests.helpers.sshd import server
 
@@ -78,7 +78,8 @@ def _stop_readers() -> Iterator[None]:
     bag._READER.stop()
     contents._WORKER.stop()
     recorded._GPX_READER.stop()
-    tlog._READER.stop()
+    if tlog := sys.modules.get("fieldkit.motion.logs.tlog"):
+        tlog._READER.stop()
 
 
 # Objects created by collection live until the end of the run, so the garbage collector must not scan them.

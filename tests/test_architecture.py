@@ -52,12 +52,25 @@ MAY_IMPORT = {
         "steps",
         "trial",
     },
+    "motion": {
+        "agent",
+        "backends",
+        "cli",
+        "config",
+        "lab",
+        "measure",
+        "remote",
+        "ros",
+        "steps",
+        "trial",
+    },  # by entry points
     "pytest": {"analysis", "api", "backends", "cli", "measure", "remote", "trial"},
 }
 # Measurement and analysis must not depend on how the files of a lab are read.
 LEAVES = {
     package_name: {
         "core.model",
+        "core.plugins",
         "core.units",
         "core.errors",
         "core.columns",
@@ -101,7 +114,7 @@ ONE_IMPORTER = {
     "rich": "fieldkit/cli/display.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # Messages of the drone, and, in a separate process, reading its log.
-    "pymavlink": "fieldkit/measure/motion/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",
+    "pymavlink": "fieldkit/motion/logs/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",
     "lz4": "fieldkit/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",
@@ -158,6 +171,14 @@ def test_imports_point_one_way(path: Path) -> None:
             assert target in {"core"} | MAY_IMPORT[own_package], f"{path} imports {name}"
         else:
             assert own_package in {"__init__.py", "__main__.py"}, f"{path} is in no package"
+
+
+@pytest.mark.parametrize("folder", ["fieldkit", "sim_backends"])
+def test_only_entry_points_lead_to_motion(folder: str) -> None:
+    """`tests/e2e/test_motion_border.py` removes the package and runs tests of the harness."""
+    for path in modules(folder):
+        if not path.is_relative_to(ROOT / "fieldkit" / "motion"):
+            assert not any(name.startswith("fieldkit.motion") for name in imported(path)), path
 
 
 # Commands of other packages declare arguments, display and draw like fieldkit's commands (docs/add-a-command.md).

@@ -21,10 +21,15 @@ def add_all(commands: Commands) -> None:
         if name in commands.choices:
             continue  # a command of fieldkit
         packages = " and ".join(dict.fromkeys(target.partition(":")[0].partition(".")[0] for target in targets))
-        parser: Parser = commands.add_parser(name, help=f"of {packages}, see fieldkit {name} --help")
-        parser.set_defaults(outside=name)
-        parser.is_foreign = True
-        parser.declare = partial(_declare, name, targets)
+        add(commands, name, targets, f"of {packages}, see fieldkit {name} --help").is_foreign = True
+
+
+def add(commands: Commands, name: str, targets: Sequence[str], help_line: str) -> Parser:
+    """Add a parser for a command of entry points, and return it."""
+    parser: Parser = commands.add_parser(name, help=help_line)
+    parser.set_defaults(outside=name)
+    parser.declare = partial(_declare, name, targets)
+    return parser
 
 
 def load(name: str, target: str) -> Any:  # noqa: ANN401 (an object of any type)
@@ -54,9 +59,9 @@ def _declare(name: str, targets: Sequence[str], parser: Parser) -> None:
         raise ConfigurationError(
             f"several packages add a command {name!r}: {', '.join(targets)}", remedy="uninstall all but one"
         )
-    add: Callable[[Parser], None] = load(name, targets[0])
+    declare: Callable[[Parser], None] = load(name, targets[0])
     try:
-        add(parser)
+        declare(parser)
     except FieldkitError:
         raise
     except Exception as error:

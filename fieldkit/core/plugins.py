@@ -9,7 +9,12 @@ from fieldkit.core.errors import ConfigurationError
 BACKENDS: Final = "fieldkit.backends"
 """Entry point group of backends: `NAME = "package.module:Class"`, a `BackendFactory`."""
 STEPS: Final = "fieldkit.steps"
-"""Entry point group of step kinds outside fieldkit: `NAME = "package.module:Class"`, a `Step`."""
+"""Entry point group of step kinds: `NAME = "package.module:Class"`, a `Step`."""
+MOTION: Final = "fieldkit.motion"
+"""Entry point group of the package that moves robots: `control`; see `fieldkit.trial.running.motion_control`."""
+POSITIONS: Final = "fieldkit.positions"
+"""Entry point group of readers of positions: `SUFFIX = "package.module:function"`, without the dot; see
+`fieldkit.measure.positions.recorded`."""
 COMMANDS: Final = "fieldkit.commands"
 """Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.outside`."""
 

@@ -294,7 +294,7 @@ class Aborted:
         locked: Whether the robot was locked.
         jobs: A line per stopped or signalled job, as from `left`.
         landing: Programs that still land a drone, `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home, each with its
-            `motion.MotionState`.
+            `motion_states.MotionState`.
         error: The error if a part failed; None otherwise.
     """
 

@@ -4,9 +4,11 @@ from abc import ABC
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from importlib.metadata import EntryPoint
 from inspect import isabstract
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+
+from typing_extensions import override
 
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.config import schema
@@ -276,24 +278,57 @@ def _roles_in(value: object) -> Iterator[Role]:
             yield from _roles_in(item)
 
 
+class StepTypes(Mapping[str, type[Step]]):
+    """The class of every kind of step by name, built-in kinds first. A kind is imported when its class is looked up.
+
+    A look-up of a kind whose entry point cannot be loaded, or names an object that is not a complete subclass of
+    `Step`, raises a `ConfigurationError`.
+
+    Args:
+        points: The entry point of each kind.
+    """
+
+    def __init__(self, points: Mapping[str, EntryPoint]) -> None:
+        self._points = points
+        self._types: dict[str, type[Step]] = {}
+
+    @override
+    def __getitem__(self, kind: str) -> type[Step]:
+        if kind not in self._types:
+            self._types[kind] = _load(self._points[kind])
+        return self._types[kind]
+
+    @override
+    def __contains__(self, kind: object) -> bool:
+        return kind in self._points
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._points)
+
+    @override
+    def __len__(self) -> int:
+        return len(self._points)
+
+
+def _load(point: EntryPoint) -> type[Step]:
+    loaded, location, remedy = plugins.load(point), plugins.location(point), plugins.REMEDY
+    if not (isinstance(loaded, type) and issubclass(loaded, Step)):
+        raise ConfigurationError("a kind of step must be a subclass of Step", where=location, remedy=remedy)
+    if isabstract(loaded):
+        missing = ", ".join(sorted(loaded.__abstractmethods__))
+        raise ConfigurationError(f"the kind of step lacks {missing}", where=location, remedy=remedy)
+    return loaded
+
+
 @cache
-def step_types() -> Mapping[str, type[Step]]:
-    """Return the class of every kind of step by name, built-in kinds first.
+def step_types() -> StepTypes:
+    """Return the class of every kind of step by name.
 
     Raises:
-        ConfigurationError: As `kinds.load`, or an entry point names an object that is not a complete subclass of
-            `Step`.
+        ConfigurationError: As `kinds.find`.
     """
-    types: dict[str, type[Step]] = {}
-    for point, loaded in kinds.load():
-        location, remedy = plugins.location(point), plugins.REMEDY
-        if not (isinstance(loaded, type) and issubclass(loaded, Step)):
-            raise ConfigurationError("a kind of step must be a subclass of Step", where=location, remedy=remedy)
-        if isabstract(loaded):
-            missing = ", ".join(sorted(loaded.__abstractmethods__))
-            raise ConfigurationError(f"the kind of step lacks {missing}", where=location, remedy=remedy)
-        types[point.name] = loaded
-    return MappingProxyType(types)
+    return StepTypes(kinds.find())
 
 
 @dataclass(frozen=True)

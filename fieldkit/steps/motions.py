@@ -5,46 +5,35 @@ robot on the open control connection, while the main thread may be waiting for a
 """
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, NamedTuple
-
-if TYPE_CHECKING:
-    from fieldkit.remote.motion import Halted
-    from fieldkit.remote.shell import Shell
-
-STOPPED_BY: Final = "the-operator"
-"""Recorded on a robot as the originator of the stop."""
+from typing import Final, Protocol
 
 STOPPED: Final = "stopped by the operator"
 """Reason of a void repeat, and of the block of motions, after the order to stop."""
 
-_REPLY_S: Final = 3.0
-"""After this time without an answer a robot is reported as out of reach; a control connection answers in 0.1 s."""
-_POLL_S: Final = 0.5
-_LANDING_S: Final = 600.0
-"""Maximum wait for a landing, equal to that of the pilot (`fieldkit.agent.landing`)."""
 _SIGNAL_S: Final = 0.5
 
 Report = Callable[[str], None]
 """Shows a line to the operator, from any thread."""
 
 
-class Mover(NamedTuple):
-    """A robot that a program of fieldkit moves.
+class Mover(Protocol):
+    """A robot that a program of fieldkit moves."""
 
-    Attributes:
-        robot: Its name.
-        shell: Its control connection.
-        folder: The folder of the attempt on it.
-        fallback: Text on what the robot does if no order reaches it: "it stops automatically within 2 s".
-    """
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+        ...
 
-    robot: str
-    shell: "Shell"
-    folder: str
-    fallback: str
+    def stop(self, report: Report, abandoned: threading.Event) -> None:
+        """Stop the robot, and wait until it is stationary or on the ground; errors are reported, not raised.
+
+        Args:
+            report: Receives a line for each change of state of the robot.
+            abandoned: Set when the operator does not want to wait any longer.
+        """
+        ...
 
 
 class Motions:
@@ -105,7 +94,9 @@ class Motions:
         self._done.set()
 
     def _stop(self, movers: tuple[Mover, ...], report: Report) -> None:
-        threads = [threading.Thread(target=self._halt, args=(mover, report), daemon=True) for mover in movers]
+        threads = [
+            threading.Thread(target=mover.stop, args=(report, self._abandoned), daemon=True) for mover in movers
+        ]
         for thread in threads:
             thread.start()
         for line in self.stop_notes if movers else ():
@@ -115,31 +106,3 @@ class Motions:
         for thread in threads:
             thread.join()
         self._done.set()
-
-    def _halt(self, mover: Mover, report: Report) -> None:
-        """Stop one robot, and wait until it is stationary or on the ground."""
-        from fieldkit.core.deadline import Deadline  # noqa: PLC0415 (needed only if robots move)
-        from fieldkit.core.errors import FieldkitError  # noqa: PLC0415
-        from fieldkit.remote import motion  # noqa: PLC0415
-
-        start_s = time.monotonic()
-        try:
-            halted = motion.halt_attempt(mover.shell, mover.folder, STOPPED_BY, Deadline.after(_REPLY_S))
-            report(self._report_line(mover, halted, start_s))
-            while halted.state in motion.DESCENDING_STATES and time.monotonic() < start_s + _LANDING_S:
-                if self._abandoned.wait(_POLL_S):
-                    return
-                names = [name for name, _ in halted.programs]
-                halted = motion.poll_states(mover.shell, names, Deadline.after(_REPLY_S))
-                if halted.state not in motion.DESCENDING_STATES:
-                    report(self._report_line(mover, halted, start_s))
-        except FieldkitError as error:
-            report(f"no answer from {mover.robot}: {mover.fallback} ({error.what})")
-
-    @staticmethod
-    def _report_line(mover: Mover, halted: "Halted", start_s: float) -> str:
-        from fieldkit.remote import motion  # noqa: PLC0415
-
-        return (
-            f"{mover.robot}: {motion.STATE_TEXTS[halted.state]}, {time.monotonic() - start_s:.1f} s after the order"
-        )

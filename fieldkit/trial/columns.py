@@ -7,8 +7,7 @@ from typing import Final
 from fieldkit.core import columns
 from fieldkit.core.columns import Column, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.measure.evidence import lateness, link
-from fieldkit.steps import kinds
+from fieldkit.measure.evidence import lateness, link, recovery
 from fieldkit.steps.base import Step, step_types
 
 IDENTITY: Final = columns.columns(
@@ -47,6 +46,12 @@ OTHERS: Final = Column("others", "text", "Robots in further roles of the procedu
 ALWAYS: Final = (*lateness.COLUMNS, *link.COLUMNS)
 """Columns that are measured whatever the steps are."""
 
+_KINDS_WITH_COLUMNS: Final = ("capture", "transfer", "ping")
+"""Kinds of step whose columns are in every trial, in addition to `recovery.COLUMNS` of faults.
+
+Columns of all other kinds are only in trials with such steps, so that a trial imports no kind that it does not use.
+"""
+
 Row = Mapping[str, Value]
 """Values of one attempt by column; missing values have no entry."""
 
@@ -54,9 +59,8 @@ Row = Mapping[str, Value]
 @cache
 def measures() -> tuple[Column, ...]:
     """Return every column that evidence fills in every trial: those of the testbed and of fieldkit's step kinds."""
-    shipped = kinds.builtin()
-    of_kinds = (column for kind, step in step_types().items() if kind in shipped for column in step.columns)
-    filled = dict.fromkeys((*ALWAYS, *of_kinds))
+    of_kinds = (column for kind in _KINDS_WITH_COLUMNS for column in step_types()[kind].columns)
+    filled = dict.fromkeys((*ALWAYS, *of_kinds, *recovery.COLUMNS))
     return tuple(sorted(filled, key=lambda column: column.rank))
 
 

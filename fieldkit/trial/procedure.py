@@ -30,7 +30,7 @@ from fieldkit.core.model import (
 )
 from fieldkit.measure.evidence import host, link_samples
 from fieldkit.steps.base import Step, StepEntry
-from fieldkit.steps.kinds.move import PathLeg
+from fieldkit.steps.legs import PathLeg
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants

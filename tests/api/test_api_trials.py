@@ -88,6 +88,7 @@ def test_cells_can_be_grouped_by_source() -> None:
     assert sources == {str(path) for path in STORED}
 
 
+@pytest.mark.motion  # a stored trial has a step `move`
 @pytest.mark.parametrize("folder", STORED, ids=lambda path: path.name)
 def test_packets_count_as_the_trial_does(folder: Path) -> None:
     """The measures of a trial follow from its packets."""

@@ -85,6 +85,7 @@ KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xY
 SHORTER = "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 60 m away, at 2 m/s is beyond its limits"
 
 
+@pytest.mark.motion
 def test_reduced_values_are_reported_once_before_the_first_trial(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

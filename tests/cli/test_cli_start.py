@@ -52,6 +52,40 @@ def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) 
     return packages | {name.partition(".")[0] for name in names} & LIBRARIES
 
 
+MOST_LINES = {"--dry-run": 25_000, "--repeats 1 --record 1s --yes": 40_500}
+"""Maximum of own lines that a trial of the paper's procedure imports, by its options."""
+
+COUNT_LINES = """
+import sys
+from pathlib import Path
+from fieldkit.cli import main
+code = main(["trial", "los", "30ft", *sys.argv[1:]])
+own = {n: m.__file__ for n, m in sys.modules.items() if n.split(".")[0] in {"fieldkit", "sim_backends"}}
+print(sum(Path(path).read_text(encoding="utf-8").count("\\n") for path in own.values() if path), *own)
+sys.exit(code)
+"""
+
+
+@pytest.mark.parametrize(
+    "options", ["--dry-run", pytest.param("--repeats 1 --record 1s --yes", marks=pytest.mark.emulated)]
+)
+def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, options: str) -> None:
+    done = subprocess.run(
+        (sys.executable, "-c", COUNT_LINES, *options.split()),
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=LIMIT_S,
+        check=True,
+    )
+    count, *names = done.stdout.splitlines()[-1].split()
+    kinds = {name for name in names if name.startswith("fieldkit.steps.kinds.")}
+    assert kinds == {f"fieldkit.steps.kinds.{kind}" for kind in ("capture", "ping", "record", "transfer")}
+    assert not any(name.startswith("fieldkit.motion") for name in names)
+    assert int(count) <= MOST_LINES[options]
+
+
 @pytest.mark.parametrize("words", ["--version", "--help"])
 def test_the_list_of_commands_imports_no_library(tmp_path: Path, words: str) -> None:
     assert imported(tmp_path, words) == set()
@@ -126,7 +160,8 @@ def test_the_help_names_the_installed_backends() -> None:
 
 def test_every_command_has_its_module_and_run_function() -> None:
     top = parser()
-    for name in commands.COMMANDS:
+    own = commands.COMMANDS.keys() - commands.FROM_ENTRY_POINTS
+    for name in own:
         command = top.command(name)
         assert command is not None
         for leaf in map(command.command, command.subcommands()) if command.subcommands() else (command,):
@@ -134,7 +169,7 @@ def test_every_command_has_its_module_and_run_function() -> None:
             run = leaf.get_default("run") or command.get_default("run")  # `show` of a listing runs as its listing
             assert isfunction(run), leaf.prog
             assert run.__module__ == f"fieldkit.cli.commands.{name}"
-    assert modules(commands) == set(commands.COMMANDS)
+    assert modules(commands) == own
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ def test_every_shipped_profile_loads(name: str) -> None:
     assert load_profile(name).name == name
 
 
+@pytest.mark.motion
 @pytest.mark.parametrize("name", names("procedures"))
 def test_every_shipped_procedure_loads(name: str) -> None:
     assert load_procedure(name).name == name

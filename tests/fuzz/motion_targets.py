@@ -19,14 +19,14 @@ from fieldkit.core.model import Role
 from fieldkit.core.prompts import Question
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping, reception
-from fieldkit.measure.motion import drive_log
 from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions import accounts, recorded, where
 from fieldkit.measure.positions.accounts import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
+from fieldkit.motion.logs import drive_log
+from fieldkit.motion.steps.driving import DriveLease
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.driving import DriveLease
 from fieldkit.steps.kinds import ask
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check.report import Report
@@ -34,8 +34,8 @@ from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
 from tests.helpers.casts import CAST, los_plan
 from tests.measure.evidence.test_reception import ROS2, log, write
-from tests.measure.motion.test_drive_log import drive
 from tests.measure.positions.test_recorded import BEGAN_NS, S, fix, odometry, transform, written
+from tests.motion.logs.test_drive_log import drive
 
 _ENDS: Final = (Role.SENDER, Role.RECEIVER)
 _JOB: Final = Job(folder="f", name="drive", argv=(), limit_s=1.0, log="drive.log")

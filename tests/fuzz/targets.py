@@ -43,11 +43,10 @@ from fieldkit.measure.evidence import (
     track,
 )
 from fieldkit.measure.evidence.confined import ReaderError
-from fieldkit.measure.motion import tlog
-from fieldkit.measure.positions import recorded
 from fieldkit.measure.positions.accounts import Account
 from fieldkit.measure.transfers import topic_log, topics
 from fieldkit.measure.transfers.topics import TopicTraffic
+from fieldkit.motion.logs import tlog, tlog_positions
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.scene import CommandResult
@@ -330,7 +329,7 @@ def _measure_tlog(path: Path) -> None:
     for kind in (tlog.LOCAL, tlog.GLOBAL):
         for stamps in ("header", "received"):
             with suppress(EvidenceError):
-                recorded.read_tlog(path, Account(topic=kind, stamps=stamps))
+                tlog_positions.read_tlog(path, Account(topic=kind, stamps=stamps))
 
 
 def _measure_topic_log(path: Path) -> None:

@@ -42,6 +42,7 @@ def resolved_step(kind: str, keys: str, away: str = "2m") -> Any:  # noqa: ANN40
     return list(procedure(kind, keys, away).resolved(CAST).walk())[-1].step
 
 
+@pytest.mark.motion
 def test_each_kind_lasts_as_long_as_the_path() -> None:
     ping = resolved_step("ping", f"{ENDS}, along: true, interval: 300ms")
     assert isinstance(ping, PingStep)
@@ -59,6 +60,7 @@ def test_each_kind_lasts_as_long_as_the_path() -> None:
     assert resolved_step("ping", f"{ENDS}, count: 7").count == 7
 
 
+@pytest.mark.motion
 def test_driving_robot_needs_time_for_turns() -> None:
     text = TEXT.replace("AWAY", "1m}, {left: 1m").replace("KIND: {KEYS}", "wait: {along: true}")
     turning = schema.validate(schema.parse(text, source="x.yaml"), Procedure)
@@ -73,6 +75,7 @@ def test_driving_robot_needs_time_for_turns() -> None:
     assert driven.duration == pytest.approx(10.0 + math.pi / 2 + 2.0, abs=1.0)
 
 
+@pytest.mark.motion
 def test_resolved_procedure_is_read_again() -> None:
     for kind, keys in (("ping", ENDS), ("wait", ""), ("topics", ENDS), ("iperf3", ENDS)):
         written = procedure(kind, f"{keys}{', ' if keys else ''}along: true", "1.23m").resolved(CAST)
@@ -103,6 +106,7 @@ def test_along_without_move_is_refused() -> None:
     assert caught.value.where == "x.yaml:8"
 
 
+@pytest.mark.motion
 def test_innermost_move_determines_the_duration() -> None:
     text = TEXT.replace("capture: {robots: [sender], during: [{KIND: {KEYS}}]}", "move: INNER")
     ping = f"ping: {{{ENDS}, along: true}}"

@@ -9,13 +9,15 @@ from pydantic import TypeAdapter, ValidationError
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.steps import kinds
 from fieldkit.steps.base import StepEntry, step_types
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.trial.columns import installed
 from tests.helpers.outside_packages import write_package
 
-BUILTIN = ["record", "capture", "transfer", "ping", "fault", "move", "wait", "ask", "together"]
-BUILTIN += ["run", "iperf3", "soak", "send", "track", "topics", "mavlink", "fly"]
+BUILTIN = ["record", "capture", "transfer", "ping", "fault", "wait", "ask", "together"]
+BUILTIN += ["run", "iperf3", "soak", "send", "track", "topics"]
+MOTION = ["fly", "mavlink", "move"]
 
 Install = Callable[..., None]
 
@@ -37,16 +39,20 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         function.cache_clear()
 
 
+@pytest.mark.motion
 def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Install) -> None:
     install()
-    assert list(step_types()) == BUILTIN
-    for kind, step in step_types().items():
+    assert list(step_types()) == [*BUILTIN, *MOTION]
+    assert kinds.shipped() == {*BUILTIN, *MOTION}
+    for kind in BUILTIN:
+        step = step_types()[kind]
         assert (step.__module__, step.__name__) == (f"fieldkit.steps.kinds.{kind}", f"{kind.capitalize()}Step")
 
 
+@pytest.mark.motion
 def test_kinds_of_packages_follow_by_name(install: Install) -> None:
     install(zoom="fieldkit.steps.kinds.ping:PingStep", load="fieldkit.steps.kinds.ping:PingStep")
-    assert list(step_types()) == [*BUILTIN, "load", "zoom"]
+    assert list(step_types()) == [*BUILTIN, "fly", "load", "mavlink", "move", "zoom"]
     assert step_types()["load"] is PingStep
 
 
@@ -66,18 +72,28 @@ def test_error_of_entry_point_that_cannot_be_loaded_names_it(
     (tmp_path / "unmet.py").write_text("1 / 0", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     install(load=target)
+    assert "load" in step_types()
     with pytest.raises(ConfigurationError, match=message) as caught:
-        step_types()
+        step_types()["load"]
     assert caught.value.what.startswith("it cannot be loaded: ")
     assert caught.value.where == f"entry point load = {target}"
     assert caught.value.remedy == "fix or uninstall its package"
+
+
+def test_a_kind_is_imported_when_it_is_used(install: Install) -> None:
+    install(broken="no_such_package.steps:Broken")
+    ping = {"from": "sender", "to": "receiver"}
+    (entry,) = TypeAdapter(tuple[StepEntry, ...]).validate_python([{"ping": ping}])
+    assert type(entry.step) is PingStep
+    with pytest.raises(ConfigurationError, match="No module named 'no_such_package'"):
+        TypeAdapter(tuple[StepEntry, ...]).validate_python([{"broken": {}}])
 
 
 @pytest.mark.parametrize("target", ["os.path:join", "fieldkit.steps.base:View", "fieldkit.steps.kinds.ping"])
 def test_entry_point_without_step_class_is_refused(install: Install, target: str) -> None:
     install(load=target)
     with pytest.raises(ConfigurationError, match="a kind of step must be a subclass of Step") as caught:
-        step_types()
+        step_types()["load"]
     assert caught.value.where == f"entry point load = {target}"
 
 
@@ -91,7 +107,7 @@ def test_builtin_kind_cannot_be_replaced(install: Install) -> None:
 def test_abstract_class_is_refused(install: Install) -> None:
     install(load="fieldkit.steps.program:ProgramStep")
     with pytest.raises(ConfigurationError, match="the kind of step lacks argv, parse"):
-        step_types()
+        step_types()["load"]
 
 
 @pytest.mark.parametrize("name", ["rtt_sent", "status"])
@@ -105,7 +121,9 @@ def test_column_name_that_is_already_used_is_refused(
     )
     monkeypatch.syspath_prepend(tmp_path)
     install(load=f"declares_{name}:Load")
-    with pytest.raises(ConfigurationError, match=f"'load' declares a column '{name}', which is another's") as caught:
+    with pytest.raises(
+        ConfigurationError, match=f"'load' declares a column '{name}', which exists already"
+    ) as caught:
         installed()
     assert caught.value.remedy == "rename it there, or uninstall its package"
 

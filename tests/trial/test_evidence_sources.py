@@ -1,13 +1,13 @@
 """The table of sources: every column of a step has a row, every check names a source, and the page is up to date."""
 
 import os
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 from fieldkit.core.crosschecks import CheckOutcome
 from fieldkit.core.model import FaultKind
-from fieldkit.measure.motion import drive_log, fly_log
 from fieldkit.measure.transfers import recoveries, stalls
 from fieldkit.steps import base
 from fieldkit.trial import evidence_sources, store
@@ -46,10 +46,12 @@ def test_a_check_without_a_second_source_is_unchecked() -> None:
         assert check.tolerance, (kind, check.quantity)
 
 
+@pytest.mark.motion
 def test_no_row_names_an_unknown_column() -> None:
     columns = {column.name for step in placed() for column in step.step.output_columns()}
     columns |= {column.name for step in base.step_types().values() for column in step.columns}
-    columns |= {column.name for column in (*drive_log.COLUMNS, *fly_log.COLUMNS)}  # of self-moving robots
+    for name in ("drive_log", "fly_log"):
+        columns |= {column.name for column in import_module(f"fieldkit.motion.logs.{name}").COLUMNS}
     # Only a procedure with such a flow, or with a flow across such a fault, declares these.
     columns |= {column.name for flow in recoveries.FLOWS for column in stalls.declare_columns(flow, flow, 120)}
     across = (recoveries.declare_columns(flow, fault) for flow in recoveries.FLOWS for fault in FaultKind)
@@ -60,6 +62,7 @@ def test_no_row_names_an_unknown_column() -> None:
                 assert any(Path(name).match(pattern) for name in columns), (kind, pattern)
 
 
+@pytest.mark.motion
 def test_the_page_has_the_table() -> None:
     """To update it: `FIELDKIT_WRITE_DOCS=1`."""
     text = PAGE.read_text(encoding="utf-8")

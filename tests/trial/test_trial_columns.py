@@ -12,9 +12,10 @@ from fieldkit.config import schema
 from fieldkit.core import plugins
 from fieldkit.core.columns import Column, Figure, Kind, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.steps import kinds
 from fieldkit.steps.base import step_types
 from fieldkit.trial import frozen, rows, store, tables
-from fieldkit.trial.columns import IDENTITY, filled_by, installed, of_steps, trial_columns
+from fieldkit.trial.columns import IDENTITY, filled_by, installed, measures, of_steps, trial_columns
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.procedure import Procedure
 from tests.helpers import meter, varied
@@ -136,6 +137,11 @@ def test_a_column_that_cannot_be_read_or_shown_is_rejected(column: Column, flaw:
     problem = column.declaration_error()
     assert problem is not None
     assert flaw in problem
+
+
+def test_columns_of_every_trial_include_those_of_every_shipped_kind() -> None:
+    declared = {column for kind in kinds.shipped() for column in step_types()[kind].columns}
+    assert declared <= set(measures())
 
 
 # Steps.

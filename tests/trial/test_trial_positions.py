@@ -49,6 +49,7 @@ def means_m(trial: Path) -> list[str]:
     return [row["rtt_distance_mean_m"] for row in rows(trial) if row["status"] == "valid"]
 
 
+@pytest.mark.motion
 def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
     trial: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -74,6 +75,7 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
     assert {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
 
+@pytest.mark.motion
 @pytest.mark.parametrize(
     ("words", "code", "complaint"),
     [
@@ -106,6 +108,7 @@ def test_invalid_positions_are_rejected_and_change_nothing(
     assert {path: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
 
+@pytest.mark.motion
 def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     walk(trial)
     with journal.claimed(trial):
@@ -117,6 +120,7 @@ def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pyte
     assert not list(trial.glob("positions*"))
 
 
+@pytest.mark.motion
 @pytest.mark.parametrize("how", ["changed", "gone", "unsummed"])
 def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.CaptureFixture[str], how: str) -> None:
     walk(trial)

@@ -10,6 +10,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Final
 
+from fieldkit.cli import outside
 from fieldkit.cli.parser import Commands, Parser
 
 COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
@@ -42,10 +43,18 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
 )
 """In the order in which the help lists them."""
 
+FROM_ENTRY_POINTS: Final = frozenset({"stop"})
+"""Commands whose modules are found by entry points, as `fieldkit.cli.outside`; without these the help omits them."""
+
 
 def add_all(commands: Commands) -> None:
     """Add a parser for each command. Its arguments are declared at first use."""
+    installed = outside.names()
     for name, help_line in COMMANDS.items():
+        if name in FROM_ENTRY_POINTS:
+            if name in installed:
+                outside.add(commands, name, installed[name], help_line)
+            continue
         parser: Parser = commands.add_parser(name, help=help_line)
         parser.declare = partial(_declare, name)
 

@@ -39,7 +39,7 @@ _ENDS: Final = (
 def run(arguments: argparse.Namespace) -> int:
     """Abort, and print the terminated jobs robot by robot."""
     from fieldkit.cli import options
-    from fieldkit.remote.motion import STATE_TEXTS, MotionState
+    from fieldkit.remote.motion_states import STATE_TEXTS, MotionState
     from fieldkit.trial.running import locks
 
     with watching(as_json=False) as sink:

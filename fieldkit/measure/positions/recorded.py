@@ -1,12 +1,16 @@
 """Position samples of one robot from a bag, a telemetry log, a GPX file or a CSV file."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from fieldkit.core import plugins
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import bag, reading
 from fieldkit.measure.evidence.confined import ReaderError, SandboxedReader
@@ -23,7 +27,9 @@ from fieldkit.measure.positions.samples import (
 MOST_STALE_S: Final = 10.0
 """If stamps and reception times differ by more than this, the stamps are from another clock."""
 
-_TLOG: Final = ".tlog"
+PositionReader = Callable[[Path, Account], Samples]
+"""Returns the samples of a source in a file, with the errors of `read_bag`."""
+
 _GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
 
 
@@ -69,37 +75,15 @@ def read_topic(path: Path, account: Account) -> Samples:
     Raises:
         EvidenceError: The file cannot be read or has no positions.
     """
-    return read_tlog(path, account) if path.suffix == _TLOG else read_bag(path, account)
+    point = _readers().get(path.suffix)
+    reader: PositionReader = read_bag if point is None else plugins.load(point)
+    return reader(path, account)
 
 
-def read_tlog(path: Path, account: Account) -> Samples:
-    """Return the samples of a message type in a telemetry log. Times are the recorder's.
-
-    With `stamps` set to `header`, the differences between times are those of the autopilot's time since boot. The
-    message with the lowest delay aligns them with the recorder's clock, because a radio may delay other messages.
-
-    Raises:
-        EvidenceError: The log cannot be read, has no such message, or the autopilot restarted during the recording.
-    """
-    from fieldkit.measure.motion import tlog  # noqa: PLC0415 (its import takes 2 ms, and few attempts need it)
-
-    rows = tlog.positions(path, account.system, account.topic)
-    if not rows:
-        raise EvidenceError(
-            f"no {account.topic}", where=str(path), remedy="request it: set `rates` in the step mavlink"
-        )
-    received_ns = np.array([row[0] for row in rows], dtype=np.int64) * 1_000
-    times_ns = received_ns
-    if account.stamps == "header":
-        boot_ns = np.array([row[1] for row in rows], dtype=np.int64) * 1_000_000
-        if (np.diff(boot_ns) < -MOST_STALE_S * 1e9).any():
-            raise EvidenceError("the autopilot restarted", where=str(path), remedy="write times: received")
-        times_ns = boot_ns + (received_ns - boot_ns).min()
-    times_ns, first = np.unique(times_ns, return_index=True)
-    require_increasing([int(times_ns[0]), int(times_ns[-1])][: len(times_ns)], [str(path)] * 2)
-    values = np.array([row[2:] for row in rows], dtype=float)[first]
-    is_local = account.topic == tlog.LOCAL
-    return Samples(times_ns, values[:, :3], PLACED if is_local else WGS84, values[:, 3] if is_local else None)
+@cache
+def _readers() -> Mapping[str, EntryPoint]:
+    """Return the readers of files other than bags, by the suffix of the files."""
+    return {f".{point.name}": point for point in plugins.entry_points(plugins.POSITIONS)}
 
 
 def read_bag(path: Path, account: Account) -> Samples:

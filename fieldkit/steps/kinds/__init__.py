@@ -1,13 +1,14 @@
 """The kinds of step: the built-in ones, and those of entry points."""
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from importlib.metadata import EntryPoint
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
 
+_PACKAGE: Final = "fieldkit"
 _OWN: Final = MappingProxyType(
     {
         "record": "RecordStep",
@@ -15,7 +16,6 @@ _OWN: Final = MappingProxyType(
         "transfer": "TransferStep",
         "ping": "PingStep",
         "fault": "FaultStep",
-        "move": "MoveStep",
         "wait": "WaitStep",
         "ask": "AskStep",
         "together": "TogetherStep",
@@ -25,8 +25,6 @@ _OWN: Final = MappingProxyType(
         "send": "SendStep",
         "track": "TrackStep",
         "topics": "TopicsStep",
-        "mavlink": "MavlinkStep",
-        "fly": "FlyStep",
     }
 )
 """Class of each built-in kind, in the module of that name in this package; in the order of messages."""
@@ -37,20 +35,25 @@ def builtin() -> frozenset[str]:
     return frozenset(_OWN)
 
 
-def load() -> Iterator[tuple[EntryPoint, Any]]:
-    """Yield every kind of step as its entry point and its loaded object, built-in kinds first.
+def shipped() -> frozenset[str]:
+    """Return the names of the kinds that ship with fieldkit: the built-in ones, and its own entry points."""
+    points = plugins.entry_points(plugins.STEPS)
+    return builtin() | {point.name for point in points if point.dist is not None and point.dist.name == _PACKAGE}
+
+
+def find() -> Mapping[str, EntryPoint]:
+    """Return the entry point of every kind of step by name, built-in kinds first, without importing any of them.
 
     Raises:
-        ConfigurationError: An entry point cannot be loaded, or its name is already used.
+        ConfigurationError: The name of an entry point is already used.
     """
-    used_names = set()
-    builtin = [EntryPoint(kind, f"fieldkit.steps.kinds.{kind}:{name}", plugins.STEPS) for kind, name in _OWN.items()]
-    for point in (*builtin, *plugins.entry_points(plugins.STEPS)):
-        if point.name in used_names:
+    points = {kind: EntryPoint(kind, f"{__name__}.{kind}:{name}", plugins.STEPS) for kind, name in _OWN.items()}
+    for point in plugins.entry_points(plugins.STEPS):
+        if point.name in points:
             raise ConfigurationError(
                 f"there is already a kind of step {point.name!r}",
                 where=plugins.location(point),
                 remedy="uninstall it, or rename it",
             )
-        used_names.add(point.name)
-        yield point, plugins.load(point)
+        points[point.name] = point
+    return MappingProxyType(points)

@@ -18,7 +18,6 @@ from fieldkit.measure.positions.samples import PLACED
 from fieldkit.remote import jobs
 from fieldkit.steps import clocks
 from fieldkit.steps.base import Step
-from fieldkit.steps.kinds.move import MoveStep
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
@@ -108,7 +107,8 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
 
 def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, Account]:
     """Return the fixed positions of the robots that stay where they were placed while the steps inside run."""
-    moving = {step.robot for step in steps_inside(nest) if isinstance(step, MoveStep)}
+    leads = (step for step in steps_inside(nest) if isinstance(step, Nest) and step.leads)
+    moving = frozenset[Role]().union(*(step.moves() for step in leads))
     places_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moving}
     return {role: Account(place=places_m[role]) for role in nest.roles() if role in places_m}
 
@@ -123,7 +123,7 @@ def steps_inside(nest: Nest) -> Iterator[Step]:
 
 def placement_error(what: str, within: Sequence[Nest]) -> str | None:
     """Return why a step `what`, which records positions, must not be inside the steps `within`; None if it may."""
-    if any(isinstance(nest, MoveStep) for nest in within):
+    if any(nest.leads for nest in within):
         return f"a {what} starts where robots were placed: put the move into the {what}"
     if any(nest.disturbs or nest.parallel for nest in within):
         return f"a {what} must not be inside a fault or a together: put them into the {what}"

@@ -15,9 +15,8 @@ from fieldkit.config.schema import Duration, Field, Number, Strict
 from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.motion import motion_sources
 from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts, samples
+from fieldkit.measure.positions import accounts, position_sources, samples
 from fieldkit.measure.positions.accounts import Account, Accounts
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds import follow
@@ -123,7 +122,7 @@ class TrackStep(Nest):
         during: Steps that run meanwhile.
     """
 
-    cross_checks = motion_sources.OF_POSITIONS
+    cross_checks = position_sources.OF_POSITIONS
 
     robots: Annotated[dict[Role, TrackedRobot], Field(min_length=1)]
     heights: schema.Bool = False

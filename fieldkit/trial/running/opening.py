@@ -13,7 +13,7 @@ from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
 from fieldkit.trial import step_packages, store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import bridges, locks, motion_leave, preflight, runner
+from fieldkit.trial.running import bridges, locks, motion_control, preflight, runner
 from fieldkit.trial.running.locks import Holder
 from fieldkit.trial.running.resumption import demand_backend, demand_cast, resumable
 from fieldkit.trial.running.runner import Outcome
@@ -70,10 +70,10 @@ def run(
         The outcome of each trial; None for a trial that the operator skipped.
 
     Raises:
-        ConfigurationError: As for `motion_leave.demand_one_place`.
+        ConfigurationError: As for `motion_control.demand_one_place`.
         FieldkitError: As for `opened` and `runner.run_trial`; a note lists the trials that were not started.
     """
-    motion_leave.demand_one_place(plans, backend, operator)
+    motion_control.demand_one_place(plans, backend, operator)
     store.prepare(out)
     first = plans[0]
     ended: list[Outcome | None] = []

@@ -31,7 +31,7 @@ from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.owners import FileOwners
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import guards, locks, step_errors
+from fieldkit.trial.running import locks, motion_control, step_errors
 
 T = TypeVar("T")
 
@@ -118,7 +118,7 @@ class Robots:
             (scene.laptop_folder / lateness.FILE).write_text(lateness.text(before, after), encoding="ascii")
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
-        with self._watched(), guards.guarded(self._plan, scene, self.shells):
+        with self._watched(), motion_control.guarded(self._plan, scene, self.shells):
             for entry in self._plan.procedure.steps:
                 with step_errors.reported(entry.kind, scene.laptop_folder):
                     entry.step.run(scene, self._testbed, announce)

@@ -30,10 +30,9 @@ from fieldkit.core.units import TimeEstimate
 from fieldkit.trial import estimates, journal, manifest, rows, store
 from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import preflight
+from fieldkit.trial.running import motion_control, preflight
 from fieldkit.trial.running.attempts import Attempts
 from fieldkit.trial.running.ledger import Ledger
-from fieldkit.trial.running.motion_leave import MotionPermission
 from fieldkit.trial.running.resumption import resumable
 from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.stop import Stop
@@ -166,7 +165,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
         robots.end_left()
         sink(PhaseStarted("preflight"))
         variants = preflight.preflight(plan, robots.shells, folder, sink)
-        permission = MotionPermission(plan, testbed, folder)
+        permission = motion_control.permission(plan, testbed, folder)
         attempts = Attempts(
             plan,
             folder,

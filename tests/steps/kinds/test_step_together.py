@@ -353,7 +353,12 @@ def load(steps: str) -> Procedure:
             "ask may prompt the operator",
             4,
         ),
-        (MOVE_INSIDE, "move may prompt the operator, so no step may run at the same time", 6),
+        pytest.param(
+            MOVE_INSIDE,
+            "move may prompt the operator, so no step may run at the same time",
+            6,
+            marks=pytest.mark.motion,
+        ),
         (RECORDED_BESIDE, "sends a, but no recording of that name is made on sender before it", 4),
         (
             SWEEP.replace("VALUES", "[1, 2, 3, 4, 5, 6, 7, 8, 9]"),

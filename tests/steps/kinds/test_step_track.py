@@ -123,6 +123,7 @@ def test_stored_source_has_start_and_heading(role: Role, facing: str, heading_ra
     )
 
 
+@pytest.mark.motion
 def test_moving_robot_without_source_has_no_position_and_fixed_one_is_stored() -> None:
     sources = sources_of(track("{receiver: {at: {lat: 48.1, lon: 11}}}", MOVE))
     assert sources == {Role.RECEIVER: Account(place=(48.1, 11.0, None), frame=WGS84)}

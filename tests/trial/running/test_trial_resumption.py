@@ -45,6 +45,7 @@ def test_other_robots_are_rejected(change: dict[str, str] | None) -> None:
     assert caught.value.where == PLAN.trial
 
 
+@pytest.mark.motion
 def test_a_self_moving_robot_needs_permission_again() -> None:
     shipped = load_procedure("driveaway")
     driving = {role: robot.model_copy(update={"drives": True}) for role, robot in PLAN.cast.items()}

@@ -1,0 +1,116 @@
+"""Stop the programs of the agent that drive or fly robots, including those of other instances of fieldkit."""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import FieldkitError
+from fieldkit.core.threads import run_parallel
+from fieldkit.remote.motion_states import BY_SEVERITY, MotionState
+from fieldkit.remote.script import SCRIPT, SCRIPT_PATH, call, require_success, word
+from fieldkit.remote.shell import Shell
+
+_LINE: Final = re.compile(r"(?P<program>\S+/\.jobs/\S+) (?P<state>[a-z]+)")
+
+
+@dataclass(frozen=True)
+class Halted:
+    """Result of `halt` on a robot.
+
+    Attributes:
+        programs: State of each program that was stopped, by `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home.
+        error: The error if the robot was not reached or its lock could not be written; None otherwise.
+    """
+
+    programs: tuple[tuple[str, MotionState], ...] = ()
+    error: FieldkitError | None = None
+
+    @property
+    def state(self) -> MotionState:
+        """State of the robot: the worst state of its programs."""
+        states = (state for _, state in self.programs)
+        return max(states, key=BY_SEVERITY.index, default=MotionState.NOTHING)
+
+
+def halt(shell: Shell, who: str, deadline: Deadline) -> Halted:
+    """Stop all programs that move a robot, from any trial, and the trial that has locked the robot.
+
+    The script is not installed for it, as for `jobs.abort`: a full disk must not prevent a stop.
+
+    Args:
+        shell: The robot.
+        who: Name of the operator, which is reported to the stopped trial.
+        deadline: When to give up.
+
+    Raises:
+        LinkError: The robot did not answer.
+    """
+    argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "halt_motion", word(who))
+    done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
+    error = None
+    try:
+        require_success(shell, done)
+    except FieldkitError as script_error:
+        error = script_error
+    return Halted(_states(done.stdout), error)
+
+
+def halt_attempt(shell: Shell, folder: str, who: str, deadline: Deadline) -> Halted:
+    """Stop all programs that move a robot for the attempt with this folder; the job script must be installed.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: The script failed.
+    """
+    return Halted(_states(call(shell, "halt_motion", word(who), folder, deadline=deadline)))
+
+
+def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Halted:
+    """Return the present state of programs from `halt_attempt`; raises as that."""
+    return Halted(_states(call(shell, "motion_states", *programs, deadline=deadline)))
+
+
+def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
+    """Return the liveness file of the pilot and the guard of a drone, then /proc/uptime; raises as `halt_attempt`."""
+    return call(shell, "life_signs", file, deadline=deadline)
+
+
+def halt_all(
+    robots: Mapping[str, Shell | FieldkitError],
+    who: str,
+    within_s: float,
+    report: Callable[[str, Halted], None] = lambda _name, _halted: None,
+) -> Mapping[str, Halted]:
+    """Stop all programs that move robots, on all robots in parallel; return the result of each.
+
+    Args:
+        robots: The robots, from `Backend.standing`.
+        who: Name of the operator, see `halt`.
+        within_s: Timeout for each robot.
+        report: Called with each result as soon as it exists, in any thread.
+    """
+
+    def stop(name: str) -> Halted:
+        robot = robots[name]
+        try:
+            halted = (
+                Halted(error=robot)
+                if isinstance(robot, FieldkitError)
+                else halt(robot, who, Deadline.after(within_s))
+            )
+        except FieldkitError as error:
+            halted = Halted(error=error)
+        report(name, halted)
+        return halted
+
+    return dict(zip(robots, run_parallel(stop, list(robots)), strict=True))
+
+
+def _states(output: bytes) -> tuple[tuple[str, MotionState], ...]:
+    matches = map(_LINE.fullmatch, output.decode("utf-8", "replace").splitlines())
+    valid_states = set(MotionState)
+    return tuple(
+        (line["program"], MotionState(line["state"])) for line in matches if line and line["state"] in valid_states
+    )

@@ -1,0 +1,165 @@
+"""Log of an autonomous drive of a ground robot, and its columns.
+
+The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.drive`): time, pose by its
+odometry in the frame of the start, and driven distance. The last line has the reason of the end. All values are
+measured by the robot itself.
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.text import shorten
+from fieldkit.motion.logs import motion_log
+from fieldkit.motion.logs.motion_log import LAST_NS, LONGEST_M, LONGEST_S
+
+FILE: Final = "drive.jsonl"
+
+HOME: Final = "home"
+"""End of a drive that returned to its start without being stopped."""
+
+COLUMNS: Final = columns(
+    100,
+    (
+        "drive_out_m",
+        "m",
+        "Distance driven until it turned back, by its odometry; so are all following columns.",
+        Figure("distance driven", Kind.MEDIAN),
+    ),
+    ("drive_farthest_m", "m", "Largest distance from its starting position."),
+    (
+        "drive_speed_median_m_s",
+        "m/s",
+        "Median of its speeds on the outward path, each over half a second; empty for a shorter path.",
+        Figure("drive speed", Kind.MEDIAN),
+    ),
+    ("drive_speed_max_m_s", "m/s", "Largest of these speeds, outward and return path."),
+    (
+        "drive_back_off_m",
+        "m",
+        "Distance from its starting position after its return; empty if it did not return.",
+        Figure("position error", Kind.MEDIAN),
+    ),
+    (
+        "drive_back_turned_rad",
+        "rad",
+        "Heading after its return relative to the start, positive to the left.",
+        (-math.pi, math.pi),
+    ),
+    (
+        "drive_ended",
+        "text",
+        "End of the drive: home, or the reason for a stop on its path. Empty if the log is incomplete.",
+    ),
+)
+"""Columns of trials with self-driving robots."""
+
+_OUT: Final = frozenset({"out", "there"})
+_PHASES: Final = frozenset({"waits", "back", HOME}) | _OUT
+_SPEED_INTERVAL_S: Final = 0.5
+"""Interval of speeds: one odometry message more or less changes a speed by 3 % at 50 Hz and by 7 % at 30 Hz."""
+_ROUNDING: Final = 1e-4
+
+
+@dataclass(frozen=True)
+class DriveMoment:
+    """A line of the log.
+
+    Attributes:
+        at_s: Time since the start of the program.
+        phase: Phase of the drive: `waits`, `out`, `there`, `back` or `home`.
+        x_m: Position ahead of the start.
+        y_m: Position to the left of the start.
+        yaw_rad: Heading relative to the start, positive to the left.
+        driven_m: Driven distance since the start.
+        forward_m_s: Commanded speed; 0 while the robot stands or turns.
+        ended: Reason of the end; empty before the end.
+        utc_ns: Time by the robot's clock, nanoseconds since 1970 UTC; 0 if the line does not have it.
+    """
+
+    at_s: float
+    phase: str
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    driven_m: float
+    forward_m_s: float
+    ended: str = ""
+    utc_ns: int = 0
+
+    @property
+    def off_m(self) -> float:
+        """Distance from the start."""
+        return math.hypot(self.x_m, self.y_m)
+
+
+def read(path: Path) -> tuple[DriveMoment, ...]:
+    """Return the lines of a log in the order of time; an incomplete last line is omitted.
+
+    Raises:
+        EvidenceError: The log is missing, empty, or has an invalid line.
+    """
+    log = motion_log.read(path, _parse_moment, "drive")
+    if any(after.driven_m < before.driven_m for before, after in pairwise(log)):
+        raise EvidenceError("its lines are not in the order of time", where=str(path))
+    return log
+
+
+def _parse_moment(fields: Mapping[str, Any]) -> DriveMoment:
+    """Convert the JSON object of a line; raises one of `JSON_ERRORS` if it is invalid."""
+    at_s, driven_m, forward_m_s = (float(fields[name]) for name in ("at_s", "driven_m", "forward_m_s"))
+    x_m, y_m, yaw_rad = (float(fields[name]) for name in ("x_m", "y_m", "yaw_rad"))
+    phase, ended, utc_ns = fields["phase"], fields["ended"], int(fields.get("utc_ns", 0))
+    is_possible = (
+        0 <= at_s <= LONGEST_S
+        and 0 <= driven_m <= LONGEST_M
+        and math.hypot(x_m, y_m) <= LONGEST_M
+        and math.isfinite(forward_m_s)
+        and abs(yaw_rad) <= math.pi + _ROUNDING
+        and phase in _PHASES
+        and isinstance(ended, str)
+        and 0 <= utc_ns < LAST_NS
+    )
+    if not is_possible:
+        raise ValueError(fields)
+    yaw_rad = max(-math.pi, min(yaw_rad, math.pi))
+    return DriveMoment(at_s, phase, x_m, y_m, yaw_rad, driven_m, forward_m_s, shorten(ended), utc_ns)
+
+
+def measure(log: Sequence[DriveMoment] | None) -> Measured:
+    """Return the columns; all are missing if there is no log."""
+    if not log:
+        return Measured.all_missing(COLUMNS, "the robot wrote no log of its drive")
+    out = [record for record in log if record.phase in _OUT]
+    home = log[-1] if log[-1].ended == HOME else None
+    out_m_s = speeds_m_s([record for record in out if record.phase == "out"])
+    all_speeds_m_s = (*out_m_s, *speeds_m_s([record for record in log if record.phase == "back"]))
+    values: dict[str, Value | None] = {
+        "drive_out_m": out[-1].driven_m if out else None,
+        "drive_farthest_m": max(record.off_m for record in log),
+        "drive_speed_median_m_s": float(np.median(out_m_s)) if out_m_s else None,
+        "drive_speed_max_m_s": max(all_speeds_m_s, default=None),
+        "drive_back_off_m": None if home is None else home.off_m,
+        "drive_back_turned_rad": None if home is None else home.yaw_rad,
+        "drive_ended": log[-1].ended or None,
+    }
+    return Measured.from_optional(values, "the log ends before that")
+
+
+def speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:
+    """Return the speeds over half a second in m/s, one per line if the robot was commanded to move at both ends."""
+    times_s = [record.at_s for record in log]
+    pairs = ((record, bisect_left(times_s, record.at_s + _SPEED_INTERVAL_S)) for record in log if record.forward_m_s)
+    return [
+        (log[later].driven_m - record.driven_m) / (log[later].at_s - record.at_s)
+        for record, later in pairs
+        if later < len(log) and log[later].forward_m_s
+    ]

@@ -1,0 +1,39 @@
+"""Position samples of one robot from a telemetry log: the entry point `tlog` of `fieldkit.positions`."""
+
+from pathlib import Path
+
+import numpy as np
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.positions.accounts import Account
+from fieldkit.measure.positions.recorded import MOST_STALE_S
+from fieldkit.measure.positions.samples import PLACED, WGS84, Samples, require_increasing
+from fieldkit.motion.logs import tlog
+
+
+def read_tlog(path: Path, account: Account) -> Samples:
+    """Return the samples of a message type in a telemetry log. Times are the recorder's.
+
+    With `stamps` set to `header`, the differences between times are those of the autopilot's time since boot. The
+    message with the lowest delay aligns them with the recorder's clock, because a radio may delay other messages.
+
+    Raises:
+        EvidenceError: The log cannot be read, has no such message, or the autopilot restarted during the recording.
+    """
+    rows = tlog.positions(path, account.system, account.topic)
+    if not rows:
+        raise EvidenceError(
+            f"no {account.topic}", where=str(path), remedy="request it: set `rates` in the step mavlink"
+        )
+    received_ns = np.array([row[0] for row in rows], dtype=np.int64) * 1_000
+    times_ns = received_ns
+    if account.stamps == "header":
+        boot_ns = np.array([row[1] for row in rows], dtype=np.int64) * 1_000_000
+        if (np.diff(boot_ns) < -MOST_STALE_S * 1e9).any():
+            raise EvidenceError("the autopilot restarted", where=str(path), remedy="write times: received")
+        times_ns = boot_ns + (received_ns - boot_ns).min()
+    times_ns, first = np.unique(times_ns, return_index=True)
+    require_increasing([int(times_ns[0]), int(times_ns[-1])][: len(times_ns)], [str(path)] * 2)
+    values = np.array([row[2:] for row in rows], dtype=float)[first]
+    is_local = account.topic == tlog.LOCAL
+    return Samples(times_ns, values[:, :3], PLACED if is_local else WGS84, values[:, 3] if is_local else None)

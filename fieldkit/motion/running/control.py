@@ -1,0 +1,18 @@
+"""The control of robots that move by themselves, as the harness calls it: the entry point of `fieldkit.motion`."""
+
+from typing import Final
+
+from fieldkit.motion.running.guards import guarded
+from fieldkit.motion.running.permission import MotionPermission, demand_one_place
+from fieldkit.trial.running.motion_control import Control
+
+
+class MotionControl:
+    """Implementation of `fieldkit.trial.running.motion_control.Control`."""
+
+    demand_one_place = staticmethod(demand_one_place)
+    permission = MotionPermission
+    guarded = staticmethod(guarded)
+
+
+CONTROL: Final[Control] = MotionControl()

@@ -1,0 +1,31 @@
+"""Guards of drones that other programs fly: each lands its drone if the attempt is aborted (`on_abort`).
+
+A guard runs on the drone's computer while the steps run, and exits without an action when they are done. It lands the
+drone or lets it return if the attempt's jobs are ended (Ctrl-C, an error, `fieldkit abort`), or if the laptop was not
+heard for `piloting.LEASE_S`; but not while a person or a failsafe controls the drone (`fieldkit.agent.flying.guard`).
+A step `fly` has a separate guard.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+from fieldkit.core.model import sort_roles
+from fieldkit.motion.steps import piloting
+from fieldkit.steps.scene import Scene, Shells
+from fieldkit.trial.plan import Plan
+
+
+@contextmanager
+def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
+    """Guard every drone of `on_abort` that no step flies while the body runs.
+
+    Raises:
+        LinkError: A robot did not answer.
+        RobotError: A guard did not start, for example because the autopilot does not answer.
+    """
+    with ExitStack() as stack:
+        for role in sort_roles(set(plan.procedure.on_abort) - plan.procedure.moved()):
+            job = piloting.guard(scene, role, f"{role}-guard")
+            body_s = plan.procedure.expected_s(scene.protocol)
+            stack.enter_context(piloting.guarding(scene, shells[role], job, body_s=body_s))
+        yield

@@ -1,0 +1,126 @@
+"""Confirmations by a person before robots move: that they are at their places, and may move again after a fault."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+from fieldkit.backends.protocols import Attended, Backend, Testbed, Transient
+from fieldkit.core.errors import ConfigurationError, MotionHeldError
+from fieldkit.core.events import Note, Sink
+from fieldkit.core.model import Role
+from fieldkit.core.prompts import Operator, Question, Unattended
+from fieldkit.motion.running import motion_journal
+from fieldkit.motion.running.motion_journal import KeptOrigins, MotionJournal
+from fieldkit.steps.origins import MemoryOrigins, Origins
+from fieldkit.trial.plan import Plan
+
+CONFIRM: Final = "confirm"
+_STOP: Final = "stop"
+
+
+def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
+    """Check that self-moving robots stay at one place in all trials, or that a person moves them.
+
+    Raises:
+        ConfigurationError: A robot must be at another place in a later trial, and with `--yes` no person moves it.
+    """
+    if not backend.by_hand or not isinstance(operator, Unattended):
+        return
+    for earlier, later in pairwise(plans):
+        for role in _self_moving(later):
+            if motion_journal.place_of(role, earlier.placement) != motion_journal.place_of(role, later.placement):
+                raise ConfigurationError(
+                    f"{later.cast[role].name} moves without a person and must be at another place for "
+                    f"{later.distance}, and with --yes no person moves it there",
+                    remedy="run it without --yes, or one distance per command",
+                )
+
+
+def _self_moving(plan: Plan) -> tuple[Role, ...]:
+    moved = plan.procedure.moved()
+    return tuple(role for role, robot in plan.cast.items() if role in moved and (robot.drives or robot.flies))
+
+
+class MotionPermission:
+    """Permission of the robots of a trial to move.
+
+    Args:
+        plan: The trial.
+        testbed: Its robots. In a transient testbed they are back at their places after each motion.
+        folder: Its folder.
+
+    Attributes:
+        origins: Origins of its robots, for the steps.
+
+    Raises:
+        EvidenceError: The journal of motions is damaged.
+    """
+
+    def __init__(self, plan: Plan, testbed: Testbed, folder: Path) -> None:
+        self.origins: Origins
+        self._moving = {role: plan.cast[role].name for role in _self_moving(plan)}
+        self._testbed = testbed
+        self._kept: KeptOrigins | None = None
+        if isinstance(testbed, Transient):
+            self.origins = MemoryOrigins()
+            return
+        self._journal = MotionJournal(motion_journal.journal_of(folder))
+        allowed = isinstance(testbed, Attended) and testbed.allow_motion_after_fault
+        robots = {role: robot.name for role, robot in plan.cast.items()}
+        self.origins = self._kept = KeptOrigins(self._journal, folder, robots, plan.placement, may_return=allowed)
+
+    def demand(self) -> None:
+        """Check that robots may move in the next attempt. After a fault, a person must type `confirm`.
+
+        Raises:
+            ConfigurationError: As for `Operator.enter`.
+            MotionHeldError: No person has confirmed.
+            OSError: The disk is full or was removed.
+        """
+        if self._kept is None or not self._moving:
+            return
+        self._demand_placed(self._kept)
+        if self._journal.holds:
+            self._demand_confirmed(self._kept)
+
+    @contextmanager
+    def noting(self, sink: Sink) -> Iterator[None]:
+        """Run the body; if the operator stops it, note each robot that may not move again without a confirmation."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            for hold in self._journal.holds if self._kept is not None else ():
+                place = f"before {hold.robot} moves again, a person must put it at its place and type {CONFIRM}"
+                sink(Note(f"{hold.reason}: {place}"))
+            raise
+
+    def _demand_placed(self, kept: KeptOrigins) -> None:
+        """Raise an error if a robot must be at a new place but no person was asked: its origin would be wrong."""
+        testbed = self._testbed
+        if isinstance(testbed, Attended) and not isinstance(testbed.operator, Unattended):
+            return  # a person was asked to move it there
+        for role, name in self._moving.items():
+            if kept.is_new_place(role):
+                raise MotionHeldError(
+                    f"{name} must be at another place than before, and --yes does not confirm that it is there",
+                    remedy="put it at its place for this trial, clear its path, then repeat this without --yes",
+                )
+
+    def _demand_confirmed(self, kept: KeptOrigins) -> None:
+        testbed = self._testbed
+        if isinstance(testbed, Attended):
+            if testbed.allow_motion_after_fault:
+                self._journal.confirm("--allow-motion-after-fault", at_place=False)
+                return
+            stopped = "; ".join(f"{hold.robot}: {hold.reason}" for hold in self._journal.holds)
+            names = " and ".join(hold.robot for hold in self._journal.holds)
+            text = (
+                f"a fault stopped a robot ({stopped}); put {names} at its place, with the initial heading, its path "
+                f"free; type {CONFIRM} to let robots move again"
+            )
+            if testbed.operator.enter(Question(text, choices=(CONFIRM, _STOP), usual=_STOP)) == CONFIRM:
+                self._journal.confirm("a person confirmed", at_place=True)
+                return
+        kept.demand()

@@ -1,0 +1,408 @@
+"""Drive a robot by its velocity topic while other steps run: its agent steers, this laptop renews the lease."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from types import MappingProxyType
+from typing import Any, Final
+
+from typing_extensions import override
+
+from fieldkit.agent import drive_plan
+from fieldkit.agent.drive_plan import DriveTask
+from fieldkit.backends.driven import topic_conflict
+from fieldkit.backends.protocols import Robot, Testbed
+from fieldkit.config.profiles import Drive
+from fieldkit.core import geometry
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError
+from fieldkit.core.model import MotionOrigin, Move
+from fieldkit.core.text import JSON_ERRORS, shorten
+from fieldkit.motion.logs import drive_log
+from fieldkit.motion.steps import lease
+from fieldkit.motion.steps.lease import LeaseKeeper, orders_file
+from fieldkit.motion.steps.robot_mover import RobotMover
+from fieldkit.remote import agent, jobs
+from fieldkit.remote.command import with_environment
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+from fieldkit.steps import streams
+from fieldkit.steps.middlewares import MiddlewareName
+from fieldkit.steps.origins import RobotMotion
+from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
+
+ODOMETRY_S: Final = 0.5
+"""The robot stops if it receives no odometry for this time."""
+
+_TURN_S: Final = 12.0
+"""Maximum duration of a turn at a corner: half a turn at 0.3 rad/s."""
+_SLACK_S: Final = 20.0
+_START_S: Final = 40.0
+"""Time for the start of Python, the middleware and both topics."""
+_RENEWALS: Final = 5
+"""Renewals per lease."""
+_GRACE_S: Final = 3.0
+_SILENT_S: Final = 10.0
+
+_ZENOH_PORT: Final = 7447
+"""Default port of Zenoh, on which the router of rmw_zenoh listens."""
+
+_TOPIC_KEYS: Final = MappingProxyType(
+    {
+        MiddlewareName.ROS1: ("md5", "definition"),
+        MiddlewareName.DDS: ("members", "dds_topic", "dds_types", "user_data"),
+        MiddlewareName.ZENOH: ("key", "tokens"),
+    }
+)
+"""Keys of a topic description that each middleware needs; others are omitted to keep command lines readable."""
+
+_STATUS: Final = "drive.status"
+_TEXT: Final = "drive.log"
+
+
+def middleware_of(robot: Robot) -> MiddlewareName:
+    """Return the middleware through which a robot's base receives velocities."""
+    ros = robot.profile.ros
+    if ros is None or ros.variant == "ros1":
+        return MiddlewareName.ROS1
+    return MiddlewareName(ros.middleware)
+
+
+def limit_s(move: Move) -> float:
+    """Return the maximum duration of the path of a move in one direction, in seconds; then the robot stops."""
+    return 2 * geometry.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
+
+
+def path_duration_s(robot: Robot, move: Move) -> float:
+    """Return the duration of the path of a move in one direction with its turns, in seconds, to the millisecond."""
+    return round(drive_plan.path_duration_s(DriveTask.from_json(_task(robot, move))), 3)
+
+
+def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
+    """Return the job that drives a robot.
+
+    Args:
+        scene: The attempt.
+        move: Path and speed.
+        inside_s: Maximum duration of the steps inside.
+        name: Pattern of the names of the step's jobs and files, from `Step.own_name`; `{}` is replaced.
+    """
+    robot = scene.robot(move.role)
+    argv = (
+        robot.profile.tools.python,
+        agent.path_from_job(),
+        "drive",
+        _driver_arguments(scene, move, name),
+        name.format(drive_log.FILE),
+    )
+    setup = streams.setup(robot)
+    job = Job(
+        folder=scene.folder,
+        name=name.format("drive"),
+        argv=with_environment(argv, setup=setup, environment=robot.ros_environment),
+        limit_s=_START_S + 2 * limit_s(move) + inside_s,
+        log=name.format(_TEXT),
+        ready="log:up,",
+    )
+    program = robot.profile.tools.python
+    return Planned(move.role, job, program=program, setup=setup, permitted_causes=BY_ITSELF | BY_FIELDKIT)
+
+
+def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
+    """Yield the reasons why a robot must not drive automatically."""
+    robot = scene.robot(move.role)
+    limits = robot.profile.limits
+    farthest_m = geometry.farthest_m(move.legs)
+    if limits.fence_m is not None and farthest_m > limits.fence_m:
+        yield Refusal(
+            move.role,
+            f"its fence is {limits.fence_m:g} m from its place, but its path leads {farthest_m:g} m away",
+            "shorten the path in the procedure, or increase limits.fence_m in its profile if the area allows it",
+        )
+    if why := topic_conflict(robot, scene.cast.values()):
+        remedy = "give each robot its own topics, ROS domain or master; or move it by hand: without --allow-motion"
+        yield Refusal(move.role, why, remedy)
+
+
+def files(name: str) -> tuple[str, ...]:
+    """Return the files that a drive writes; see `planned` for `name`."""
+    return tuple(name.format(file) for file in (drive_log.FILE, orders_file("drive"), _STATUS, _TEXT))
+
+
+def _drive(robot: Robot) -> Drive:
+    """Return the section `drive` of a robot's profile.
+
+    Raises:
+        RobotError: The profile has no such section.
+    """
+    if robot.profile.drive is None:
+        raise RobotError(
+            "it cannot be driven", where=robot.name, remedy="add drive: and limits.fence_m to its profile"
+        )
+    return robot.profile.drive
+
+
+def _origin(scene: Scene, move: Move) -> dict[str, Any]:
+    """Return the keys of a drive task that depend on the origin of the robot in this trial."""
+    origin, last = scene.origins.get(move.role), scene.origins.last(move.role)
+    if origin is None or not scene.origins.robots_stay:
+        return {}
+    places = {"origin": (origin.x_m, origin.y_m, origin.heading_rad)}
+    if last is not None:
+        places["last"] = (last.x_m, last.y_m, last.heading_rad)
+    return {**places, "frame_id": origin.frame_id, "may_return": scene.origins.may_return}
+
+
+def _task(robot: Robot, move: Move) -> dict[str, Any]:
+    """Return the fields of a `fieldkit.agent.drive_plan.DriveTask`."""
+    drive = _drive(robot)
+    return {
+        "legs": [(leg.away_m, leg.left_m) for leg in move.legs],
+        "speed_m_s": move.speed_m_s,
+        "turn_rad_s": drive.turn_rad_s,
+        "acceleration_m_s2": drive.acceleration_m_s2,
+        "fence_m": robot.profile.limits.fence_m,  # required in a profile with `drive`
+        "lease_s": drive.lease,
+        "odometry_s": ODOMETRY_S,
+        "limit_s": limit_s(move),
+    }
+
+
+def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
+    """Return the argument of the driver program, as JSON."""
+    from fieldkit.ros import topics, types  # noqa: PLC0415 (takes 50 ms and is needed only here)
+    from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
+
+    robot = scene.robot(move.role)
+    drive = _drive(robot)
+    middleware, ros = middleware_of(robot), robot.profile.ros
+    message_types = types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.shipped()
+    network = _network(robot, middleware) | {"gid_bytes": message_types.distribution.gid_bytes}
+
+    def topic(topic_name: str, kind: str, profile: str, number: int) -> dict[str, Any]:
+        described = topics.describe(
+            message_types,
+            topic_name,
+            kind,
+            PROFILES[profile],
+            domain=network["domain"],
+            node=network["node"],
+            number=number,
+        )
+        return {key: described[key] for key in ("name", "type", "quality", *_TOPIC_KEYS[middleware])}
+
+    arguments = {
+        "over": middleware.value,
+        "network": network,
+        "cdr": middleware is not MiddlewareName.ROS1,
+        "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default", 1),
+        "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
+        "task": {**_task(robot, move), **_origin(scene, move)},
+        "orders": orders_file(name.format("drive")),
+        "status": name.format(_STATUS),
+        "stationary": jobs.stationary_file(name.format("drive")),
+    }
+    return streams.compact(arguments)
+
+
+def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
+    """Return the settings with which the driver discovers the nodes of its robot without multicast."""
+    network = {
+        "address": robot.address,
+        "domain": robot.profile.ros.domain if robot.profile.ros else 0,
+        "node": f"fieldkit_drive_{robot.name}".replace("-", "_"),
+    }
+    if middleware is not MiddlewareName.ZENOH:
+        return network | {"peers": [robot.address]}
+    # The router of rmw_zenoh on the robot announces all sessions there. A session without a router may use its port.
+    endpoints = [f"tcp/{address}:{_ZENOH_PORT}" for address in ("127.0.0.1", robot.address)]
+    settings = {"connect/endpoints": streams.compact(endpoints), "listen/endpoints": f'["tcp/{robot.address}:0"]'}
+    return network | {"settings": settings}
+
+
+class DriveLease(LeaseKeeper):
+    """Keeps the lease of the program that drives a robot. The first order is to wait.
+
+    Args:
+        shell: Connection to the robot.
+        job: The running program.
+        name: See `planned`.
+        lease_s: The robot stops if the lease is not renewed for this time.
+    """
+
+    def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
+        super().__init__(
+            shell, job, output_file=name.format(_STATUS), order=drive_plan.WAIT, lease_s=lease_s, renewals=_RENEWALS
+        )
+
+    def turn_back(self) -> None:
+        """Order the robot back to its place.
+
+        If the order is lost, the next renewal repeats it; without renewals the robot stops.
+        """
+        with suppress(LinkError, RobotError):
+            self.give_order(drive_plan.BACK)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the robot is stationary at its start position."""
+        return self.status.get("ready") is True
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the robot refused to start because it is not at its start position."""
+        return self.status.get("refused") is True
+
+    @property
+    def pose(self) -> MotionOrigin | None:
+        """The last reported pose of the robot in the frame of its odometry; None if there is no valid report."""
+        status = self.status
+        try:
+            x_m, y_m, yaw_rad = map(float, status["pose"])
+            frame_id = status["frame_id"]
+        except (KeyError, TypeError, ValueError):
+            return None
+        if not isinstance(frame_id, str) or not all(map(math.isfinite, (x_m, y_m, yaw_rad))):
+            return None
+        return MotionOrigin("odometry", shorten(frame_id), x_m, y_m, yaw_rad)
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """The last status of the program; empty before the first one."""
+        return _parse_status(self.output)
+
+    @property
+    def end_state(self) -> str:
+        """Why the drive has ended, `home` if the robot is back at its place; empty while it drives.
+
+        The driver writes its status ten times a second. A driver without a new status has exited or is out of reach.
+        """
+        status, silent_s = self.status, self.unchanged_s
+        if isinstance(ended := status.get("ended"), str) and ended:
+            return shorten(ended)
+        if silent_s > (_SILENT_S if status else _START_S):
+            return f"its driver sent no status for {silent_s:.0f} s"
+        return super().end_reason
+
+    @property
+    @override
+    def end_reason(self) -> str:
+        return "" if self.end_state in {"", drive_log.HOME} else f"it stopped on its path: {self.end_state}"
+
+    def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
+        """Wait until a condition holds or the deadline has passed."""
+        while not condition() and not deadline.expired:
+            self.pause()
+            # Without the link the robot stops automatically and its driver reports why; the link may be restored.
+            with suppress(LinkError, RobotError):
+                self.renew()
+
+
+def _parse_status(text: bytes) -> dict[str, Any]:
+    """Return the status that a driver wrote; empty if it is incomplete."""
+    try:
+        status = json.loads(text)
+    except JSON_ERRORS:
+        return {}
+    return status if isinstance(status, dict) else {}
+
+
+@contextmanager
+def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str) -> Iterator[DriveLease]:
+    """Drive a robot along its path while the body runs, and back to its place afterwards; yield its lease.
+
+    After an error in the body the robot drives back, too; if it cannot, the operator brings it back. After an
+    interruption (Ctrl-C) the robot stops where it is.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: It could not be driven, or stopped before the body had ended.
+        MotionHeldError: It is not at its start position, or a person must confirm before robots may move again.
+        OSError: The journal of motions cannot be written; the robot does not start.
+    """
+    shell, robot = testbed.shells[move.role], scene.robot(move.role)
+    lease_s = robot.profile.drive.lease if robot.profile.drive else 0.0
+    mover = RobotMover(robot.name, shell, scene.folder, f"it stops automatically within {lease_s:g} s")
+    drive_lease = DriveLease(shell, plan.job, name, lease_s)
+    with scene.motions.moving(mover), lease.start_program(shell, plan.job), drive_lease, ExitStack() as stack:
+        try:
+            _commit(scene, drive_lease, move)
+            motion = stack.enter_context(scene.origins.moving(move.role))
+        except BaseException:
+            _end(shell, plan.job)
+            raise
+        yield from _out_and_back(scene, testbed, shell, plan.job, drive_lease, move, motion)
+
+
+def _commit(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
+    """Wait until a robot is stationary at its place, and record its origin before its first start there."""
+    drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.end_state, Deadline.after(_START_S))
+    if drive_lease.is_refused:
+        scene.origins.refuse(move.role, drive_lease.end_state)
+        raise MotionHeldError(
+            f"it does not start: {drive_lease.end_state}",
+            where=scene.robot(move.role).name,
+            remedy="put it at its place with its initial direction, then resume without --yes and confirm it",
+        )
+    drive_lease.check_running()
+    if not drive_lease.is_ready:
+        raise drive_lease.failure(f"it was not stationary for {_START_S:g} s")
+    if scene.origins.robots_stay and scene.origins.get(move.role) is None:
+        pose = drive_lease.pose
+        if pose is None:
+            raise drive_lease.failure("its driver does not report its position")
+        scene.origins.record(move.role, pose)
+
+
+def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
+    scene: Scene, testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, motion: RobotMotion
+) -> Iterator[DriveLease]:
+    """Drive a robot out while the body runs, and back; see `driven`."""
+
+    def bring_back() -> str:
+        why_ended = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not scene.origins.robots_stay)
+        if why_ended == drive_log.HOME:
+            motion.mark_ended(drive_lease.pose)
+        elif drive_lease.status.get("ended"):
+            motion.at = drive_lease.pose
+        return why_ended
+
+    try:
+        with suppress(LinkError, RobotError):  # each renewal repeats the order
+            drive_lease.give_order(drive_plan.OUT)
+        yield drive_lease
+    except Exception:
+        bring_back()
+        raise
+    except BaseException:
+        _end(shell, job)
+        raise
+    early_end = drive_lease.end_reason
+    why_ended = bring_back()
+    if early_end or why_ended != drive_log.HOME:
+        reason = early_end or drive_lease.end_reason or "it stopped on its path: it was not back in time"
+        raise drive_lease.failure(reason)
+
+
+def _bring_back(
+    testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, by_hand: bool
+) -> str:
+    """Let a robot drive back; if it fails and `by_hand` is set, let the operator bring it. Return `DriveLease.why`.
+
+    Without `by_hand` a robot that did not come back stays where it is: before robots move again, a person is asked to
+    put it at its place (`fieldkit.motion.running.permission`).
+    """
+    drive_lease.turn_back()
+    drive_lease.wait(lambda: drive_lease.end_state, Deadline.after(_START_S + limit_s(move)))
+    end_state = drive_lease.end_state
+    _end(shell, job)
+    if by_hand or end_state == drive_log.HOME:
+        testbed.bring_back(move.role, by_itself=end_state == drive_log.HOME)
+    return end_state
+
+
+def _end(shell: Shell, job: Job) -> None:
+    """Stop the driver, which stops the robot; without the link, the robot stops when its lease expires."""
+    with suppress(FieldkitError):
+        jobs.stop(shell, job, grace_s=_GRACE_S)

@@ -1,0 +1,371 @@
+"""Fly a drone over MAVLink while other steps run, within the limits of its profile; it lands at the end."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Annotated, Final
+
+from typing_extensions import override
+
+from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Duration, Field, Length, Speed
+from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.errors import EvidenceError, RobotError
+from fieldkit.core.model import Control, OnAbort, Protocol, Role
+from fieldkit.core.units import format_duration
+from fieldkit.measure.evidence import numbered_lines
+from fieldkit.motion.logs import fly_checks, fly_log, motion_sources
+from fieldkit.motion.steps import piloting
+from fieldkit.motion.steps.arming_need import arming_need
+from fieldkit.motion.steps.flight_alarm import alarmed
+from fieldkit.motion.steps.flight_rescue import FlightRescue
+from fieldkit.motion.steps.lease import orders_file, run_inside
+from fieldkit.motion.steps.link_need import link_need
+from fieldkit.motion.steps.mavlink import MavlinkStep
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.kinds import follow
+from fieldkit.steps.legs import PathLeg
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.view import View
+
+_Distance = Annotated[Length, Field(gt=0)] | None
+
+STANDS_S: Final = 60.0
+"""Timeout until the motors are off; after an aborted attempt the drone may still be landing."""
+_SLACK_S: Final = 30.0
+"""Additional time for the change of mode, the motors and the last metre; again for the landing."""
+_SLOWEST_M_S: Final = 0.3
+"""Lower bound of the landing speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED), slower near the ground (MPC_LAND_CRWL)."""
+_LIMIT_S: Final = 3600.0
+_AT_REST_S: Final = 3.0
+"""Approximate time that the log covers before the take-off and after the landing."""
+_LOG_BYTES_PER_S: Final = 2200.0
+"""Ten lines a second (`agent/flight_log.py`), each of about 200 bytes."""
+
+
+class FlyLeg(PathLeg):
+    """A straight segment of a path in the air; several keys together are one diagonal segment.
+
+    Attributes:
+        up: Distance up.
+        down: Distance down, but not to the ground.
+    """
+
+    up: _Distance = None
+    down: _Distance = None
+
+    @schema.model_validator(mode="after")
+    def _one_direction(self) -> "FlyLeg":
+        for key, opposite in (("away", "towards"), ("left", "right"), ("up", "down")):
+            if getattr(self, key) is not None and getattr(self, opposite) is not None:
+                raise schema.validation_error(
+                    f"a segment has {key} or {opposite}, not both; make two segments", opposite
+                )
+        if not any((self.away, self.towards, self.left, self.right, self.up, self.down)):
+            raise schema.validation_error("a segment needs a distance: away, towards, left, right, up or down")
+        return self
+
+    @property
+    def metres(self) -> tuple[float, float, float]:
+        """Distances forward, to the left and up, in metres."""
+        return self.leg.away_m, self.leg.left_m, (self.up or 0.0) - (self.down or 0.0)
+
+
+class FlyStep(Nest):
+    """Lets a drone take off, fly its path while the steps in `during` run, and land.
+
+    See [MAVLink](mavlink.md#fly-in-a-procedure). Forward is where its nose points before take-off: place it with its
+    nose away from the robot at the other end of its link. Real drones need `--allow-motion`. A flight beyond `limits`
+    of the profile is refused, and so is a robot whose profile has no `mavlink`. Before the trial and before each
+    take-off its autopilot, PX4 or ArduCopter, must report [that it can be
+    armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight, but not a
+    flight inside them. Adds columns of the flight (`fly_height_median_m` and others,
+    [MAVLink](mavlink.md#what-a-flight-leaves)). Leaves `fly.jsonl`, `fly.log` and `fly.orders`.
+
+    Attributes:
+        robot: Role that flies.
+        height: Height above the take-off point to which it climbs first; together with all segments upwards at most
+            `limits.max_height_m`.
+        path: Its path then, a list of straight segments; forward is where its nose points before take-off. Without a
+            path it hovers; at the end of the path it waits. Every corner must be within `limits.fence_m` of the
+            take-off point.
+        speed: Speed, at most `limits.max_speed_m_s`.
+        climb: Rate of climb, at most `limits.max_speed_m_s`.
+        then: Where it lands: `return` to the take-off point, or `land` where it is.
+        lease: How long it continues without contact to the laptop, 3 s to 10 min; then it does what `on_abort` says,
+            or lands.
+        during: Steps that run meanwhile.
+    """
+
+    cross_checks = motion_sources.OF_FLIGHT
+
+    robot: Role
+    height: Annotated[Length, Field(gt=0)]
+    path: tuple[FlyLeg, ...] = ()
+    speed: Annotated[Speed, Field(gt=0)] = 1.0
+    climb: Annotated[Speed, Field(gt=0)] = 1.0
+    then: OnAbort = OnAbort.RETURN
+    lease: Annotated[Duration, Field(ge=3, le=600)] = piloting.LEASE_S
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
+
+    @schema.model_validator(mode="after")
+    def _stays_in_the_air(self) -> "FlyStep":
+        if min(up_m for _, _, up_m in self._corners_m()) <= 0:
+            raise schema.validation_error("the path leads to the ground, or below it", "path")
+        return self
+
+    def _corners_m(self) -> list[tuple[float, float, float]]:
+        """Return the corners of the path relative to the take-off point, in metres: forward, left, up."""
+        away_m, left_m, up_m = 0.0, 0.0, self.height
+        corners = [(away_m, left_m, up_m)]
+        for leg in self.path:
+            away_m, left_m, up_m = (a + b for a, b in zip((away_m, left_m, up_m), leg.metres, strict=True))
+            corners.append((away_m, left_m, up_m))
+        return corners
+
+    @property
+    def _farthest_m(self) -> float:
+        """Maximum horizontal distance of a corner from the take-off point."""
+        return max(math.hypot(*corner[:2]) for corner in self._corners_m())
+
+    @property
+    def _highest_m(self) -> float:
+        return max(up_m for _, _, up_m in self._corners_m())
+
+    @property
+    def _climb_s(self) -> float:
+        return self.height / self.climb
+
+    @property
+    def _descent_s(self) -> float:
+        return self._farthest_m / self.speed + self._highest_m / _SLOWEST_M_S
+
+    def _plan(self, scene: Scene) -> FlightPlan:
+        limits, mavlink = scene.robot(self.robot).profile.limits, scene.robot(self.robot).profile.mavlink
+        origin = scene.origins.get(self.robot)
+        return FlightPlan(
+            connection=piloting.connection(scene.robot(self.robot)),
+            orders=orders_file(self.prefixed_name("fly")),
+            abort=piloting.abort_of(scene, self.robot).value,
+            lease_s=self.lease,
+            end=self.then.value,
+            height_m=self.height,
+            legs=[leg.metres for leg in self.path],
+            speed_m_s=self.speed,
+            climb_m_s=self.climb,
+            ceiling_m=limits.max_height_m or 0.0,
+            fence_m=limits.fence_m or 0.0,
+            least_charge=mavlink.least_charge if mavlink else 0.0,
+            origin=None if origin is None else asdict(origin),
+            log=self._log,
+            liveness=piloting.liveness_file(self.prefixed_name("guard")),
+        )
+
+    @property
+    def _log(self) -> str:
+        return self.prefixed_name(fly_log.FILE)
+
+    def _pilot(self, scene: Scene) -> Planned:
+        limit_s = _LIMIT_S + self.expected_s(scene.protocol)
+        return piloting.planned(scene, self.robot, self.prefixed_name("fly"), self._plan(scene), limit_s)
+
+    @property
+    def _lease_s(self) -> float:
+        """Lease of the guard, which must not expire before the pilot's."""
+        return max(self.lease, piloting.LEASE_S)
+
+    def _guard(self, scene: Scene) -> Planned:
+        return piloting.guard(scene, self.robot, self.prefixed_name("guard"), lease_s=self._lease_s, has_pilot=True)
+
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
+        if scene.robot(self.robot).profile.mavlink is not None:  # otherwise `refusals` reports it
+            yield self._guard(scene)
+            yield self._pilot(scene)
+        yield from self.inside(scene)
+
+    @override
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
+        path_m = sum(math.hypot(*leg.metres) for leg in self.path)
+        name, then = scene.robot(self.robot).name, {"return": "returns", "land": "lands there"}[self.then]
+        flight = f"climbs to {self.height:g} m, flies {path_m:g} m at {self.speed:g} m/s, and {then}"
+        yield f"{name} {flight}; after an abort, for example by Ctrl-C, it {self._abort_action(scene)}"
+        yield from super().dry_run_notes(scene)
+
+    def _abort_action(self, scene: Scene) -> str:
+        return {"return": "returns automatically", "land": "lands"}[piloting.abort_of(scene, self.robot)]
+
+    @override
+    def abort_notes(self, scene: Scene) -> Iterator[str]:
+        takes = format_duration(self._descent_s + _SLACK_S)
+        note = f"if it is in the air: this takes up to about {takes}, also after fieldkit has exited"
+        yield f"{scene.robot(self.robot).name} {self._abort_action(scene)}, {note}"
+        yield from super().abort_notes(scene)
+
+    @override
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:
+        """Yield a reason for each limit of the profile that the flight exceeds or that is missing."""
+        profile, name = scene.robot(self.robot).profile, scene.robot(self.robot).profile.name
+        limits = profile.limits
+        if profile.mavlink is None:
+            yield Refusal(self.robot, "it cannot fly: its profile has no mavlink", "use a drone in this role")
+        elif not scene.robot(self.robot).flies:
+            remedy = "--allow-motion, if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
+            yield Refusal(self.robot, "it is a real drone, and flights are not allowed", remedy)
+        for quantity, planned_m, limit_m, key in (
+            ("height", self._highest_m, limits.max_height_m, "max_height_m"),
+            ("distance from the take-off point", self._farthest_m, limits.fence_m, "fence_m"),
+        ):
+            if limit_m is None:
+                why = f"its profile has no limit for the {quantity}"
+                yield Refusal(self.robot, why, f"write limits: {{{key}: ...}} in robots/{name}.yaml")
+            elif planned_m > limit_m:
+                why = f"its {quantity} is limited to {limit_m:g} m, but the flight needs {planned_m:g} m"
+                yield Refusal(
+                    self.robot, why, f"reduce it in the procedure; the limit is limits.{key} in its profile"
+                )
+        speed_m_s = max(self.speed, self.climb)
+        if speed_m_s > limits.max_speed_m_s:
+            why = f"its top speed is {limits.max_speed_m_s:g} m/s, but the flight needs {speed_m_s:g} m/s"
+            remedy = "reduce the speed in the procedure; the limit is limits.max_speed_m_s in its profile"
+            yield Refusal(self.robot, why, remedy)
+        yield from super().refusals(scene)
+
+    @override
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """Return the size of the log, which covers the time from before the take-off until the motors are off."""
+        lasts_s = self.expected_s(scene.protocol) + _AT_REST_S
+        return _LOG_BYTES_PER_S * lasts_s if role == self.robot else 0.0
+
+    @override
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """Yield the checks of the connection to the autopilot, and that it can be armed for this flight."""
+        robot = scene.robot(self.robot)
+        if (
+            robot.profile.mavlink is not None and robot.profile.limits.max_height_m is not None
+        ):  # otherwise `refusals` reports it
+            plan = self._plan(scene)
+            yield link_need(robot, self.robot, plan.connection, ("pilot", "guard"))
+            yield arming_need(robot, self.robot, plan)
+
+    @override
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        shell, guard = testbed.shells[self.robot], self._guard(scene)
+        flight_s, body_s = self.expected_s(scene.protocol), self.inside_s(scene.protocol)
+        with (
+            piloting.guarding(scene, shell, guard, lease_s=self._lease_s, body_s=flight_s),
+            piloting.leased_program(
+                scene, shell, self._pilot(scene), lease_s=self.lease, body_s=body_s, ends_s=_SLACK_S
+            ) as flight,
+            self._rescue(scene, shell, flight, announce) as rescue,
+            alarmed(flight, guard, rescue, self._log, announce, lands_s=self._descent_s + _SLACK_S),
+        ):
+            self._fly(scene, testbed, announce, flight)
+
+    def _rescue(self, scene: Scene, shell: Shell, flight: piloting.FlightLease, announce: Announce) -> FlightRescue:
+        """Return the rescue, which is inactive if the control connection crosses the radio under test."""
+
+        def raise_alarm(text: str) -> None:
+            flight.lost = "neither its pilot nor its guard runs"
+            announce(text, None)
+
+        guard_name = self.prefixed_name("guard")
+        job = piloting.rescue(scene, self.robot, self.prefixed_name("rescue"), guard_name)
+        sends = scene.robot(self.robot).control is not Control.RADIO
+        return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, sends=sends)
+
+    def _fly(self, scene: Scene, testbed: Testbed, announce: Announce, flight: piloting.FlightLease) -> None:
+        """Give the orders of the flight; the origin is stored before the first one that moves the drone."""
+        name = scene.robot(self.robot).name
+        self._wait_for_start(scene, flight)
+        with scene.origins.moving(self.robot) as motion:
+            announce(f"take off with {name}", self._climb_s)
+            flight.give_order(CLIMB)
+            flight.wait_for("up", self._climb_s + _SLACK_S)
+            announce(f"fly {name}", None)
+            flight.give_order(GO)
+            run_inside(self, flight, scene, testbed, announce)
+            announce(f"land {name}", self._descent_s)
+            flight.give_order(HOME)
+            flight.wait_for("landed", self._descent_s + _SLACK_S)
+            motion.mark_ended()
+
+    def _wait_for_start(self, scene: Scene, flight: piloting.FlightLease) -> None:
+        """Wait until the drone is ready at its origin; record the origin before the first start."""
+        try:
+            flight.wait_for("standing", STANDS_S)
+        except RobotError as error:
+            if flight.is_misplaced:
+                scene.origins.refuse(self.robot, error.what)
+            raise
+        if scene.origins.get(self.robot) is None:
+            scene.origins.record(self.robot, flight.origin())
+
+    @override
+    def moves(self) -> frozenset[Role]:
+        return frozenset({self.robot})
+
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
+        return ("a flight",)
+
+    @override
+    def files(self) -> tuple[str, ...]:
+        name = self.prefixed_name("fly")
+        guard = self.prefixed_name("guard")
+        rescue = self.prefixed_name("rescue")
+        return (f"{name}.log", orders_file(name), self._log, f"{guard}.log", orders_file(guard), f"{rescue}.log")
+
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """Return the columns of a flight, which only trials with a flight have."""
+        return fly_log.COLUMNS
+
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """Yield a reason if the log of the flight is damaged, or contradicts the plan or the telemetry."""
+        try:
+            log = view.evidence.read(fly_log.read, self._log)
+            damage = view.evidence.read(numbered_lines.problem, self._log)
+        except EvidenceError as error:
+            yield f"{self._log}: {error.what}"
+            return
+        limits = view.scene.robot(self.robot).profile.limits
+        plan = fly_checks.FlyPlan(
+            highest_m=self._highest_m,
+            farthest_m=self._farthest_m,
+            fastest_m_s=max(self.speed, self.climb, limits.max_speed_m_s),
+            window=view.attempt_window(self.robot),
+        )
+        reasons = [damage] if damage else list(fly_checks.contradictions(log, plan))
+        for step in (*view.within, *follow.steps_inside(self)):
+            if isinstance(step, MavlinkStep) and step.robot == self.robot and not reasons:
+                reasons += filter(None, (fly_checks.telemetry_contradiction(log, step.places_m(view)),))
+        yield from (f"{self._log}: {why}" for why in reasons)
+
+    @override
+    def measure(self, view: View) -> Measured:
+        return fly_log.measure(view.evidence.read_or_none(fly_log.read, self._log))
+
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
+        if isinstance(farthest_m := values.get("fly_farthest_m"), float):
+            yield f"flew {farthest_m:.1f} m away"
+        if isinstance(height_m := values.get("fly_height_median_m"), float):
+            yield f"{height_m:.1f} m high"
+
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+        if any(nest.disturbs for nest in within):
+            return "a flight must not be inside a fault: put the fault into the flight"
+        if any(nest.parallel for nest in within):
+            return "a flight must not be inside a together: put the together into the flight"
+        return None
+
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
+        return self._climb_s + self.inside_s(protocol) + self._descent_s

@@ -1,0 +1,309 @@
+"""Record the MAVLink telemetry of an autopilot while other steps run: position, speed, attitude, battery, losses."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from types import MappingProxyType
+from typing import Annotated, Final, Literal
+
+import numpy as np
+from typing_extensions import override
+
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import AfterValidator, Duration, Field, Hertz, Int
+from fieldkit.core import geometry
+from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.captures.arrays import Floats
+from fieldkit.measure.offsets import Offset
+from fieldkit.measure.positions import accounts, position_sources
+from fieldkit.measure.positions.accounts import GAP_S, Account, Accounts
+from fieldkit.motion.logs import motion_sources, tlog
+from fieldkit.motion.logs.tlog import GLOBAL, LOCAL, Tlog
+from fieldkit.motion.steps.link_need import link_need
+from fieldkit.remote import agent
+from fieldkit.remote.jobs import Job
+from fieldkit.steps import streams
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.kinds import follow
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Scene
+from fieldkit.steps.view import View
+
+MESSAGES: Final = MappingProxyType(
+    {
+        "SYS_STATUS": 1,
+        "GPS_RAW_INT": 24,
+        "ATTITUDE": 30,
+        LOCAL: 32,
+        GLOBAL: 33,
+        "VFR_HUD": 74,
+        "RADIO_STATUS": 109,
+        "BATTERY_STATUS": 147,
+        "ESTIMATOR_STATUS": 230,
+        "HOME_POSITION": 242,
+        "EXTENDED_SYS_STATE": 245,
+    }
+)
+"""Ids of the messages whose rate a procedure may request (https://mavlink.io/en/messages/common.html)."""
+
+_POSITIONS: Final = MappingProxyType({"local": LOCAL, "global": GLOBAL})
+_DEFAULT_HZ: Final = 40.0
+"""Approximate number of messages per second that an autopilot sends without a request."""
+_FRAME_BYTES: Final = 40
+_STAMP_BYTES: Final = 8
+_START_S: Final = 2.0
+_READY_S: Final = 75
+"""Longer than the timeout of the recorder, 60 s. ArduCopter sends LOCAL_POSITION_NED about 30 s after its boot."""
+_ON_GROUND_M: Final = 0.1
+"""Lower heights are noise of the position estimate of a drone on the ground."""
+_EXTRA_S: Final = 2
+"""Recording time after the last step, enough for a message of each kind at default rates."""
+
+
+def _is_message(name: str) -> str:
+    if name not in MESSAGES:
+        raise schema.validation_error(f"no rate can be requested for {name!r}; possible: {', '.join(MESSAGES)}")
+    return name
+
+
+class MavlinkStep(Nest):
+    """Records the telemetry of a robot's autopilot while the steps in `during` run.
+
+    That is position, speed, attitude, battery and losses; see [MAVLink](mavlink.md#record-telemetry), also for
+    the columns. The profile of its robot has `mavlink`. Leaves `mavlink.tlog`, `mavlink.json` (counters of the
+    recorder) and `ROLE-mavlink.log`; with `positions` also `positions.json` and the columns of a `track`.
+
+    Attributes:
+        robot: Role of the robot with the autopilot.
+        at: Role of the robot that records, over the radio; without it, the robot's own computer.
+        system: The autopilot's system id; 0 for the first one received, which is then the only one in the log.
+        rates: Requested messages per second, of `SYS_STATUS`, `GPS_RAW_INT`, `ATTITUDE`, `LOCAL_POSITION_NED`,
+            `GLOBAL_POSITION_INT`, `VFR_HUD`, `RADIO_STATUS`, `BATTERY_STATUS`, `ESTIMATOR_STATUS`, `HOME_POSITION`
+            and `EXTENDED_SYS_STATE`: `{ATTITUDE: 20Hz}`. Every message received is recorded.
+        positions: Message that fills the columns of distances and speeds: `local` for `LOCAL_POSITION_NED`, `global`
+            for `GLOBAL_POSITION_INT`. Such a step must not be inside a move, a fault or a `together`.
+        facing: With `local`, direction of the robot when the step begins: `away`, `towards`, `left` or `right`, seen
+            by an observer who looks away from the other end of its link.
+        times: Time of a message: `header`, the autopilot's own time, or `received`, when it arrived.
+        gap: If two consecutive messages are further apart than this, the position between them is unknown.
+        heights: Whether heights above the sea are used, with `global`.
+        during: Steps that run meanwhile.
+    """
+
+    cross_checks = (*motion_sources.OF_TELEMETRY, *position_sources.OF_POSITIONS)
+
+    robot: Role
+    at: Role | None = None
+    system: Annotated[Int, Field(ge=0, le=255)] = 0
+    rates: dict[Annotated[str, AfterValidator(_is_message)], Annotated[Hertz, Field(gt=0, le=1000)]] = Field(
+        default_factory=dict
+    )
+    positions: Literal["local", "global"] | None = None
+    facing: Literal["away", "towards", "left", "right"] | None = None
+    times: Literal["header", "received"] = "header"
+    gap: Annotated[Duration, Field(gt=0)] = GAP_S
+    heights: schema.Bool = False
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
+
+    @schema.model_validator(mode="after")
+    def _has_direction(self) -> "MavlinkStep":
+        if (self.positions == "local") is (self.facing is None):
+            raise schema.validation_error(
+                "facing is required with positions: local, and not allowed otherwise", "facing"
+            )
+        return self
+
+    @property
+    def recorder(self) -> Role:
+        """Role of the robot that records."""
+        return self.at or self.robot
+
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
+        yield self._recording(scene)
+        yield from self.inside(scene)
+
+    def _recording(self, scene: Scene) -> Planned:
+        """Return the job that records until it is stopped."""
+        robot = scene.robot(self.recorder)
+        intervals_us = {str(MESSAGES[name]): round(1e6 / rate) for name, rate in self.rates.items()}
+        arguments = {"connection": self._connection(scene), "intervals_us": intervals_us, "system": self.system}
+        job = Job(
+            folder=scene.folder,
+            name=self.prefixed_name("mavlink"),
+            argv=streams.agent_command(robot, "mavlink", streams.compact(arguments), self._file),
+            limit_s=follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
+            log=self._log,
+            stdout=self._counters_file,
+            ready="log:up,",
+            ready_s=_READY_S,
+        )
+        setup, program = streams.setup(robot), robot.profile.tools.python
+        return Planned(self.recorder, job, program=program, setup=setup, permitted_causes=BY_FIELDKIT)
+
+    def _connection(self, scene: Scene) -> str:
+        """Return the connection from the recorder to the autopilot.
+
+        Raises:
+            ConfigurationError: The profile of the robot has no `mavlink`.
+        """
+        robot = scene.robot(self.robot)
+        if (mavlink := robot.profile.mavlink) is None:
+            raise ConfigurationError(
+                f"telemetry of {robot.name} cannot be recorded: its profile {robot.profile.name} has no mavlink",
+                remedy="write mavlink: {port: 14550} in the profile, or name another robot in the step mavlink",
+            )
+        if self.recorder != self.robot:
+            return f"udpout:{robot.address}:{mavlink.port}"
+        return mavlink.onboard_connection
+
+    @override
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """Yield the check of the connection to the autopilot; over the radio its loss is a measurement instead."""
+        if self.recorder == self.robot:
+            yield link_need(scene.robot(self.recorder), self.recorder, self._connection(scene), ("recorder",))
+
+    @override
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        agent.install(testbed.shells[self.recorder])
+        announce("record MAVLink", None)
+        ((planned, code),) = follow.follow(
+            self,
+            scene,
+            testbed,
+            announce,
+            [self._recording(scene)],
+            make_accounts=partial(self._accounts, scene) if self.positions else None,
+            extra_s=lambda _: _EXTRA_S,
+        )
+        if code != 0:
+            raise scene.failure(planned, f"{planned.job.name} ended with exit code {code}")
+
+    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
+        """Return the sources of the robots' positions in an attempt."""
+        account = Account(
+            file=self._file,
+            topic=_POSITIONS[self.positions or "local"],
+            stamps=self.times,
+            gap_s=self.gap,
+            start=scene.places_m.get(self.robot, (0.0, 0.0, 0.0)),
+            heading_rad=None if self.facing is None else geometry.heading_rad(self.robot, self.facing),
+            began_utc_ns=began_utc_ns,
+            clock="" if self.recorder == self.robot else self.recorder,
+            system=self.system,
+        )
+        return Accounts({**follow.stationary_robots(self, scene), self.robot: account}, offsets, self.heights)
+
+    @override
+    def roles(self) -> frozenset[Role]:
+        return frozenset({self.robot, self.recorder}) | self.roles_inside()
+
+    @override
+    def exclusive_resources(self) -> tuple[str, ...]:
+        return ("a telemetry log", *(("a track",) if self.positions else ()))
+
+    @override
+    def files(self) -> tuple[str, ...]:
+        return (self._file, self._counters_file, self._log, *self.laptop_files())
+
+    @override
+    def laptop_files(self) -> tuple[str, ...]:
+        return (accounts.FILE,) if self.positions else ()
+
+    @property
+    def _file(self) -> str:
+        return self.prefixed_name(f"mavlink{tlog.SUFFIX}")
+
+    @property
+    def _counters_file(self) -> str:
+        return self.prefixed_name("mavlink.json")
+
+    @property
+    def _log(self) -> str:
+        return self.prefixed_name(f"{self.recorder}-mavlink.log")
+
+    @override
+    def flows(self, scene: Scene) -> Iterator[Flow]:
+        """Yield the telemetry, if another robot records it over the radio."""
+        mavlink = scene.robot(self.robot).profile.mavlink
+        if self.recorder != self.robot and mavlink is not None:
+            frames = self._messages(scene)
+            yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, served=True)
+
+    @override
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        return (_FRAME_BYTES + _STAMP_BYTES) * self._messages(scene) if role == self.recorder else 0.0
+
+    def _messages(self, scene: Scene) -> float:
+        """Return the approximate number of recorded messages."""
+        return (_DEFAULT_HZ + sum(self.rates.values())) * self.expected_s(scene.protocol)
+
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+        return None if self.positions is None else follow.placement_error("mavlink with positions", within)
+
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """Yield a reason if the log is incomplete, lacks requested messages, or contradicts its recorder."""
+        try:
+            counters = view.evidence.read(tlog.read_summary, self._counters_file)
+            log = self._read(view)
+            total = view.evidence.read(tlog.crc32_of, self._file)
+        except EvidenceError as error:
+            yield f"{self._file}: {error.what}"
+            return
+        if counters.left_out:
+            yield f"{self._file} lacks {counters.left_out} received frames, because it reached its maximum size"
+        if log.frames != counters.frames:
+            yield f"{self._file} has {log.frames} frames, its recorder wrote {counters.frames}"
+        window = view.attempt_window(self.recorder)
+        yield from (f"{self._file} {why}" for why in tlog.contradictions(log, counters, total, window))
+        for name in self.rates:
+            if (result := counters.refused.get(MESSAGES[name])) is not None:
+                yield f"the autopilot refused the request for {name} (MAV_RESULT {result})"
+            elif name not in log.kinds:
+                yield f"{self._file}: no {name}, which was requested"
+        if self.positions:
+            yield from follow.problems(view, (self.robot,))
+
+    def places_m(self, view: View) -> Floats:
+        """Return the positions in the messages LOCAL_POSITION_NED: metres north, east and up. Shape (n, 3)."""
+        rows = view.evidence.read_or_none(tlog.positions, self._file, self.system, LOCAL) or []
+        return np.array([row[2:5] for row in rows], dtype=float).reshape(-1, 3)
+
+    def _read(self, view: View) -> Tlog:
+        """Return the content of the log.
+
+        Raises:
+            EvidenceError: The log or the counters of its recorder cannot be read.
+        """
+        counters = view.evidence.read(tlog.read_summary, self._counters_file)
+        intervals_us = tuple((name, round(1e6 / rate)) for name, rate in self.rates.items())
+        return view.evidence.read(tlog.read, self._file, self.system, counters.ended_us, intervals_us)
+
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        return (*tlog.COLUMNS, *(follow.COLUMNS if self.positions else ()))
+
+    @override
+    def measure(self, view: View) -> Measured:
+        try:
+            measured = tlog.measure(
+                self._read(view), view.evidence.read(tlog.read_summary, self._counters_file).slow_s
+            )
+        except EvidenceError:
+            measured = tlog.measure(None)
+        return measured | follow.measure(view) if self.positions else measured
+
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
+        if isinstance(loss := values.get("mavlink_loss"), float):
+            yield f"MAVLink loss {100 * loss:.1f} %"
+        if isinstance(height_m := values.get("mavlink_height_max_m"), float) and height_m > _ON_GROUND_M:
+            yield f"up to {height_m:.1f} m high"
+
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
+        return _START_S + _EXTRA_S + self.inside_s(protocol)

@@ -1,0 +1,262 @@
+"""Move a robot along a path while other steps run, and bring it back to its place."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Final, Self
+
+from typing_extensions import override
+
+from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.config import schema
+from fieldkit.config.schema import Bool, Field, Speed
+from fieldkit.core import geometry, model
+from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.evidence import numbered_lines
+from fieldkit.measure.positions import farthest
+from fieldkit.motion.logs import drive_checks, drive_log, motion_sources
+from fieldkit.motion.steps import driving
+from fieldkit.motion.steps.lease import run_inside
+from fieldkit.steps import streams
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.legs import PathLeg
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.view import View
+
+_LOG_BYTES_PER_S: Final = 2200.0
+"""Ten lines a second (`agent/drive.py`), each of about 220 bytes."""
+_FENCE_MARGIN_M: Final = 0.5
+"""Distance between the fence and the end of a shortened path, because the robot may overshoot."""
+
+
+class MoveStep(Nest):
+    """Moves a robot while the steps in `during` run; afterwards the robot is at its place again.
+
+    So all repeats start from the same place. At the end of its path the robot stops and waits. Robots of a lab move
+    on the ground of their world, and return instantly; in the field the operator is asked to start the motion and
+    to bring the robot back. Ground robots that [drive by themselves](motion.md) do both, with `--allow-motion`, and
+    leave `drive.jsonl`. `--dry-run` describes the path. A move may be inside another one of another robot, with a
+    `name` for one of them, since each may leave such a file; a `fault` may be inside a move, but not a move inside
+    a fault.
+
+    Attributes:
+        robot: Role that moves.
+        path: Its path, a list of straight segments; each begins where the previous one ends.
+        speed: Speed, `0.2m/s`; at most `limits.max_speed_m_s` of its profile, or the trial is refused. Without it,
+            that speed.
+        within_limits: Whether a robot whose `limits.max_speed_m_s` or `limits.fence_m` are exceeded moves as far and
+            as fast as they allow, and stops half a metre before the fence; `trial.yaml` records the actual motion.
+            Otherwise the trial is refused.
+        driven: Whether there are columns of how it [drove by itself](motion.md#what-is-kept). A robot that drives by
+            itself always has them.
+        during: Steps that run meanwhile.
+    """
+
+    leads = True
+    cross_checks = motion_sources.OF_DRIVE
+
+    robot: Role
+    path: Annotated[tuple[PathLeg, ...], Field(min_length=1)]
+    speed: Annotated[Speed, Field(gt=0)] | None = None
+    within_limits: Bool = Field(default=False, exclude_if=schema.is_empty)
+    driven: Bool = Field(default=False, exclude_if=schema.is_empty)
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
+
+    @override
+    def resolved(self, cast: Cast, path_s: float | None = None) -> Self:
+        """Return the step with a speed, and with `within_limits` reduced to the robot's limits."""
+        robot = cast[self.robot]
+        fastest_m_s, fence_m = robot.profile.limits.max_speed_m_s, robot.profile.limits.fence_m
+        speed_m_s = fastest_m_s if self.speed is None else self.speed
+        legs = tuple(segment.leg for segment in self.path)
+        path = self.path
+        if self.within_limits:
+            speed_m_s = min(speed_m_s, fastest_m_s)
+            if fence_m is not None and geometry.farthest_m(legs) > fence_m:
+                margin_m = min(_FENCE_MARGIN_M, fence_m / 2)
+                path = tuple(filter(None, map(PathLeg.of, geometry.clip_path(legs, fence_m - margin_m)))) or path
+        update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or robot.drives}
+        step = self.model_copy(update=update)
+        return super(MoveStep, step).resolved(cast, step.path_s(robot))
+
+    @override
+    def adjustments(self, cast: Cast) -> Iterator[str]:
+        if self.within_limits:
+            requested = self.model_copy(update={"within_limits": False}).resolved(cast).motion
+            permitted = self.resolved(cast).motion
+            if permitted != requested:
+                permitted_text, requested_text = geometry.describe_move(permitted), geometry.describe_move(requested)
+                yield f"{cast[self.robot].name} moves {permitted_text}; {requested_text} is beyond its limits"
+        yield from super().adjustments(cast)
+
+    @property
+    def motion(self) -> model.Move:
+        """The move, as passed to the testbed.
+
+        Raises:
+            ValueError: The step has no speed, because it is not resolved.
+        """
+        if self.speed is None:
+            raise ValueError("the step has no speed: call resolved() first")
+        return model.Move(self.robot, tuple(segment.leg for segment in self.path), self.speed)
+
+    @property
+    def straight_s(self) -> float:
+        """Duration of the path at its speed without the time for turns, in seconds, to the millisecond."""
+        motion = self.motion
+        return round(geometry.length_m(motion) / motion.speed_m_s, 3)
+
+    def path_s(self, robot: Robot) -> float:
+        """Return the duration of the path in seconds, including turns if the robot drives automatically."""
+        return driving.path_duration_s(robot, self.motion) if robot.drives else self.straight_s
+
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
+        """Yield the job that drives the robot, unless the testbed moves it, and the jobs of the steps inside."""
+        if scene.robot(self.robot).drives:
+            yield self._driving(scene)
+        yield from self.inside(scene)
+
+    def _driving(self, scene: Scene) -> Planned:
+        """Return the job that drives the robot."""
+        inside_s = sum(planned.job.limit_s for planned in self.inside(scene))
+        return driving.planned(scene, self.motion, inside_s, self._name_pattern)
+
+    @property
+    def _name_pattern(self) -> str:
+        """Pattern of the names of jobs and files, see `driving.planned`."""
+        return self.prefixed_name("{}")
+
+    @property
+    def _log(self) -> str:
+        return self.prefixed_name(drive_log.FILE)
+
+    @override
+    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
+        robot = scene.robot(self.robot)
+        driving_note = ""
+        if robot.drives and robot.profile.drive is not None:
+            drive = robot.profile.drive
+            driving_note = (
+                f", and back, automatically: velocities on {drive.topic}, odometry of {drive.odometry}; it stops if "
+                f"the laptop is silent for {drive.lease:g} s, and {robot.profile.limits.fence_m:g} m from its place"
+            )
+        duration = f"for up to {round(self.path_s(robot), 1):g} s"
+        yield f"{robot.name} moves {geometry.describe_move(self.motion)}, {duration}{driving_note}"
+        yield from super().dry_run_notes(scene)
+
+    @override
+    def abort_notes(self, scene: Scene) -> Iterator[str]:
+        if scene.robot(self.robot).drives:
+            yield f"{scene.robot(self.robot).name} stops where it is"
+        yield from super().abort_notes(scene)
+
+    @override
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:
+        robot = scene.robot(self.robot)
+        fastest_m_s = robot.profile.limits.max_speed_m_s
+        speed_m_s = self.motion.speed_m_s
+        if speed_m_s > fastest_m_s:
+            yield Refusal(
+                self.robot,
+                f"its top speed is {fastest_m_s:g} m/s, but the move needs {speed_m_s:g} m/s",
+                "reduce the speed in the procedure, or write within_limits: true; the limit is "
+                "limits.max_speed_m_s in its profile",
+            )
+        if robot.drives:
+            yield from driving.refusals(scene, self.motion)
+        yield from super().refusals(scene)
+
+    @override
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        """Return the size of the log of a driving robot, which covers path, steps inside and the return."""
+        robot = scene.robot(role)
+        if role != self.robot or not robot.drives or robot.profile.drive is None:
+            return 0.0
+        return _LOG_BYTES_PER_S * (2 * self.path_s(robot) + self.inside_s(scene.protocol))
+
+    @override
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        """Yield the check of the middleware's Python package for a robot that drives automatically."""
+        robot = scene.robot(self.robot)
+        if robot.drives:
+            yield streams.need(self.robot, robot, driving.middleware_of(robot))
+
+    @override
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        robot = scene.robot(self.robot)
+        announce(f"move {robot.name}", None)
+        if robot.drives:
+            with driving.driven(scene, testbed, self._driving(scene), self.motion, self._name_pattern) as drive_lease:
+                run_inside(self, drive_lease, scene, testbed, announce)
+                announce(f"drive {robot.name} back", self.path_s(robot))
+            return
+        with testbed.moving(self.motion):
+            for entry in self.during:
+                entry.step.run(scene, testbed, announce)
+
+    @override
+    def moves(self) -> frozenset[Role]:
+        return frozenset({self.robot})
+
+    @override
+    def files(self) -> tuple[str, ...]:
+        """Return the files of the driver, which exist only if the robot drives automatically."""
+        return driving.files(self._name_pattern)
+
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """Return the columns of the drive, if the robot drives automatically."""
+        return drive_log.COLUMNS if self.driven else ()
+
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """Yield a reason if the log of the drive is damaged or contradicts the plan."""
+        if not (self.driven and view.scene.robot(self.robot).drives):
+            return
+        try:
+            log = view.evidence.read(drive_log.read, self._log)
+            damage = view.evidence.read(numbered_lines.problem, self._log)
+        except EvidenceError as error:
+            yield f"{self._log}: {error.what}"
+            return
+        motion = self.motion
+        plan = drive_checks.DrivePlan(motion.legs, motion.speed_m_s, view.attempt_window(self.robot))
+        reasons = [damage] if damage else drive_checks.contradictions(log, plan)
+        yield from (f"{self._log}: {why}" for why in reasons)
+
+    @override
+    def measure(self, view: View) -> Measured:
+        """Return the values of the drive, without those that other sources of the robot's position contradict."""
+        if not self.driven:
+            return Measured()
+        log = view.evidence.read_or_none(drive_log.read, self._log)
+        measured = drive_log.measure(log)
+        if log is None:
+            return measured
+        during_ns = (log[0].utc_ns, log[-1].utc_ns) if log[0].utc_ns else None
+        away_m = max(moment.off_m for moment in log)
+        why = farthest.contradiction(view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns)
+        return measured.without({name: why for name in measured.values if name != "drive_ended"}) if why else measured
+
+    @override
+    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
+        if isinstance(driven_m := values.get("drive_out_m"), float):
+            yield f"drove {driven_m:.1f} m"
+
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+        if any(nest.disturbs for nest in within):
+            return "a move must not be inside a fault: put the fault into the move"
+        if any(nest.parallel for nest in within):
+            return "a move must not be inside a together: put the together into the move"
+        return None
+
+    @override
+    def may_prompt(self) -> bool:
+        return True
+
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
+        return self.inside_s(protocol) + (self.straight_s if self.driven else 0.0)

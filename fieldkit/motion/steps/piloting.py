@@ -1,0 +1,305 @@
+"""Control of drones from the laptop: jobs of the programs on the drone that fly or guard it, and their leases.
+
+The programs are parts of the agent (`fieldkit.agent.flight`, `fieldkit.agent.flying.guard`). If this process is
+killed, or the control link is down for longer than the lease, they end the flight as `on_abort` says.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from typing import Any, Final
+
+from typing_extensions import override
+
+from fieldkit.agent.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
+from fieldkit.backends.protocols import Robot
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Control, MotionOrigin, OnAbort, Role
+from fieldkit.core.text import JSON_ERRORS, shorten
+from fieldkit.motion.steps import lease
+from fieldkit.motion.steps.lease import LeaseKeeper, orders_file
+from fieldkit.motion.steps.robot_mover import RobotMover
+from fieldkit.remote import jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+from fieldkit.steps import streams
+from fieldkit.steps.scene import BY_ITSELF, Planned, Scene
+
+LEASE_S: Final = 15.0
+"""Default time for which a drone continues without contact to the laptop."""
+
+READY: Final = " ready"
+_GUARD_S: Final = 86_400.0
+_RESCUE_S: Final = 900.0
+"""Longer than any landing, and shorter than the lock of a flight, which the start therefore need not extend."""
+_RENEWALS: Final = 3
+"""Renewals per lease, so that one may be late."""
+_GUARD_EXIT_S: Final = 10.0
+"""Maximum time from the order `LEAVE` to the exit of a guard."""
+_QUERY_S: Final = 5.0
+"""Timeout of a query, so that a robot that does not answer delays an alarm for at most this time."""
+_END_LINE: Final = re.compile(r"(?:[0-9.]+ )?(?:error|land|return): (?P<why>.+)")
+"""Line of the program when it aborts the flight or stops sending to the autopilot."""
+_SEPARATOR: Final = "\x1e"
+_TAILS: Final = 'for name do tail -c 2000 "$name" 2>/dev/null | tr "\\036" " "; printf "\\036"; done'
+
+
+def connection(robot: Robot) -> str:
+    """Return the connection from a drone's onboard computer to its autopilot.
+
+    Raises:
+        ConfigurationError: Its profile has no `mavlink`.
+    """
+    if robot.profile.mavlink is None:
+        raise ConfigurationError(
+            "it cannot fly: its profile has no mavlink", where=robot.name, remedy="use a drone in this role"
+        )
+    return robot.profile.mavlink.onboard_connection
+
+
+def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: float) -> Planned:
+    """Return the job of a flight program on a drone.
+
+    Args:
+        scene: The attempt.
+        role: Role of the drone.
+        name: Name of the job; its log is `NAME.log`.
+        plan: Argument of the program; the file of its orders is in the folder of the attempt.
+        limit_s: Time limit of the job.
+    """
+    robot, complete_plan = scene.robot(role), replace(plan, unhurried=jobs.landing_marker_file(name))
+    argv = streams.agent_command(robot, "fly", streams.compact(asdict(complete_plan)))
+    log = f"{name}.log"
+    job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")
+    return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_ITSELF)
+
+
+def guard(scene: Scene, role: Role, name: str, *, lease_s: float = LEASE_S, has_pilot: bool = False) -> Planned:
+    """Return the job of the program that guards a drone, and ends its flight if the attempt is aborted.
+
+    Args:
+        scene: The attempt.
+        role: Role of the drone.
+        name: Name of the job.
+        lease_s: Time in seconds until an order expires.
+        has_pilot: Whether a pilot program flies the drone, with which the guard shares the liveness file.
+    """
+    plan = FlightPlan(
+        connection=connection(scene.robot(role)),
+        orders=orders_file(name),
+        abort=abort_of(scene, role).value,
+        lease_s=lease_s,
+        guards=True,
+        liveness=liveness_file(name) if has_pilot else "",
+    )
+    return planned(scene, role, name, plan, _GUARD_S)
+
+
+def rescue(scene: Scene, role: Role, name: str, guard_name: str) -> Job:
+    """Return the job that ends the flight of a drone if neither its pilot nor its guard runs.
+
+    Args:
+        scene: The attempt.
+        role: Role of the drone.
+        name: Name of the job.
+        guard_name: Name of the guard's job.
+    """
+    plan = FlightPlan(
+        connection=connection(scene.robot(role)),
+        orders="",
+        abort=abort_of(scene, role).value,
+        lease_s=0.0,
+        rescues=True,
+        liveness=liveness_file(guard_name),
+    )
+    return replace(planned(scene, role, name, plan, _RESCUE_S).job, ready=None)
+
+
+def liveness_file(guard_name: str) -> str:
+    """Return the path, relative to the attempt's folder, of the liveness file of a pilot and its guard."""
+    return f".jobs/{guard_name}/liveness"
+
+
+@contextmanager
+def guarding(
+    scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float
+) -> Iterator["FlightLease"]:
+    """Start the guard of a drone, yield its lease, and stop it after the body; errors as `leased_program`."""
+    with leased_program(scene, shell, program, lease_s=lease_s, body_s=body_s, ends_s=_GUARD_EXIT_S) as flight:
+        yield flight
+        flight.release()
+
+
+class FlightLease(LeaseKeeper):
+    """Keeps the lease of a flight program on a drone.
+
+    Args:
+        shell: Connection to the robot.
+        program: The running job.
+        lease_s: Time in seconds until an order expires.
+        silent_lease_s: Time until an order expires if nothing may be sent meanwhile; None if the control connection
+            does not cross the radio under test.
+
+    Attributes:
+        lost: Why the program cannot report its end; empty if it can.
+    """
+
+    def __init__(self, shell: Shell, program: Planned, lease_s: float, silent_lease_s: float | None) -> None:
+        job = program.job
+        self.lost = ""
+        super().__init__(
+            shell,
+            job,
+            output_file=job.log,
+            order=STAY,
+            lease_s=lease_s,
+            renewals=_RENEWALS,
+            silent_lease_s=silent_lease_s,
+        )
+
+    @property
+    @override
+    def end_reason(self) -> str:
+        why = self._reported_reason or self.lost
+        return f"its flight ended early: {why}" if why else super().end_reason
+
+    @property
+    def _lines(self) -> Sequence[str]:
+        return self.output.decode("utf-8", "replace").splitlines()
+
+    @property
+    def _reported_reason(self) -> str:
+        """The reason for which the program ended the flight, from its log; empty if it did not."""
+        match = next(filter(None, map(_END_LINE.match, self._lines)), None)
+        return shorten(match["why"]) if match else ""
+
+    def release(self) -> None:
+        """Order the program to exit without a command to the drone; errors as `give_order`."""
+        self.give_order(LEAVE)
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot."""
+        return self._shell.robot
+
+    @property
+    def is_aloft(self) -> bool:
+        """Whether the drone has taken off and not landed, according to the log of the program."""
+        marks = [line.rpartition(" ")[2] for line in self._lines]
+        return "climbing" in marks and "landed" not in marks
+
+    @property
+    def last_lines(self) -> Sequence[str]:
+        """The last two lines of the log without their times."""
+        return [shorten(line.partition(" ")[2]) for line in self._lines[-2:]]
+
+    def origin(self) -> MotionOrigin:
+        """Return the origin that the program has reported, which it does before it moves the drone.
+
+        Raises:
+            RobotError: The report is missing or invalid.
+        """
+        for line in self._lines:
+            _, _, text = line.partition(" origin ")
+            if text:
+                try:
+                    return _motion_origin(json.loads(text))
+                except JSON_ERRORS as error:
+                    raise self.failure(f"its origin is unreadable: {shorten(text)}") from error
+        raise self.failure("it has not reported its origin")
+
+    @property
+    def is_misplaced(self) -> bool:
+        """Whether the program refuses to fly because the drone is not at its origin."""
+        return any(line.endswith(f" {MISPLACED}") for line in self._lines)
+
+    def tails(self, names: Sequence[str]) -> list[list[str]]:
+        """Return the lines in the last 2,000 bytes of files in the attempt's folder; errors as `give_order`.
+
+        A file that is empty or missing has no lines.
+        """
+        files = [f"{self._job.folder}/{name}" for name in names]
+        result = self._shell.run(("sh", "-c", _TAILS, "sh", *files), deadline=Deadline.after(_QUERY_S))
+        tails = result.stdout.decode("utf-8", "replace").split(_SEPARATOR)[: len(names)]
+        return [[shorten(line, 1000) for line in tail.splitlines()] for tail in tails]
+
+    def refresh(self) -> None:
+        """Renew the order with a short timeout; errors as `give_order`."""
+        self._send(_QUERY_S)
+
+    def wait_for(self, mark: str, within_s: float) -> None:
+        """Wait until the program reports that it has reached a state.
+
+        Args:
+            mark: The state, as at the end of a line of the log.
+            within_s: Timeout in seconds.
+
+        Raises:
+            LinkError: The robot did not answer.
+            RobotError: The program ended, or did not reach the state in time.
+        """
+        deadline = Deadline.after(within_s)
+        while True:
+            self.renew()
+            if any(line.endswith(f" {mark}") for line in self._lines):
+                return
+            if why := self._reported_reason or self.lost or self.end_reason:
+                raise self.failure(why)
+            if deadline.expired:
+                last = shorten(self._lines[-1].partition(" ")[2]) if self._lines else "nothing"
+                raise self.failure(f"it is not {mark} after {within_s:.0f} s; its last line: {last}")
+            self.pause()
+
+
+def _motion_origin(values: Mapping[str, Any]) -> MotionOrigin:
+    """Return the origin in the report of a program (untrusted); raises an error of `JSON_ERRORS` if it is invalid."""
+    numbers = [float(values[name]) for name in ("x_m", "y_m", "heading_rad")]
+    degrees = [None if values[name] is None else float(values[name]) for name in ("latitude_deg", "longitude_deg")]
+    if not all(map(math.isfinite, (*numbers, *(value or 0.0 for value in degrees)))):
+        raise ValueError(values)
+    return MotionOrigin(shorten(str(values["frame"])), shorten(str(values["frame_id"])), *numbers, *degrees)
+
+
+@contextmanager
+def leased_program(
+    scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float, ends_s: float
+) -> Iterator[FlightLease]:
+    """Start a flight program on a drone, yield its lease, and wait for its exit after the body has ordered it.
+
+    If the body fails, the program continues until its lease expires or the clean-up of the attempt stops its job.
+
+    Args:
+        scene: The attempt.
+        shell: Connection to the robot.
+        program: The job, from `planned`.
+        lease_s: Time in seconds until an order expires.
+        body_s: Approximate duration of the body, needed if the control connection must be silent meanwhile.
+        ends_s: Maximum time for the exit of the program.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: The program did not start, or failed.
+    """
+    robot = scene.robot(program.role)
+    silent_lease_s = lease_s + 2 * body_s if robot.control is Control.RADIO else None
+    fallback = f"if it flies, it comes down automatically within {silent_lease_s or lease_s:g} s"
+    mover = RobotMover(robot.name, shell, scene.folder, fallback)
+    with (
+        scene.motions.moving(mover),
+        lease.start_program(shell, program.job),
+        FlightLease(shell, program, lease_s, silent_lease_s) as flight,
+    ):
+        yield flight
+        code = jobs.begin_wait(shell, program.job, ends_s).end(ends_s + jobs.REPLY_S)
+        if code != 0:
+            flight.renew()
+            raise flight.failure(flight.end_reason or f"{program.job.name} ended with exit code {code}")
+
+
+def abort_of(scene: Scene, role: Role) -> OnAbort:
+    """Return the action of a drone if the attempt is aborted."""
+    return scene.on_abort.get(role, OnAbort.LAND)

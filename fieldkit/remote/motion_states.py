@@ -1,0 +1,45 @@
+"""States of the programs that move a robot, as the job script prints them, and their texts for the operator."""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Final
+
+
+class MotionState(StrEnum):
+    """State of a robot after the order to stop, the worst last; `job.sh` uses the same names for each program.
+
+    Attributes:
+        NOTHING: No program of fieldkit moves it; nothing is sent to it.
+        STATIONARY: Its odometry shows no motion.
+        LANDED: Its motors have stopped.
+        ENDED: The program has ended without a report about the robot: it had not started to move it.
+        LAND: A drone is landing at its position.
+        RETURN: A drone is returning, and will land then.
+        SILENT: The program received a signal and has not confirmed anything. A driving program was killed.
+        ALARM: The program cannot land its drone now: the autopilot sends no heartbeat, or another party flies it.
+    """
+
+    NOTHING = "nothing"
+    STATIONARY = "stationary"
+    LANDED = "landed"
+    ENDED = "ended"
+    LAND = "land"
+    RETURN = "return"
+    SILENT = "silent"
+    ALARM = "alarm"
+
+
+BY_SEVERITY: Final = tuple(MotionState)
+DESCENDING_STATES: Final = frozenset({MotionState.LAND, MotionState.RETURN})
+
+STATE_TEXTS: Final[Mapping[MotionState, str]] = {
+    MotionState.NOTHING: "nothing of fieldkit moves it; nothing was sent to it",
+    MotionState.STATIONARY: "stopped (standing)",
+    MotionState.LANDED: "stopped (on the ground)",
+    MotionState.ENDED: "stopped (its program had not started to move it, or has ended)",
+    MotionState.LAND: "coming down (land)",
+    MotionState.RETURN: "coming down (return)",
+    MotionState.SILENT: "NOT CONFIRMED: stop it by hand; its program was signalled but has not confirmed the stop",
+    MotionState.ALARM: "ALARM: IT MAY STILL BE IN THE AIR, AND ITS AUTOPILOT SENDS NO HEARTBEAT OR DOES NOT OBEY. "
+    "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION",
+}

@@ -1,0 +1,55 @@
+"""Directions as procedures write them: a segment of a path, or the place of a robot relative to another."""
+
+import math
+from typing import Annotated
+
+from fieldkit.config import schema
+from fieldkit.config.schema import Field, Length, Strict
+from fieldkit.core import model
+
+_Distance = Annotated[Length, Field(gt=0)] | None
+
+
+class PathLeg(Strict):
+    """A straight segment of a path; several keys together are one diagonal segment.
+
+    Attributes:
+        away: Distance away from the robot at the other end of the link, along the line between them (the relay: from
+            the sender). For a drone: forward.
+        towards: Distance towards that robot. For a drone: backward.
+        left: Distance to the left, seen by an observer who looks away from that robot. Combined with `away` or
+            `towards` it is a diagonal.
+        right: Distance to the right.
+    """
+
+    away: _Distance = None
+    towards: _Distance = None
+    left: _Distance = None
+    right: _Distance = None
+
+    @schema.model_validator(mode="after")
+    def _one_direction(self) -> "PathLeg":
+        for key, opposite in (("away", "towards"), ("left", "right")):
+            if getattr(self, key) is not None and getattr(self, opposite) is not None:
+                raise schema.validation_error(
+                    f"a segment has {key} or {opposite}, not both; make two segments", opposite
+                )
+        if not any((self.away, self.towards, self.left, self.right)):
+            raise schema.validation_error("a segment needs a distance: away, towards, left or right")
+        return self
+
+    @classmethod
+    def of(cls, leg: model.Leg) -> "PathLeg | None":
+        """Return a leg as a segment of a procedure, rounded down to centimetres; None if its length is then 0."""
+        keys = (("away", "towards", leg.away_m), ("left", "right", leg.left_m))
+        lengths = {
+            (key if metres > 0 else opposite): math.floor(100 * abs(metres)) / 100 for key, opposite, metres in keys
+        }
+        if not any(lengths.values()):
+            return None
+        return cls.defaults().model_copy(update={name: metres or None for name, metres in lengths.items()})
+
+    @property
+    def leg(self) -> model.Leg:
+        """The segment, as passed to the testbed."""
+        return model.Leg((self.away or 0.0) - (self.towards or 0.0), (self.left or 0.0) - (self.right or 0.0))

@@ -1,0 +1,172 @@
+"""Detection of changes in the log of a drive, by comparison of all fields with path, speeds, plan and attempt."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.agent.numbered_lines import NumberedLines
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Leg, Role, TrackPoint
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import numbered_lines, track
+from fieldkit.measure.positions import farthest
+from fieldkit.motion.logs import drive_checks, drive_log
+from fieldkit.motion.logs.drive_checks import DrivePlan
+from tests.motion.logs.test_drive_log import drive
+
+START_NS = 1_795_000_000_000_000_000
+PLAN = DrivePlan((Leg(2.0, 0.0),), 1.0, (START_NS - 10**9, START_NS + 60 * 10**9))
+FIELDS = ("utc_ns", "at_s", "phase", "x_m", "y_m", "forward_m_s", "driven_m", "ended")
+
+
+def lines() -> list[dict[str, Any]]:
+    """Lines of a robot that drives 2 m and returns."""
+    made = [*drive(4.0, 0.5, 1.0)]
+    made[-1] = {**made[-1], "x_m": 0.0, "y_m": 0.0}
+    return [{**line, "utc_ns": START_NS + round(1e9 * line["at_s"])} for line in made]
+
+
+def written(folder: Path, lines_: list[dict[str, Any]], *, numbered: bool = True) -> Path:
+    """Write lines in the format of the agent; without numbers in that of older versions."""
+    text = StringIO()
+    log = NumberedLines(text)
+    for line in lines_[:-1]:
+        log.write(line)
+    log.end(lines_[-1])
+    path = folder / drive_log.FILE
+    path.write_text(
+        text.getvalue() if numbered else "".join(f"{json.dumps(line)}\n" for line in lines_), encoding="ascii"
+    )
+    return path
+
+
+def reasons(path: Path) -> list[str]:
+    log = drive_log.read(path)
+    return [*filter(None, (numbered_lines.problem(path),)), *drive_checks.contradictions(log, PLAN)]
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_an_unchanged_log_has_no_contradiction(numbered: bool, tmp_path: Path) -> None:
+    path = written(tmp_path, lines(), numbered=numbered)
+    assert reasons(path) == []
+    assert drive_log.measure(drive_log.read(path)).values["drive_farthest_m"] == pytest.approx(2.0)
+
+
+@given(cut=st.integers(1, 2000))
+def test_a_truncated_log_is_detected(cut: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = written(tmp_path_factory.mktemp("drive"), lines())
+    content = path.read_bytes()
+    path.write_bytes(content[: max(len(content) - cut, 1)])
+    try:
+        assert reasons(path)
+    except EvidenceError:
+        return
+
+
+def test_a_truncated_log_of_an_older_agent_is_detected(tmp_path: Path) -> None:
+    path = written(tmp_path, lines()[:40], numbered=False)
+    assert reasons(path) == ["does not end with the robot at its starting position, but on its path"]
+
+
+CHANGES: Mapping[str, Any] = {
+    "an hour later": ({"utc_ns": 3600 * 10**9}, "before the attempt or after it"),
+    "200 m away": ({"x_m": 200.0}, "differs from the driven distance"),
+    "1 m longer": ({"driven_m": 1.0}, "differs from the driven distance"),
+    "commanded speed too high": ({"forward_m_s": 5.0}, "a commanded speed is not between"),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_changed_line_is_detected(name: str, tmp_path: Path) -> None:
+    change, why = CHANGES[name]
+    made = lines()
+    for field, by in change.items():
+        made[45] = {**made[45], field: made[45][field] + by}
+    if "driven_m" in change:
+        made = [{**line, "driven_m": line["driven_m"] + (at > 45)} for at, line in enumerate(made)]
+    assert any(why in reason for reason in reasons(written(tmp_path, made)))
+
+
+def test_a_deviation_from_the_planned_path_is_detected(tmp_path: Path) -> None:
+    made = [{**line, "x_m": 3 * line["x_m"], "driven_m": 3 * line["driven_m"]} for line in lines()]
+    contradictions = reasons(written(tmp_path, made))
+    assert any("deviates by 4.0 m" in reason for reason in contradictions)
+    assert any("drove at 3.00 m/s instead of 1 m/s" in reason for reason in contradictions)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    field=st.sampled_from(FIELDS[3:7]),
+    some=st.tuples(st.integers(0, 90), st.integers(1, 100)),
+    by=st.sampled_from([0.2, -0.2, 1.0, -1.0, 200.0, -200.0]),
+)
+def test_a_change_of_a_field_is_detected_or_leaves_the_distance(
+    field: str, some: tuple[int, int], by: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder, made = tmp_path_factory.getbasetemp(), lines()
+    before = drive_log.measure(drive_log.read(written(folder, made))).values
+    for at in range(some[0], min(some[0] + some[1], len(made))):
+        made[at] = {**made[at], field: made[at][field] + by}
+    path = written(folder, made)
+    try:
+        if reasons(path):
+            return
+    except EvidenceError:
+        return
+    for name, value in drive_log.measure(drive_log.read(path)).values.items():
+        if isinstance(value, float):
+            # Positions that were changed by up to 0.2 m can still agree with the driven distance.
+            assert value == pytest.approx(before[name], abs=0.25), name
+
+
+@given(chosen=st.sets(st.integers(0, 80), min_size=1))
+def test_missing_lines_are_detected(chosen: set[int], tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = written(tmp_path_factory.mktemp("drive"), lines())
+    kept = [line for at, line in enumerate(path.read_text("ascii").splitlines(keepends=True)) if at not in chosen]
+    path.write_text("".join(kept), encoding="ascii")
+    assert reasons(path)
+
+
+@given(place=st.integers(0), bit=st.integers(0, 6))
+def test_any_flipped_bit_is_detected(place: int, bit: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = written(tmp_path_factory.mktemp("drive"), lines())
+    content = bytearray(path.read_bytes())
+    content[place % len(content)] ^= 1 << bit
+    path.write_bytes(content)
+    try:
+        assert numbered_lines.problem(path) is not None
+    except EvidenceError:
+        return
+
+
+def oracle(folder: Path, far_m: float) -> AttemptEvidence:
+    """Evidence with a testbed's track of a robot that drives away in 4 s, and back."""
+    places = [
+        TrackPoint(START_NS + at * 10**9, Role.RECEIVER, (10 + far_m * x, 0, 0), (0, 0, 0))
+        for at, x in ((0, 0), (4, 1), (9, 0))
+    ]
+    (folder / track.FILE).write_text(track.text(places), encoding="ascii")
+    return AttemptEvidence(folder)
+
+
+@pytest.mark.parametrize(("far_m", "agrees"), [(2.0, True), (2.1, True), (8.0, False), (0.0, False)])
+def test_the_farthest_position_agrees_with_the_testbed(far_m: float, agrees: bool, tmp_path: Path) -> None:
+    during_ns = (START_NS, START_NS + 9 * 10**9)
+    why = farthest.contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
+    assert (why is None) is agrees
+    if why:
+        assert why == f"it was 2.0 m from its place by its odometry, and {far_m:.1f} m by track.csv"
+
+
+def test_the_deviation_at_a_corner_is_the_straight_distance() -> None:
+    made = drive_log.DriveMoment(0.0, "out", 3.0, 4.0, 0.0, 5.0, 0.0)
+    (off,) = [why for why in drive_checks.contradictions([replace(made, ended="home")], PLAN) if "deviates by" in why]
+    assert f"deviates by {math.hypot(1.0, 4.0):.1f} m" in off

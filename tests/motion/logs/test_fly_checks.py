@@ -1,0 +1,121 @@
+"""A change in the log of a flight is detected, or changes figures by less than an autopilot's position error."""
+
+import math
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.agent.numbered_lines import NumberedLines
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence import numbered_lines
+from fieldkit.motion.logs import fly_checks, fly_log
+from fieldkit.motion.logs.fly_checks import POSITION_ERROR_M, FlyPlan
+
+START_NS = 1_795_000_000_000_000_000
+PLAN = FlyPlan(3.0, 20.0, 3.0, (START_NS - 10**9, START_NS + 60 * 10**9))
+
+
+def lines() -> list[dict[str, Any]]:
+    """Lines of a drone that climbs to 3 m in 3 s, flies 20 m away in 10 s, and lands there in 5 s."""
+    made = []
+    for tenth in range(201):
+        at_s = tenth / 10
+        phase = next(name for name, until in PHASES if at_s <= until)
+        up_m = min(at_s, 3.0) if at_s < 14 else max(3.0 - (at_s - 14) * 0.6, 0.0)
+        made.append(
+            {
+                "utc_ns": START_NS + round(1e9 * at_s),
+                "at_s": at_s,
+                "phase": phase,
+                "ahead_m": min(max(at_s - 4, 0.0) * 2, 20.0),
+                "left_m": 0.0,
+                "up_m": up_m,
+                "speed_m_s": 2.0 if 4 <= at_s <= 14 else 1.0,
+            }
+        )
+    return made
+
+
+PHASES = (("standing", 0.5), ("climbing", 3.0), ("up", 4.0), ("flying", 14.0), ("there", 14.5), ("coming down", 20.0))
+
+
+def written(folder: Path, lines_: list[dict[str, Any]], *, ended: bool = True) -> Path:
+    text = StringIO()
+    log = NumberedLines(text)
+    for line in lines_:
+        log.write(line)
+    if ended:
+        log.end({"utc_ns": START_NS + 21 * 10**9, "ended": "landed"})
+    path = folder / fly_log.FILE
+    path.write_text(text.getvalue(), encoding="ascii")
+    return path
+
+
+def reasons(path: Path) -> list[str]:
+    log = fly_log.read(path)
+    return [*filter(None, (numbered_lines.problem(path),)), *fly_checks.contradictions(log, PLAN)]
+
+
+def test_an_unchanged_log_has_no_contradiction(tmp_path: Path) -> None:
+    assert reasons(written(tmp_path, lines())) == []
+
+
+def test_a_log_without_its_end_is_detected(tmp_path: Path) -> None:
+    assert reasons(written(tmp_path, lines(), ended=False)) == ["its last line is missing: its writer was killed"]
+    short = reasons(written(tmp_path, lines()[:90]))
+    assert short == ["ends while the drone was flying, not coming down"]
+
+
+@pytest.mark.parametrize(
+    ("field", "by", "why"),
+    [
+        ("ahead_m", 200.0, "two consecutive positions are farther apart"),
+        ("up_m", 50.0, "two consecutive positions are farther apart"),
+        ("speed_m_s", 60.0, "the drone flew at 62.0 m/s, but its limit is 3 m/s"),
+        ("utc_ns", 3600 * 10**9, "from before the attempt or after it"),
+        ("at_s", 0.05, ""),
+    ],
+)
+def test_a_changed_line_is_detected(field: str, by: float, why: str, tmp_path: Path) -> None:
+    made = lines()
+    made[80] = {**made[80], field: made[80][field] + by}
+    contradictions = reasons(written(tmp_path, made))
+    assert any(why in reason for reason in contradictions) if why else contradictions == []
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    field=st.sampled_from(["ahead_m", "left_m", "up_m", "speed_m_s"]),
+    some=st.tuples(st.integers(0, 200), st.integers(1, 200)),
+    by=st.sampled_from([1.0, -1.0, 7.0, 30.0, -30.0, 200.0, -200.0]),
+)
+def test_any_change_of_a_field_is_detected(
+    field: str, some: tuple[int, int], by: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder, made = tmp_path_factory.getbasetemp(), lines()
+    before = fly_log.measure(fly_log.read(written(folder, made))).values
+    for at in range(some[0], min(sum(some), len(made))):
+        made[at] = {**made[at], field: made[at][field] + by}
+    path = written(folder, made)
+    try:
+        if reasons(path):
+            return
+    except EvidenceError:
+        return
+    for name, value in fly_log.measure(fly_log.read(path)).values.items():
+        assert value == pytest.approx(before[name], abs=POSITION_ERROR_M + 2.0), name
+
+
+def test_telemetry_of_another_flight_is_detected(tmp_path: Path) -> None:
+    log = fly_log.read(written(tmp_path, lines()))
+    own = np.array([(moment.ahead_m, moment.left_m, moment.up_m) for moment in log])
+    turned = own @ np.array([[math.cos(0.7), -math.sin(0.7), 0], [math.sin(0.7), math.cos(0.7), 0], [0, 0, 1]])
+    assert fly_checks.telemetry_contradiction(log, turned + 300.0) is None
+    assert fly_checks.telemetry_contradiction(log, np.empty((0, 3))) is None
+    assert "over the ground" in (fly_checks.telemetry_contradiction(log, 3 * own) or "")
+    assert "in height" in (fly_checks.telemetry_contradiction(log, own * [1, 1, 5]) or "")

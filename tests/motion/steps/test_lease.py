@@ -1,0 +1,132 @@
+"""A lease: orders on the robot, their renewals, and errors of the link and the program."""
+
+from collections.abc import Sequence
+from threading import Event
+from typing import cast
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError, LockLostError, RobotError
+from fieldkit.motion.steps.lease import LeaseKeeper, orders_file
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Completed, Shell
+
+JOB = Job(folder="f", name="up.fly", argv=(), limit_s=1.0, log="up.fly.log")
+SHORT_S = 0.05
+
+
+class Link:
+    """A shell that records each written line, and fails for a number of calls."""
+
+    robot = "r"
+
+    def __init__(self) -> None:
+        self.words: list[Sequence[str]] = []
+        self.broken = 0
+        self.many = Event()
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        self.words.append(argv)
+        if len(self.words) >= 5:
+            self.many.set()
+        if self.broken > 0:
+            self.broken -= 1
+            raise LinkError("is out of range", where=self.robot, remedy="wait")
+        return Completed(tuple(argv), 0, b"said", b"")
+
+    @property
+    def lines(self) -> list[str]:
+        return [words[-2] for words in self.words]
+
+
+def keeper(link: Link, silent_lease_s: float | None = None) -> LeaseKeeper:
+    return LeaseKeeper(
+        cast("Shell", link),
+        JOB,
+        output_file="log",
+        order="stay",
+        lease_s=SHORT_S,
+        renewals=2,
+        silent_lease_s=silent_lease_s,
+    )
+
+
+def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
+    link = Link()
+    with keeper(link) as lease:
+        assert lease.output == b"said"
+        link.broken = 2
+        assert link.many.wait(60)
+        lease.give_order("go")
+    count = len(link.lines)
+    numbers, orders, seconds = zip(*(line.split() for line in link.lines), strict=True)
+    assert sorted(map(int, numbers)) == list(range(1, count + 1))
+    assert orders[:5] == ("stay",) * 5
+    assert orders[-1] == "go"
+    assert set(seconds) == {"0.05"}
+    assert {tuple(words[-3::2]) for words in link.words} == {("f/up.fly.orders", "f/log")}
+    assert orders_file("up.fly") == "up.fly.orders"
+
+
+def test_silent_lease_lasts_longer_and_is_not_renewed() -> None:
+    link = Link()
+    with keeper(link, silent_lease_s=90.0) as lease:
+        lease.give_order("go")
+        assert not any(renewal_threads(lease))
+    assert link.lines == ["1 stay 90", "2 go 90"]
+
+
+def renewal_threads(lease: LeaseKeeper) -> list[bool]:
+    """Return whether the thread of renewals is alive."""
+    lease._thread.join(60)
+    return [lease._thread.is_alive()]
+
+
+def test_order_that_cannot_be_written_is_an_error() -> None:
+    link = Link()
+    with keeper(link, silent_lease_s=90.0) as lease:
+        link.broken = 1
+        with pytest.raises(LinkError):
+            lease.give_order("go")
+        lease.renew()
+    assert link.lines[-1] == "3 go 90"
+
+
+def test_unreachable_robot_at_start_is_an_error() -> None:
+    link = Link()
+    link.broken = 1
+    with pytest.raises(LinkError), keeper(link):
+        pytest.fail("the lease was entered")
+
+
+class Ending(Link):
+    """A shell whose program has exited at the third query."""
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        result = super().run(argv, deadline=deadline)
+        stderr = b"bash: warning: no locale\n7\n" if len(self.words) > 2 else b"bash: warning: no locale\n"
+        return Completed(result.argv, 0, result.stdout, stderr)
+
+
+def test_body_is_aborted_when_program_ends() -> None:
+    ended = Event()
+
+    def wait() -> None:
+        assert ended.wait(60)
+        raise LinkError("the connection broke", where="r", remedy="wait")
+
+    with keeper(Ending()) as lease:
+        assert lease.end_reason == ""
+        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.run_while_leased(ended.set):
+            wait()
+        assert "the connection broke" in str(caught.value.__cause__)
+        with pytest.raises(RobotError, match="ended with exit code 7"), lease.run_while_leased(ended.set):
+            pass
+        with pytest.raises(LockLostError), lease.run_while_leased(ended.set):
+            raise LockLostError("aborted", where="r", remedy="ask")
+
+
+def test_error_of_body_is_raised_while_program_runs() -> None:
+    with keeper(Link()) as lease, pytest.raises(LinkError), lease.run_while_leased(pytest.fail):
+        raise LinkError("the connection broke", where="r", remedy="wait")

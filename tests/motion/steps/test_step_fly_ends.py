@@ -1,0 +1,298 @@
+"""Flights that end before their steps, with the real agent and an emulated autopilot on this machine."""
+
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from fieldkit.backends.protocols import Robot
+from fieldkit.config import schema
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError, RobotError
+from fieldkit.core.model import OnAbort, Protocol, Role
+from fieldkit.motion.steps.fly import FlyStep
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.shell import Completed
+from fieldkit.steps.scene import Scene
+from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
+from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.modes import Mode
+from sim_backends.emulated.autopilot.px4 import PX4
+from tests.agent.test_link_server import servers
+from tests.helpers import drones
+from tests.helpers.casts import DUCKIEDRONE
+from tests.helpers.host import descendants, wait_for_end
+from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.mavlink_router import MavlinkRouter
+from tests.helpers.sshd import wait_until
+from tests.helpers.userlands import LocalShell
+
+pytestmark = pytest.mark.emulated
+
+FOLDER = jobs.work_folder("trial", "tcp-01-1")
+FLIGHT = "robot: receiver, height: 60cm, path: [{away: 2m}], speed: 3m/s, lease: 3s"
+NOTICED_S = 5.0
+"""Maximum time until the loss is noticed on a busy machine; a quiet machine needs less than 1 s."""
+NEAR_M = 0.6
+"""Maximum distance to the take-off point after the return; the drone had flown three times as far."""
+
+
+class Shell(LocalShell):
+    """A robot with a link that can be interrupted."""
+
+    is_cut = False
+
+    def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
+        if self.is_cut:
+            raise LinkError("is out of range", where=self.robot, remedy="wait")
+        return super().run(argv, deadline=deadline, stdin=stdin, check=check)
+
+
+@pytest.fixture
+def shell(tmp_path: Path) -> Iterator[Shell]:
+    made = Shell(tmp_path)
+    jobs.install(made, Deadline.after(30))
+    evidence.begin(made, FOLDER, "receiver", "lo")
+    yield made
+    wait_until(lambda: jobs.list_running(made, Deadline.after(30)) == (), Deadline.after(60))
+
+
+def fly(
+    shell: Shell, where: int | str, waits: str, begun: Callable[[], object], abort: OnAbort = OnAbort.LAND
+) -> None:
+    """Fly a drone at a UDP port or a connection; call `begun` when a step inside starts."""
+    connection = where if isinstance(where, str) else f"udpout:127.0.0.1:{where}"
+    assert DUCKIEDRONE.mavlink is not None
+    update = {
+        "ros": None,
+        "tools": DUCKIEDRONE.tools.model_copy(update={"python": sys.executable}),
+        "mavlink": DUCKIEDRONE.mavlink.model_copy(update={"connection": connection}),
+    }
+    robot = Robot(name="drone", address="127.0.0.1", profile=DUCKIEDRONE.model_copy(update=update), flies=True)
+    scene = Scene(Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, on_abort={Role.RECEIVER: abort})
+    step = f"{{{FLIGHT}, during: [{{wait: {{duration: {waits}}}}}, {{wait: {{duration: {waits}}}}}]}}"
+
+    def announce(name: str, _: float | None) -> None:
+        if name == "wait":
+            begun()
+
+    schema.validate(schema.parse(step, source="x.yaml"), FlyStep).run(
+        scene, IdleTestbed({Role.RECEIVER: shell}), announce
+    )
+
+
+def log(shell: Shell) -> str:
+    return (shell.home / FOLDER / "fly.log").read_text(encoding="utf-8")
+
+
+def test_takeover_by_a_person_aborts_steps_inside(shell: Shell) -> None:
+    with drones.autopilot_at_udp() as (port, autopilot):
+        with pytest.raises(RobotError, match="here: its flight ended early: another party flies it") as caught:
+            fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LAND))
+        assert "the wait was interrupted" in str(caught.value.__cause__)
+        assert "landed" not in log(shell), "the pilot released the drone"
+
+
+def agent_of(shell: Shell, job: str) -> int:
+    """Return the process id of the agent of a job."""
+    leader = int((shell.home / FOLDER / f".jobs/{job}/pid").read_text(encoding="ascii").split()[0])
+    names = {pid: Path(f"/proc/{pid}/comm").read_text(encoding="utf-8") for pid in descendants(leader)}
+    (pid,) = (pid for pid, name in names.items() if name.startswith("python"))
+    return pid
+
+
+def log_lines(shell: Shell, job: str) -> list[tuple[float, str]]:
+    """Return the lines of a job's log with their times, in seconds since 1970."""
+    lines = (shell.home / FOLDER / f"{job}.log").read_text(encoding="utf-8").splitlines()
+    return [(float(line.partition(" ")[0]), line.partition(" ")[2]) for line in lines]
+
+
+@pytest.mark.quiet
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize(("target", "watcher"), [("fly", "guard"), ("guard", "fly")])
+def test_pilot_and_guard_notice_within_a_second_that_the_other_does_not_run(
+    shell: Shell, target: str, watcher: str, number: signal.Signals
+) -> None:
+    at_s: list[float] = []
+
+    def send_signal() -> None:
+        at_s.append(time.time())
+        os.kill(agent_of(shell, target), number)
+
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
+        with pytest.raises(RobotError):
+            fly(shell, port, "60min", send_signal)
+        wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
+        evidence.end_jobs(shell, FOLDER)
+    (seen_s,) = (seen_s for seen_s, text in log_lines(shell, watcher) if text.startswith("land: the "))
+    assert seen_s - at_s[0] < 1.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_flight_continues_without_its_link_server(shell: Shell, number: signal.Signals) -> None:
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
+        connection, ended = f"udpout:127.0.0.1:{port}", list[int]()
+
+        def send_signal() -> None:
+            if not ended:
+                ended.extend(servers(connection))
+                os.kill(ended[0], number)
+                wait_until(lambda: bool({*servers(connection)} - {*ended}), Deadline.after(60))
+                assert autopilot.vehicle.armed, "the server was replaced in flight"
+
+        fly(shell, port, "5s", send_signal)
+        assert len(ended) == 1
+        assert autopilot.vehicle.body.on_ground
+        assert not autopilot.vehicle.armed
+    wait_for_end(set(ended), within_s=30.0)
+    assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
+
+
+def silent_lines(shell: Shell) -> int:
+    """Return the number of log lines, ten per second, that report no position in the last second of flight."""
+    lines = (shell.home / FOLDER / "fly.jsonl").read_text(encoding="ascii").splitlines()
+    moments = [moment for moment in map(json.loads, lines) if moment.get("phase") in {"flying", "there"}]
+    assert moments
+    return sum(moment["rate_hz"] == 0 for moment in moments)
+
+
+def test_flight_continues_after_restart_of_its_router(shell: Shell) -> None:
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), MavlinkRouter(port) as router:
+        restarts: list[float] = []
+
+        def restart() -> None:
+            if not restarts:
+                restarts.append(2.0)
+                router.restart(restarts[0])
+
+        fly(shell, f"tcp:127.0.0.1:{router.tcp}", "5s", restart)
+        assert autopilot.vehicle.body.on_ground
+        assert not autopilot.vehicle.armed
+        assert restarts
+        assert router.accepted == 2, "the connection of the link server, and the one after the restart"
+    assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
+    assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
+
+
+def test_flight_continues_after_serial_device_was_missing_for_two_seconds(shell: Shell, tmp_path: Path) -> None:
+    with drones.autopilot_at_usb(tmp_path / "ttyUSB0") as (usb, autopilot):
+        back = threading.Timer(2.0, usb.plug_in)
+
+        def pull_out() -> None:
+            if not back.ident:
+                usb.pull_out()
+                back.start()
+                assert autopilot.vehicle.armed
+
+        fly(shell, f"{usb.path}:115200", "5s", pull_out)
+        back.join()
+        assert autopilot.vehicle.body.on_ground
+        assert not autopilot.vehicle.armed
+    assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
+    assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])
+def test_guard_lands_drone_whose_pilot_does_not_run(shell: Shell, number: signal.Signals, firmware: Firmware) -> None:
+    """It kills a suspended pilot first, which could otherwise control the drone again later."""
+    target: list[tuple[int, float]] = []
+
+    def send_signal() -> None:
+        pid = agent_of(shell, "fly")
+        os.kill(pid, number)
+        target.append((pid, time.time()))
+
+    with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot):
+        with pytest.raises(RobotError, match="ended with exit code 137"):
+            fly(shell, port, "60min", send_signal)
+        wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
+        assert autopilot.vehicle.body.on_ground
+        wait_until(lambda: any(text == "landed" for _, text in log_lines(shell, "guard")), Deadline.after(60))
+    ((pid, at_s),) = target
+    wait_for_end({pid}, within_s=30.0)
+    (seen_s,) = (seen_s for seen_s, text in log_lines(shell, "guard") if text.startswith("land: the pilot "))
+    assert seen_s - at_s < NOTICED_S
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_pilot_lands_drone_whose_guard_does_not_run(shell: Shell, number: signal.Signals) -> None:
+    guards: list[int] = []
+
+    def send_signal() -> None:
+        guards.append(agent_of(shell, "guard"))
+        os.kill(guards[0], number)
+
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
+        with pytest.raises(RobotError, match="its flight ended early: the guard "):
+            fly(shell, port, "60min", send_signal)
+        wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
+        wait_until(lambda: "landed" in log(shell), Deadline.after(60))
+        if number == signal.SIGSTOP:
+            os.kill(guards[0], signal.SIGCONT)
+    evidence.end_jobs(shell, FOLDER)
+
+
+def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) -> None:
+    """A person switches an ArduCopter to LOITER by remote control; then the job is stopped, as by Ctrl-C."""
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
+        with pytest.raises(RobotError, match=r"another party flies it \(mode LOITER") as caught:
+            fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LOITER))
+        assert "MAY STILL BE IN THE AIR" in str(caught.value)
+        assert "MODE LOITER" in log(shell)
+        evidence.end_jobs(shell, FOLDER)
+        wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
+        assert autopilot.vehicle.mode is Mode.LOITER
+        assert autopilot.vehicle.armed
+        assert not autopilot.vehicle.body.on_ground
+
+
+def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(shell: Shell) -> None:
+    def send_signal() -> None:
+        os.kill(agent_of(shell, "fly"), signal.SIGSTOP)
+        autopilot.vehicle.change_mode(Mode.LOITER)
+
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
+        with pytest.raises(RobotError, match="ended with exit code 137"):
+            fly(shell, port, "60min", send_signal)
+        wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
+        assert autopilot.vehicle.mode is Mode.LOITER
+        assert not autopilot.vehicle.body.on_ground
+
+
+def test_arducopter_returns_after_its_lease_expired(shell: Shell) -> None:
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
+        for name, centimetres in (("RTL_ALT", 100.0), ("WPNAV_RADIUS", 10.0)):
+            autopilot._parameters.set(name, centimetres)
+        vehicle = autopilot.vehicle
+
+        def cut() -> None:
+            wait_until(lambda: math.hypot(*vehicle.body.position_m[:2]) > 1.5, Deadline.after(60))
+            shell.is_cut = True
+
+        with pytest.raises(LinkError, match="out of range"):
+            fly(shell, port, "1ms", cut, OnAbort.RETURN)
+        wait_until(lambda: not vehicle.armed, Deadline.after(60))
+        assert math.hypot(*vehicle.body.position_m[:2]) < NEAR_M, "at the take-off point"
+        shell.is_cut = False
+        wait_until(lambda: "landed" in log(shell), Deadline.after(60))
+        assert "return: the order was not renewed in time" in log(shell)
+
+
+def test_stop_of_all_jobs_lets_the_pilot_land(shell: Shell) -> None:
+    """The landing takes longer than the grace period of other jobs."""
+    with drones.autopilot_at_udp() as (port, autopilot):
+        autopilot._parameters.set("MPC_LAND_SPEED", 0.1)
+        with suppress(RobotError):
+            fly(shell, port, "60min", lambda: evidence.end_jobs(shell, FOLDER))
+        wait_until(lambda: "landed" in log(shell), Deadline.after(60))
+        assert "land: the job was ended" in log(shell)
+        assert not autopilot.vehicle.armed

@@ -1,0 +1,132 @@
+"""Stopping programs that move robots: the script of the robot, run in a folder of this machine in each userland."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError, LockLostError, RobotError
+from fieldkit.core.model import Role
+from fieldkit.motion import halting
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.motion_states import MotionState
+from fieldkit.trial.running.locks import Holder, locked
+from tests.helpers.sshd import wait_until
+from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
+
+pytestmark = pytest.mark.emulated
+
+FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
+ANNA = Holder("trial-a", "anna@one", "trial-a")
+STANDS = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
+LANDS = (
+    "trap 'echo 1.0 land: told >&2; sleep 4; echo 5.0 landed >&2; exit' INT; echo up; while :; do sleep 0.05; done"
+)
+WARNS = (
+    "trap 'touch .jobs/fly/unhurried; echo 1.0 land: told >&2; echo 1.2 ALARM: IT MAY FALL >&2; trap : INT' INT; "
+    "echo up; while :; do sleep 0.05; done"
+)
+HANGS = "trap '' INT; echo up; while :; do sleep 0.05; done"
+
+
+@pytest.fixture(params=USERLANDS)
+def robot(tmp_path: Path, request: pytest.FixtureRequest) -> LocalShell:
+    home = tmp_path / "home"
+    home.mkdir()
+    made = LocalShell(home, userland_path(request.param, tmp_path / "bin"), "turtlebot-1")
+    jobs.install(made, Deadline.after(30))
+    return made
+
+
+def start(robot: LocalShell, name: str, verb: str, script: str) -> None:
+    """Start a program with the command line of the agent and the behaviour of a shell script."""
+    argv = ("sh", "-c", script, "python3", "../../agent-0123456789ab.pyz", verb, '{"over": "ros1"}')
+    jobs.start(robot, Job(FOLDER, name, argv, 60.0, f"{name}.log", ready="log:up"))
+
+
+def runs(robot: LocalShell) -> list[str]:
+    return [line.split()[0].rpartition("/")[2] for line in jobs.list_running(robot, Deadline.after(30))]
+
+
+def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShell) -> None:
+    evidence.begin(robot, FOLDER, "sender", "lo")
+    start(robot, "drive", "drive", STANDS)
+    start(robot, "fly", "fly", LANDS)
+    start(robot, "record", "mavlink", HANGS)
+    halted = halting.halt(robot, "bert@two", Deadline.after(60))
+    assert halted.error is None
+    assert dict(halted.programs) == {
+        f"{FOLDER}/.jobs/drive": MotionState.STATIONARY,
+        f"{FOLDER}/.jobs/fly": MotionState.LAND,
+    }
+    assert halted.state is MotionState.LAND, "the worst"
+    names = [name for name, _ in halted.programs]
+    (robot.home / FOLDER / "ground").touch()
+    wait_until(
+        lambda: halting.poll_states(robot, names, Deadline.after(30)).state is MotionState.LANDED, Deadline.after(60)
+    )
+    assert "record" in runs(robot), "it does not move the robot"
+    again = halting.halt(robot, "bert@two", Deadline.after(60))
+    assert (again.programs, again.state) == ((), MotionState.NOTHING)
+    with pytest.raises(RobotError, match=r"the jobs of .* were ended by bert@two"):
+        start(robot, "later", "drive", STANDS)
+    evidence.end_jobs(robot, FOLDER)
+
+
+def test_alarm_is_the_state_of_a_drone_that_does_not_land(robot: LocalShell) -> None:
+    evidence.begin(robot, FOLDER, "sender", "lo")
+    start(robot, "fly", "fly", WARNS)
+    start(robot, "record", "mavlink", HANGS)
+    halted = halting.halt(robot, "bert@two", Deadline.after(60))
+    assert halted.programs == ((f"{FOLDER}/.jobs/fly", MotionState.ALARM),)
+    aborted = jobs.abort(robot, "bert@two", Deadline.after(60))
+    assert aborted.landing == ((f"{FOLDER}/.jobs/fly", "alarm"),), "it is not killed"
+    assert [line.split()[0] for line in aborted.jobs] == [f"{FOLDER}/fly", f"{FOLDER}/record"]
+    assert runs(robot) == ["fly"]
+    (robot.home / FOLDER / ".jobs/fly/unhurried").unlink()
+    assert jobs.abort(robot, "bert@two", Deadline.after(60)).landing == ()
+    assert runs(robot) == []
+
+
+def test_liveness_file_and_time_since_boot(robot: LocalShell) -> None:
+    content = bytes(range(64))
+    (robot.home / FOLDER).mkdir(parents=True)
+    (robot.home / FOLDER / "liveness").write_bytes(content)
+    answer = halting.read_liveness(robot, f"{FOLDER}/liveness", Deadline.after(60))
+    assert answer[:64] == content
+    assert 0 < float(answer[64:].split()[0]) <= float(Path("/proc/uptime").read_text(encoding="ascii").split()[0])
+    with pytest.raises(RobotError):
+        halting.read_liveness(robot, f"{FOLDER}/missing", Deadline.after(60))
+
+
+def test_program_that_confirms_nothing_is_killed_and_reported(robot: LocalShell) -> None:
+    evidence.begin(robot, FOLDER, "sender", "lo")
+    start(robot, "drive", "drive", HANGS)
+    (halted,) = halting.halt_all({"turtlebot-1": robot}, "bert@two", 60.0).values()
+    assert halted.programs == ((f"{FOLDER}/.jobs/drive", MotionState.SILENT),)
+    wait_until(lambda: not runs(robot), Deadline.after(60))
+
+
+def test_trial_with_the_lock_is_informed_and_starts_nothing(robot: LocalShell) -> None:
+    with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):
+        evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
+        start(robot, "drive", "drive", STANDS)
+        own = halting.halt_attempt(robot, FOLDER, "the-operator", Deadline.after(60))
+        assert own.state is MotionState.STATIONARY
+        other = jobs.work_folder("trial-a", "tcp-01-2")
+        evidence.begin(robot, other, "sender", "lo", token=ANNA.token)  # an order for one attempt keeps the lock
+        halting.halt(robot, "bert@two", Deadline.after(60))
+        with pytest.raises(LockLostError, match=r"bert@two stopped the robots at \d\d:\d\d:\d\d UTC"):
+            evidence.begin(robot, jobs.work_folder("trial-a", "tcp-01-3"), "sender", "lo", token=ANNA.token)
+    with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):  # resumed
+        evidence.begin(robot, jobs.work_folder("trial-a", "tcp-01-4"), "sender", "lo", token=ANNA.token)
+
+
+def test_unreachable_robot_does_not_prevent_the_stop_of_others(robot: LocalShell) -> None:
+    evidence.begin(robot, FOLDER, "sender", "lo")
+    start(robot, "drive", "drive", STANDS)
+    gone = LinkError("no route", where="eve", remedy="")
+    halted = halting.halt_all({"eve": gone, "turtlebot-1": robot}, "bert@two", 60.0)
+    assert halted["eve"].error is gone
+    assert halted["turtlebot-1"].state is MotionState.STATIONARY

@@ -1,0 +1,401 @@
+"""The MAVLink recorder: frames compared with pymavlink, and the program with a drone at each kind of connection."""
+
+import json
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink import mavutil
+from pymavlink.dialects.v10 import common as v1
+from pymavlink.dialects.v20 import common as d
+
+from fieldkit.agent import mavlink, mavlink_frames
+from fieldkit.agent.links import devices
+from fieldkit.agent.links.client import MessageRate
+from fieldkit.motion.logs import tlog
+from fieldkit.remote import agent
+from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
+from tests.helpers import drones
+from tests.helpers.drones import Sender
+
+ConnectionKind = Callable[[], AbstractContextManager[str]]
+WANTED = {"32": 20_000, "30": -1}
+"""LOCAL_POSITION_NED at 50 Hz, no ATTITUDE; requested by the recorder."""
+
+
+def real_frames() -> list[bytes]:
+    """Frames of MAVLink 1 and 2, and a signed one."""
+    old, new, signed = v1.MAVLink(None, srcSystem=3), Sender(), Sender()
+    signed.link.signing.secret_key = b"k" * 32
+    signed.link.signing.sign_outgoing = True
+    attitude = d.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0)
+    text = d.MAVLink_statustext_message(4, b"\xfe\xfd" * 20)
+    return [
+        bytes(v1.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0).pack(old)),
+        *(one.frame(message) for one in (new, signed) for message in (attitude, text, drones.beat())),
+    ]
+
+
+FRAMES = real_frames()
+
+
+@given(st.lists(st.sampled_from(FRAMES), max_size=8), st.lists(st.integers(0, 400), max_size=5))
+def test_frames_are_complete_for_any_cut_of_the_stream(sent: list[bytes], cuts: list[int]) -> None:
+    stream = b"".join(sent)
+    edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
+    buffer, came = bytearray(), list[bytes]()
+    for begin, end in pairwise(edges):
+        buffer += stream[begin:end]
+        came += mavlink_frames.frames(buffer)
+    assert came == sent
+    assert not buffer
+
+
+@given(st.binary(max_size=700))
+def test_frames_of_any_bytes_are_parts_of_them_in_order(noise: bytes) -> None:
+    at = 0
+    for frame in mavlink_frames.frames(bytearray(noise)):
+        assert mavlink_frames.frame_bytes(frame) == len(frame)
+        mavlink_frames.head(frame)
+        at = noise.index(frame, at) + len(frame)
+
+
+def test_reception_from_the_middle_of_a_frame_recovers() -> None:
+    rest = FRAMES[1][7:] + b"".join(FRAMES)
+    assert list(mavlink_frames.frames(bytearray(rest)))[-len(FRAMES) :] == FRAMES
+
+
+def test_created_frames_are_read_by_pymavlink() -> None:
+    writer, reader = mavlink_frames.FrameWriter(), d.MAVLink(None)
+    reader.robust_parsing = False
+    beat, command, other = reader.parse_buffer(
+        writer.heartbeat() + writer.command((7, 1), 511, 32, 100_000) + writer.command((7, 1), 511, 0, 0)
+    )
+    assert (beat.type, beat.autopilot, beat.get_srcComponent()) == (
+        d.MAV_TYPE_LOG,
+        d.MAV_AUTOPILOT_INVALID,
+        d.MAV_COMP_ID_LOG,
+    )
+    assert (command.command, command.param1, command.param2) == (d.MAV_CMD_SET_MESSAGE_INTERVAL, 32, 100_000)
+    assert (command.target_system, command.target_component) == (7, 1)
+    assert [one.get_seq() for one in (beat, command, other)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_checksums_are_those_of_pymavlink(old: bool) -> None:
+    link = d.MAVLink(None, srcSystem=7)
+    for message in (drones.beat(), d.MAVLink_command_ack_message(511, 2)):
+        frame = bytes(message.pack(link, force_mavlink1=old))
+        assert mavlink_frames.is_intact(frame)
+        for at in range(1 if old else 3, len(frame)):
+            changed = bytes((*frame[:at], frame[at] ^ 1, *frame[at + 1 :]))
+            assert not mavlink_frames.is_intact(changed)
+    other = bytes(d.MAVLink_system_time_message(1, 2).pack(link, force_mavlink1=old))
+    assert not mavlink_frames.is_intact(other), "the CRC_EXTRA of another message is unknown"
+
+
+@dataclass
+class Ended:
+    """The result of a recorder."""
+
+    code: int
+    said: dict[str, Any]
+    log: Path
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("agent") / "agent.pyz"
+    path.write_bytes(agent.content())
+    return path
+
+
+@contextmanager
+def recording(program: Path, log: Path, connection: str, **arguments: object) -> Iterator[Ended]:
+    """Record while the body runs, after the recorder is ready; then stop it as a job is stopped."""
+    request = json.dumps({"connection": connection, "intervals_us": {}, **arguments})
+    argv = (sys.executable, str(program), "mavlink", request, str(log))
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith(b"waiting for the heartbeat")
+        ended = Ended(-1, {}, log)
+        try:
+            assert process.stderr.readline() == b"up, MAVLink\n"
+            yield ended
+            process.send_signal(signal.SIGINT)
+            said, errors = process.communicate(timeout=60)
+            assert errors == b""
+            ended.code, ended.said = process.returncode, json.loads(said)
+        finally:
+            process.kill()
+
+
+def wait_until_size(log: Path, size_bytes: int) -> None:
+    """Wait until a log has reached a size."""
+    for _ in range(600):
+        if log.stat().st_size >= size_bytes:
+            return
+        threading.Event().wait(0.05)
+    raise AssertionError(f"{log} does not grow")
+
+
+def kinds(path: Path) -> list[str]:
+    """Return the message types of a log, read by pymavlink."""
+    reader = mavutil.mavlink_connection(str(path))
+    types = []
+    while (message := reader.recv_msg()) is not None:
+        types.append(message.get_type())
+    return types
+
+
+@contextmanager
+def over_tcp() -> Iterator[str]:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        streams: list[socket.socket] = []
+        accepted = threading.Thread(target=lambda: streams.append(server.accept()[0]))
+        accepted.start()
+
+        def stream() -> socket.socket:
+            accepted.join()
+            return streams[0]
+
+        with _late(stream):
+            yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
+
+
+@contextmanager
+def _late(stream: Callable[[], socket.socket]) -> Iterator[None]:
+    """Let a drone answer on a stream when it is open."""
+    over, ready = threading.Event(), threading.Event()
+
+    def fly() -> None:
+        with stream() as one, drones.flying(one.fileno(), one.sendall, one.recv):
+            ready.set()
+            over.wait()
+
+    thread = threading.Thread(target=fly)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextmanager
+def over_udp() -> Iterator[str]:
+    with drones.at_udp() as port:
+        yield f"udpout:127.0.0.1:{port}"
+
+
+@contextmanager
+def over_udp_that_speaks_first() -> Iterator[str]:
+    there = ("127.9.9.9", 14_550)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        endpoint.bind(("127.0.0.1", 0))
+        with drones.flying(
+            endpoint.fileno(), lambda frame: endpoint.sendto(frame, there), endpoint.recv
+        ) as autopilot:
+            list(autopilot.receive(Sender(255, 190).frame(drones.beat()), ("gcs", 1), time.monotonic_ns()))
+            yield f"udpin:{there[0]}:{there[1]}"
+
+
+@contextmanager
+def over_a_serial_line() -> Iterator[str]:
+    with drones.at_terminal() as path:
+        yield f"{path}:115200"
+
+
+@pytest.mark.parametrize(
+    "connection_kind",
+    [over_udp, over_udp_that_speaks_first, over_tcp, over_a_serial_line],
+    ids=lambda connection_kind: connection_kind.__name__,
+)
+def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path, tmp_path: Path) -> None:
+    with (
+        connection_kind() as connection,
+        recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended,
+    ):
+        wait_until_size(ended.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
+    assert ended.code == 0
+    types = kinds(ended.log)
+    read = tlog.read(ended.log, 0, ended.said["ended_us"])
+    assert ended.said["frames"] == read.frames == len(types)
+    assert (ended.said["refused"], ended.said["left_out"]) == ({}, 0)
+    assert read.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
+    assert read.values["mavlink_loss"] == 0
+    assert types.count("LOCAL_POSITION_NED") > 3 * types.count("ATTITUDE")
+
+
+def test_peer_that_restarts_at_another_port_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    device = devices.open_device(f"udpin:127.0.0.1:{port}")
+    with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
+        first.settimeout(60)
+        second.settimeout(60)
+        for sends, heard_by in ((first, first), (second, first), (second, second)):
+            if heard_by is second:
+                monkeypatch.setattr(devices, "_PEER_TIMEOUT_S", 0.0)
+            sends.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
+            select.select([device], [], [], 60)
+            assert device.read()
+            device.write(b"to whom it may concern")
+            assert heard_by.recv(100) == b"to whom it may concern"
+    device.close()
+
+
+def test_refused_rate_is_reported(program: Path, tmp_path: Path) -> None:
+    with (
+        over_udp() as connection,
+        recording(program, tmp_path / "x.tlog", connection, intervals_us={"12345": 1, "1": 500_000}) as ended,
+    ):
+        pass
+    assert ended.said["refused"] == {"12345": d.MAV_RESULT_FAILED}
+
+
+def test_waits_for_the_given_system_and_reports_it(program: Path, tmp_path: Path) -> None:
+    with over_udp() as connection:
+        arguments = json.dumps({"connection": connection, "intervals_us": {}, "system": 9})
+        argv = (sys.executable, str(program), "mavlink", arguments, str(tmp_path / "x.tlog"))
+        with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            until_there(tmp_path / "x.tlog")
+            wait_until_size(tmp_path / "x.tlog", 500)
+            process.send_signal(signal.SIGTERM)
+            _, errors = process.communicate(timeout=60)
+    assert errors.decode() == f"waiting for the heartbeat of an autopilot at {connection}\n"
+
+
+class FakeClock:
+    """A clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def time_ns(self) -> int:
+        return round(self.now_s * 1e9)
+
+
+class FakeLink:
+    """A link with messages from a test; it is also the selector that reports them."""
+
+    def __init__(self) -> None:
+        self.frames: list[bytes] = []
+        self.messages: dict[int, MessageRate] = {}
+        self.left_out = 0
+
+    def select(self, _: float) -> bool:
+        return bool(self.frames)
+
+    def receive(self) -> Iterator[bytes]:
+        frames, self.frames = self.frames, []
+        yield from frames
+
+    def send(self, frame: bytes) -> None:
+        assert frame
+
+
+@pytest.mark.parametrize(("comes", "is_refused"), [(False, False), (True, False), (False, True)])
+def test_requested_message_must_arrive_60_s_after_the_first_heartbeat(
+    comes: bool, is_refused: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    clock, link, sender = FakeClock(), FakeLink(), Sender()
+    monkeypatch.setattr(mavlink, "time", clock)
+    arguments = mavlink.FlightRecording("udpout:127.0.0.1:1", {"30": 100_000, "32": 100_000})
+    recorder = mavlink.FlightRecorder(arguments, link, str(tmp_path / "x.tlog"))  # type: ignore[arg-type]
+
+    def turn(at_s: float, *messages: d.MAVLink_message) -> None:
+        clock.now_s = 100.0 + at_s
+        link.frames = [sender.frame(message) for message in messages]
+        recorder.send()
+        recorder.receive(0.1, link)  # type: ignore[arg-type]
+        recorder.check()
+
+    turn(500.0)  # the autopilot is switched on late
+    turn(500.0, drones.beat(), d.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0))
+    turn(559.9, drones.beat())
+    assert not recorder.ready
+    if comes:
+        turn(559.95, d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0))
+    if is_refused:
+        link.messages = {32: MessageRate(100_000, d.MAV_RESULT_DENIED, 0.0)}
+    if comes or is_refused:
+        turn(560.1, drones.beat())
+        assert recorder.ready
+        turn(2000.0)
+    else:
+        with pytest.raises(mavlink.MissingMessageError, match="requested message 32 in 60 s"):
+            turn(560.1, drones.beat())
+    recorder.end()
+
+
+def test_recorder_stops_after_the_timeout_of_first_messages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """An autopilot whose boot takes longer has no position before."""
+    monkeypatch.setattr(mavlink, "_TIMEOUT_S", 2.0)
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER, boot_s=3600.0) as (port, _):
+        arguments = mavlink.FlightRecording(f"udpout:127.0.0.1:{port}", {"32": 100_000})
+        with pytest.raises(mavlink.MissingMessageError, match="requested message 32 in 2 s"):
+            mavlink.record(arguments, str(tmp_path / "x.tlog"), threading.Event())
+
+
+def until_there(path: Path) -> None:
+    for _ in range(600):
+        if path.exists():
+            return
+        threading.Event().wait(0.05)
+    raise AssertionError(path)
+
+
+@pytest.mark.parametrize(
+    ("connection", "complaint"),
+    [
+        ("tcp:127.0.0.1:1", "Connection refused"),
+        ("/dev/null:115200", "Inappropriate ioctl"),
+        ("/dev/none:115200", "No such file"),
+        ("/dev/null:7", "has no rate of 7 baud"),
+        ("usb:1:2", "is not a connection: udpout:"),
+    ],
+)
+def test_connection_that_cannot_be_opened_is_reported(
+    connection: str, complaint: str, program: Path, tmp_path: Path
+) -> None:
+    arguments = json.dumps({"connection": connection, "intervals_us": {}})
+    argv = (sys.executable, str(program), "mavlink", arguments, str(tmp_path / "x.tlog"))
+    done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 3
+    assert f"error: MAVLink over {connection}: " in done.stderr
+    assert complaint in done.stderr
+
+
+@pytest.mark.parametrize("serial", [False, True], ids=["udp", "serial"])
+def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
+    serial: bool, program: Path, tmp_path: Path
+) -> None:
+    damage = drones.damage_randomly(1)
+    drone = drones.at_terminal(damage) if serial else drones.at_udp(damage)
+    with drone as where:
+        connection = f"{where}:115200" if serial else f"udpout:127.0.0.1:{where}"
+        with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended:
+            wait_until_size(ended.log, 12_000)
+    assert ended.code == 0
+    read = tlog.read(ended.log, drones.SYSTEM, ended.said["ended_us"])
+    assert read.frames == ended.said["frames"]
+    assert int(read.values["mavlink_damaged"]) > 10
+    assert read.kinds["LOCAL_POSITION_NED"] > 5

@@ -1,0 +1,44 @@
+"""The loss of MAVLink behind a router, compared with the counters of the kernel that dropped the messages."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fieldkit.motion.logs import tlog
+from tests.helpers import drones
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.emulated
+
+LASTS_S = 8
+EDGE = 3
+"""Messages that may differ: one of each stream is on its way when the counters begin, and one when they end."""
+REQUESTED = (("ATTITUDE", 50_000), ("LOCAL_POSITION_NED", 50_000))
+
+
+@pytest.mark.quiet
+@pytest.mark.parametrize("percent", [0, 20])
+def test_loss_behind_a_router_is_that_of_the_kernel(percent: int, tmp_path: Path) -> None:
+    log = tmp_path / "mavlink.tlog"
+    words = ("unshare", "--net", "--", sys.executable, "-m", "tests.helpers.mavlink_loss")
+    done = subprocess.run(
+        (*words, str(log), str(LASTS_S), str(percent)),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    counted = json.loads(done.stdout)
+    assert counted["periodic"] > 200
+    assert counted["withheld"] > 10, "numbers have gaps that are not losses"
+    values = tlog.measure(tlog.read(log, drones.SYSTEM, counted["ended_us"], REQUESTED), 0.0).values
+    came, sent = int(values["mavlink_periodic"]), int(values["mavlink_periodic_sent"])
+    assert abs(sent - came - counted["dropped"]) <= EDGE
+    assert came >= counted["periodic"] - counted["dropped"]
+    assert float(values["mavlink_loss"]) == pytest.approx(1 - came / sent)
+    assert float(values["mavlink_loss_most"]) > float(values["mavlink_loss"])
