@@ -178,7 +178,7 @@ def test_only_entry_points_lead_to_motion(folder: str) -> None:
     """`tests/e2e/test_motion_border.py` removes the package and runs tests of the harness."""
     for path in modules(folder):
         if not path.is_relative_to(ROOT / "fieldkit" / "motion"):
-            assert not any(name.startswith("fieldkit.motion") for name in imported(path)), path
+            assert not any(name.startswith("fieldkit.motion") for name in imported_names(path)), path
 
 
 # Commands of other packages declare arguments, display and draw like fieldkit's commands (docs/add-a-command.md).
