@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from fieldkit.bags import contents
 from fieldkit.measure.evidence import bag
 from fieldkit.measure.motion import tlog
-from fieldkit.measure.positions import recorded
+from fieldkit.measure.positions import position_files
 from tests.helpers.sshd import server
 
 __all__ = ["server"]
@@ -75,7 +75,7 @@ def _no_reader_waits() -> Iterator[None]:
     yield
     bag._READER.stop()
     contents._WORKER.stop()
-    recorded._GPX_READER.stop()
+    position_files._GPX_READER.stop()
     tlog._READER.stop()
 
 

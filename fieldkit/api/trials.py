@@ -18,7 +18,7 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean
 from fieldkit.core.model import Protocol
 from fieldkit.export import table
 from fieldkit.export.table import Table
-from fieldkit.measure.transfers import crossings
+from fieldkit.measure.transfers import fates
 from fieldkit.report.evidence import Evidence, load_evidence
 from fieldkit.trial import sources
 from fieldkit.trial.sources import Sources
@@ -122,7 +122,9 @@ class Trials:
                 remedy=did_you_mean(step, transfers, f"its transfers: {named}"),
             )
         selected = transfers if step is None else {step: transfers[step]}
-        return table.of_packets({name: crossings.read(attempt, transfer) for name, transfer in selected.items()})
+        return table.of_packets(
+            {name: fates.read_crossings(attempt, transfer) for name, transfer in selected.items()}
+        )
 
     def __len__(self) -> int:
         """Return the number of attempts."""

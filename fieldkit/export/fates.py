@@ -10,9 +10,9 @@ from fieldkit.core.model import Protocol
 from fieldkit.export.packets import NOT_KNOWN, MarkedPackets
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.transfers import strangers
+from fieldkit.measure.transfers import altered_packets
 from fieldkit.measure.transfers.match import Match, match
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 # Largest IP payload of a frame that offload did not join: the MTU of Ethernet and Wi-Fi without the shortest header.
 _LARGEST_PAYLOAD_BYTES: Final = 1480
@@ -57,7 +57,7 @@ def _matched(here: Capture, there: Capture, same_path: Sequence[Transfer]) -> Ma
     is_tcp = any(transfer.protocol is Protocol.TCP for transfer in same_path)
     if is_tcp and (_is_offloaded(sent) or _is_offloaded(received)):
         return None
-    if any(strangers.reason(sent, received, transfer) for transfer in same_path):
+    if any(altered_packets.reason(sent, received, transfer) for transfer in same_path):
         return None
     try:
         return match(sent, received)

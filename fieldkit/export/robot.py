@@ -15,7 +15,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, ping
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 

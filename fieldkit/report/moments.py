@@ -11,11 +11,11 @@ from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.columns import plain_name, step_prefixed
 from fieldkit.core.model import FaultKind, Protocol, Role, StationSample
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import bag, host, link, ping, recovery, track
-from fieldkit.measure.positions import where
+from fieldkit.measure.evidence import bag, host, link, outage, ping, track
+from fieldkit.measure.positions import position_columns
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report.theme import Colour
 from fieldkit.trial.plan import Plan
 
@@ -97,7 +97,7 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> M
         clocks=clocks,
         links={role: [(at_ns - ahead_ns[role], sample) for at_ns, sample in line] for role, line in links.items()},
         ends=ends,
-        distances_m=where.distances_m(evidence, ends),
+        distances_m=position_columns.distances_m(evidence, ends),
         jobs={
             (role, name): (start_ns - ahead_ns[role], stop_ns - ahead_ns[role])
             for role in plan.cast
@@ -203,8 +203,8 @@ def _activities_of_faults(moments: Moments, evidence: AttemptEvidence) -> Iterat
         step, _, what = name.rpartition(".")
         kind = what.removeprefix("fault-").removesuffix(_HEALS)
         if what.startswith("fault-") and what.endswith(_HEALS) and kind in {str(fault) for fault in FaultKind}:
-            note = step_prefixed(step, recovery.note_file(FaultKind(kind)))
-            lasted_s = evidence.read_or_none(recovery.cause_lasted_s, note) or 0.0
+            note = step_prefixed(step, outage.note_file(FaultKind(kind)))
+            lasted_s = evidence.read_or_none(outage.cause_lasted_s, note) or 0.0
             yield Activity(f"fault {_step_label(kind, step)}", heals_ns - round(lasted_s * 1e9), heals_ns, "lost")
             yield from _outage(moments, evidence, role, FaultKind(kind), step)
 
@@ -213,7 +213,7 @@ def _outage(
     moments: Moments, evidence: AttemptEvidence, role: Role, kind: FaultKind, step: str
 ) -> Iterator[Activity]:
     """Yield the longest time without an answer to the observer's pings, up to the end if no more answers came."""
-    output = evidence.read_or_none(ping.read, step_prefixed(step, recovery.observed_file(kind)))
+    output = evidence.read_or_none(ping.read, step_prefixed(step, outage.observed_file(kind)))
     stamps_ns = sorted(reply.at_utc_ns for reply in output.answers if reply.at_utc_ns is not None) if output else []
     if not stamps_ns or kind is FaultKind.KILL:
         return

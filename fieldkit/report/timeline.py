@@ -12,7 +12,7 @@ from fieldkit.core.columns import step_prefixed
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers.fates import Fates
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report import flows, moments
 from fieldkit.report.charts import Chart, Panel, Series, Span
 from fieldkit.report.evidence import Evidence

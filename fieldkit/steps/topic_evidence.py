@@ -12,8 +12,8 @@ from fieldkit.measure.checks.topic_captures import CapturedTopic
 from fieldkit.measure.checks.topic_checks import TopicPlan
 from fieldkit.measure.transfers import sample_heads, topic_log
 from fieldkit.measure.transfers.sample_heads import SampleFlow
+from fieldkit.measure.transfers.topic_columns import first_arrivals
 from fieldkit.measure.transfers.topic_log import TopicLog
-from fieldkit.measure.transfers.topics import first_arrivals
 from fieldkit.ros.qos import History, Reliability
 from fieldkit.steps.middlewares import Middleware
 from fieldkit.steps.streams import StreamOptions

@@ -7,7 +7,7 @@ from typing import Final
 from fieldkit.core import columns
 from fieldkit.core.columns import Column, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.measure.evidence import lateness, link
+from fieldkit.measure.evidence import link, oracle_delays
 from fieldkit.steps import kinds
 from fieldkit.steps.base import Step, step_types
 
@@ -44,7 +44,7 @@ IDENTITY: Final = columns.columns(
 OTHERS: Final = Column("others", "text", "Robots in further roles of the procedure: ROLE=ROBOT, separated by spaces.")
 """The column is present only if a procedure has such roles."""
 
-ALWAYS: Final = (*lateness.COLUMNS, *link.COLUMNS)
+ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS)
 """Columns that are measured whatever the steps are."""
 
 Row = Mapping[str, Value]

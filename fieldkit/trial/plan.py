@@ -13,7 +13,7 @@ from fieldkit.config.schema import Field, Int, Number, Strict
 from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Pinging, Planned, PutProgram, Refusal, Scene
 from fieldkit.steps.variants import Variants

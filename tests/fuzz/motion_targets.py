@@ -18,12 +18,12 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.core.prompts import Question
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import ping, reception
+from fieldkit.measure.evidence import ping, recorded_topics
 from fieldkit.measure.motion import drive_log
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts, recorded, where
-from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions import position_columns, position_files, position_sources
+from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.driving import DriveLease
@@ -117,7 +117,7 @@ def _needs(data: bytes, _: Path) -> None:
 
 def _kept(sender: Account, receiver: Account) -> bytes:
     clocks = {Role.SENDER: Offset(0.2, 0.01), Role.RECEIVER: Offset(-0.2, 0.01)}
-    return accounts.text(Accounts({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
+    return position_sources.text(Accounts({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
 
 
 @cache
@@ -147,16 +147,16 @@ def _bag(data: bytes, place: Path) -> None:
     for stamps in ("header", "received"):
         account = Account(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
         with suppress(EvidenceError):
-            found = recorded.read_topic(path, account)
+            found = position_files.read_topic(path, account)
             _sound(found)
             if found.yaws_rad is not None:
-                _sound(recorded.to_placement_frame(found, account))
+                _sound(position_files.to_placement_frame(found, account))
 
 
 def _file(ending: str, data: bytes, place: Path) -> None:
     path = place / f"walk.{ending}"
     path.write_bytes(data)
-    _sound(recorded.read_file(path))
+    _sound(position_files.read_file(path))
 
 
 def _whole(of_trial: bool, data: bytes, place: Path) -> None:
@@ -167,18 +167,18 @@ def _whole(of_trial: bool, data: bytes, place: Path) -> None:
     (place / "positions-receiver.gpx").write_bytes(_GPX)
     (place / "positions-receiver.csv").write_bytes(_CSV)
     folder = place if of_trial else attempt
-    (folder / accounts.FILE).write_bytes(data)
+    (folder / position_sources.FILE).write_bytes(data)
     evidence = AttemptEvidence(attempt)
     times_ns = [BEGAN_NS + S, BEGAN_NS + 3 * S]
-    found = where.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
+    found = position_columns.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
     assert all(math.isfinite(float(value)) for value in found.values.values())  # what is too far, gates refuse
-    where.distances_m(evidence, _ENDS)
-    where.readable_samples(evidence)
-    said = accounts.read(folder / accounts.FILE)
-    (place / "again.json").write_text(accounts.text(said), encoding="utf-8")
-    assert accounts.read(place / "again.json") == said
-    where.sources_text(evidence)
-    assert math.isfinite(where.clock_error_s(evidence) or 0.0)
+    position_columns.distances_m(evidence, _ENDS)
+    position_columns.readable_samples(evidence)
+    said = position_sources.read(folder / position_sources.FILE)
+    (place / "again.json").write_text(position_sources.text(said), encoding="utf-8")
+    assert position_sources.read(place / "again.json") == said
+    position_columns.sources_text(evidence)
+    assert math.isfinite(position_columns.clock_error_s(evidence) or 0.0)
 
 
 def _accounts() -> tuple[bytes, ...]:
@@ -204,8 +204,8 @@ def _received(data: bytes, place: Path) -> None:
     """Read how soon topics were heard, by a mutated log beside a whole bag."""
     (place / "log").write_bytes(data)
     (place / "scan.bag").write_bytes(_heard())
-    found = reception.measure(reception.read(place, "log", "scan.bag", ["/scan"], 5.0))
-    for column in reception.COLUMNS:
+    found = recorded_topics.measure(recorded_topics.read(place, "log", "scan.bag", ["/scan"], 5.0))
+    for column in recorded_topics.COLUMNS:
         assert column.invalid_value_reason(cell(found.values.get(column.name))) is None, column.name
 
 

@@ -11,7 +11,7 @@ from typing import Final
 from fieldkit.core.columns import cell
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
-from fieldkit.measure.evidence import iw, link, link_samples, printed
+from fieldkit.measure.evidence import iw, link, link_samples, program_output
 from tests.fuzz.harness import Target
 from tests.helpers.paths import DATA
 
@@ -67,16 +67,16 @@ def _path(data: bytes, place: Path) -> None:
     """Look where a procedure's author says, a text of any length."""
     where = data.decode(errors="replace")
     (place / "run.txt").write_text(json.dumps(_PRINTED), encoding="ascii")
-    if printed.path_error(where) is None:
+    if program_output.path_error(where) is None:
         with suppress(EvidenceError):
-            printed.at_path(place / "run.txt", where)
+            program_output.at_path(place / "run.txt", where)
 
 
 def _expression(data: bytes, place: Path) -> None:
     expression = data.decode(errors="replace")
     (place / "run.txt").write_text("rtt = 12.5 ms\nloss: 3%\n" + "a" * 5000 + "b\n", encoding="ascii")
-    if printed.expression_error(expression) is None:
-        printed.by_expression(place / "run.txt", expression)
+    if program_output.expression_error(expression) is None:
+        program_output.by_expression(place / "run.txt", expression)
 
 
 def radio_targets() -> Iterator[Target]:

@@ -22,7 +22,7 @@ from fieldkit.core.columns import Column
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
-from fieldkit.measure import offsets
+from fieldkit.measure import robot_clock
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.checks import topic_captures, topic_checks
@@ -34,20 +34,19 @@ from fieldkit.measure.evidence import (
     endings,
     host,
     iperf3,
-    lateness,
-    medium,
+    oracle_delays,
+    outage,
     ping,
-    printed,
-    recovery,
+    program_output,
     tcpdump_log,
     track,
 )
-from fieldkit.measure.evidence.confined import ReaderError
+from fieldkit.measure.evidence.sandbox import ReaderError
 from fieldkit.measure.motion import tlog
-from fieldkit.measure.positions import recorded
-from fieldkit.measure.positions.accounts import Account
-from fieldkit.measure.transfers import topic_log, topics
-from fieldkit.measure.transfers.topics import TopicTraffic
+from fieldkit.measure.positions import position_files
+from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.transfers import topic_columns, topic_log
+from fieldkit.measure.transfers.topic_columns import TopicTraffic
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.steps.scene import CommandResult
@@ -132,15 +131,15 @@ def _capture(data: bytes, _: Path) -> None:
 
 def _fault(data: bytes, place: Path) -> None:
     for kind in FaultKind:
-        for name in (recovery.note_file(kind), recovery.observed_file(kind)):
+        for name in (outage.note_file(kind), outage.observed_file(kind)):
             stored = next(SELFHEAL.glob(f"repeats/*/{name}"), None)
             (place / name).write_bytes(stored.read_bytes() if stored is not None else data)
-        (place / recovery.observed_file(kind)).write_bytes(data)
+        (place / outage.observed_file(kind)).write_bytes(data)
         for which in (kind, None):
             try:
-                recovery.measure(kind, recovery.read(place, kind) if which else None)
+                outage.measure(kind, outage.read(place, kind) if which else None)
             finally:
-                (place / recovery.note_file(kind)).write_bytes(data)
+                (place / outage.note_file(kind)).write_bytes(data)
 
 
 def _sections(data: bytes, _: Path) -> None:
@@ -200,7 +199,7 @@ def _replies(data: bytes, place: Path) -> None:
         for ask in (locks.holder, partial(jobs.list_running, deadline=Deadline.after(1)), _called):
             with suppress(RobotError):
                 ask(shell)
-    offsets.parse_date(data.decode("ascii", "replace"))
+    robot_clock.parse_date(data.decode("ascii", "replace"))
     printable(data)
 
 
@@ -321,7 +320,7 @@ def _tlog(path: Path) -> None:
     for kind in (tlog.LOCAL, tlog.GLOBAL):
         for stamps in ("header", "received"):
             with suppress(EvidenceError):
-                recorded.read_tlog(path, Account(topic=kind, stamps=stamps))
+                position_files.read_tlog(path, Account(topic=kind, stamps=stamps))
 
 
 def _topic_log(path: Path) -> None:
@@ -330,7 +329,7 @@ def _topic_log(path: Path) -> None:
     plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, on_ports=True)
     list(topic_checks.check_logs(plan, found, found))
     list(topic_captures.check_captures(plan, found, found, CapturedTopic(None, None, complete=False)))
-    topics.measure(flow, found, found, None, None)
+    topic_columns.measure(flow, found, found, None, None)
 
 
 def _printed(data: bytes, place: Path) -> None:
@@ -338,13 +337,16 @@ def _printed(data: bytes, place: Path) -> None:
     path = place / "run.txt"
     path.write_bytes(data)
     looks = (
-        *(partial(printed.at_path, path, where) for where in ("[0].a[1].b", "end.sum.bytes", "@", "*", "[].a[]")),
-        *(partial(printed.by_expression, path, what) for what in (r"(a+)+$", r"= ([0-9]+)", r"(?s)(.*)")),
+        *(
+            partial(program_output.at_path, path, where)
+            for where in ("[0].a[1].b", "end.sum.bytes", "@", "*", "[].a[]")
+        ),
+        *(partial(program_output.by_expression, path, what) for what in (r"(a+)+$", r"= ([0-9]+)", r"(?s)(.*)")),
     )
     for look in looks:
         for unit in ("V", "count", "ns", "share", "bool", "text"):
             with suppress(EvidenceError):
-                printed.value(Column("x", unit, "X."), look())
+                program_output.value(Column("x", unit, "X."), look())
 
 
 def _all_targets() -> Iterator[Target]:
@@ -360,8 +362,12 @@ def _all_targets() -> Iterator[Target]:
     yield Target("ping", (*pings, *_attempts("ping.txt")), partial(_parsed, _pinged), 3)
     yield Target("tcpdump-log", _all("tcpdump/*/*.log"), partial(_parsed, tcpdump_log.parse))
     yield Target("host", _attempts("*-before.txt", "*-after.txt"), partial(_measured_text, _host))
-    yield Target("lateness", _attempts(lateness.FILE), partial(_measured_text, lateness.read))
-    yield Target("medium", _attempts(medium.FILE), partial(_measured_text, medium.read))
+    yield Target(
+        "lateness", _attempts(oracle_delays.LATENESS_FILE), partial(_measured_text, oracle_delays.read_lateness)
+    )
+    yield Target(
+        "medium", _attempts(oracle_delays.AIR_DELAY_FILE), partial(_measured_text, oracle_delays.read_air_delay)
+    )
     yield Target("track", _attempts(track.FILE), partial(_measured_text, _tracked))
     yield Target("fault", _attempts("fault-*.txt"), _fault)
     yield Target("iperf3", _all("iperf3/*/*.json"), partial(_measured_text, _iperf3))

@@ -23,7 +23,7 @@ from fieldkit.measure.captures.arrays import (
     row_hashes,
 )
 from fieldkit.measure.captures.ip import ICMP, SCTP, TCP, UDP, Addresses, address, headers
-from fieldkit.measure.captures.links import network
+from fieldkit.measure.captures.link_layer import network
 
 FIN: Final = 0x01
 SYN: Final = 0x02

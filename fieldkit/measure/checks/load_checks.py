@@ -20,8 +20,8 @@ from fieldkit.measure.captures.ip import TCP
 from fieldkit.measure.captures.packets import ACK, NOT_CAPTURED, SYN, Packets
 from fieldkit.measure.evidence.host import Counters
 from fieldkit.measure.evidence.iperf3 import IperfTest
-from fieldkit.measure.transfers.load import LoadFlow
-from fieldkit.measure.transfers.streams import LONGEST_BYTES
+from fieldkit.measure.transfers.iperf3_load import LoadFlow
+from fieldkit.measure.transfers.tcp_streams import LONGEST_BYTES
 
 COOKIE_BYTES: Final = 37
 """Length of the cookie at the start of each TCP connection of the client (iperf_api.h, COOKIE_SIZE)."""

@@ -20,8 +20,8 @@ from fieldkit.measure.checks.topic_checks import TopicPlan
 from fieldkit.measure.transfers.delay import LARGEST_ERROR
 from fieldkit.measure.transfers.match import match
 from fieldkit.measure.transfers.sample_heads import SampleFlow, SampleHeads
+from fieldkit.measure.transfers.topic_columns import first_arrivals
 from fieldkit.measure.transfers.topic_log import TopicLog, TopicSamples
-from fieldkit.measure.transfers.topics import first_arrivals
 
 STAMP_NS: Final = 2_000
 """tcpdump truncates times to microseconds, and the kernel may stamp a packet with a time read 1 us later."""

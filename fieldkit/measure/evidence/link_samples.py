@@ -19,7 +19,7 @@ from typing import Final
 from fieldkit.core import laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role, StationSample
-from fieldkit.measure.evidence import counted_csv, host, iw, reading
+from fieldkit.measure.evidence import host, iw, reading
 
 FILE: Final = laptop_files.LINK
 
@@ -46,7 +46,7 @@ def file(role: Role) -> str:
 
 def text(samples: Mapping[Role, Sequence[LinkSample]]) -> str:
     """Return the file text for samples of a testbed."""
-    return counted_csv.text(_HEADER, (line for role in samples for line in _rows(role, samples)))
+    return reading.counted_csv_text(_HEADER, (line for role in samples for line in _rows(role, samples)))
 
 
 def _rows(role: Role, samples: Mapping[Role, Sequence[LinkSample]]) -> Iterator[str]:
@@ -69,7 +69,7 @@ def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
     Raises:
         EvidenceError: The file is missing, truncated, or has other contents.
     """
-    rows = map(_parse_row, counted_csv.read(path, _HEADER, _ROW, "is not a file of link samples"))
+    rows = map(_parse_row, reading.read_counted_csv(path, _HEADER, _ROW, "is not a file of link samples"))
     samples: dict[Role, list[LinkSample]] = {}
     for (role, _), group in groupby(rows, key=lambda row: (row[0], row[1].utc_ns)):
         samples.setdefault(role, []).append(_merge(sample for _, sample in group))

@@ -18,9 +18,9 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.motion import motion_sources, tlog
 from fieldkit.measure.motion.tlog import GLOBAL, LOCAL, Tlog
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts
-from fieldkit.measure.positions.accounts import GAP_S, Account, Accounts
+from fieldkit.measure.positions import position_sources
+from fieldkit.measure.positions.position_sources import GAP_S, Account, Accounts
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.remote import agent
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
@@ -210,7 +210,7 @@ class MavlinkStep(Nest):
 
     @override
     def laptop_files(self) -> tuple[str, ...]:
-        return (accounts.FILE,) if self.positions else ()
+        return (position_sources.FILE,) if self.positions else ()
 
     @property
     def _file(self) -> str:

@@ -13,9 +13,9 @@ from fieldkit.core import geometry, model
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import numbered_lines
+from fieldkit.measure.evidence import reading
 from fieldkit.measure.motion import drive_checks, drive_log, motion_sources
-from fieldkit.measure.positions import farthest
+from fieldkit.measure.positions import travelled_distance
 from fieldkit.steps import driving, streams
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.lease import run_inside
@@ -263,7 +263,7 @@ class MoveStep(Nest):
             return
         try:
             log = view.evidence.read(drive_log.read, self._log)
-            damage = view.evidence.read(numbered_lines.problem, self._log)
+            damage = view.evidence.read(reading.numbered_lines_problem, self._log)
         except EvidenceError as error:
             yield f"{self._log}: {error.what}"
             return
@@ -283,7 +283,7 @@ class MoveStep(Nest):
             return measured
         during_ns = (log[0].utc_ns, log[-1].utc_ns) if log[0].utc_ns else None
         away_m = max(moment.off_m for moment in log)
-        why = farthest.contradiction(view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns)
+        why = travelled_distance.contradiction(view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns)
         return measured.without({name: why for name in measured.values if name != "drive_ended"}) if why else measured
 
     @override

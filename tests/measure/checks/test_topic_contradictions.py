@@ -13,7 +13,7 @@ from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.measure.checks import topic_captures, topic_checks
-from fieldkit.measure.transfers import sample_heads, topic_log, topics
+from fieldkit.measure.transfers import sample_heads, topic_columns, topic_log
 from tests.helpers import topic_attempts
 from tests.helpers.captures import Frame
 from tests.helpers.topic_attempts import MS, PERIOD, PLAN, SAMPLES, SECOND, Row, TopicAttempt, attempt, best_effort
@@ -331,5 +331,5 @@ def test_constants_equal_those_of_the_agent() -> None:
 
 def test_every_time_of_a_topic_is_compared_with_the_capture() -> None:
     """Columns added later are included."""
-    times = {column.name for column in topics.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
+    times = {column.name for column in topic_columns.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
     assert times | {"topic_deadline_misses"} == topic_captures.SHARE_FIGURES.keys()

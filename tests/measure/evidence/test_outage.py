@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
-from fieldkit.measure.evidence import recovery
-from fieldkit.measure.evidence.recovery import Recovery
+from fieldkit.measure.evidence import outage
+from fieldkit.measure.evidence.outage import Recovery
 from tests.helpers.measures import measure
 
 HEAD = "PING 10.42.0.1 (10.42.0.1) 56(84) bytes of data."
@@ -48,7 +48,7 @@ AWAY = [*range(1, 11), *range(36, 50)]
 def test_the_outage_is_the_longest_gap_and_the_recovery_its_part_after_the_cause(
     tmp_path: Path, stamps: bool
 ) -> None:
-    result = recovery.read(folder(tmp_path, FaultKind.LINK_DOWN, pings(AWAY, 49, stamps=stamps)), FaultKind.LINK_DOWN)
+    result = outage.read(folder(tmp_path, FaultKind.LINK_DOWN, pings(AWAY, 49, stamps=stamps)), FaultKind.LINK_DOWN)
     assert result.recovered
     assert result.outage_s == pytest.approx(2.6)
     assert result.recovery_s == pytest.approx(0.6)
@@ -56,18 +56,18 @@ def test_the_outage_is_the_longest_gap_and_the_recovery_its_part_after_the_cause
 
 def test_time_stamps_are_preferred_to_the_interval(tmp_path: Path) -> None:
     text = pings(AWAY, 49, interval_s=0.2)
-    result = recovery.read(folder(tmp_path, FaultKind.REBOOT, text, lasted="0.000"), FaultKind.REBOOT)
+    result = outage.read(folder(tmp_path, FaultKind.REBOOT, text, lasted="0.000"), FaultKind.REBOOT)
     assert result.outage_s == result.recovery_s == pytest.approx(5.2)
 
 
 def test_recovery_is_never_negative(tmp_path: Path) -> None:
-    result = recovery.read(folder(tmp_path, FaultKind.LINK_DOWN, pings(AWAY, 49), lasted="2.7"), FaultKind.LINK_DOWN)
+    result = outage.read(folder(tmp_path, FaultKind.LINK_DOWN, pings(AWAY, 49), lasted="2.7"), FaultKind.LINK_DOWN)
     assert result.recovery_s == 0.0
 
 
 def test_without_the_cause_s_time_there_is_an_outage_and_no_recovery_time(tmp_path: Path) -> None:
     kind = FaultKind.OUT_OF_RANGE
-    result = recovery.read(folder(tmp_path, kind, pings(AWAY, 49), lasted="unknown"), kind)
+    result = outage.read(folder(tmp_path, kind, pings(AWAY, 49), lasted="unknown"), kind)
     assert result == Recovery(pytest.approx(2.6), None, recovered=True)  # type: ignore[arg-type]
 
 
@@ -75,35 +75,35 @@ def test_without_the_cause_s_time_there_is_an_outage_and_no_recovery_time(tmp_pa
 def test_a_robot_that_does_not_recover_has_no_times(tmp_path: Path, sent: int) -> None:
     text = pings(list(range(1, 11)), sent)
     kind = FaultKind.LINK_DOWN
-    result = recovery.read(folder(tmp_path, kind, text), kind)
+    result = outage.read(folder(tmp_path, kind, text), kind)
     lasted_s = 2.0  # duration of the cause
     bound_s = max(0.0, (sent - 10) * 0.1 - lasted_s)
     assert result == Recovery(None, None, recovered=False, recovery_at_least_s=pytest.approx(bound_s))  # type: ignore[arg-type]
-    values = recovery.measure(kind, result).values
+    values = outage.measure(kind, result).values
     assert values.keys() == {"link_down_recovered", "link_down_recovery_at_least_s"}
 
 
 def test_a_robot_that_is_silent_again_has_not_recovered(tmp_path: Path) -> None:
     text = pings([*range(1, 11), *range(36, 40)], 60)
-    assert not recovery.read(folder(tmp_path, FaultKind.REBOOT, text, lasted="0.0"), FaultKind.REBOOT).recovered
+    assert not outage.read(folder(tmp_path, FaultKind.REBOOT, text, lasted="0.0"), FaultKind.REBOOT).recovered
 
 
 def test_duplicates_and_damaged_answers_are_no_answers(tmp_path: Path) -> None:
     text = pings(AWAY, 49).replace("icmp_seq=36 ttl=64 time=0.6 ms", "icmp_seq=36 ttl=64 time=0.6 ms (BAD CHECKSUM!)")
-    result = recovery.read(folder(tmp_path, FaultKind.LINK_DOWN, text), FaultKind.LINK_DOWN)
+    result = outage.read(folder(tmp_path, FaultKind.LINK_DOWN, text), FaultKind.LINK_DOWN)
     assert result.outage_s == pytest.approx(2.7)
 
 
 def test_the_outage_of_a_process_is_between_the_last_observation_and_the_next(tmp_path: Path) -> None:
     text = watched((5.0, "31 40"), (5.1, "31"), (5.2, ""), (5.3, ""), (5.4, "77"), (5.5, "77"))
-    result = recovery.read(folder(tmp_path, FaultKind.KILL, text, lasted="0.000"), FaultKind.KILL)
+    result = outage.read(folder(tmp_path, FaultKind.KILL, text, lasted="0.000"), FaultKind.KILL)
     assert result.recovered
     assert result.outage_s == result.recovery_s == pytest.approx(0.3)
 
 
 def test_a_process_that_does_not_recover(tmp_path: Path) -> None:
     text = watched((1.0, ""), (4.9, "31"), (5.0, "31"), *((5.1 + n / 10, "") for n in range(20)))
-    result = recovery.read(folder(tmp_path, FaultKind.KILL, text, lasted="0.000"), FaultKind.KILL)
+    result = outage.read(folder(tmp_path, FaultKind.KILL, text, lasted="0.000"), FaultKind.KILL)
     assert result == Recovery(None, None, recovered=False, recovery_at_least_s=pytest.approx(2.0))  # type: ignore[arg-type]
 
 
@@ -123,7 +123,7 @@ def test_evidence_without_effect_of_the_fault_is_an_error(
     tmp_path: Path, kind: FaultKind, text: str, complaint: str
 ) -> None:
     with pytest.raises(EvidenceError, match=complaint):
-        recovery.read(folder(tmp_path, kind, text), kind)
+        outage.read(folder(tmp_path, kind, text), kind)
 
 
 @pytest.mark.parametrize(
@@ -133,12 +133,12 @@ def test_a_note_without_the_duration_is_an_error(tmp_path: Path, note: str) -> N
     folder(tmp_path, FaultKind.LINK_DOWN, pings(AWAY, 49))
     (tmp_path / "fault-link-down.txt").write_text(note, encoding="utf-8")
     with pytest.raises(EvidenceError, match="duration of the fault"):
-        recovery.read(tmp_path, FaultKind.LINK_DOWN)
+        outage.read(tmp_path, FaultKind.LINK_DOWN)
 
 
 def test_a_missing_file_is_an_evidence_error(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="cannot be read"):
-        recovery.read(tmp_path, FaultKind.REBOOT)
+        outage.read(tmp_path, FaultKind.REBOOT)
 
 
 def test_each_kind_has_separate_columns_and_no_transfer_is_needed(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_the_longest_gap_is_found_at_any_position(
     for number in range(answered[0], sent + 1):
         run = 0 if number in set(answered) else run + 1
         longest = max(longest, run)
-    result = recovery.read(folder(path, FaultKind.LINK_DOWN, pings(answered, sent)), FaultKind.LINK_DOWN)
+    result = outage.read(folder(path, FaultKind.LINK_DOWN, pings(answered, sent)), FaultKind.LINK_DOWN)
     assert result.outage_s == pytest.approx((longest + 1) / 10, abs=1e-5)
 
 
@@ -182,7 +182,7 @@ def test_any_file_of_a_robot_is_measured_or_refused(
     path = folder(tmp_path_factory.mktemp("fault"), kind, text)
     (path / f"fault-{kind}.txt").write_text(f"lasted_s 1\ninterval_s 0.1\n{note}", encoding="utf-8")
     try:
-        result = recovery.read(path, kind)
+        result = outage.read(path, kind)
     except EvidenceError:
         return
     assert result.outage_s is None or result.outage_s >= 0

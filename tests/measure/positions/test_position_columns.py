@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod
+from tests.measure.positions.test_recorded import BEGAN_NS, S, odometry, stamped, written
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FIXED_ROLES, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping, track
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts, where
-from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions import position_columns, position_sources
+from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, PLACED, WGS84
-from tests.measure.positions.test_recorded import BEGAN_NS, S, odometry, stamped, written
+from fieldkit.measure.robot_clock import Offset
 
 SENDER, RECEIVER = Role.SENDER, Role.RECEIVER
 ENDS = (SENDER, RECEIVER)
@@ -44,13 +44,13 @@ def attempt(tmp_path: Path) -> Path:
 
 def write_accounts(folder: Path, robots: Mapping[Role, Account], clocks: Mapping[Role, float] | None = None) -> None:
     offsets = {role: Offset(offset_s, 0.01) for role, offset_s in (clocks or {}).items()}
-    (folder / accounts.FILE).write_text(accounts.text(Accounts(robots, offsets)), encoding="utf-8")
+    (folder / position_sources.FILE).write_text(position_sources.text(Accounts(robots, offsets)), encoding="utf-8")
 
 
 def mean_m(folder: Path, begin_s: float = 1.0, end_s: float = 3.0) -> float | str:
     """Return the mean distance during these seconds by the sender's clock, or the reason why it is missing."""
     times_ns = [BEGAN_NS + round(at_s * S) for at_s in (begin_s, end_s)]
-    measured = where.measure(AttemptEvidence(folder), ping.MOTION_COLUMNS, ENDS, times_ns)
+    measured = position_columns.measure(AttemptEvidence(folder), ping.MOTION_COLUMNS, ENDS, times_ns)
     name = "rtt_distance_mean_m"
     assert measured.values.keys() | measured.missing.keys() == {column.name for column in ping.MOTION_COLUMNS}
     return float(measured.values[name]) if name in measured.values else measured.missing[name]
@@ -63,7 +63,7 @@ def test_the_trials_sources_precede_the_attempts_and_those_the_testbeds(attempt:
     written(attempt, AWAY)
     write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt) == pytest.approx(12)
-    assert where.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
+    assert position_columns.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
     trial = attempt.parent.parent
     lines = "".join(f"{BEGAN_NS + n * S},{30 + n},0\n" for n in range(5))
     (trial / "positions-receiver.csv").write_text(f"t_ns,x_m,y_m\n{lines}", encoding="ascii")
@@ -104,7 +104,9 @@ def test_times_of_robots_are_converted_to_one_clock(
     write_accounts(attempt, {SENDER: HERE, RECEIVER: start}, clocks)
     begin_s, end_s = (1.0 + wrong_ns / 1e9, 3.0 + wrong_ns / 1e9)
     assert mean_m(attempt, begin_s, end_s) == pytest.approx(metres)
-    assert where.clock_error_s(AttemptEvidence(attempt)) == (pytest.approx(0.01 * len(clocks)) if clocks else None)
+    assert position_columns.clock_error_s(AttemptEvidence(attempt)) == (
+        pytest.approx(0.01 * len(clocks)) if clocks else None
+    )
 
 
 @pytest.mark.parametrize(
@@ -132,12 +134,12 @@ def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
 def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt: Path) -> None:
     written(attempt, AWAY[:2] + AWAY[3:])
     write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
-    distances = where.distances_m(AttemptEvidence(attempt), ENDS)
+    distances = position_columns.distances_m(AttemptEvidence(attempt), ENDS)
     begin_ns = BEGAN_NS + S // 4
     in_gap = (begin_ns + S + 1, None)
     assert distances == [(begin_ns, 10), (begin_ns + S, 11), in_gap, (begin_ns + 3 * S, 13), (begin_ns + 4 * S, 14)]
     (attempt / "track.bag").unlink()
-    assert where.distances_m(AttemptEvidence(attempt), ENDS) == ()
+    assert position_columns.distances_m(AttemptEvidence(attempt), ENDS) == ()
 
 
 def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
@@ -169,10 +171,14 @@ def test_wgs84_heights_are_used_only_if_requested(attempt: Path) -> None:
     write_accounts(attempt, robots)
     level_m = 1000 * (1 + 1625 / 6_371_000)
     assert mean_m(attempt) == pytest.approx(level_m, abs=0.002)
-    (attempt / accounts.FILE).write_text(accounts.text(Accounts(robots, heights=True)), encoding="utf-8")
+    (attempt / position_sources.FILE).write_text(
+        position_sources.text(Accounts(robots, heights=True)), encoding="utf-8"
+    )
     assert mean_m(attempt) == pytest.approx(math.hypot(level_m, 50), abs=0.002)
     without_height = robots | {SENDER: Account(place=(latitude, longitude, None), frame=WGS84)}
-    (attempt / accounts.FILE).write_text(accounts.text(Accounts(without_height, heights=True)), encoding="utf-8")
+    (attempt / position_sources.FILE).write_text(
+        position_sources.text(Accounts(without_height, heights=True)), encoding="utf-8"
+    )
     assert mean_m(attempt) == "heights are required, but some positions have none"
 
 
@@ -201,9 +207,9 @@ ANY_ACCOUNTS = st.builds(
 def test_accounts_are_read_as_they_were_written(
     tmp_path_factory: pytest.TempPathFactory, written_accounts: Accounts
 ) -> None:
-    path = tmp_path_factory.getbasetemp() / accounts.FILE
-    path.write_text(accounts.text(written_accounts), encoding="utf-8")
-    assert accounts.read(path) == written_accounts
+    path = tmp_path_factory.getbasetemp() / position_sources.FILE
+    path.write_text(position_sources.text(written_accounts), encoding="utf-8")
+    assert position_sources.read(path) == written_accounts
 
 
 @pytest.mark.parametrize(
@@ -231,8 +237,8 @@ def test_accounts_are_read_as_they_were_written(
 )
 def test_invalid_accounts_are_rejected_and_leave_the_columns_empty(attempt: Path, damage: object) -> None:
     assert isinstance(damage, dict)
-    path = attempt / accounts.FILE
+    path = attempt / position_sources.FILE
     path.write_text(json.dumps({"robots": {}, "clocks": {}, "heights": False} | damage), encoding="utf-8")
     with pytest.raises(EvidenceError, match="list of position sources"):
-        accounts.read(path)
+        position_sources.read(path)
     assert "list of position sources" in str(mean_m(attempt))

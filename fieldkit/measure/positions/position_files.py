@@ -9,16 +9,9 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import bag, reading
-from fieldkit.measure.evidence.confined import ReaderError, SandboxedReader
-from fieldkit.measure.positions.accounts import Account
-from fieldkit.measure.positions.samples import (
-    MOST_SAMPLES,
-    PLACED,
-    WGS84,
-    Samples,
-    read_csv,
-    require_increasing,
-)
+from fieldkit.measure.evidence.sandbox import ReaderError, SandboxedReader
+from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.samples import MOST_SAMPLES, PLACED, WGS84, Samples, read_csv, require_increasing
 
 MOST_STALE_S: Final = 10.0
 """If stamps and reception times differ by more than this, the stamps are from another clock."""

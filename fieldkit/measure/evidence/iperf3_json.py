@@ -1,14 +1,36 @@
-"""Parameters (`start`) and totals (`end`) of a test in iperf3's JSON.
+"""Parts of iperf3's JSON: fields, each checked for its type before use, parameters (`start`) and totals (`end`)."""
 
-Only the client's `end` describes both ends; the server's has 0 for the other end. Versions before 3.8 have one `sum`
-for both ends of a UDP test. 0 in `end` therefore means unknown (checked with 3.1 to 3.17).
-"""
-
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
-from fieldkit.measure.evidence.json_fields import count, items, mapping, number
+_MAX_COUNT: Final = 2**53
+
+
+def mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return the object under a key; an empty one if there is no object."""
+    value = document.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def items(document: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
+    """Return the objects of the list under a key; an empty list if there is no list."""
+    value = document.get(key)
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def number(document: Mapping[str, Any], key: str) -> float | None:
+    """Return the number under a key; None if it is missing, not finite, negative, or not below 2**53."""
+    value = document.get(key)
+    fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _MAX_COUNT
+    return float(value) if fits and value is not None and math.isfinite(value) else None
+
+
+def count(document: Mapping[str, Any], key: str) -> int | None:
+    """Return the number under a key as an integer; None under the conditions of `number`."""
+    value = number(document, key)
+    return None if value is None else int(value)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence import bag, confined
+from fieldkit.measure.evidence import bag, sandbox
 from tests.measure.evidence.test_measure_bag import write_bag, write_ros2_bag
 from tests.measure.evidence.test_measure_battery import TOPIC, TYPE, message, ros1
 
@@ -30,17 +30,17 @@ MIB = 1 << 20
 @pytest.fixture
 def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the CPU limit from 10 s to 1 s."""
-    monkeypatch.setattr(confined, "CPU_S", 1)
+    monkeypatch.setattr(sandbox, "CPU_S", 1)
 
 
 @pytest.fixture
-def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[confined.SandboxedReader]:
+def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[sandbox.SandboxedReader]:
     """Reader that unpacks 1 kB and is killed by the signals of the query, one per try, before it answers."""
     (tmp_path / "unpacks.py").write_text(_UNPACKS, encoding="utf-8")
     (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    reader = confined.SandboxedReader("unpacks")
+    reader = sandbox.SandboxedReader("unpacks")
     yield reader
     reader.stop()
 
@@ -77,21 +77,21 @@ confined.serve(answer)
     ],
 )
 def test_a_reader_that_is_killed_externally_is_restarted_and_leaves_no_files(
-    unpacks: confined.SandboxedReader, tmp_path: Path, signals: list[signal.Signals], why: str | None
+    unpacks: sandbox.SandboxedReader, tmp_path: Path, signals: list[signal.Signals], why: str | None
 ) -> None:
     question = {"signals": signals, "ended": str(tmp_path / "ended")}
     if why is None:
         assert unpacks.query(question, 1) == {"said": "whole"}
     else:
-        with pytest.raises(confined.ReaderError, match=why):
+        with pytest.raises(sandbox.ReaderError, match=why):
             unpacks.query(question, 1)
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_the_limit_of_an_answer_grows_with_the_file(unpacks: confined.SandboxedReader) -> None:
-    large = confined.ANSWER_BYTES + 1000
+def test_the_limit_of_an_answer_grows_with_the_file(unpacks: sandbox.SandboxedReader) -> None:
+    large = sandbox.ANSWER_BYTES + 1000
     assert len(unpacks.query({"says": large}, 4096)["said"]) == large
-    with pytest.raises(confined.ReaderError, match="its contents exceed the limit for a file of its size"):
+    with pytest.raises(sandbox.ReaderError, match="its contents exceed the limit for a file of its size"):
         unpacks.query({"says": large}, 10)
     assert len(unpacks.query({"says": 10}, 10)["said"]) == 10, "the next query is answered"
 
@@ -107,9 +107,9 @@ def test_sparse_and_large_files_have_limits_of_the_machine(tmp_path: Path) -> No
     path.touch()
     os.truncate(path, 1 << 42)
     assert bag.allocated_bytes(path) < 128 * MIB
-    memory_bytes, _, cpu_s = confined._limits(1 << 42)
+    memory_bytes, _, cpu_s = sandbox._limits(1 << 42)
     assert memory_bytes < os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    assert cpu_s == confined.MAX_CPU_S
+    assert cpu_s == sandbox.MAX_CPU_S
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence import reception
-from fieldkit.measure.evidence.reception import RecordingReception
+from fieldkit.measure.evidence import recorded_topics
+from fieldkit.measure.evidence.recorded_topics import RecordingReception
 from tests.measure.evidence.test_measure_bag import SUFFIXES
 
 BEGAN_NS = 1_795_208_123_219_164_628
@@ -46,7 +46,7 @@ def write(folder: Path, text: str, came_ns: Mapping[str, Sequence[int]]) -> None
 
 
 def read(folder: Path, *topics: str, duration_s: float = 5.0) -> RecordingReception:
-    return reception.read(folder, "log", "scan.bag", topics, duration_s)
+    return recorded_topics.read(folder, "log", "scan.bag", topics, duration_s)
 
 
 def test_discovery_is_of_the_slowest_topic_and_the_gap_of_any_topic(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_topic_without_a_message_is_not_discovered(tmp_path: Path) -> None:
     assert read(tmp_path, "/scan", "/imu") == RecordingReception(
         discovered=False, messages=1, discovery_s=None, gap_s=None
     )
-    measured = reception.measure(read(tmp_path, "/imu"))
+    measured = recorded_topics.measure(read(tmp_path, "/imu"))
     assert dict(measured.values) == {"bag_discovered": False, "bag_messages": 0}
     assert measured.missing.keys() == {"bag_discovery_s", "bag_gap_s"}
 
@@ -87,14 +87,14 @@ def test_a_topic_of_a_longer_name_is_another_one(tmp_path: Path) -> None:
 
 def test_a_recorder_without_its_master_discovers_nothing(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("", encoding="utf-8")
-    measured = reception.measure(read(tmp_path, "/scan"))
+    measured = recorded_topics.measure(read(tmp_path, "/scan"))
     assert dict(measured.values) == {"bag_discovered": False}
     assert measured.missing.keys() == {"bag_discovery_s", "bag_messages", "bag_gap_s"}
 
 
 def test_the_reception_without_a_complete_bag_is_unknown(tmp_path: Path) -> None:
     (tmp_path / "log").write_text(log({"/scan": BEGAN_NS}), encoding="utf-8")
-    assert not reception.measure(read(tmp_path, "/scan")).values
+    assert not recorded_topics.measure(read(tmp_path, "/scan")).values
 
 
 def test_an_unknown_log_gives_messages_but_no_discovery_time(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_an_unknown_log_gives_messages_but_no_discovery_time(tmp_path: Path) -> 
 def test_without_a_log_the_columns_are_missing(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
         read(tmp_path, "/scan")
-    assert not reception.measure(None).values
+    assert not recorded_topics.measure(None).values
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -118,16 +118,16 @@ def test_a_ros2_recorder_starts_discovery_of_all_topics_together(suffix: str, tm
         for at_ns in (BEGAN_NS + 2 * S, BEGAN_NS + 3 * S):
             writer.write(connection, at_ns, data)
     (tmp_path / "log").write_text(ROS2.format(s=BEGAN_NS // S, ns=BEGAN_NS % S), encoding="utf-8")
-    result = reception.read(tmp_path, "log", f"scan/scan.{suffix}", ["/scan"], 4.0)
+    result = recorded_topics.read(tmp_path, "log", f"scan/scan.{suffix}", ["/scan"], 4.0)
     assert result == RecordingReception(discovered=True, messages=2, discovery_s=2.0, gap_s=1.0)
 
 
 @given(st.integers(0, 9_999_999_999 * S), st.sampled_from([ROSBAG, ROS2]))
 def test_no_digit_of_a_stamp_is_lost(at_ns: int, text: str) -> None:
     text = text.format(s=at_ns // S, ns=at_ns % S, topic="/scan")
-    assert reception.subscribed_ns(text, ["/scan", "/imu"])["/scan"] == at_ns
+    assert recorded_topics.subscribed_ns(text, ["/scan", "/imu"])["/scan"] == at_ns
 
 
 @given(st.text())
 def test_any_log_is_parsed_or_ignored(text: str) -> None:
-    assert reception.subscribed_ns(text, ["/scan"]).keys() <= {"/scan"}
+    assert recorded_topics.subscribed_ns(text, ["/scan"]).keys() <= {"/scan"}

@@ -17,9 +17,9 @@ from fieldkit.core.model import Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.evidence import track
-from fieldkit.measure.positions import accounts, geodesy, recorded, trajectories
-from fieldkit.measure.positions.accounts import Account, Accounts
-from fieldkit.measure.positions.samples import WGS84, Samples
+from fieldkit.measure.positions import position_files, position_sources, trajectories
+from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.samples import WGS84, Samples, ecef_m
 from fieldkit.measure.positions.trajectories import Trajectory
 
 _ATTEMPTS: Final = "repeats"
@@ -93,9 +93,17 @@ def position_accounts(evidence: AttemptEvidence) -> Accounts:
 
 
 def _given(evidence: AttemptEvidence) -> Accounts:
-    of_attempt = evidence.read(accounts.read, accounts.FILE) if evidence.has(accounts.FILE) else Accounts()
+    of_attempt = (
+        evidence.read(position_sources.read, position_sources.FILE)
+        if evidence.has(position_sources.FILE)
+        else Accounts()
+    )
     trial = _trial_folder(evidence)
-    of_trial = accounts.read(trial / accounts.FILE) if trial and (trial / accounts.FILE).is_file() else Accounts()
+    of_trial = (
+        position_sources.read(trial / position_sources.FILE)
+        if trial and (trial / position_sources.FILE).is_file()
+        else Accounts()
+    )
     return Accounts(
         {**of_attempt.robots, **of_trial.robots}, of_attempt.clocks, of_attempt.heights or of_trial.heights
     )
@@ -156,9 +164,9 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
         place = np.array([account.place], dtype=float)  # NaN for None
         return Samples(np.zeros(1, dtype=np.int64), place, account.frame)
     if account.topic:
-        recorded_samples = evidence.read(recorded.read_topic, account.file, account)
+        recorded_samples = evidence.read(position_files.read_topic, account.file, account)
         samples = _shifted(recorded_samples, -_ahead_ns(sources, Role(account.clock) if account.clock else role))
-        return samples if samples.yaws_rad is None else recorded.to_placement_frame(samples, account)
+        return samples if samples.yaws_rad is None else position_files.to_placement_frame(samples, account)
     folder = _trial_folder(evidence)
     assert folder is not None  # only the sources of a trial have neither a place nor a topic
     return _shifted(_samples_in_trial(folder / account.file), round(account.offset_s * 1e9))
@@ -189,7 +197,7 @@ def _samples_in_trial(path: Path) -> Samples:
 
 @lru_cache(maxsize=4)
 def _read_cached(path: Path, _mtime_ns: int, _size_bytes: int) -> Samples:
-    return recorded.read_file(path)
+    return position_files.read_file(path)
 
 
 def _ahead_ns(sources: Accounts, role: Role) -> int:
@@ -222,6 +230,6 @@ def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Fl
 
     def place_m(samples: Samples) -> Floats:
         north, east, up_m = samples.values.T
-        return geodesy.ecef_m(north, east, up_m if heights else np.full(len(up_m), median_m))
+        return ecef_m(north, east, up_m if heights else np.full(len(up_m), median_m))
 
     return place_m(source), place_m(destination)

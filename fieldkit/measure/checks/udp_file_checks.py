@@ -18,7 +18,7 @@ from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 CROSS_CHECK: Final = CrossCheck(
     "file received over UDP",

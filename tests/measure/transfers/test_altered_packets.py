@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.transfers import fates, strangers
+from fieldkit.measure.transfers import altered_packets, fates
 from tests.helpers import links
 from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, packets, timed, transfer
 from tests.helpers.casts import los_plan
@@ -74,7 +74,7 @@ def _tcp(change: Change, *, stamped: bool = True) -> tuple[list[Frame], list[Fra
 
 def _why(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> str | None:
     sender, receiver = map(packets, captures)
-    return strangers.reason(sender, receiver, transfer(protocol))
+    return altered_packets.reason(sender, receiver, transfer(protocol))
 
 
 @pytest.mark.parametrize("protocol", Protocol)

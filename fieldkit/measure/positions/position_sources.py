@@ -17,8 +17,8 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role, Vector
 from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.offsets import Offset
 from fieldkit.measure.positions.samples import PLACED
+from fieldkit.measure.robot_clock import Offset
 
 FILE: Final = laptop_files.POSITIONS
 Place = tuple[float, float, float | None]

@@ -1,4 +1,13 @@
-"""All columns of one transfer, computed from files, captures, ping and host counters."""
+"""All columns of one transfer, computed from files, captures, ping and host counters.
+
+The columns of the paper are computed as in its procedure, for comparison with those of fieldkit. Its filters are
+tcpdump's `src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port` matches either
+port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
+"""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
@@ -6,14 +15,41 @@ from fieldkit.core.columns import Measured, Value, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.captures.arrays import NO_TIME, Mask
+from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence import bag, host, medium, ping, reading
-from fieldkit.measure.positions import where
-from fieldkit.measure.transfers import delay, paper, rates, stalls, strangers, tcp, transfer_stalls, udp
-from fieldkit.measure.transfers.columns import DISTANCE, LAYERS, OF_TCP, OF_UDP, STALLS, TIMES
+from fieldkit.measure.evidence import bag, host, oracle_delays, ping, reading
+from fieldkit.measure.positions import position_columns
+from fieldkit.measure.transfers import altered_packets, delay, rates, stalls, tcp, udp
 from fieldkit.measure.transfers.deliveries import FlowSchedule
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_columns import DISTANCE, LAYERS, OF_TCP, OF_UDP, STALLS, TIMES
+from fieldkit.measure.transfers.transfer_spec import Transfer
+
+PAPER_WINDOW_BYTES: Final[Mapping[Protocol, int]] = MappingProxyType({Protocol.TCP: 502, Protocol.UDP: 8192})
+"""Ping payload that the paper uses as the window of each protocol."""
+
+PAPER_COUNTS: Final = ("paper_packets", "paper_received", "paper_loss", "paper_transfer_s")
+"""Columns that depend on the counts of these filters, which may include packets of other transfers."""
+
+
+def paper_frames_from(packets: Packets, address: str, port: int) -> int:
+    """Return the number of packets that match `src ADDRESS and port PORT`."""
+    return int((packets.are_from(address) & _port(packets, port)).sum())
+
+
+def paper_frames_to(packets: Packets, address: str, port: int) -> int:
+    """Return the number of packets that match `dst ADDRESS and port PORT`."""
+    return int((packets.are_to(address) & _port(packets, port)).sum())
+
+
+def paper_transfer_s(packets: int, delay_s: float) -> float:
+    """Return the paper's transfer time: one mean round trip of a ping with the window's payload per packet."""
+    return packets * delay_s
+
+
+def _port(packets: Packets, port: int) -> Mask:
+    matches: Mask = (packets.sport == port) | (packets.dport == port)
+    return matches
 
 
 def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -> Measured:
@@ -40,10 +76,16 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
             transfer,
             files,
             contradiction,
-            transfer_stalls.flow_schedule(evidence, transfer, listener),
+            stalls.flow_schedule(evidence, transfer, listener),
         )
-        | medium.measure(evidence.read_or_none(medium.read, step_prefixed(transfer.name, medium.FILE)))
-        | where.measure(evidence, DISTANCE, (transfer.source, transfer.destination), _sent_ns(sender, transfer))
+        | oracle_delays.measure_air_delay(
+            evidence.read_or_none(
+                oracle_delays.read_air_delay, step_prefixed(transfer.name, oracle_delays.AIR_DELAY_FILE)
+            )
+        )
+        | position_columns.measure(
+            evidence, DISTANCE, (transfer.source, transfer.destination), _sent_ns(sender, transfer)
+        )
         | _paper(sender, None if contradiction else receiver, pings, transfer)
         | host.measure(*(evidence.read_or_none(host.read, name) for name in states))
         | _system(evidence, transfer)
@@ -67,7 +109,7 @@ def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
 
 def _incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     sender, receiver = map(evidence.whole_capture, transfer.captures)
-    if sender and receiver and (why := strangers.reason(sender.packets, receiver.packets, transfer)):
+    if sender and receiver and (why := altered_packets.reason(sender.packets, receiver.packets, transfer)):
         return f"the captures of the transfer cannot be compared: {why}"
     if evidence.read_or_none(reading.size, transfer.received_file):
         for role, capture in ((transfer.source, sender), (transfer.destination, receiver)):
@@ -123,14 +165,14 @@ def _layers(
             udp_counts = udp.count(udp_packets)
             pairs, counts, sent = delay.udp_packets(udp_packets), _udp(udp_counts), udp_counts.packets_sent
             transfer_rates = rates.of_udp(udp_packets)
-            stall_columns = stalls.measure("transfer", lambda: transfer_stalls.of_udp(udp_packets, schedule))
+            stall_columns = stalls.measure("transfer", lambda: stalls.udp_deliveries(udp_packets, schedule))
         else:
             frames = tcp.match_transfer(sender.packets, receiver.packets, transfer)
             tcp_counts = tcp.count(frames)
             pairs, counts, sent = delay.tcp_frames(frames), _tcp(tcp_counts), delay.tcp_sent(frames)
             transfer_rates = rates.of_tcp(frames, receiver.packets, transfer, tcp_counts)
             reverse = transfer.backward(sender.packets)
-            stall_columns = stalls.measure("transfer", lambda: transfer_stalls.of_tcp(frames, reverse, schedule))
+            stall_columns = stalls.measure("transfer", lambda: stalls.tcp_deliveries(frames, reverse, schedule))
         ambiguous = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
         delays = delay.measure(pairs, sender.packets, receiver.packets, transfer, sent=sent or 0, ambiguous=ambiguous)
     except EvidenceError as error:  # handled like a damaged capture
@@ -208,9 +250,9 @@ def _sent_ns(sender: Capture | None, transfer: Transfer) -> list[int]:
 
 
 def _paper(sender: Capture | None, receiver: Capture | None, pings: ping.Ping | None, transfer: Transfer) -> Measured:
-    window_bytes = paper.WINDOW_BYTES[transfer.protocol]
-    sent = paper.frames_from(sender.packets, transfer.sender_address, transfer.port) if sender else None
-    received = paper.frames_to(receiver.packets, transfer.receiver_address, transfer.port) if receiver else None
+    window_bytes = PAPER_WINDOW_BYTES[transfer.protocol]
+    sent = paper_frames_from(sender.packets, transfer.sender_address, transfer.port) if sender else None
+    received = paper_frames_to(receiver.packets, transfer.receiver_address, transfer.port) if receiver else None
     rtt_s = pings.rtt_s if pings and pings.payload_bytes == window_bytes else ()
     delay_s = float(np.mean(rtt_s)) if rtt_s else None
     frames: dict[str, Value | None] = {
@@ -221,7 +263,7 @@ def _paper(sender: Capture | None, receiver: Capture | None, pings: ping.Ping | 
     }
     times: dict[str, Value | None] = {
         "paper_delay_s": delay_s,
-        "paper_transfer_s": None if sent is None or delay_s is None else paper.transfer_s(sent, delay_s),
+        "paper_transfer_s": None if sent is None or delay_s is None else paper_transfer_s(sent, delay_s),
     }
     return Measured.from_optional(
         frames, "there are no complete captures of both ends, or nothing was sent"

@@ -3,7 +3,7 @@
 from typing import Final
 
 from fieldkit.core.columns import NEGATIVE_LOSS_BOUNDS, Column, Figure, Kind, columns
-from fieldkit.measure.evidence import host, medium
+from fieldkit.measure.evidence import host, oracle_delays
 from fieldkit.measure.transfers import delay, rates, stalls
 
 FILES: Final = columns(
@@ -202,7 +202,7 @@ COLUMNS: Final[tuple[Column, ...]] = (
     *FILES,
     *LAYERS,
     *delay.COLUMNS,
-    *medium.COLUMNS,
+    *oracle_delays.AIR_DELAY_COLUMNS,
     *DISTANCE,
     *PAPER,
     *host.COLUMNS,

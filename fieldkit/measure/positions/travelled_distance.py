@@ -10,8 +10,8 @@ from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.evidence import track
-from fieldkit.measure.positions import geodesy, where
-from fieldkit.measure.positions.samples import WGS84
+from fieldkit.measure.positions import position_columns
+from fieldkit.measure.positions.samples import WGS84, ecef_m
 
 DRIFT: Final = 0.1
 """Upper limit of odometry drift as a share of the path, for wheels that do not slip."""
@@ -57,15 +57,15 @@ def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: f
     a smaller one is not.
     """
     try:
-        account = where.position_accounts(evidence).robots.get(role)
+        account = position_columns.position_accounts(evidence).robots.get(role)
         if account is None or account.place is not None:
             return None
-        samples = where.samples_of(evidence, role)
+        samples = position_columns.samples_of(evidence, role)
     except EvidenceError:
         return None
     on_earth = samples.frame == WGS84
     north, east, up_m = samples.values.T
-    places_m = geodesy.ecef_m(north, east, np.zeros(len(up_m))) if on_earth else samples.values
+    places_m = ecef_m(north, east, np.zeros(len(up_m))) if on_earth else samples.values
     other_m = _from_first_m(places_m)
     if farthest_m - other_m > (SATELLITE_M if on_earth else PLACE_M) + DRIFT * farthest_m:
         return (

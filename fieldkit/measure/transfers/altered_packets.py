@@ -13,7 +13,7 @@ from fieldkit.measure.captures.arrays import Keys, Mask, row_hashes
 from fieldkit.measure.captures.ip import TCP, address_text
 from fieldkit.measure.captures.packets import NO_PORT, SYN, Packets
 from fieldkit.measure.transfers.match import connection_keys, usable_stamps
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 MAX_ALTERED_SHARE: Final = 0.05
 """Largest permitted share of received packets that are not in the sender's capture: a few may be earlier traffic."""

@@ -1,22 +1,25 @@
-"""Contradictions between the two captures and the two files of one transfer, which show that one is incomplete.
+"""Sources of the columns of a transfer, and contradictions between its two captures and two files.
 
-They are contradictions whatever the link loses, duplicates or reorders, and for any clock offset.
+A contradiction shows that a capture or a file is incomplete, whatever the link loses, duplicates or reorders, and for
+any clock offset.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Keys, row_hashes
 from fieldkit.measure.captures.packets import NO_PORT, RST, SYN, UDP_HEADER_BYTES, Packets
-from fieldkit.measure.checks import udp_file
+from fieldkit.measure.checks import udp_file_checks
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.transfers.streams import LONGEST_BYTES, Connections
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.tcp_streams import LONGEST_BYTES, Connections
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,9 @@ def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, cut: 
         yield f"packets of an earlier attempt were still on the way: {earlier_packets}"
     elif transfer.protocol is Protocol.UDP:
         size_problems = list(_udp(sender.packets, receiver.packets, files, transfer))
-        yield from size_problems or udp_file.find(evidence, transfer, sender.packets, receiver.packets, cut=cut)
+        yield from size_problems or udp_file_checks.find(
+            evidence, transfer, sender.packets, receiver.packets, cut=cut
+        )
     elif files is None or max(files.sent_bytes, files.received_bytes) < LONGEST_BYTES:
         yield from _tcp(sender.packets, receiver.packets, files, transfer, finished=finished)
 
@@ -184,3 +189,71 @@ def _is_refused(sent: Packets, answers: Packets) -> bool:
         return False
     syn_packets = sent.where((sent.tcp_flags & SYN != 0) & (sent.time_ns <= resets.time_ns.min()))
     return len(syn_packets) == 1
+
+
+CROSS_CHECKS: Final = (
+    udp_file_checks.CROSS_CHECK,
+    CrossCheck(
+        "file received over TCP",
+        ("received_bytes", "file_loss", "hash_match", "goodput_bit_s", "completion_s"),
+        "`recv.bag`",
+        ("`scan.bag`: the same content up to there", "both captures: bytes that arrived", "how the listener ended"),
+        "bytes that its listener did not read before its time limit",
+    ),
+    CrossCheck(
+        "file sent",
+        ("sent_bytes", "bag_messages", "bag_duration_s"),
+        "`scan.bag`",
+        ("sender's capture: bytes that left", "the procedure: topics and duration"),
+        "half of the duration, because a recorder needs time to subscribe",
+    ),
+    CrossCheck(
+        "packets sent and received",
+        (
+            *("ip_*", "datagram*", "byte_loss", "tcp_*", "paper_packets", "paper_received", "paper_loss"),
+            *("transfer_s", "transfer_from", "throughput_bit_s", "paper_window_bytes"),
+        ),
+        "`sender.pcap`, `receiver.pcap`",
+        ("each other", "`ROLE-capture.log`: tcpdump's counters", "TCP's acknowledgments", "both files"),
+        "none: losses, copies and reordering on the link are no contradictions",
+    ),
+    CrossCheck(
+        "delay and its variation",
+        ("one_way_*", "delay_variation_*", "jitter_s", "clock_*"),
+        "times in `sender.pcap` and `receiver.pcap`",
+        ("packets in both directions: offset and skew of the clocks", "each robot's clock before and after"),
+        "withheld if the error of the offset is above a tenth of the delay, or the clocks were unsteady",
+        CheckOutcome.WITHHELD,
+    ),
+    CrossCheck(
+        "the paper's delay",
+        ("paper_delay_s", "paper_transfer_s"),
+        "`ping.txt`: `time=`",
+        ("as for the round-trip time of the step ping",),
+        "as for the step ping",
+    ),
+    CrossCheck(
+        "datagrams that the kernel refused",
+        ("receiver_udp_buffer_errors", "receiver_reassembly_failures"),
+        "`ROLE-before.txt`, `ROLE-after.txt`: /proc/net/snmp",
+        (),
+        "only the kernel counts them; a counter that is missing or decreased is withheld",
+        CheckOutcome.UNCHECKED,
+    ),
+    CrossCheck(
+        "components of the delay in the emulator",
+        ("delay_s", "delay_*_s", "delay_packets"),
+        "`medium.txt`",
+        (),
+        "only the testbed knows them; the file is rejected if a robot provides it",
+        CheckOutcome.UNCHECKED,
+    ),
+    CrossCheck(
+        "distance and speed during the transfer",
+        ("transfer_distance_*", "transfer_*_speed_m_s"),
+        "`track.csv` of the testbed, else `positions.json`",
+        (),
+        "compared if steps move robots or record positions",
+        CheckOutcome.UNCHECKED,
+    ),
+)
