@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from fieldkit.cli.display import table
 from fieldkit.config import locations
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 
 
 def list_or_show(kind: locations.Kind, summary: Callable[[str], str], name: str | None) -> int:

@@ -11,7 +11,7 @@ BACKENDS: Final = "fieldkit.backends"
 STEPS: Final = "fieldkit.steps"
 """Entry point group of step kinds outside fieldkit: `NAME = "package.module:Class"`, a `Step`."""
 COMMANDS: Final = "fieldkit.commands"
-"""Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.outside`."""
+"""Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.parser`."""
 
 REMEDY: Final = "fix or uninstall its package"
 

@@ -12,7 +12,7 @@ from fieldkit import __version__
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.analysis.tables import estimate_rows
+from fieldkit.analysis.result_tables import estimate_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column, EstimateRow, cell, csv_text, declared
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Crossings
@@ -59,7 +59,7 @@ def of_repeats(repeats: Repeats) -> Table:
 
 
 def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
-    """Return the content of `analysis.tables.to_csv` as a table, with all digits of the numbers.
+    """Return the content of `analysis.result_tables.to_csv` as a table, with all digits of the numbers.
 
     Args:
         by: Columns that define a cell.

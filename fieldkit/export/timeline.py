@@ -14,7 +14,7 @@ from typing import Final
 from fieldkit.core import geometry
 from fieldkit.core.errors import EvidenceError, shell_command
 from fieldkit.core.model import ENDED, Role, Status, Vector
-from fieldkit.export import robot, schemas
+from fieldkit.export import robot_messages, schemas
 from fieldkit.export.mcap import Channel, Json, Message
 from fieldkit.export.schemas import Level
 from fieldkit.measure.attempt import AttemptEvidence
@@ -157,6 +157,6 @@ def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int)
 def _robots(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Iterator[Message]:
     """Yield the messages of the robots' recordings, attempt by attempt."""
     for attempt in attempts:
-        record = robot.read(plan, attempt, evidence(attempt))
-        yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot.flaws(record))
-        yield from robot.messages(record)
+        record = robot_messages.read(plan, attempt, evidence(attempt))
+        yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot_messages.flaws(record))
+        yield from robot_messages.messages(record)

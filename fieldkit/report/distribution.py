@@ -13,8 +13,8 @@ from fieldkit.analysis.wording import Scale, time_scale
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities, panels
-from fieldkit.report.evidence import Evidence
 from fieldkit.report.points import needs_log
+from fieldkit.report.trial_folders import Evidence
 
 MOST_DISTANCES: Final = 3
 """Most distances with a panel: the nearest, the middle and the farthest."""

@@ -13,9 +13,9 @@ from fieldkit.report import distance, wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.conditions import Identities, Identity, panels
 from fieldkit.report.coverage import absences
-from fieldkit.report.evidence import Evidence
+from fieldkit.report.headlines import Ranking
 from fieldkit.report.points import Point, ends, needs_log, point
-from fieldkit.report.ranking import Ranking
+from fieldkit.report.trial_folders import Evidence
 
 _DODGE: Final = 0.7
 """Share of a lane over which the conditions of one quantity are spread."""

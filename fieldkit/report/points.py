@@ -11,7 +11,7 @@ from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.wording import incomplete
 from fieldkit.core.columns import Kind
 from fieldkit.report import wording
-from fieldkit.report.evidence import Evidence
+from fieldkit.report.trial_folders import Evidence
 
 MOST_BEHIND: Final = 100
 """Most single repeats behind one estimate; of more repeats, every k-th is drawn."""

@@ -33,9 +33,9 @@ from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
 from tests.helpers.casts import CAST, los_plan
-from tests.measure.evidence.test_reception import ROS2, log, write
+from tests.measure.evidence.test_recorded_topics import ROS2, log, write
 from tests.measure.motion.test_drive_log import drive
-from tests.measure.positions.test_recorded import BEGAN_NS, S, fix, odometry, transform, written
+from tests.measure.positions.test_position_files import BEGAN_NS, S, fix, odometry, transform, written
 
 _ENDS: Final = (Role.SENDER, Role.RECEIVER)
 _JOB: Final = Job(folder="f", name="drive", argv=(), limit_s=1.0, log="drive.log")

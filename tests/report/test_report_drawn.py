@@ -18,9 +18,9 @@ from fieldkit.report import distance, distribution, dots, figures
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
-from fieldkit.report.evidence import load_evidence
 from fieldkit.report.points import needs_log
 from fieldkit.report.theme import Style
+from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
 from tests.helpers import lawns

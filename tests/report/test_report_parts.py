@@ -20,12 +20,12 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import iperf3, ping
 from fieldkit.measure.transfers import fates, iperf3_load, tcp, topic_columns
 from fieldkit.measure.transfers.transfer_spec import Transfer
-from fieldkit.report import bursts, distance, distribution, figures, headlines, strips, summary, timeline
+from fieldkit.report import distance, distribution, figures, headlines, packet_rasters, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
-from fieldkit.report.evidence import load_evidence
 from fieldkit.report.theme import Style
+from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
 from tests.helpers import lawns, tables
@@ -113,7 +113,7 @@ def test_damaged_capture_is_not_read(tmp_path: Path) -> None:
 @given(st.lists(st.booleans(), max_size=50))
 def test_runs_cover_the_marked_packets(marked: list[bool]) -> None:
     drawn = np.zeros(len(marked), dtype=np.bool_)
-    runs = bursts._runs(np.array(marked, dtype=np.bool_))
+    runs = packet_rasters._runs(np.array(marked, dtype=np.bool_))
     for start, length in runs:
         assert not drawn[max(0, start - 1) : start + length].any()
         drawn[start : start + length] = True

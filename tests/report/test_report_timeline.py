@@ -15,7 +15,7 @@ from fieldkit.measure.transfers import topic_log
 from fieldkit.report import timeline
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import repeat_to_draw
-from fieldkit.report.evidence import load_evidence
+from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial import procedure, sources, store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded

@@ -6,7 +6,7 @@ An editor with a YAML language server finds it through a comment in the file's f
 from collections.abc import Iterator
 from typing import Any
 
-from fieldkit.config.meanings import attributes, description, without_links
+from fieldkit.config.documentation import attribute_meanings, class_description, without_links
 from fieldkit.config.schema import Strict
 from sim_backends.cosim.scenario.schema import CosimScenario
 
@@ -19,8 +19,8 @@ def editor_schema() -> dict[str, Any]:
         model = models.get(part["title"])
         if model is None:
             continue  # an enumeration
-        part["description"] = without_links(description(model))
-        meanings = attributes(model)
+        part["description"] = without_links(class_description(model))
+        meanings = attribute_meanings(model)
         for key, value in part["properties"].items():
             value.pop("title", None)
             value["description"] = without_links(meanings[key])

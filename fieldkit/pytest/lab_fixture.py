@@ -2,16 +2,22 @@
 
 import argparse
 import secrets
+import sys
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from functools import cached_property
-from typing import Self
+from typing import Self, TypeVar
+
+import pytest
 
 from fieldkit.backends.protocols import Backend, Cast, Testbed
-from fieldkit.cli import options as command_line
+from fieldkit.cli import cli_options as command_line
 from fieldkit.cli import sites
+from fieldkit.cli.terminal import Terminal
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.events import Asked, Event, Request, Sink
 from fieldkit.core.model import Fault, FaultKind, Leg, Move, Placement, Scenario, Topology
-from fieldkit.core.prompts import Operator
+from fieldkit.core.prompts import UNATTENDED, Answer, Operator, Question
 from fieldkit.core.units import (
     METRES_PER_S_PER_UNIT,
     parse_distance,
@@ -20,9 +26,60 @@ from fieldkit.core.units import (
     parse_quantity,
 )
 from fieldkit.pytest.evidence import EvidenceKeeper
-from fieldkit.pytest.options import LabOptions, one_of
-from fieldkit.pytest.robots import RobotHandles
+from fieldkit.pytest.plugin_options import LabOptions, one_of
+from fieldkit.pytest.robot_fixture import RobotHandles
 from fieldkit.trial.running import opening
+
+T = TypeVar("T")
+
+
+def operator_of(config: pytest.Config, options: LabOptions, sink: Sink) -> Operator:
+    """Return the operator: none if the options say so, else the person at the terminal."""
+    return UNATTENDED if options.yes else Uncaptured(config, sink)
+
+
+class Uncaptured:
+    """Asks questions at the terminal although pytest captures the output and closes the input.
+
+    Args:
+        config: The configuration of pytest.
+        sink: Receives each request and its answer.
+    """
+
+    def __init__(self, config: pytest.Config, sink: Sink) -> None:
+        self._capture = config.pluginmanager.getplugin("capturemanager")
+        self._sink = sink
+        self._terminal = Terminal(self._show)
+
+    def ask(self, request: str, *, may_skip: bool = False) -> Answer:  # noqa: ARG002 (a test cannot be skipped here)
+        """Ask a person to do something, as `Operator.ask`."""
+        return self._uncaptured(request, lambda: self._terminal.ask(request))
+
+    def enter(self, question: Question) -> str:
+        """Ask a person a question, as `Operator.enter`."""
+        return self._uncaptured(f"answer: {question.text}", lambda: self._terminal.enter(question))
+
+    def _uncaptured(self, task: str, ask: Callable[[], T]) -> T:
+        if self._capture is not None:
+            self._capture.suspend(in_=True)
+        try:
+            if not sys.stdin.isatty():
+                raise ConfigurationError(
+                    f"a person must {task}, but there is no terminal to ask at",
+                    remedy="place the robots first, then add --fieldkit-yes",
+                )
+            return ask()
+        finally:
+            if self._capture is not None:
+                self._capture.resume()
+
+    def _show(self, event: Event) -> None:
+        self._sink(event)
+        match event:
+            case Request(text):
+                sys.stderr.write(f"\n{text}, then Enter\n")
+            case Asked(text, how):
+                sys.stderr.write(f"\n{text}? {how}\n")
 
 
 class OpenedLab:

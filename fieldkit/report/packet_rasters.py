@@ -12,7 +12,7 @@ from fieldkit.measure.captures.arrays import Mask
 from fieldkit.measure.transfers import fates
 from fieldkit.report import wording
 from fieldkit.report.conditions import panels
-from fieldkit.report.evidence import Evidence
+from fieldkit.report.trial_folders import Evidence
 
 MOST_REPEATS: Final = 400
 """Most repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""

@@ -1,23 +1,149 @@
-"""MCAP messages from the robots' recordings of one attempt; each robot's times are by its clock."""
+"""MCAP messages from the robots' recordings of one attempt; each robot's times are by its clock.
+
+The packets of a capture are messages, each with its fate if it is known.
+"""
 
 import heapq
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
+from typing import Final
 
-from fieldkit.core.model import LinkSample, Role
-from fieldkit.export import fates, packets, schemas
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import LinkSample, Protocol, Role
+from fieldkit.export import schemas
 from fieldkit.export.mcap import Channel, Json, Message
-from fieldkit.export.schemas import Level
+from fieldkit.export.schemas import Level, time
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.captures.ip import address_text
+from fieldkit.measure.captures.packets import NO_PORT, Packets
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, ping
+from fieldkit.measure.transfers import altered_packets
+from fieldkit.measure.transfers.match import Match, match
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
+
+NOT_KNOWN: Final = -1
+_SLICE: Final = 1 << 14
+"""Number of packets that are converted to Python objects at a time."""
+
+_LOST: Final[tuple[dict[str, bool], ...]] = ({"lost": False}, {"lost": True}, {})  # index -1 (NOT_KNOWN) is the last
+_COPY: Final[tuple[dict[str, bool], ...]] = ({"copy": False}, {"copy": True}, {})
+
+
+@dataclass(frozen=True, eq=False)
+class MarkedPackets:
+    """The packets captured by one robot, with their fates.
+
+    Attributes:
+        packets: The packets in the order of the file.
+        lost: 1 if a packet that this robot sent was lost, 0 if not, `NOT_KNOWN` otherwise. Shape (n,).
+        copy: 1 if a packet that it received is a duplicate, 0 if not, `NOT_KNOWN` otherwise. Shape (n,).
+    """
+
+    packets: Packets
+    lost: NDArray[np.int8]
+    copy: NDArray[np.int8]
+
+
+def packet_messages(channel: Channel, repeat: str, captured: MarkedPackets) -> Iterator[Message]:
+    """Yield a message per packet whose time is known, in the order of time.
+
+    Args:
+        channel: The channel.
+        repeat: Name of the repeat's folder.
+        captured: The packets.
+    """
+    time_ns = captured.packets.time_ns
+    order = np.argsort(time_ns, kind="stable")
+    order = order[time_ns[order] != NO_TIME]
+    for start in range(0, len(order), _SLICE):
+        chosen = order[start : start + _SLICE]
+        packets = captured.packets.where(chosen)
+        fates = (captured.lost[chosen].tolist(), captured.copy[chosen].tolist())
+        for t_ns, fields, lost, copy in zip(packets.time_ns.tolist(), _contents(packets), *fates, strict=True):
+            fate = _LOST[lost] | _COPY[copy]
+            yield Message(channel, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | fields | fate)
+
+
+def _contents(packets: Packets) -> Iterator[dict[str, object]]:
+    """Yield the header fields of each packet."""
+    columns = {
+        "protocol": packets.protocol.tolist(),
+        "source": [address_text(*halves) for halves in packets.src.tolist()],
+        "destination": [address_text(*halves) for halves in packets.dst.tolist()],
+        "source_port": packets.sport.tolist(),
+        "destination_port": packets.dport.tolist(),
+        "wire_bytes": packets.wire_bytes.tolist(),
+        "payload_bytes": packets.ip_payload_bytes.tolist(),
+        "fragment_offset": packets.fragment_offset.tolist(),
+    }
+    for values in zip(*columns.values(), strict=True):
+        yield {name: value for name, value in zip(columns, values, strict=True) if value != NO_PORT}
+
+
+# Largest IP payload of a frame that offload did not join: the MTU of Ethernet and Wi-Fi without the shortest header.
+_LARGEST_PAYLOAD_BYTES: Final = 1480
+
+
+def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
+    """Return the fates of the packets of each capture, as far as they belong to transfers captured at both ends.
+
+    Args:
+        captures: The captures by file.
+        transfers: The packet filter of each transfer.
+    """
+    marked = {file: _unknown(capture.packets) for file, capture in captures.items()}
+    by_path: dict[tuple[str, str, str, str], list[Transfer]] = {}
+    for transfer in transfers:
+        here, there = transfer.captures
+        if here is not None and there is not None and {here, there} <= captures.keys():
+            by_path.setdefault((here, there, transfer.sender_address, transfer.receiver_address), []).append(transfer)
+    for (here, there, sender, receiver), same_path in by_path.items():
+        matched = _matched(captures[here], captures[there], same_path)
+        if matched is None:
+            continue
+        sent, received = marked[here], marked[there]
+        forward = sent.packets.are_from(sender) & sent.packets.are_to(receiver) & ~matched.ambiguous
+        sent.lost[forward] = ~matched.arrived[forward]
+        is_ambiguous = np.append(matched.ambiguous, False)[matched.sent_index]  # the last entry is for match.NONE
+        forward = received.packets.are_from(sender) & received.packets.are_to(receiver) & ~is_ambiguous
+        received.copy[forward] = matched.duplicates[forward]
+    return marked
+
+
+def _unknown(packets: Packets) -> MarkedPackets:
+    lost, copy = np.full((2, len(packets)), NOT_KNOWN, np.int8)
+    return MarkedPackets(packets, lost, copy)
+
+
+def _matched(here: Capture, there: Capture, same_path: Sequence[Transfer]) -> Match | None:
+    """Return the matching packets of two captures, or None if they cannot be matched for all transfers of a path."""
+    sent, received = here.packets, there.packets
+    if here.damage or there.damage:
+        return None
+    is_tcp = any(transfer.protocol is Protocol.TCP for transfer in same_path)
+    if is_tcp and (_is_offloaded(sent) or _is_offloaded(received)):
+        return None
+    if any(altered_packets.reason(sent, received, transfer) for transfer in same_path):
+        return None
+    try:
+        return match(sent, received)
+    except EvidenceError:
+        return None
+
+
+def _is_offloaded(captured: Packets) -> bool:
+    """Return True if a capture has frames of several segments; they differ between the two ends."""
+    return bool((captured.ip_payload_bytes > _LARGEST_PAYLOAD_BYTES).any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +205,7 @@ def flaws(record: AttemptRecord) -> Iterator[Json]:
 def messages(record: AttemptRecord) -> Iterator[Message]:
     """Return the messages of the robots' recordings, in the order of their times as far as their clocks agree."""
     streams = []
-    marked = fates.packet_fates(record.captures, record.transfers)
+    marked = packet_fates(record.captures, record.transfers)
     for file, role in record.plan.captures().items():
         if file in record.captures:
             topic, meaning = (
@@ -87,7 +213,7 @@ def messages(record: AttemptRecord) -> Iterator[Message]:
                 "What its capture holds: IP packets, frames of offload.",
             )
             channel = _channel(record, role, topic, schemas.PACKET, meaning)
-            streams.append(packets.messages(channel, record.attempt.folder, marked[file]))
+            streams.append(packet_messages(channel, record.attempt.folder, marked[file]))
     for role in record.plan.cast:
         short = [*_phases(record, role), *_links(record, role), *_rtts(record, role)]
         streams.append(iter(sorted(short, key=attrgetter("time_ns"))))

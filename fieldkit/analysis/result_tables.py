@@ -9,9 +9,8 @@ from typing import Any, Final
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.compare import Comparison, Difference, Pair
-from fieldkit.analysis.lines import TableLine, lines
-from fieldkit.analysis.quantities import Quantity
-from fieldkit.analysis.words import Tally
+from fieldkit.analysis.quantities import Quantity, Tally
+from fieldkit.analysis.table_lines import TableLine, lines
 from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, EstimateRow, Kind, csv_text, declared
 from fieldkit.core.text import json_text, one_line
 

@@ -1,11 +1,13 @@
-"""The lab's process: starts the robots, answers requests on a Unix socket, and stops the robots."""
+"""The lab's process: moves to the background, starts the robots, answers on a Unix socket, and stops the robots."""
 
 import os
 import signal
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
@@ -13,10 +15,67 @@ from fieldkit.core import runtime
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Sink
 from fieldkit.core.runtime import NameHeldError
-from fieldkit.lab import answers, ssh
-from fieldkit.lab.answers import LabState, RobotState
-from fieldkit.lab.folder import LabFolder, make, remove
+from fieldkit.lab import requests
+from fieldkit.lab.folder import LabFolder, make, remove, write_ssh_config
 from fieldkit.lab.protocol import Lab, LabBackend, unknown_robot
+from fieldkit.lab.requests import LabState, RobotState
+
+OnReady = Callable[[Path], None]
+"""Called when start-up is complete, with the log file for all further output."""
+
+_READY: Final = b"+"
+
+
+def run_detached(work: Callable[[OnReady], int]) -> int:
+    """Run `work` in a child process; return when its start-up is complete or it has exited.
+
+    During start-up the child keeps this terminal: its output is shown here, and it receives Ctrl-C.
+
+    Args:
+        work: Receives a function that it calls with its log file when start-up is complete; after that call it has no
+            terminal. Returns its exit code.
+
+    Returns:
+        0 if start-up is complete, the exit code of `work` if it exited before.
+    """
+    reader, writer = os.pipe()
+    sys.stdout.flush()  # otherwise the child would write the buffered text again
+    pid = os.fork()
+    if pid == 0:
+        os.close(reader)
+        code = 1
+        try:
+            code = work(lambda log: _leave(writer, log))
+        except BaseException:  # noqa: BLE001 (reported as by the interpreter; the parent does its own clean-up)
+            sys.excepthook(*sys.exc_info())
+        sys.stdout.flush()
+        os._exit(code)
+    os.close(writer)
+    try:
+        with os.fdopen(reader, "rb") as ready:
+            if ready.read() == _READY:
+                return 0
+    except BaseException:
+        os.kill(pid, signal.SIGTERM)
+        os.waitpid(pid, 0)
+        raise
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def _leave(writer: int, log: Path) -> None:
+    """Detach from the terminal and the current directory, and notify the parent that start-up is complete."""
+    sys.stdout.flush()
+    os.setsid()
+    os.chdir("/")
+    null = os.open(os.devnull, os.O_RDONLY)
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    for source, target in ((null, 0), (output, 1), (output, 2)):
+        os.dup2(source, target)
+    os.close(null)
+    os.close(output)
+    os.write(writer, _READY)
+    os.close(writer)
+
 
 REQUEST_S: Final = 5.0
 """Timeout for a client to send its request, and for a robot to accept a connection."""
@@ -47,7 +106,7 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready:
         backend.open_lab(seed=seed, sink=sink) as robots,
     ):
         began_s = time.monotonic()
-        ssh.write(folder, robots.login)
+        write_ssh_config(folder, robots.login)
         ready(robots)
         while True:
             client, _ = listener.accept()
@@ -109,9 +168,9 @@ def _serve(client: socket.socket, robots: Lab, began_s: float) -> None:
                 case "connect":
                     _pass_socket(client, robots, arguments)
                 case "state":
-                    client.sendall(answers.pack_state(_state(robots, time.monotonic() - began_s)))
+                    client.sendall(requests.pack_state(_state(robots, time.monotonic() - began_s)))
                 case "overview":
-                    client.sendall(answers.pack_overview(robots.overview()))
+                    client.sendall(requests.pack_overview(robots.overview()))
                 case "move":
                     client.sendall(_move(robots, *arguments.split(" ", 1)))
         except (OSError, TypeError, ValueError):
@@ -137,9 +196,9 @@ def _move(robots: Lab, name: str, to: str) -> bytes:
     try:
         if name not in robots.members:
             raise unknown_robot(name, robots.members)
-        return answers.pack_place(robots.move(name, answers.destination(to)))
+        return requests.pack_place(robots.move(name, requests.unpack_destination(to)))
     except FieldkitError as error:
-        return answers.pack_error(error)
+        return requests.pack_error(error)
 
 
 def _state(robots: Lab, up_s: float) -> LabState:

@@ -4,6 +4,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -13,9 +14,57 @@ from fieldkit.core.errors import ConfigurationError, LinkError, LinkLostError, d
 from fieldkit.core.model import LinkSample, Role
 from fieldkit.core.text import sanitized
 from fieldkit.measure.evidence import iw
-from fieldkit.pytest.programs import ProgramError, ProgramOutput, RunningProgram, until_closed
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.shell import Completed, Shell
+
+# The inner shell becomes the program, which therefore receives SIGINT as from Ctrl-C. The signal is sent when our end
+# of standard input closes, also because this process was killed. The outer shell returns an exit code in any case.
+_UNTIL_CLOSED: Final = (
+    'exec 3<&0; { cat <&3 >/dev/null; kill -INT "$$"; sleep 2; kill -TERM "$$"; sleep 2; kill -KILL "$$"; } '
+    '>/dev/null 2>&1 & exec "$@" 3<&- </dev/null'
+)
+_RUNNING: Final = ("sh", "-c", 'sh -c "$@"; exit "$?"', "sh", _UNTIL_CLOSED, "sh")
+
+
+class ProgramError(AssertionError):
+    """A program on a robot did not do what the test requires: the test fails, but the lab works."""
+
+
+@dataclass(frozen=True)
+class ProgramOutput:
+    """The result of a program on a robot.
+
+    Attributes:
+        argv: The program with its arguments.
+        exit_code: Its exit code.
+        stdout: Its output; bytes that are not UTF-8 are replaced.
+        stderr: Its output on standard error.
+    """
+
+    argv: tuple[str, ...]
+    exit_code: int
+    stdout: str
+    stderr: str
+
+
+class RunningProgram:
+    """A program that runs on a robot.
+
+    Attributes:
+        output: Its result after it has exited, None before.
+    """
+
+    def __init__(self) -> None:
+        self.output: ProgramOutput | None = None
+
+
+def until_closed(argv: Sequence[str]) -> tuple[str, ...]:
+    """Return the command that runs a program until the command's standard input is closed.
+
+    The program then receives SIGINT, and SIGTERM and SIGKILL two and four seconds later if it continues.
+    """
+    return (*_RUNNING, *argv)
+
 
 TIMEOUT_S: Final = 30.0
 FILE_BYTES: Final = 1 << 30
