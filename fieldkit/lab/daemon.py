@@ -1,11 +1,12 @@
 """The lab's process: moves to the background, starts the robots, answers on a Unix socket, and stops the robots."""
 
 import os
+import shlex
 import signal
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -16,8 +17,8 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Sink
 from fieldkit.core.runtime import NameHeldError
 from fieldkit.lab import requests
-from fieldkit.lab.folder import LabFolder, make, remove, write_ssh_config
-from fieldkit.lab.protocol import Lab, LabBackend, unknown_robot
+from fieldkit.lab.folder import LabFolder, make, remove
+from fieldkit.lab.protocol import Lab, LabBackend, Login, unknown_robot
 from fieldkit.lab.requests import LabState, RobotState
 
 OnReady = Callable[[Path], None]
@@ -214,3 +215,39 @@ def _state(robots: Lab, up_s: float) -> LabState:
         for name, member in robots.members.items()
     )
     return LabState(os.getpid(), up_s, tuple(rows))
+
+
+_CONNECT: Final = Path(__file__).with_name("connect.py")
+
+
+def write_ssh_config(folder: LabFolder, login: Login) -> None:
+    """Write key, host keys and configuration into the lab's folder, readable for this user only."""
+    hosts = "".join(f"{name} {key}\n" for name, key in login.host_keys.items())
+    for path, text in (
+        (folder.key, login.private_key),
+        (folder.known_hosts, hosts),
+        (folder.ssh_config, ssh_config(folder, login.user, login.host_keys)),
+    ):
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+
+
+def ssh_config(folder: LabFolder, user: str, robots: Iterable[str]) -> str:
+    """Return a configuration for `ssh -F`: robots by name, with pinned host keys, over Unix sockets."""
+    # -I ignores modules in the current directory and Python's environment variables.
+    words = (sys.executable, "-I", str(_CONNECT), str(folder.socket))
+    command = shlex.join(words).replace("%", "%%")
+    return f"""\
+Host {" ".join(robots)}
+    User {user}
+    IdentityFile "{folder.key}"
+    IdentitiesOnly yes
+    IdentityAgent none
+    UserKnownHostsFile "{folder.known_hosts}"
+    GlobalKnownHostsFile none
+    StrictHostKeyChecking yes
+    UpdateHostKeys no
+    ProxyCommand {command} %n
+    ProxyUseFdpass yes
+"""

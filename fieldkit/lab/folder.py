@@ -2,16 +2,11 @@
 
 import hashlib
 import os
-import shlex
 import shutil
-import sys
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from fieldkit.core import runtime
-from fieldkit.lab.protocol import Login
 
 
 @dataclass(frozen=True)
@@ -91,39 +86,3 @@ def _is_private_or_absent(path: Path) -> bool:
         return runtime.is_private(path.lstat())
     except FileNotFoundError:
         return True
-
-
-_CONNECT: Final = Path(__file__).with_name("connect.py")
-
-
-def write_ssh_config(folder: LabFolder, login: Login) -> None:
-    """Write key, host keys and configuration into the lab's folder, readable for this user only."""
-    hosts = "".join(f"{name} {key}\n" for name, key in login.host_keys.items())
-    for path, text in (
-        (folder.key, login.private_key),
-        (folder.known_hosts, hosts),
-        (folder.ssh_config, ssh_config(folder, login.user, login.host_keys)),
-    ):
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-
-
-def ssh_config(folder: LabFolder, user: str, robots: Iterable[str]) -> str:
-    """Return a configuration for `ssh -F`: robots by name, with pinned host keys, over Unix sockets."""
-    # -I ignores modules in the current directory and Python's environment variables.
-    words = (sys.executable, "-I", str(_CONNECT), str(folder.socket))
-    command = shlex.join(words).replace("%", "%%")
-    return f"""\
-Host {" ".join(robots)}
-    User {user}
-    IdentityFile "{folder.key}"
-    IdentitiesOnly yes
-    IdentityAgent none
-    UserKnownHostsFile "{folder.known_hosts}"
-    GlobalKnownHostsFile none
-    StrictHostKeyChecking yes
-    UpdateHostKeys no
-    ProxyCommand {command} %n
-    ProxyUseFdpass yes
-"""
