@@ -6,17 +6,19 @@ a wanted width.
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fieldkit.analysis import one_sided_bounds
-from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.expectations import Expectation, Scope
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, NORMAL, Intervals, student
 from fieldkit.core.columns import Kind
+
+if TYPE_CHECKING:  # a plan needs no tables of trials, which take long to import
+    from fieldkit.analysis.cells import Cell
 
 _USUAL_SHARE = 0.9
 """Share of all repeats that is used to show the difference between `every` repeat of a trial and all repeats."""
@@ -91,7 +93,7 @@ def _for_interval(expectation: Expectation, quantity: Quantity) -> int:
 _BISECTIONS: Final = 60  # enough for every number of repeats that a float represents exactly
 
 
-def more_wanted_of(cells: Sequence[Cell], half_widths: Mapping[str, float]) -> tuple[Mapping[str, int], ...]:
+def more_wanted_of(cells: "Sequence[Cell]", half_widths: Mapping[str, float]) -> tuple[Mapping[str, int], ...]:
     """Return `more_wanted` of all estimates: for each cell, by name of the quantity.
 
     Args:

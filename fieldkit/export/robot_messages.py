@@ -21,7 +21,7 @@ from fieldkit.export.schemas import Level, time
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
-from fieldkit.measure.captures.ip import address_text
+from fieldkit.measure.captures.headers import address_text
 from fieldkit.measure.captures.packets import NO_PORT, Packets
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import bag, ping

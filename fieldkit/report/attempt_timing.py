@@ -19,7 +19,7 @@ from fieldkit.core.model import FaultKind, Protocol, Role, StationSample
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import bag, host, iperf3, link, outage, ping, track
 from fieldkit.measure.positions import position_columns
-from fieldkit.measure.transfers import fates, topic_log
+from fieldkit.measure.transfers import fates, topic_samples
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report.charts import Panel, Series
@@ -299,7 +299,7 @@ def _topic(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_n
     """Yield the delays of received samples, and the lost samples, by the time of sending."""
     step = placed.step
     logs = {
-        role: evidence.read_or_none(topic_log.read, step.prefixed_name(f"{role}-topic.bin"))
+        role: evidence.read_or_none(topic_samples.read_log, step.prefixed_name(f"{role}-topic.bin"))
         for verb in ("publish", "subscribe")
         for role, job in times.jobs
         if job == step.prefixed_name(verb)

@@ -18,9 +18,9 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind
 from fieldkit.report import distance, distribution, dots, expected, packet_rasters, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart
-from fieldkit.report.conditions import Identities
 from fieldkit.report.coverage import absences
 from fieldkit.report.headlines import Headline, Ranking, headlines
+from fieldkit.report.series import Identities
 from fieldkit.report.trial_folders import Evidence, load_evidence
 
 _ALWAYS_VISIBLE: Final = frozenset(

@@ -11,7 +11,7 @@ from fieldkit.core.model import Protocol, Status
 from fieldkit.measure.captures.arrays import Mask
 from fieldkit.measure.transfers import fates
 from fieldkit.report import wording
-from fieldkit.report.conditions import panels
+from fieldkit.report.series import panels
 from fieldkit.report.trial_folders import Evidence
 
 MOST_REPEATS: Final = 400

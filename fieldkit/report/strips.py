@@ -11,7 +11,7 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import LOSSES, Quantity, with_plain_name
 from fieldkit.core.model import Status
 from fieldkit.report import wording
-from fieldkit.report.conditions import Identities, panels
+from fieldkit.report.series import Identities, panels
 from fieldkit.report.theme import Colour
 from fieldkit.report.trial_folders import Evidence
 

@@ -11,7 +11,7 @@ from typing import Final
 from fieldkit.core.columns import cell
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
-from fieldkit.measure.evidence import iw, link, link_samples, program_output
+from fieldkit.measure.evidence import link, link_samples, program_output
 from tests.fuzz.harness import Target
 from tests.helpers.paths import DATA
 
@@ -56,11 +56,11 @@ def _own(name: str, data: bytes, place: Path) -> None:
 
 def _iw(data: bytes, _: Path) -> None:
     text = data.decode(errors="replace")
-    iw.stations(text)
-    iw.cell(text)
-    iw.channel(text)
+    link_samples.parse_stations(text)
+    link_samples.parse_cell(text)
+    link_samples.parse_channel(text)
     for line in text.split("\n"):
-        iw.wireless(line)
+        link_samples.parse_wireless(line)
 
 
 def _path(data: bytes, place: Path) -> None:

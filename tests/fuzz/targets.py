@@ -45,7 +45,7 @@ from fieldkit.measure.evidence.sandbox import ReaderError
 from fieldkit.measure.motion import tlog
 from fieldkit.measure.positions import position_files
 from fieldkit.measure.positions.position_sources import Account
-from fieldkit.measure.transfers import topic_columns, topic_log
+from fieldkit.measure.transfers import topic_columns, topic_samples
 from fieldkit.measure.transfers.topic_columns import TopicTraffic
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
@@ -324,7 +324,7 @@ def _tlog(path: Path) -> None:
 
 
 def _topic_log(path: Path) -> None:
-    found = topic_log.read(path)
+    found = topic_samples.read_log(path)
     flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
     plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, on_ports=True)
     list(topic_checks.check_logs(plan, found, found))

@@ -13,7 +13,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.checks import topic_captures, topic_checks
 from fieldkit.measure.checks.topic_captures import CapturedTopic
 from fieldkit.measure.checks.topic_checks import TopicPlan
-from fieldkit.measure.transfers import sample_heads, topic_columns, topic_log
+from fieldkit.measure.transfers import topic_columns, topic_samples
 from fieldkit.measure.transfers.topic_columns import TopicTraffic
 from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4
 
@@ -144,14 +144,14 @@ def write(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> 
 def judge_attempt(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> tuple[list[str], Measured]:
     """The contradictions in an attempt, and its measured values."""
     write(topic_attempt, folder, signed=signed)
-    sent, came = (topic_log.read(folder / f"{role}-topic.bin") for role in ("sender", "receiver"))
+    sent, came = (topic_samples.read_log(folder / f"{role}-topic.bin") for role in ("sender", "receiver"))
     flows, packets = [], []
     for role, address in (("sender", SENDER), ("receiver", RECEIVER)):
         path, is_publisher = folder / f"{role}.pcap", role == "sender"
         packets.append(pcap.read(path).packets)
-        headers = sample_heads.find(path, topic_attempt.plan.size_bytes)
+        headers = topic_samples.find_heads(path, topic_attempt.plan.size_bytes)
         flows.append(
-            sample_heads.flow(
+            topic_samples.sample_flow(
                 packets[-1],
                 headers,
                 frozenset({PORT}),

@@ -16,9 +16,8 @@ from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import outage, ping
 from fieldkit.report import distance, distribution, dots, figures
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
-from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
-from fieldkit.report.points import needs_log
+from fieldkit.report.series import Identities, needs_log
 from fieldkit.report.theme import Style
 from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial.columns import trial_columns

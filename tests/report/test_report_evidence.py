@@ -12,8 +12,8 @@ from fieldkit.config import schema
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import track
 from fieldkit.report import distribution, packet_rasters, timeline
-from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together, repeat_to_draw
+from fieldkit.report.series import Identities
 from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial import sources, store
 from fieldkit.trial.plan import PLAN_FILE

@@ -22,8 +22,8 @@ from fieldkit.measure.transfers import fates, iperf3_load, tcp, topic_columns
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report import distance, distribution, figures, headlines, packet_rasters, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
-from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
+from fieldkit.report.series import Identities
 from fieldkit.report.theme import Style
 from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial.columns import trial_columns

@@ -1,10 +1,11 @@
 """Every command with its help line, in a module of its name: `add` declares its arguments, `run` runs it.
 
+Commands that list items share the module `listings`, with a pair of functions for each, such as `add_robots`.
 A module is imported when its command is used. Slow imports are inside of the functions that need them, so that help
 and Tab completion do not wait for them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
 from types import MappingProxyType
@@ -41,6 +42,8 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
     }
 )
 """In the order in which the help lists them."""
+LISTINGS: Final = ("robots", "procedures", "columns")
+"""Commands in the module `listings`."""
 
 
 def add_all(commands: Commands) -> None:
@@ -51,4 +54,8 @@ def add_all(commands: Commands) -> None:
 
 
 def _declare(name: str, parser: Parser) -> None:
-    import_module(f"{__name__}.{name}").add(parser)
+    if name in LISTINGS:
+        add: Callable[[Parser], None] = getattr(import_module(f"{__name__}.listings"), f"add_{name}")
+    else:
+        add = import_module(f"{__name__}.{name}").add
+    add(parser)

@@ -18,7 +18,7 @@ from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Vector
 from fieldkit.core.text import json_text, print_text
 from fieldkit.core.units import format_count, format_duration, parse_offset_m
-from fieldkit.lab import daemon, folder
+from fieldkit.lab import folder
 from fieldkit.lab.folder import LabFolder
 
 if TYPE_CHECKING:
@@ -115,6 +115,8 @@ _NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
 
 def up(arguments: argparse.Namespace) -> int:
     """Start the robots, and return when they are up, or with --foreground when they are down."""
+    from fieldkit.lab import daemon
+
     here, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
     def announce(robots: "Lab") -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures import pcapng
 from fieldkit.measure.captures.arrays import Buffer, Chunk, Frames, Integers, Ints, Mask, Order, layout
-from fieldkit.measure.captures.link_layer import check_link_type
+from fieldkit.measure.captures.headers import check_link_type
 from fieldkit.measure.captures.packets import Packets, decode
 from fieldkit.measure.evidence import reading
 

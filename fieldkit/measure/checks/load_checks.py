@@ -16,7 +16,7 @@ import numpy as np
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Ints
-from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.headers import TCP
 from fieldkit.measure.captures.packets import ACK, NOT_CAPTURED, SYN, Packets
 from fieldkit.measure.evidence.host import Counters
 from fieldkit.measure.evidence.iperf3 import IperfTest

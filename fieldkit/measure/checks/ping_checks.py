@@ -15,7 +15,7 @@ import numpy as np
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Ints
-from fieldkit.measure.captures.ip import ICMP
+from fieldkit.measure.captures.headers import ICMP
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
 from fieldkit.measure.evidence.ping import Ping, Reply
 

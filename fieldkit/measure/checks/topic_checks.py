@@ -13,8 +13,8 @@ import numpy as np
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.model import Role
 from fieldkit.core.units import format_count
-from fieldkit.measure.transfers import topic_log
-from fieldkit.measure.transfers.topic_log import TopicLog
+from fieldkit.measure.transfers import topic_samples
+from fieldkit.measure.transfers.topic_samples import TopicLog
 
 MAX_SLEW_NS: Final = 1_000_000
 """Largest difference by which two consecutive times of one program may be reversed by a slewed clock."""
@@ -25,7 +25,7 @@ SETTLES_NS: Final = 500_000_000
 PADDING_BYTES: Final = 3
 """DDS pads a sample to a multiple of 4 bytes, and some implementations do not report this."""
 
-_NAMES: Final = {topic_log.PUBLISHER: "publisher", topic_log.SUBSCRIBER: "subscriber"}
+_NAMES: Final = {topic_samples.PUBLISHER: "publisher", topic_samples.SUBSCRIBER: "subscriber"}
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ def check_logs(plan: TopicPlan, sent: TopicLog, received: TopicLog) -> Iterator[
         sent: Complete log of the publisher.
         received: Complete log of the subscriber.
     """
-    yield from _wrong_end(plan, sent, topic_log.PUBLISHER)
-    yield from _wrong_end(plan, received, topic_log.SUBSCRIBER)
+    yield from _wrong_end(plan, sent, topic_samples.PUBLISHER)
+    yield from _wrong_end(plan, received, topic_samples.SUBSCRIBER)
     yield from _publisher_problems(plan, sent)
     yield from _wrong_sizes(plan, received, PADDING_BYTES, "subscriber")
     if plan.in_order and (reversed_s := _reversed_s(received)):
@@ -103,8 +103,10 @@ def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
         yield f"the {name}'s log was written by the {_NAMES.get(log.end, 'unknown end')} of the topic"
     if log.topic_sum is not None and log.topic_sum != zlib.crc32(plan.topic.encode()):
         yield f"the {name}'s log is of another topic than {plan.topic}"
-    has_valid_count = (log.kinds.get(topic_log.BEGUN) == 1, log.kinds.get(topic_log.MATCHED, 0) <= 1)
-    unexpected_kinds = (topic_log.FOREIGN,) if end == topic_log.PUBLISHER else (topic_log.REFUSED, topic_log.SKIPPED)
+    has_valid_count = (log.kinds.get(topic_samples.BEGUN) == 1, log.kinds.get(topic_samples.MATCHED, 0) <= 1)
+    unexpected_kinds = (
+        (topic_samples.FOREIGN,) if end == topic_samples.PUBLISHER else (topic_samples.REFUSED, topic_samples.SKIPPED)
+    )
     if not all(has_valid_count) or any(log.kinds.get(kind) for kind in unexpected_kinds):
         yield f"the {name}'s log has records that no {name} writes"
     times_ns = log.times_ns

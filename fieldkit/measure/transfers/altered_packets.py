@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import Keys, Mask, row_hashes
-from fieldkit.measure.captures.ip import TCP, address_text
+from fieldkit.measure.captures.headers import TCP, address_text
 from fieldkit.measure.captures.packets import NO_PORT, SYN, Packets
 from fieldkit.measure.transfers.match import connection_keys, usable_stamps
 from fieldkit.measure.transfers.transfer_spec import Transfer

@@ -7,7 +7,7 @@ import numpy as np
 from fieldkit.core.columns import CLOCK_DIFFERENCE_BOUNDS_S, Figure, Kind, Measured, columns
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
-from fieldkit.measure.captures.ip import UDP
+from fieldkit.measure.captures.headers import UDP
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.evidence.delay_quantiles import quantile_of_sent
 from fieldkit.measure.transfers import tcp, udp

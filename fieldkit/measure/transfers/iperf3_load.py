@@ -11,7 +11,7 @@ from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
-from fieldkit.measure.captures.ip import TCP, UDP
+from fieldkit.measure.captures.headers import TCP, UDP
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
 from fieldkit.measure.transfers import delay, deliveries, stalls, tcp
 from fieldkit.measure.transfers.clock_offset import Clocks

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import Ints, Keys, Mask, row_hashes
-from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.headers import TCP
 from fieldkit.measure.captures.packets import NO_STAMP, NOT_CAPTURED, RST, Packets
 from fieldkit.measure.transfers import tcp_streams
 from fieldkit.measure.transfers.tcp_streams import Pieces

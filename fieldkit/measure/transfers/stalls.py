@@ -26,7 +26,7 @@ from fieldkit.measure.transfers.clock_offset import StampPairs
 from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
 from fieldkit.measure.transfers.tcp import TcpFrames
 from fieldkit.measure.transfers.topic_columns import TopicTraffic
-from fieldkit.measure.transfers.topic_log import TopicLog
+from fieldkit.measure.transfers.topic_samples import TopicLog
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.measure.transfers.udp import UdpPackets
 

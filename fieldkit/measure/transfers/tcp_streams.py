@@ -10,7 +10,7 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import Ints, Mask, Table, row_hashes
-from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.headers import TCP
 from fieldkit.measure.captures.packets import ACK, FIN, SYN, Packets
 
 # Upper limit of the length of a stream: byte positions of different connections are this far apart.

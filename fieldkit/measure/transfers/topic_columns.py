@@ -13,13 +13,13 @@ import numpy as np
 
 from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.measure.captures.arrays import Floats, Ints
-from fieldkit.measure.captures.ip import UDP
+from fieldkit.measure.captures.headers import UDP
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.evidence.delay_quantiles import quantile_of_sent
 from fieldkit.measure.transfers.clock_offset import Clocks
 from fieldkit.measure.transfers.delay import LARGEST_ERROR, clocks_between, jitter_s
 from fieldkit.measure.transfers.match import match
-from fieldkit.measure.transfers.topic_log import TopicLog, TopicSamples
+from fieldkit.measure.transfers.topic_samples import TopicLog, TopicSamples
 from fieldkit.measure.transfers.udp import with_ports
 
 _COUNTS: Final = columns(

@@ -5,7 +5,7 @@ from typing import Final
 
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
-from fieldkit.measure.captures.ip import TCP, UDP
+from fieldkit.measure.captures.headers import TCP, UDP
 from fieldkit.measure.captures.packets import Packets
 
 _IP_PROTOCOL: Final = {Protocol.TCP: TCP, Protocol.UDP: UDP}

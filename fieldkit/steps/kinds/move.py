@@ -15,7 +15,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.motion import drive_checks, drive_log, motion_sources
-from fieldkit.measure.positions import travelled_distance
+from fieldkit.measure.positions import position_columns
 from fieldkit.steps import driving, streams
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.lease import run_inside
@@ -283,7 +283,9 @@ class MoveStep(Nest):
             return measured
         during_ns = (log[0].utc_ns, log[-1].utc_ns) if log[0].utc_ns else None
         away_m = max(moment.off_m for moment in log)
-        why = travelled_distance.contradiction(view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns)
+        why = position_columns.distance_contradiction(
+            view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns
+        )
         return measured.without({name: why for name in measured.values if name != "drive_ended"}) if why else measured
 
     @override

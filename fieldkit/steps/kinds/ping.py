@@ -15,7 +15,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Mask
-from fieldkit.measure.captures.ip import ICMP
+from fieldkit.measure.captures.headers import ICMP
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
 from fieldkit.measure.checks import ping_checks
 from fieldkit.measure.evidence import ping

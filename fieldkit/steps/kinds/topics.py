@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from fieldkit.measure.captures.packets import Packets
     from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
     from fieldkit.measure.transfers.topic_columns import TopicTraffic
-    from fieldkit.measure.transfers.topic_log import TopicLog
+    from fieldkit.measure.transfers.topic_samples import TopicLog
 
 
 MASTER: Final = "rosmaster"

@@ -19,7 +19,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import reading, track
 from fieldkit.measure.motion import drive_checks, drive_log
 from fieldkit.measure.motion.drive_checks import DrivePlan
-from fieldkit.measure.positions import travelled_distance
+from fieldkit.measure.positions import position_columns
 from tests.measure.motion.test_drive_log import drive
 
 START_NS = 1_795_000_000_000_000_000
@@ -160,7 +160,7 @@ def oracle(folder: Path, far_m: float) -> AttemptEvidence:
 @pytest.mark.parametrize(("far_m", "agrees"), [(2.0, True), (2.1, True), (8.0, False), (0.0, False)])
 def test_the_farthest_position_agrees_with_the_testbed(far_m: float, agrees: bool, tmp_path: Path) -> None:
     during_ns = (START_NS, START_NS + 9 * 10**9)
-    why = travelled_distance.contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
+    why = position_columns.distance_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
     assert (why is None) is agrees
     if why:
         assert why == f"it was 2.0 m from its place by its odometry, and {far_m:.1f} m by track.csv"

@@ -13,7 +13,7 @@ from scapy.layers.inet import IP, UDP, fragment
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import topic_columns
 from fieldkit.measure.transfers.topic_columns import TopicTraffic
-from fieldkit.measure.transfers.topic_log import TopicLog, TopicSamples
+from fieldkit.measure.transfers.topic_samples import TopicLog, TopicSamples
 from tests.helpers.captures import RECEIVER, SENDER, Frame, datagram, ipv4, packets
 
 MS = 1_000_000

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fieldkit.measure.transfers import stalls
 from fieldkit.measure.transfers.deliveries import FlowSchedule
-from fieldkit.measure.transfers.topic_log import TopicLog
+from fieldkit.measure.transfers.topic_samples import TopicLog
 from tests.measure.transfers.test_measure_topics import FLOW, arrived, captures, log, published
 
 EXPECTED = FlowSchedule(interval_s=0.1, lasts_s=9.9)
