@@ -16,8 +16,8 @@ from tests.helpers.sshd import free_port, make_key
 ASKS = "def test_asks(robots):\n    pass\n"
 TOLD = """
 def test_told(lab_options, pytestconfig):
-    from fieldkit.pytest import options
-    said = lab_options, options.output(pytestconfig), options.keep(pytestconfig)
+    from fieldkit.pytest import plugin_options
+    said = lab_options, plugin_options.output(pytestconfig), plugin_options.keep(pytestconfig)
     print(*(f"[{one}]" for one in said), sep="\\n")
 """
 OTHERS = """

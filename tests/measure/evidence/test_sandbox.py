@@ -48,7 +48,7 @@ def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[sandbox
 _UNPACKS = """
 import os, tempfile
 from pathlib import Path
-from fieldkit.measure.evidence import confined
+from fieldkit.measure.evidence import sandbox
 
 def answer(question):
     if "says" in question:
