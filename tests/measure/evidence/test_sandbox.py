@@ -61,7 +61,7 @@ def answer(question):
         os.kill(os.getpid(), signals[0])
     return {"said": "whole"}
 
-confined.serve(answer)
+sandbox.serve(answer)
 """
 
 
