@@ -20,7 +20,7 @@ from typing import Final
 
 from benchmarks.medium import quantile
 from fieldkit import __version__
-from fieldkit.lab import client, folder
+from fieldkit.lab import folder, requests
 from fieldkit.measure.evidence.ping import parse
 
 RADIOS: Final = {
@@ -85,7 +85,7 @@ def pinged(here: Path) -> Figures:
             "median": statistics.median(rtt_ms),
             "p99": quantile(rtt_ms, 0.99),
         }
-    links = client.overview(folder.of_directory(here)).links
+    links = requests.overview(folder.of_directory(here)).links
     snr_db = next((link.snr_db for link in links if link.ends == ("robot-1", f"robot-{ROBOTS}")), None)
     return {**times, "loss": 100 * (1 - len(rtt_ms) / PINGS), "snr_db": snr_db}
 

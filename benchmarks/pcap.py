@@ -3,8 +3,8 @@
 The captures are of a UDP transfer of 200,000 IP packets with a loss of 10 %: fragments of 8,192-byte datagrams, with
 128 bytes captured of each, as in a trial. Each peer reads both captures into columns and matches the packets by
 identification and offset; in every round all peers run in turn, and all must compute the same losses. fieldkit does
-all that `fieldkit.measure.transfers.figures` does with captures: losses of packets, datagrams and bytes, the
-transfer's time, the paper's counts. The peers, dpkt, tshark and scapy, only count lost packets. scapy would take
+all that `fieldkit.measure.transfers.transfer_measures` does with captures: losses of packets, datagrams and bytes,
+the transfer's time, the paper's counts. The peers, dpkt, tshark and scapy, only count lost packets. scapy would take
 minutes and reads only the first packets; tshark is omitted if it is not installed. Times are processor times,
 children included, which other load disturbs less.
 
@@ -36,8 +36,8 @@ from scapy.utils import PcapReader
 
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.transfers import paper, udp
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers import transfer_measures, udp
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 PACKETS: Final = 200_000
 SCAPY_PACKETS: Final = 4_000
@@ -98,8 +98,8 @@ def write_captures(folder: Path) -> tuple[Path, Path]:
 def by_fieldkit(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets."""
     sent, received = pcap.read(sender).packets, pcap.read(receiver).packets
-    paper.frames_from(sent, TRANSFER.sender_address, TRANSFER.port)
-    paper.frames_to(received, TRANSFER.receiver_address, TRANSFER.port)
+    transfer_measures.paper_frames_from(sent, TRANSFER.sender_address, TRANSFER.port)
+    transfer_measures.paper_frames_to(received, TRANSFER.receiver_address, TRANSFER.port)
     counts = udp.count(udp.match_transfer(sent, received, TRANSFER))
     return counts.packets_sent - counts.packets_received
 

@@ -27,7 +27,7 @@ from benchmarks.footprint import Memory, cpu_s
 from benchmarks.medium import PAYLOAD_BYTES, RADIO, iperf, listening_iperf, packets_in, quantile, radio, veth_path
 from benchmarks.namespaces import Namespace
 from fieldkit.core.model import Lateness, Role, Topology
-from fieldkit.measure.evidence.lateness import quantile_ns
+from fieldkit.measure.evidence.oracle_delays import lateness_quantile_ns
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import RosChoice
 from sim_backends.emulated.medium.medium_client import MediumClient
@@ -116,7 +116,7 @@ def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
     """Return the lateness of the medium's packets since the counts `before`."""
     late = Lateness(bound_ns=1, packets=Counter(medium.stats().late) - before)
     shares = {"median": 0.5, "p99": 0.99, "max": 1.0}
-    return {f"late_{word}_ms": (quantile_ns(late, share) or 0) / 1e6 for word, share in shares.items()}
+    return {f"late_{word}_ms": (lateness_quantile_ns(late, share) or 0) / 1e6 for word, share in shares.items()}
 
 
 def throughput(near: Namespace, far: Namespace, seconds: float) -> Figures:

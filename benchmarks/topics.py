@@ -26,7 +26,7 @@ from typing import Any, Final
 from benchmarks.bridge import HOST, SIZE, TYPE, Running, Way, free_port, spread
 from fieldkit.analysis import statistics
 from fieldkit.core.threads import run_parallel
-from fieldkit.measure.transfers import topic_log
+from fieldkit.measure.transfers import topic_samples
 from fieldkit.ros import topics
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
@@ -70,7 +70,7 @@ class AgentPair:
 
     def arrived(self) -> Times:
         """Return the arrivals of the last stream."""
-        samples = topic_log.read(self._log("subscribe")).samples
+        samples = topic_samples.read_log(self._log("subscribe")).samples
         return list(zip(samples.at_ns.tolist(), (samples.at_ns - samples.sent_ns).tolist(), strict=True))
 
     @contextmanager

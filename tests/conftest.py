@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 
 from fieldkit.bags import contents
 from fieldkit.measure.evidence import bag
-from fieldkit.measure.positions import recorded
+from fieldkit.measure.positions import position_files
 from tests.helpers.sshd import server
 
 __all__ = ["server"]
@@ -77,7 +77,7 @@ def _stop_readers() -> Iterator[None]:
     yield
     bag._READER.stop()
     contents._WORKER.stop()
-    recorded._GPX_READER.stop()
+    position_files._GPX_READER.stop()
     if tlog := sys.modules.get("fieldkit.motion.logs.tlog"):
         tlog._READER.stop()
 

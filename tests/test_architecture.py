@@ -106,8 +106,8 @@ ONE_IMPORTER = {
     "matplotlib": "fieldkit/report/drawing.py fieldkit/report/figures.py sim_backends/cosim/plots.py",
     "jinja2": "fieldkit/report/page.py",
     "gpxpy": "fieldkit/measure/positions/gpx_reader.py",
-    "jmespath": "fieldkit/measure/evidence/printed.py",
-    "re2": "fieldkit/measure/evidence/printed.py",
+    "jmespath": "fieldkit/measure/evidence/program_output.py",
+    "re2": "fieldkit/measure/evidence/program_output.py",
     # Connections, and key formats.
     "paramiko": "fieldkit/remote/keys.py fieldkit/remote/link.py",
     "keyring": "fieldkit/remote/passwords.py",

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from benchmarks.studies.middleware import LAB, ROOT
 from fieldkit.core import files
-from fieldkit.measure.transfers import topic_log
+from fieldkit.measure.transfers import topic_samples
 from fieldkit.ros import topics, tuning
 from fieldkit.ros.qos import PROFILES
 from fieldkit.ros.types import shipped
@@ -142,7 +142,7 @@ class ImageLab:
         data = subprocess.run(self.command(robot, "cat", f"{verb}.bin"), check=True, capture_output=True).stdout
         path = self._folder / f"{verb}.bin"
         path.write_bytes(data)
-        log = topic_log.read(path)
+        log = topic_samples.read_log(path)
         if not log.whole:
             raise RuntimeError(f"{path} is incomplete")
         return [int(number) for number in log.samples.sequence]

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 from pydantic.fields import FieldInfo
 
 from docs.generator.markdown import relative, table
-from fieldkit.config.meanings import attributes, description
+from fieldkit.config.documentation import attribute_meanings, class_description
 from fieldkit.config.schema import Strict
 
 HEAD = ("key", "default", "meaning")
@@ -17,7 +17,7 @@ HEAD = ("key", "default", "meaning")
 
 def describe(model: type) -> str:
     """Return the description in the docstring of a model."""
-    return relative(description(model))
+    return relative(class_description(model))
 
 
 def keys_table(model: type[Strict], prefix: str = "", without: frozenset[str] = frozenset()) -> str:
@@ -34,7 +34,7 @@ def keys_table(model: type[Strict], prefix: str = "", without: frozenset[str] = 
 
 def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]]:
     """Yield key, default and meaning of every key, nested keys after their parent."""
-    meanings = attributes(model)
+    meanings = attribute_meanings(model)
     for name, field in model.model_fields.items():
         key = field.alias or name
         meaning = meanings.get(key) or meanings[name]

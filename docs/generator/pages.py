@@ -13,7 +13,7 @@ from fieldkit import cli
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.campaign.plan import CampaignFile
 from fieldkit.config import loops
-from fieldkit.config.meanings import attributes, description
+from fieldkit.config.documentation import attribute_meanings, class_description
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import Site
 from fieldkit.core import errors, events
@@ -76,7 +76,7 @@ def exit_codes() -> str:
     meanings: dict[int, list[str]] = {}
     for family in families:
         if "exit_code" in vars(family) and family.__module__ == errors.__name__:
-            meanings.setdefault(family.exit_code, []).append(description(family).partition("\n")[0])
+            meanings.setdefault(family.exit_code, []).append(class_description(family).partition("\n")[0])
     codes = {code: relative(" ".join(texts)) for code, texts in meanings.items()} | dict(cli.EXIT_CODES)
     lines = ((str(code), meaning) for code, meaning in sorted(codes.items()))
     return page(
@@ -150,7 +150,7 @@ def steps() -> str:
 
 
 def _first_sentence(model: type) -> str:
-    return relative(description(model)).partition("\n")[0]
+    return relative(class_description(model)).partition("\n")[0]
 
 
 def scenario_file() -> str:
@@ -195,9 +195,9 @@ def json_events() -> str:
     ]
     for name, record in vars(events).items():
         if inspect.isclass(record) and is_dataclass(record) and record.__module__ == events.__name__:
-            meanings = attributes(record)
+            meanings = attribute_meanings(record)
             lines = ((f"`{field.name}`", meanings.get(field.name, "")) for field in fields(record))
-            blocks += [f"## {_snake(name)}", description(record), table(("field", "meaning"), lines)]
+            blocks += [f"## {_snake(name)}", class_description(record), table(("field", "meaning"), lines)]
     return page("JSON events", *blocks)
 
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis import order
-from fieldkit.analysis.quantities import DEFAULT_BY, Quantity
+from fieldkit.analysis import independence
+from fieldkit.analysis.quantities import DEFAULT_BY, Quantity, Tally, tallies
 from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
-from fieldkit.analysis.words import Tally, tallies
 from fieldkit.core.columns import Column, Kind
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import ENDED, Status
@@ -50,8 +49,8 @@ class Estimate:
         high: Upper end; None for a single repeat, and if censored repeats leave it open.
         assured: Coverage of the interval for any distribution of the repeats; None unless it is a median of at least
             two repeats.
-        p_order: p-value of the independence of the repeats in time (`order.p_values`), corrected for the number of
-            all estimates; None if it was not tested.
+        p_order: p-value of the independence of the repeats in time (`independence.p_values`), corrected for the
+            number of all estimates; None if it was not tested.
         wilson_low: Lower end of the 95 % Wilson interval, which assumes that all counted items are independent; None
             unless counted.
         wilson_high: Upper end.
@@ -197,7 +196,9 @@ def _quantities_without_value(
 def _correct_p_values(estimates: Sequence[dict[str, Estimate]]) -> None:
     """Correct the p-values `p_order` for the number of all estimates."""
     tested = [(cell, estimate) for cell in estimates for estimate in cell.values() if estimate.p_order is not None]
-    corrected = order.corrected(np.array([estimate.p_order for _, estimate in tested], dtype=np.float64)).tolist()
+    corrected = independence.corrected(
+        np.array([estimate.p_order for _, estimate in tested], dtype=np.float64)
+    ).tolist()
     for (cell, estimate), p_order in zip(tested, corrected, strict=True):
         cell[estimate.quantity.name] = replace(estimate, p_order=p_order)
 
@@ -319,7 +320,7 @@ def _p_order(repeats: Repeats, quantity: Quantity, chosen: Indices) -> NDArray[n
     """Return the p-value of independence in time of each cell; NaN if a start time is unknown, and for flags."""
     if quantity.kind is Kind.FLAG or "started_utc_ns" not in repeats.numbers:
         return np.full(len(chosen), np.nan)
-    p_values = order.p_values(repeats.observed(quantity)[0][chosen])
+    p_values = independence.p_values(repeats.observed(quantity)[0][chosen])
     return np.where(np.isnan(repeats.numbers["started_utc_ns"][chosen]).any(axis=1), np.nan, p_values)
 
 

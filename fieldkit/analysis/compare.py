@@ -10,9 +10,8 @@ from fieldkit.analysis import comparable, statistics
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
-from fieldkit.analysis.quantities import Quantity, quantities
+from fieldkit.analysis.quantities import Quantity, Tally, quantities
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.analysis.words import Tally
 from fieldkit.core.columns import cell
 from fieldkit.core.model import Interval, Status
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis import bounds
+from fieldkit.analysis import one_sided_bounds
 from fieldkit.analysis.cells import Cell, Estimate, RepeatValues
 from fieldkit.analysis.expectations import Expectation, Scope
 
@@ -160,12 +160,12 @@ def _are_met(expectation: Expectation, values: NDArray[np.float64]) -> NDArray[n
 def _decide_share(expectation: Expectation, n: int, met: int, violated: int) -> _Decision:
     """Decide by the one-sided 95 % bound of the share of all repeats that meet the expectation."""
     share = expectation.share or 1.0
-    low = bounds.share_low(met, n)
+    low = one_sided_bounds.share_low(met, n)
     if low >= share:
         return _Decision(Ruling.HOLDS, met=met, limit=low)
-    if bounds.share_high(n - violated, n) < share:
+    if one_sided_bounds.share_high(n - violated, n) < share:
         return _Decision(Ruling.FAILS, met=met, limit=low)
-    needed = bounds.repeats_for(share)
+    needed = one_sided_bounds.repeats_for(share)
     why = f"{needed} repeats are needed, if all meet it" if n < needed else ""
     return _Decision(Ruling.OPEN, why, met, low)
 
@@ -174,11 +174,11 @@ def _decide_packets(expectation: Expectation, estimate: Estimate, sample: Repeat
     """Decide by the share of all packets that were lost, and its upper bound."""
     if sample.lost is None or sample.sent is None:
         return _Decision(Ruling.OPEN)
-    limit = bounds.loss_high(sample.lost, sample.sent)
+    limit = one_sided_bounds.loss_high(sample.lost, sample.sent)
     if not expectation.is_met(estimate.value):
         return _Decision(Ruling.FAILS, limit=limit)
     if expectation.is_met(limit):
         return _Decision(Ruling.HOLDS, limit=limit)
-    needed, sent = bounds.packets_for(expectation.bound), int(sample.sent.sum())
+    needed, sent = one_sided_bounds.packets_for(expectation.bound), int(sample.sent.sum())
     why = f"{sent} packets were sent, at least {needed} are needed" if sent < needed else ""
     return _Decision(Ruling.OPEN, why, limit=limit)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.analysis.quantities import Quantity, quantities
-from fieldkit.analysis.words import worded
+from fieldkit.analysis.quantities import Quantity, quantities, worded
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status

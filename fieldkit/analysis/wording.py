@@ -10,9 +10,8 @@ from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.expectations import Scope
 from fieldkit.analysis.judgements import Judgement
-from fieldkit.analysis.quantities import DIFFERENCE_UNITS, Quantity, in_order
+from fieldkit.analysis.quantities import DIFFERENCE_UNITS, Quantity, Tally, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, assured
-from fieldkit.analysis.words import Tally
 from fieldkit.core import columns
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import ENDED, Status

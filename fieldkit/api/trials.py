@@ -1,27 +1,107 @@
 """Trials in memory: their repeats, cells and packets as Arrow tables."""
 
+import math
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
-from fieldkit.analysis.cells import aggregate
+from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import mixtures
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE
-from fieldkit.api.cell import TrialCell
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean
 from fieldkit.core.model import Protocol
 from fieldkit.export import table
 from fieldkit.export.table import Table
-from fieldkit.measure.transfers import crossings
-from fieldkit.report.evidence import Evidence, load_evidence
+from fieldkit.measure.transfers import fates
+from fieldkit.report.trial_folders import Evidence, load_evidence
 from fieldkit.trial import sources
 from fieldkit.trial.sources import Sources
+
+
+@dataclass(frozen=True)
+class CellFigure:
+    """A figure with its 95 % interval.
+
+    Attributes:
+        name: The column that it is calculated from.
+        unit: Its unit.
+        n: Number of valid repeats that have it.
+        value: The figure.
+        low: Lower end of the interval; minus infinity for a single repeat, which has no interval.
+        high: Upper end; infinity for a single repeat.
+    """
+
+    name: str
+    unit: str
+    n: int
+    value: float
+    low: float
+    high: float
+
+
+class TrialCell:
+    """The repeats under one condition: `cell.file_loss.high`, or `cell["up.file_loss"]` for a step with a name.
+
+    Args:
+        cell: The cell.
+
+    Attributes:
+        condition: The condition, by column.
+        n_valid: Number of valid repeats; all figures are of these.
+        n_void: Number of attempts whose evidence was incomplete.
+        n_failed: Number of attempts that failed.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        self.condition: Mapping[str, str | float | None] = cell.key
+        self.n_valid, self.n_void, self.n_failed = cell.n_valid, cell.n_void, cell.n_failed
+        self._estimates = cell.estimates
+
+    def __getitem__(self, name: str) -> CellFigure:
+        """Return a figure.
+
+        Raises:
+            ConfigurationError: No valid repeat has it.
+        """
+        if name not in self._estimates:
+            remedy = did_you_mean(name, self._estimates, f"its figures: {', '.join(self._estimates) or 'none'}")
+            raise ConfigurationError(f"none of {self.n_valid} valid repeats has a figure {name!r}", remedy=remedy)
+        return _figure(self._estimates[name])
+
+    def __getattr__(self, name: str) -> CellFigure:
+        """Return a figure, like `cell[name]`."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return self[name]
+
+    def __iter__(self) -> Iterator[CellFigure]:
+        """Yield every figure."""
+        return map(_figure, self._estimates.values())
+
+    def __repr__(self) -> str:
+        condition = ", ".join(
+            f"{name}={value!r}" for name, value in self.condition.items() if value not in {None, ""}
+        )
+        return f"<fieldkit cell {condition}: {self.n_valid} valid>"
+
+
+def _figure(estimate: Estimate) -> CellFigure:
+    return CellFigure(
+        name=estimate.quantity.name,
+        unit=estimate.quantity.unit,
+        n=estimate.n,
+        value=estimate.value,
+        low=-math.inf if estimate.low is None else estimate.low,
+        high=math.inf if estimate.high is None else estimate.high,
+    )
+
 
 _SOURCE: Column = Column(SOURCE, "text", "Folder of the trial, or CSV file, that a row was read from.")
 
@@ -122,7 +202,9 @@ class Trials:
                 remedy=did_you_mean(step, transfers, f"its transfers: {named}"),
             )
         selected = transfers if step is None else {step: transfers[step]}
-        return table.of_packets({name: crossings.read(attempt, transfer) for name, transfer in selected.items()})
+        return table.of_packets(
+            {name: fates.read_crossings(attempt, transfer) for name, transfer in selected.items()}
+        )
 
     def __len__(self) -> int:
         """Return the number of attempts."""

@@ -12,7 +12,7 @@ from typing import Final
 from fieldkit.bags.formats import LAST_RESORT, BagFiles, BagFormat, find
 from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
 from fieldkit.measure.evidence.bag import allocated_bytes
-from fieldkit.measure.evidence.confined import Json, ReaderError, SandboxedReader
+from fieldkit.measure.evidence.sandbox import Json, ReaderError, SandboxedReader
 
 _WORKER: Final = SandboxedReader("fieldkit.bags.worker")
 

@@ -1,7 +1,7 @@
 """The process that opens bags with libraries: inspects, repairs and converts them.
 
 `fieldkit.bags.contents` runs it in a sandbox, because files from a robot may be malicious
-(`fieldkit.measure.evidence.confined`).
+(`fieldkit.measure.evidence.sandbox`).
 """
 
 import contextlib
@@ -24,8 +24,8 @@ from rosbags.typesys.store import Typestore
 from fieldkit.bags import salvage
 from fieldkit.bags.formats import BagFiles, BagFormat, find
 from fieldkit.bags.salvage import BagConnection, DamagedError
-from fieldkit.measure.evidence import bag_paths, confined
-from fieldkit.measure.evidence.confined import Json
+from fieldkit.measure.evidence import bag_paths, sandbox
+from fieldkit.measure.evidence.sandbox import Json
 
 _MAX_PROBLEMS: Final = 20
 _METADATA_VERSION: Final = 9
@@ -233,4 +233,4 @@ def _error_text(error: Exception) -> str:
 
 if __name__ == "__main__":
     bag_paths.allow_any()
-    confined.serve(answer)
+    sandbox.serve(answer)

@@ -1,7 +1,7 @@
 """The command line: parse, call one library function, print, return an exit code.
 
 `commands` lists every command and imports the module of a command only when the command is used, so help, usage
-errors and completion import no library except rich. `outside` adds the commands of other packages.
+errors and completion import no library except rich. `parser` adds the commands of other packages.
 """
 
 import argparse
@@ -15,8 +15,8 @@ from types import MappingProxyType
 from typing import Final
 
 from fieldkit import __version__
-from fieldkit.cli import commands, hints, outside
-from fieldkit.cli.parser import Parser
+from fieldkit.cli import commands, hints
+from fieldkit.cli.parser import Parser, add_plugin_commands, load_plugin
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 
 INTERRUPTED: Final = 130
@@ -64,7 +64,7 @@ def parser() -> Parser:
     subparsers = top.add_commands(title="commands", metavar="COMMAND")
     commands.add_all(subparsers)
     top.set_defaults(outside=None)
-    outside.add_all(subparsers)
+    add_plugin_commands(subparsers)
     return top
 
 
@@ -126,7 +126,7 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.parser.print_help()
         return 0
     run: Callable[[argparse.Namespace], int]
-    run = arguments.run if arguments.outside is None else outside.load(arguments.outside, arguments.run)
+    run = arguments.run if arguments.outside is None else load_plugin(arguments.outside, arguments.run)
     return run(arguments)
 
 

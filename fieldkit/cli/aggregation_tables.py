@@ -5,20 +5,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.analysis import lines, tables, wording
+from fieldkit.analysis import result_tables, table_lines, wording
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.comparable import MIXED_BY, mixtures
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.judgements import Judgement, judge_by_trial
-from fieldkit.analysis.lines import TableLine
-from fieldkit.analysis.planning import more_wanted_of
 from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.cli import summary
+from fieldkit.analysis.sample_size import more_wanted_of
+from fieldkit.analysis.table_lines import TableLine
+from fieldkit.cli import results
 from fieldkit.cli.display import prose, show_note, table
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import parse_quantity
 from fieldkit.trial import sources
 from fieldkit.trial.sources import Sources
@@ -26,8 +26,8 @@ from fieldkit.trial.sources import Sources
 _More = Sequence[Mapping[str, int]]
 """For each cell, the number of additional repeats per quantity; empty unless `--width` is given."""
 
-_FOR_PROGRAMS: Final = MappingProxyType({"csv": tables.to_csv, "json": tables.to_json})
-_FOR_PAPERS: Final = MappingProxyType({"markdown": tables.to_markdown, "latex": tables.to_latex})
+_FOR_PROGRAMS: Final = MappingProxyType({"csv": result_tables.to_csv, "json": result_tables.to_json})
+_FOR_PAPERS: Final = MappingProxyType({"markdown": result_tables.to_markdown, "latex": result_tables.to_latex})
 # A table in a paper has room for one delay and one loss. Each protocol has one of these two losses.
 _PAPER: Final = ("rtt_median_s", "ip_loss", "tcp_byte_loss")
 _VALUE: Final = MappingProxyType(
@@ -71,7 +71,7 @@ def show(arguments: argparse.Namespace) -> int:
         judgements = _judged(data, repeats, cells, quantities)
         expected = {judgement.expectation.quantity for judgement in judgements}
         show_all = arguments.all or chosen is not None or bool(widths)
-        shown = lines.lines(cells, quantities) if show_all else lines.operator_lines(cells, expected)
+        shown = table_lines.lines(cells, quantities) if show_all else table_lines.operator_lines(cells, expected)
         _show(by, cells, shown, more)
         _show_expected(by, cells, judgements)
         _note_rest(cells, shown)
@@ -125,7 +125,7 @@ def _note_rest(cells: Sequence[Cell], shown: Sequence[TableLine]) -> None:
     """Print how many quantities are not shown."""
     names = {quantity.name for line in shown for quantity in line.quantities}
     if left_out := len({quantity.name for quantity in wording.measured(cells)} - names):
-        prose(f"{summary.more(left_out)}: add --all")
+        prose(f"{results.more_rows_note(left_out)}: add --all")
 
 
 def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], more: _More) -> None:
@@ -207,7 +207,7 @@ def _additional_repeats(line: TableLine, cell: Cell, more: Mapping[str, int]) ->
 
 def _n(n: int, cell: Cell) -> str:
     """Return the number of valid repeats with a value: `5`, or `4 of 5`."""
-    return lines.part_of(n, cell) or str(n)
+    return table_lines.part_of(n, cell) or str(n)
 
 
 def _figures(line: TableLine, cell: Cell, scale: wording.Scale) -> dict[str, str]:
@@ -223,7 +223,7 @@ def _figures(line: TableLine, cell: Cell, scale: wording.Scale) -> dict[str, str
     if quantity.at_least:
         heads.append("not ended")
     if estimate is None:
-        return dict.fromkeys(heads, "") | {"n": lines.part_of(0, cell)}
+        return dict.fromkeys(heads, "") | {"n": table_lines.part_of(0, cell)}
     figures = {
         "n": _n(estimate.n, cell),
         "sent": "" if estimate.trials is None else str(estimate.trials),

@@ -6,14 +6,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.analysis import tables, wording
+from fieldkit.analysis import result_tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.comparable import VARIED, Concern
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import ConfigurationError, did_you_mean, shell_command
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.trial import sources
 
 MISSED: Final = 1
@@ -159,14 +159,14 @@ def _markdown(comparison: Comparison) -> str:
         *(f"{_weight(comparison, concern)}: {concern}" for concern in differing),
     ]
     return (
-        "".join(map(tables.markdown_line, rows))
+        "".join(map(result_tables.markdown_line, rows))
         + "\n"
-        + "".join(f"- {tables.markdown_escaped(line)}\n" for line in notes)
+        + "".join(f"- {result_tables.markdown_escaped(line)}\n" for line in notes)
     )
 
 
 _FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
-    {"csv": tables.comparison_csv, "json": tables.comparison_json, "markdown": _markdown}
+    {"csv": result_tables.comparison_csv, "json": result_tables.comparison_json, "markdown": _markdown}
 )
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.events import CommandPlanned, Note, Sink
 from fieldkit.core.model import Protocol, RepeatId
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import quote

@@ -2,23 +2,83 @@
 
 import argparse
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from fieldkit.analysis import wording
+from fieldkit.analysis import table_lines, wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.judgements import Judgement
-from fieldkit.cli import summary
-from fieldkit.cli.display import show_error, table
+from fieldkit.analysis.table_lines import TableLine
+from fieldkit.cli.display import fits, prose, show_error, table
 from fieldkit.cli.hints import completed
 from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from fieldkit.export import junit
 from fieldkit.trial import store
 from fieldkit.trial.running.runner import Outcome
+
+Row = tuple[str, ...]
+_SummaryTable = tuple[Row, list[Row]]
+"""Head and rows of a table."""
+
+
+def show_summary(cells: Sequence[Cell], *, every: bool = False, expected: Collection[str] = ()) -> int:
+    """Print a table per condition, each value with its 95 % interval, and return the number of omitted quantities.
+
+    If the terminal is too narrow for that, each protocol has a separate table; if that is still too wide, intervals
+    are below their values and labels are folded.
+
+    Args:
+        cells: The cells to show.
+        every: True to show all quantities, not only those of `table_lines.operator_lines`.
+        expected: Names of quantities with an expectation. They are always shown.
+    """
+    groups: dict[tuple[str | float | None, ...], list[Cell]] = {}
+    for cell in cells:
+        condition = tuple(cell.key[name] for name in ("procedure", "distance", "topology", "backend"))
+        groups.setdefault(condition, []).append(cell)
+    left_out, names = set[str](), set[str]()
+    for condition, group in groups.items():
+        title = ", ".join(str(part) for part in condition)
+        shown = (
+            table_lines.lines(group)
+            if every
+            else table_lines.with_radio_loss(table_lines.operator_lines(group, expected), group)
+        )
+        names |= (group_names := {quantity.name for line in shown for quantity in line.quantities})
+        left_out |= {quantity.name for quantity in wording.measured(group)} - group_names
+        layouts: Sequence[tuple[list[_SummaryTable], Sequence[int]]] = (
+            ([_summary(group, shown)], ()),
+            ([_summary([cell], shown) for cell in group], ()),
+            ([_summary([cell], shown, between="\n") for cell in group], (0,)),
+        )
+        tables, fold = next((layout for layout in layouts if all(fits(*part) for part in layout[0])), layouts[-1])
+        for head, rows in tables:
+            table(head, rows, title=title, right=range(1, len(head)), fold=fold)
+    for caution in wording.cautions(cells, names):
+        prose(caution)
+    return len(left_out)
+
+
+def _summary(group: Sequence[Cell], shown: Sequence[TableLine], between: str = " ") -> _SummaryTable:
+    """Return the head and the rows of a table of one condition, with `between` between the parts of a cell."""
+    figures = [(line.label, *(line.amount(cell, line.scale(group), between) for cell in group)) for line in shown]
+    words = [
+        (label, *(wording.tally(cell, name, f",{between}") for cell in group))
+        for name, label in wording.worded(group).items()
+    ]
+    sent = [(label, *counts) for label, counts in table_lines.sent(group).items()]
+    rows = [("repeats", *map(wording.counts, group)), *sent, *(row for row in figures if any(row[1:])), *words]
+    return ("[95 % interval]", *(str(cell.key["protocol"]).upper() for cell in group)), rows
+
+
+def more_rows_note(left_out: int) -> str:
+    """Return the number of omitted quantities in words."""
+    return f"{left_out} more {'quantity' if left_out == 1 else 'quantities'}"
+
 
 _LENGTH: Final = re.compile(r"(?P<number>[0-9]+(?:\.[0-9]+)?)(?P<unit>[a-z]+)")
 
@@ -36,7 +96,7 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
     for outcome in ended:
         if not is_json:
             expected = {judgement.expectation.quantity for judgement in outcome.judgements}
-            left_out = max(left_out, summary.show(outcome.cells, every=arguments.all, expected=expected))
+            left_out = max(left_out, show_summary(outcome.cells, every=arguments.all, expected=expected))
             expectation_table(outcome.judgements)
         if outcome.failed:
             reasons = outcome.folder / store.TRIAL_CSV
@@ -94,7 +154,7 @@ def _next_commands(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
     folders = [outcome.folder for outcome in ended]
     yield shell_command("fieldkit", "report", *folders)
     if left_out:
-        yield f"{shell_command('fieldkit', 'aggregate', *folders, '--all')}  # {summary.more(left_out)}"
+        yield f"{shell_command('fieldkit', 'aggregate', *folders, '--all')}  # {more_rows_note(left_out)}"
     cells = [cell for outcome in ended for cell in outcome.cells[:1]]
     farther = _farther([str(cell.key["distance"]) for cell in cells])
     if farther and not any(_lost_all(cell) for outcome in ended for cell in outcome.cells):

@@ -1,8 +1,10 @@
-"""The installed documentation: its pages by topic.
+"""Documentation: the installed pages by topic, and descriptions of models and records from their docstrings.
 
-A wheel contains the site as HTML. In a source checkout, where the site is not built, the pages are Markdown.
+Links in the descriptions are Markdown, relative to the folder `docs/`.
 """
 
+import inspect
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -76,3 +78,27 @@ def _commands(reference: Path) -> set[str]:
     """Return the names of the commands that a page describes, read from the page's links to their sections."""
     text = reference.read_text(encoding="utf-8")
     return {part.partition('"')[0].partition(")")[0] for part in text.split("#fieldkit-")[1:]}
+
+
+_ENTRY: Final = re.compile(r"^    (?P<key>\w+): (?P<text>.*(?:\n {8}.*)*)", re.MULTILINE)
+_LINK: Final = re.compile(r"\[([^\]]+)\]\([^)]+\)")
+
+
+def class_description(model: type) -> str:
+    """Return the docstring of a class without its `Attributes:`."""
+    text = inspect.cleandoc(model.__doc__ or "")
+    return text.partition("\n\nAttributes:")[0]
+
+
+def attribute_meanings(model: type) -> dict[str, str]:
+    """Return the meaning of each attribute, from the docstrings of the class and of its base classes."""
+    meanings: dict[str, str] = {}
+    for base in reversed(model.__mro__):
+        text = inspect.cleandoc(base.__doc__ or "").partition("\n\nAttributes:")[2]
+        meanings |= {match["key"]: " ".join(match["text"].split()) for match in _ENTRY.finditer(text)}
+    return meanings
+
+
+def without_links(text: str) -> str:
+    """Return a text with each Markdown link replaced by its link text."""
+    return _LINK.sub(r"\1", text)

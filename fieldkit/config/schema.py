@@ -34,7 +34,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, core_schema
 
-from fieldkit.config import misplaced, problems
+from fieldkit.config import yaml_errors
 from fieldkit.config.documents import Document, Location, parse, read, to_text
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, did_you_mean
@@ -102,7 +102,7 @@ def pattern_field(pattern: str, words: str) -> Any:  # noqa: ANN401 (as pydantic
         pattern: A regular expression for the whole text.
         words: Description of a valid text for error messages: `a name in lower-case letters`.
     """
-    problems.SHAPES[pattern] = words
+    yaml_errors.SHAPES[pattern] = words
     return Field(pattern=pattern)
 
 
@@ -187,7 +187,7 @@ class Strict(BaseModel):
         for key in data:
             if key not in fields:
                 outer = [_types(model) for model in _ENCLOSING.get()[:-1]]
-                hint, index = misplaced.hint(key, data, fields, outer)
+                hint, index = yaml_errors.misplaced_hint(key, data, fields, outer)
                 raise _unknown(str(key), hint, outer[index] if index >= 0 else ())
         return data
 
@@ -303,7 +303,7 @@ def validate(document: Document, model: type[Model]) -> Model:
     try:
         return model.model_validate(document.data)
     except ValidationError as error:
-        raise problems.explain(error.errors(), document) from error
+        raise yaml_errors.explain(error.errors(), document) from error
     finally:
         _FOLDER.reset(token)
 

@@ -16,7 +16,7 @@ POSITIONS: Final = "fieldkit.positions"
 """Entry point group of readers of positions: `SUFFIX = "package.module:function"`, without the dot; see
 `fieldkit.measure.positions.recorded`."""
 COMMANDS: Final = "fieldkit.commands"
-"""Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.outside`."""
+"""Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.parser`."""
 
 REMEDY: Final = "fix or uninstall its package"
 

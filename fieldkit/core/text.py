@@ -1,11 +1,8 @@
-"""Sanitizing of text of unknown origin, and the exceptions that reading untrusted JSON can raise.
-
-All output passes through `sanitized`, or `json_text` if it is JSON: tables, CSV, Markdown, LaTeX, JUnit, the report's
-HTML, and printed text. `tests/e2e/test_hostile_text.py` lists the outputs.
-"""
+"""Plain text: sanitizing of text of unknown origin, printing, and the exceptions of reading untrusted JSON."""
 
 import json
 import re
+import sys
 from typing import Any, Final
 
 JSON_ERRORS: Final = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
@@ -74,3 +71,10 @@ def encodable(text: str) -> str:
     Python uses unpaired surrogates for the bytes of file names that are not UTF-8.
     """
     return text.encode(errors="replace").decode()
+
+
+def print_text(text: object = "", *, end: str = "\n", flush: bool = False) -> None:
+    """Print a text with its control characters replaced, except tabs, which files that are shown may contain."""
+    sys.stdout.write("\t".join(map(sanitized, str(text).split("\t"))) + end)
+    if flush:
+        sys.stdout.flush()

@@ -12,10 +12,10 @@ from fieldkit import __version__
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
-from fieldkit.analysis.tables import estimate_rows
+from fieldkit.analysis.result_tables import estimate_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column, EstimateRow, cell, csv_text, declared
-from fieldkit.measure.transfers import crossings
-from fieldkit.measure.transfers.crossings import Crossings
+from fieldkit.measure.transfers import fates
+from fieldkit.measure.transfers.fates import Crossings
 
 Table: TypeAlias = pa.Table
 
@@ -59,7 +59,7 @@ def of_repeats(repeats: Repeats) -> Table:
 
 
 def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
-    """Return the content of `analysis.tables.to_csv` as a table, with all digits of the numbers.
+    """Return the content of `analysis.result_tables.to_csv` as a table, with all digits of the numbers.
 
     Args:
         by: Columns that define a cell.
@@ -78,7 +78,10 @@ def of_packets(transfers: Mapping[str, Crossings]) -> Table:
     Args:
         transfers: Packets by name of the step, empty if it has none.
     """
-    columns = (Column("step", "text", "Name of the step that sent it; empty where it has none."), *crossings.COLUMNS)
+    columns = (
+        Column("step", "text", "Name of the step that sent it; empty where it has none."),
+        *fates.CROSSING_COLUMNS,
+    )
     schema = _schema(columns)
     parts = [
         Table.from_arrays(

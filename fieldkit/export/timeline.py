@@ -14,12 +14,12 @@ from typing import Final
 from fieldkit.core import geometry
 from fieldkit.core.errors import EvidenceError, shell_command
 from fieldkit.core.model import ENDED, Role, Status, Vector
-from fieldkit.export import robot, schemas
+from fieldkit.export import robot_messages, schemas
 from fieldkit.export.mcap import Channel, Json, Message
 from fieldkit.export.schemas import Level
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
-from fieldkit.measure.positions import accounts, where
+from fieldkit.measure.positions import position_columns, position_sources
 from fieldkit.measure.positions.samples import WGS84, Samples
 from fieldkit.trial import journal, rebuild, store
 from fieldkit.trial.journal import Attempt, JournalEntry
@@ -74,7 +74,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
         )
     # Planned and measured positions have different origins, so a file has only one kind.
     places = (folder, *(store.attempt_folder(folder, attempt.folder) for attempt in attempts))
-    has_positions = any((place / name).exists() for place in places for name in (track.FILE, accounts.FILE))
+    has_positions = any((place / name).exists() for place in places for name in (track.FILE, position_sources.FILE))
     ended_ns = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status in ENDED}
 
     @lru_cache(maxsize=_OPEN_ATTEMPTS)
@@ -116,9 +116,9 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 
 
 def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, int]]) -> Iterator[Message]:
-    """Yield the positions of robots by attempt, each from the best source according to `where`."""
+    """Yield the positions of robots by attempt, each from the best source according to `position_columns`."""
     for attempt, ended_ns in attempts:
-        samples_by_role = where.readable_samples(evidence(attempt))
+        samples_by_role = position_columns.readable_samples(evidence(attempt))
         # A position from before the start of the attempt is reported at the start.
         messages_of_attempt = [
             _place(plan, whereabouts.role, max(whereabouts.utc_ns, attempt.started_utc_ns), whereabouts.position_m)
@@ -157,6 +157,6 @@ def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int)
 def _robots(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Iterator[Message]:
     """Yield the messages of the robots' recordings, attempt by attempt."""
     for attempt in attempts:
-        record = robot.read(plan, attempt, evidence(attempt))
-        yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot.flaws(record))
-        yield from robot.messages(record)
+        record = robot_messages.read(plan, attempt, evidence(attempt))
+        yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot_messages.flaws(record))
+        yield from robot_messages.messages(record)

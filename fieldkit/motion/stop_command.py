@@ -19,8 +19,8 @@ from fieldkit.config import documents, robot_access
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.config.robot_access import RobotAccess
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError, did_you_mean
-from fieldkit.core.printing import print_text
 from fieldkit.core.runtime import user_at_host
+from fieldkit.core.text import print_text
 from fieldkit.lab import folder
 from fieldkit.motion import halting
 from fieldkit.motion.halting import Halted

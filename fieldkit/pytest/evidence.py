@@ -13,8 +13,8 @@ import pytest
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Finding, Note, PhaseStarted, RepeatEnded, Request
 from fieldkit.core.text import sanitized
-from fieldkit.pytest import options
-from fieldkit.pytest.options import Keep
+from fieldkit.pytest import plugin_options
+from fieldkit.pytest.plugin_options import Keep
 
 LOG: Final = "lab.log"
 """Log of the lab: commands with their output, faults, places, repeats of trials."""
@@ -152,7 +152,7 @@ def _as_lab_error(item: pytest.Item, call: pytest.CallInfo[None], report: pytest
     """Report a problem of the lab as an error of the set-up, with the message for operators, instead of a failure."""
     if call.excinfo is None or not isinstance(call.excinfo.value, FieldkitError):
         return
-    call.excinfo.value.remedy = options.as_pytest_option(call.excinfo.value.remedy)
+    call.excinfo.value.remedy = plugin_options.as_pytest_option(call.excinfo.value.remedy)
     if report.when == "call":
         report.when = "setup"
     if item.config.getoption("tbstyle") == "auto":

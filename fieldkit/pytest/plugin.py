@@ -11,9 +11,9 @@ import pytest
 
 if TYPE_CHECKING:
     from fieldkit.pytest.evidence import EvidenceKeeper
-    from fieldkit.pytest.lab import OpenedLab
-    from fieldkit.pytest.options import LabOptions
-    from fieldkit.pytest.robots import RobotHandles
+    from fieldkit.pytest.lab_fixture import OpenedLab
+    from fieldkit.pytest.plugin_options import LabOptions
+    from fieldkit.pytest.robot_fixture import RobotHandles
     from fieldkit.pytest.trials import TrialRunner
 
 _FIXTURES: Final = frozenset({"lab", "robots", "trial"})
@@ -96,7 +96,7 @@ def _run(config: pytest.Config) -> str:
 
 def _keeper(config: pytest.Config) -> "EvidenceKeeper":
     from fieldkit.pytest.evidence import EvidenceKeeper  # noqa: PLC0415 (see the module docstring; also below)
-    from fieldkit.pytest.options import keep, output  # noqa: PLC0415
+    from fieldkit.pytest.plugin_options import keep, output  # noqa: PLC0415
 
     if _KEEPER not in config.stash:
         config.stash[_KEEPER] = EvidenceKeeper(output(config) / _run(config), keep(config))
@@ -107,7 +107,7 @@ def _keeper(config: pytest.Config) -> "EvidenceKeeper":
 @pytest.fixture(scope="module")
 def lab_options(pytestconfig: pytest.Config) -> "LabOptions":
     """Options of the lab; define a fixture of this name to change them for a test module."""
-    from fieldkit.pytest.options import of  # noqa: PLC0415
+    from fieldkit.pytest.plugin_options import of  # noqa: PLC0415
 
     return of(pytestconfig)
 
@@ -115,8 +115,7 @@ def lab_options(pytestconfig: pytest.Config) -> "LabOptions":
 @pytest.fixture(scope="module")
 def _fieldkit_lab(request: pytest.FixtureRequest, lab_options: "LabOptions") -> "Iterator[OpenedLab]":
     """The lab of a test module; its robots are opened on first use."""
-    from fieldkit.pytest.lab import OpenedLab  # noqa: PLC0415
-    from fieldkit.pytest.operator import operator_of  # noqa: PLC0415
+    from fieldkit.pytest.lab_fixture import OpenedLab, operator_of  # noqa: PLC0415
 
     keeper = _keeper(request.config)
     workers = getattr(request.config, "workerinput", {}).get("workercount", 1)

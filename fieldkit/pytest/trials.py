@@ -8,12 +8,12 @@ from typing import Final
 from fieldkit.analysis import wording
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.api.trials import Trials, load
-from fieldkit.cli import options as command_line
+from fieldkit.cli import cli_options as command_line
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Topology
 from fieldkit.core.units import format_count, parse_distance
-from fieldkit.pytest.lab import OpenedLab
-from fieldkit.pytest.options import one_of
+from fieldkit.pytest.lab_fixture import OpenedLab
+from fieldkit.pytest.plugin_options import one_of
 from fieldkit.trial import store
 from fieldkit.trial.request import make_plan
 from fieldkit.trial.running import runner

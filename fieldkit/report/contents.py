@@ -16,24 +16,12 @@ from fieldkit.analysis.wording import worded
 from fieldkit.core.columns import fault_column_name, plain_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind
-from fieldkit.report import (
-    bursts,
-    distance,
-    distribution,
-    dots,
-    expected,
-    provenance,
-    strips,
-    summary,
-    timeline,
-    wording,
-)
+from fieldkit.report import distance, distribution, dots, expected, packet_rasters, strips, summary, timeline, wording
 from fieldkit.report.charts import Chart
-from fieldkit.report.conditions import Identities
 from fieldkit.report.coverage import absences
-from fieldkit.report.evidence import Evidence, load_evidence
-from fieldkit.report.headlines import Headline, headlines
-from fieldkit.report.ranking import Ranking
+from fieldkit.report.headlines import Headline, Ranking, headlines
+from fieldkit.report.series import Identities
+from fieldkit.report.trial_folders import Evidence, load_evidence
 
 _ALWAYS_VISIBLE: Final = frozenset(
     (
@@ -125,8 +113,8 @@ class Contents:
     tables: Sequence[CellTable]
     sections: Sequence[ChartSection]
     strips: Sequence[strips.StripGroup]
-    bursts: Sequence[bursts.RasterGroup]
-    trials: Sequence[provenance.Provenance]
+    bursts: Sequence[packet_rasters.RasterGroup]
+    trials: Sequence[summary.Provenance]
     evidence: Evidence
     command: str
 
@@ -194,8 +182,8 @@ def put_together(
         tables=_tables(cells, evidence),
         sections=[section for section in sections if section.charts],
         strips=list(strips.groups(cells, identities, evidence)),
-        bursts=list(bursts.groups(cells, evidence)),
-        trials=list(provenance.trials(evidence)),
+        bursts=list(packet_rasters.groups(cells, evidence)),
+        trials=list(summary.trial_provenance(evidence)),
         evidence=evidence,
         command=shlex.join([*command, "--rebuild"] if is_whole else command),
     )

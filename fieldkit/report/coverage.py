@@ -13,7 +13,7 @@ from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.columns import plain_name, step_prefixed
 from fieldkit.core.model import ENDED, Status
 from fieldkit.report import wording
-from fieldkit.report.evidence import Evidence
+from fieldkit.report.trial_folders import Evidence
 
 Rows = NDArray[np.bool_]
 

@@ -10,11 +10,10 @@ from fieldkit.analysis.wording import scale_of
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
-from fieldkit.report.conditions import Identities, Identity, panels
 from fieldkit.report.coverage import Absence, absences
-from fieldkit.report.evidence import Evidence
-from fieldkit.report.points import Point, ends, point
-from fieldkit.report.ranking import Ranking
+from fieldkit.report.headlines import Ranking
+from fieldkit.report.series import Identities, Identity, Point, ends, panels, point
+from fieldkit.report.trial_folders import Evidence
 
 LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "topic_loss", "iperf3_loss", "iperf3_captured_loss")
 DELAY: Final = ("rtt_median_s", "one_way_median_s", "delay_s", "transfer_s", "topic_delay_median_s")

@@ -12,9 +12,8 @@ from fieldkit.analysis.quantities import Quantity, with_plain_name
 from fieldkit.analysis.wording import Scale, time_scale
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, Panel, Series
-from fieldkit.report.conditions import Identities, panels
-from fieldkit.report.evidence import Evidence
-from fieldkit.report.points import needs_log
+from fieldkit.report.series import Identities, needs_log, panels
+from fieldkit.report.trial_folders import Evidence
 
 MOST_DISTANCES: Final = 3
 """Most distances with a panel: the nearest, the middle and the farthest."""

@@ -11,11 +11,10 @@ from fieldkit.analysis.wording import Scale, measured, scale_of
 from fieldkit.core.columns import Kind
 from fieldkit.report import distance, wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
-from fieldkit.report.conditions import Identities, Identity, panels
 from fieldkit.report.coverage import absences
-from fieldkit.report.evidence import Evidence
-from fieldkit.report.points import Point, ends, needs_log, point
-from fieldkit.report.ranking import Ranking
+from fieldkit.report.headlines import Ranking
+from fieldkit.report.series import Identities, Identity, Point, ends, needs_log, panels, point
+from fieldkit.report.trial_folders import Evidence
 
 _DODGE: Final = 0.7
 """Share of a lane over which the conditions of one quantity are spread."""

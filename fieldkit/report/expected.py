@@ -8,7 +8,7 @@ from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.judgements import Judgement, Ruling, judge_by_trial
 from fieldkit.analysis.wording import judgement_texts
 from fieldkit.report import wording
-from fieldkit.report.evidence import Evidence
+from fieldkit.report.trial_folders import Evidence
 
 
 @dataclass(frozen=True)

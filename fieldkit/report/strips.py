@@ -11,9 +11,9 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import LOSSES, Quantity, with_plain_name
 from fieldkit.core.model import Status
 from fieldkit.report import wording
-from fieldkit.report.conditions import Identities, panels
-from fieldkit.report.evidence import Evidence
+from fieldkit.report.series import Identities, panels
 from fieldkit.report.theme import Colour
+from fieldkit.report.trial_folders import Evidence
 
 MOST_MARKS: Final = 2000
 """Most marks on a page, shared by its strips. Of more attempts, valid ones are omitted evenly, others never."""

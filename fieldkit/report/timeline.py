@@ -12,12 +12,12 @@ from fieldkit.core.columns import step_prefixed
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers.fates import Fates
-from fieldkit.measure.transfers.transfer import Transfer
-from fieldkit.report import flows, moments
+from fieldkit.measure.transfers.transfer_spec import Transfer
+from fieldkit.report import attempt_timing
+from fieldkit.report.attempt_timing import Moments
 from fieldkit.report.charts import Chart, Panel, Series, Span
-from fieldkit.report.evidence import Evidence
-from fieldkit.report.moments import Moments
 from fieldkit.report.theme import Style
+from fieldkit.report.trial_folders import Evidence
 
 MOST_PACKETS: Final = 1500
 """Most packets of each kind in a panel; of more packets, every k-th is drawn."""
@@ -45,7 +45,7 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
     evidence, plan = data.attempt(row), data.plan(row)
     if evidence is None or plan is None:
         return
-    times = moments.read(evidence, plan, data.repeats, row)
+    times = attempt_timing.read(evidence, plan, data.repeats, row)
     if not times.activities:
         return
     zero_ns = times.activities[0].start_ns
@@ -56,7 +56,7 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
     stops_s += [float(np.max(series.x)) for panel in pings for series in panel.series if len(series.x)]
     strips = [
         _bars(times, zero_ns),
-        *flows.panels(evidence, plan, times, zero_ns),
+        *attempt_timing.flow_panels(evidence, plan, times, zero_ns),
         *pings,
         *_links(times, zero_ns),
         *_distance(times, zero_ns),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 from fieldkit.core.columns import Column, Measured, with_step_name
 from fieldkit.core.model import Fault, Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.transfers.fault_times import FaultTimes
+from fieldkit.measure.transfers.recoveries import FaultTimes
 from fieldkit.steps.base import Step
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.view import View

@@ -18,7 +18,7 @@ from fieldkit.core.columns import Column, Measured, Value, step_prefixed
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.remote import jobs
 from fieldkit.steps import kinds
 from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, Pinging, Planned, RecordedFile, Refusal, Scene

@@ -3,7 +3,7 @@
 import time
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.measure.offsets import Exchange, parse_date
+from fieldkit.measure.robot_clock import Exchange, parse_date
 from fieldkit.remote.shell import Shell
 
 EXCHANGES = 5

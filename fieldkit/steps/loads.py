@@ -9,7 +9,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Bits, Field, Int, Strict
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.transfers.deliveries import FlowSchedule
-from fieldkit.measure.transfers.load_streams import COOKIE_BYTES, LoadStreams
+from fieldkit.measure.transfers.iperf3_load import COOKIE_BYTES, LoadStreams
 from fieldkit.steps.scene import GOOD_BIT_S, Flow, Scene, frames
 
 PROGRAM: Final = "iperf3"

@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import host, printed
+from fieldkit.measure.evidence import host, program_output
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.base import Step
@@ -22,7 +22,7 @@ class ProgramStep(Step):
     """A step that runs one program on one robot and parses its output.
 
     A kind needs the fields that are its YAML keys, `columns`, and two methods: `argv` and `parse`. The output is
-    stored in a file of at most `printed.MOST_BYTES` bytes.
+    stored in a file of at most `program_output.MOST_BYTES` bytes.
 
     Attributes:
         exit_codes: Exit codes of success; any other one makes the repeat void.
@@ -63,7 +63,7 @@ class ProgramStep(Step):
             limit_s=self.limit_s,
             log=self._log,
             stdout=self._output,
-            output_limit_bytes=printed.MAX_OUTPUT_BYTES,
+            output_limit_bytes=program_output.MAX_OUTPUT_BYTES,
         )
         yield Planned(self.robot, job, program=argv[0], remedy=f"install {argv[0]}")
 
@@ -103,7 +103,7 @@ class ProgramStep(Step):
     def measure(self, view: View) -> Measured:
         columns = self.output_columns()
         try:
-            values = self.parse(view.evidence.read(printed.text, self._output))
+            values = self.parse(view.evidence.read(program_output.text, self._output))
         except EvidenceError as error:
             return Measured.all_missing(columns, error.what)
         except (ValueError, LookupError, ArithmeticError) as error:

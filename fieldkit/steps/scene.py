@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
-from fieldkit.config.programs import LabProgram
+from fieldkit.config.program_files import LabProgram
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import OnAbort, Placement, Protocol, Role, Vector, Verdict

@@ -10,10 +10,9 @@ from fieldkit.core.units import format_count
 from fieldkit.measure.checks import topic_captures, topic_checks
 from fieldkit.measure.checks.topic_captures import CapturedTopic
 from fieldkit.measure.checks.topic_checks import TopicPlan
-from fieldkit.measure.transfers import sample_heads, topic_log
-from fieldkit.measure.transfers.sample_heads import SampleFlow
-from fieldkit.measure.transfers.topic_log import TopicLog
-from fieldkit.measure.transfers.topics import first_arrivals
+from fieldkit.measure.transfers import topic_samples
+from fieldkit.measure.transfers.topic_columns import first_arrivals
+from fieldkit.measure.transfers.topic_samples import SampleFlow, TopicLog
 from fieldkit.ros.qos import History, Reliability
 from fieldkit.steps.middlewares import MiddlewareName
 from fieldkit.steps.streams import StreamOptions
@@ -88,10 +87,10 @@ def _flow(step: StreamOptions, view: View, role: Role) -> SampleFlow | None:
     capture = view.capture(role)
     if name is None or capture is None:
         return None
-    heads = view.evidence.read(sample_heads.find, name, round(step.bytes))
+    heads = view.evidence.read(topic_samples.find_heads, name, round(step.bytes))
     address = view.scene.robot(role).address
     publishes = role == step.sender
-    return sample_heads.flow(
+    return topic_samples.sample_flow(
         capture.packets,
         heads,
         step.wire_ports.data,
@@ -120,7 +119,7 @@ def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[di
     logs, errors = dict[Role, TopicLog](), list[str]()
     for role, name in files.items():
         try:
-            log = view.evidence.read(topic_log.read, name)
+            log = view.evidence.read(topic_samples.read_log, name)
         except EvidenceError as error:
             errors.append(f"{name}: {error.what}")
             continue

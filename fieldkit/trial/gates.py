@@ -9,7 +9,7 @@ from fieldkit.core.columns import Measured, cell, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import lateness, link, link_samples, track
+from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
 from fieldkit.steps.view import View
 from fieldkit.trial import hosts, placements
 from fieldkit.trial.plan import Plan
@@ -44,7 +44,9 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     scene = plan.scene(repeat, "")
     # The robots' states are judged first, because their problems cause many of the others.
     problems = list(hosts.problems(plan.procedure, scene, evidence))
-    measured = lateness.measure(evidence.read_or_none(lateness.read, lateness.FILE))
+    measured = oracle_delays.measure_lateness(
+        evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
+    )
     for role in link.ROLES:
         measured |= link.measure(role, evidence.links(role))
     placement_problem = placements.contradiction(scene, evidence)
@@ -98,7 +100,7 @@ def _impossible(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, s
 
 
 _TESTBED_FILES: Final[tuple[tuple[Callable[[Path], object], str], ...]] = (
-    (lateness.read, lateness.FILE),
+    (oracle_delays.read_lateness, oracle_delays.LATENESS_FILE),
     (track.read, track.FILE),
     (link_samples.read, link_samples.FILE),
 )
@@ -112,5 +114,5 @@ def _testbed_problems(evidence: AttemptEvidence) -> Iterator[str]:
         except EvidenceError as error:
             yield f"{name}: {error.what}"
             continue
-        if isinstance(content, Lateness) and (why := lateness.problem(content)):
+        if isinstance(content, Lateness) and (why := oracle_delays.lateness_problem(content)):
             yield f"{name}: {why}"

@@ -12,7 +12,7 @@ from fieldkit.core.model import Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Ints
 from fieldkit.measure.evidence import host
-from fieldkit.measure.positions import where
+from fieldkit.measure.positions import position_columns
 from fieldkit.measure.positions.samples import WGS84
 from fieldkit.measure.positions.trajectories import Trajectory
 from fieldkit.steps.scene import Scene
@@ -47,13 +47,13 @@ def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
 def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
     places_m = scene.places_m
     try:
-        accounts = where.position_accounts(evidence).robots
+        accounts = position_columns.position_accounts(evidence).robots
     except EvidenceError:
         return
     for ends in combinations([role for role in sort_roles(accounts) if role in places_m], 2):
         try:
-            source, destination = where.trajectories_of_pair(evidence, (ends[0], ends[1]))
-            satellites = where.samples_of(evidence, ends[0]).frame == WGS84
+            source, destination = position_columns.trajectories_of_pair(evidence, (ends[0], ends[1]))
+            satellites = position_columns.samples_of(evidence, ends[0]).frame == WGS84
         except EvidenceError:
             continue  # there are no distances then
         times_ns = _times_ns(evidence, ends[0], source, destination)
@@ -73,7 +73,7 @@ def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) 
     clocks = [state.clock for state in states if state is not None and state.clock is not None]
     if len(clocks) < len(states):
         return times_ns
-    ahead_ns = where.ahead_ns(evidence, role)
+    ahead_ns = position_columns.ahead_ns(evidence, role)
     first, last = clocks[0].first_ns - ahead_ns, clocks[1].last_ns - ahead_ns
     inside = times_ns[(times_ns > first) & (times_ns < last)]
     return np.concatenate(((first,), inside, (last,)))

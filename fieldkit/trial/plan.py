@@ -6,14 +6,14 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Final
 
-from fieldkit.analysis import claims
+from fieldkit.analysis import sample_size
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.config.schema import Field, Int, Number, Strict
 from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Pinging, Planned, PutProgram, Refusal, Scene
 from fieldkit.steps.variants import Variants
@@ -128,7 +128,7 @@ class Plan(Strict):
 
     def shortfalls(self) -> Iterator[str]:
         """Yield a sentence for each expectation that the plan cannot decide, for example with too few repeats."""
-        return claims.unmet_requirements(self.procedure.expectations, self.procedure.figures, self.repeats)
+        return sample_size.unmet_requirements(self.procedure.expectations, self.procedure.figures, self.repeats)
 
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
         """Return descriptions of what the testbed does in one repeat besides running the commands."""

@@ -13,8 +13,8 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean
 from fieldkit.core.model import Role, Status
 from fieldkit.core.units import format_bytes, parse_offset_m
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.positions import accounts, recorded, where
-from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions import position_columns, position_files, position_sources
+from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.trial import gates, journal, manifest, store
 from fieldkit.trial.plan import Plan
@@ -63,7 +63,7 @@ def set_positions(
         _demand_role(plan, role)
         if isinstance(source, Path):
             _demand_file(source)
-            recorded.read_file(source)
+            position_files.read_file(source)
     # Position files that were added before are replaced, so their changes do not matter.
     changes = {
         name: change for name, change in manifest.differences(folder).items() if not manifest.is_positions(name)
@@ -74,10 +74,10 @@ def set_positions(
     with journal.claimed(folder):
         accounts_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
         if accounts_by_role:
-            text = accounts.text(Accounts(accounts_by_role, heights=heights))
-            files.write(folder / accounts.FILE, text.encode())
+            text = position_sources.text(Accounts(accounts_by_role, heights=heights))
+            files.write(folder / position_sources.FILE, text.encode())
         else:
-            (folder / accounts.FILE).unlink(missing_ok=True)
+            (folder / position_sources.FILE).unlink(missing_ok=True)
         _remove_others(folder, {account.file for account in accounts_by_role.values()})
         if (folder / store.MANIFEST_FILE).exists():
             manifest.Manifest(folder).renew_positions()
@@ -170,7 +170,10 @@ def attempt_positions(folder: Path) -> Iterator[AttemptPositions]:
             evidence = AttemptEvidence(store.attempt_folder(folder, attempt.folder))
             measured = gates.judge(plan, attempt.repeat, evidence).measured
             yield AttemptPositions(
-                attempt.folder, where.sources_text(evidence), dict(_distances_m(measured)), _missing(measured)
+                attempt.folder,
+                position_columns.sources_text(evidence),
+                dict(_distances_m(measured)),
+                _missing(measured),
             )
 
 

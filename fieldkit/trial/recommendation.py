@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.analysis import judgements
-from fieldkit.analysis.bounds import share_low
 from fieldkit.analysis.judgements import Judgement, Ruling
+from fieldkit.analysis.one_sided_bounds import share_low
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.measure.evidence import reading
 from fieldkit.steps.base import Step

@@ -5,7 +5,7 @@ from itertools import filterfalse
 from pathlib import Path
 from typing import Final
 
-from fieldkit.analysis import repeats, tables
+from fieldkit.analysis import repeats, result_tables
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.core import columns, files
@@ -137,5 +137,5 @@ def summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
 def write_summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
     """Write summary.csv for a trial's table and return its cells; errors as for `summary`."""
     cells = summary(folder, plan, table)
-    files.write(folder / store.SUMMARY_CSV, tables.to_csv(DEFAULT_BY, cells).encode())
+    files.write(folder / store.SUMMARY_CSV, result_tables.to_csv(DEFAULT_BY, cells).encode())
     return cells

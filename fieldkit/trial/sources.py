@@ -9,9 +9,8 @@ from pathlib import Path
 from fieldkit.analysis import expectations, repeats
 from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.expectations import Expectation
-from fieldkit.analysis.quantities import Quantity, quantities
+from fieldkit.analysis.quantities import Quantity, quantities, worded
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.analysis.words import worded
 from fieldkit.core import files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command

@@ -11,7 +11,7 @@ import pytest
 
 from fieldkit.agent import records
 from fieldkit.agent.records import Log, LogError
-from fieldkit.measure.transfers import topic_log
+from fieldkit.measure.transfers import topic_samples
 from tests.helpers.paths import ROOT
 
 SEVERAL_PIECES = 5 * records.PIECE_BYTES // records.RECORD.size
@@ -45,7 +45,7 @@ def test_killed_writer_leaves_all_noted_records(tmp_path: Path) -> None:
         rest = process.stdout.read()
     noted = SEVERAL_PIECES + len(rest) // 8
 
-    content = topic_log.read(tmp_path / "log")
+    content = topic_samples.read_log(tmp_path / "log")
     assert not content.whole
     samples = content.samples
     assert len(samples) - noted in {0, 1}, "the last record was stored, and perhaps not yet sent"
@@ -61,7 +61,7 @@ def test_closed_log_contains_only_its_records(tmp_path: Path) -> None:
     log.end(6)
     size = (tmp_path / "log").stat().st_size
     assert size == len(records.MAGIC) + (SEVERAL_PIECES + 1) * records.RECORD.size
-    content = topic_log.read(tmp_path / "log")
+    content = topic_samples.read_log(tmp_path / "log")
     assert content.whole
     assert content.samples.sequence.tolist() == list(range(SEVERAL_PIECES))
 
@@ -81,7 +81,7 @@ def test_full_disk_is_reported_and_keeps_noted_records(tmp_path: Path, monkeypat
             log.note(records.SAMPLE, 5, sequence=room)
     with pytest.raises(LogError):
         log.end(6)
-    content = topic_log.read(tmp_path / "log")
+    content = topic_samples.read_log(tmp_path / "log")
     assert (len(content.samples), content.whole) == (room, False)
 
 
@@ -96,7 +96,7 @@ def test_full_file_system_raises_no_signal(tmp_path: Path) -> None:
     assert done.returncode == 0, done
     noted, _, output = done.stdout.partition(" ")
     assert output == "the log disk/log cannot be written: No space left on device\n"
-    assert topic_log.read(tmp_path / "log").samples.sequence.tolist() == list(range(int(noted)))
+    assert topic_samples.read_log(tmp_path / "log").samples.sequence.tolist() == list(range(int(noted)))
 
 
 def test_log_that_cannot_be_created_is_reported(tmp_path: Path) -> None:

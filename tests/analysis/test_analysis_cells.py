@@ -2,7 +2,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from fieldkit.analysis import tables
+from fieldkit.analysis import result_tables
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import parse
@@ -78,7 +78,7 @@ def test_estimates_use_valid_rows_and_all_rows_are_counted() -> None:
 def test_a_cell_without_a_valid_row_is_kept_without_estimates() -> None:
     cells = summarize([replace(UDP, status="failed")])
     assert cells[0].estimates == {}
-    header, line = tables.to_csv(DEFAULT_BY, cells).splitlines()
+    header, line = result_tables.to_csv(DEFAULT_BY, cells).splitlines()
     named = dict(zip(header.split(","), line.split(","), strict=True))
     assert {name: value for name, value in named.items() if value} == {
         "procedure": "los",

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis.compare import Comparison, Difference, compare
-from fieldkit.analysis.tables import comparison_csv
+from fieldkit.analysis.result_tables import comparison_csv
 from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, parsed, replace
 
 UDP = bursty(COMPARABLE, 20, seed=1)

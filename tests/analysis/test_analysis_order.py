@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fieldkit.analysis import order
+from fieldkit.analysis import independence
 from fieldkit.cli import main
 from tests.helpers.tables import ROW, RepeatRow, replace, write
 
 START_NS = 1_795_262_410_000_000_000
 
 
-def autoregressive(random: np.random.Generator, cells: int, n: int, kept: float) -> order.Floats:
+def autoregressive(random: np.random.Generator, cells: int, n: int, kept: float) -> independence.Floats:
     values = np.zeros((cells, n + 50))
     for at in range(1, n + 50):
         values[:, at] = kept * values[:, at - 1] + random.normal(size=cells)
@@ -26,28 +26,30 @@ def autoregressive(random: np.random.Generator, cells: int, n: int, kept: float)
 def test_the_variances_are_those_over_all_permutations(ranks: list[int]) -> None:
     centred = np.array(list(permutations(ranks)), dtype=np.float64)
     centred -= centred.mean(axis=1, keepdims=True)
-    statistic, variance = order._von_neumann(centred)
+    statistic, variance = independence._von_neumann(centred)
     assert statistic.mean() == pytest.approx(0, abs=1e-12)
     assert variance == pytest.approx(statistic.var())
-    correlation, variance = order._spearman(centred)
+    correlation, variance = independence._spearman(centred)
     assert variance == pytest.approx((correlation**2).mean())
 
 
 def test_ranks_and_trend_equal_scipy() -> None:
     values = np.random.default_rng(1).integers(0, 6, (9, 25)).astype(float)
-    assert order._ranks(values) + 1 == pytest.approx(stats.rankdata(values, axis=1))
-    centred = order._ranks(values)
+    assert independence._ranks(values) + 1 == pytest.approx(stats.rankdata(values, axis=1))
+    centred = independence._ranks(values)
     centred -= centred.mean(axis=1, keepdims=True)
     theirs = [stats.spearmanr(row, np.arange(25)) for row in values]
-    correlation, variance = order._spearman(centred)
+    correlation, variance = independence._spearman(centred)
     assert correlation == pytest.approx([abs(item.statistic) for item in theirs])
-    assert 2 * order._upper_tail(correlation, variance) == pytest.approx([item.pvalue for item in theirs], rel=0.02)
+    assert 2 * independence._upper_tail(correlation, variance) == pytest.approx(
+        [item.pvalue for item in theirs], rel=0.02
+    )
 
 
 def test_the_correction_equals_scipy() -> None:
     some = np.random.default_rng(2).random(40) ** 3
-    assert order.corrected(some) == pytest.approx(stats.false_discovery_control(some))
-    assert not len(order.corrected(np.empty(0)))
+    assert independence.corrected(some) == pytest.approx(stats.false_discovery_control(some))
+    assert not len(independence.corrected(np.empty(0)))
 
 
 @pytest.mark.parametrize("n", [10, 20, 40])
@@ -57,21 +59,21 @@ def test_about_5_percent_of_the_tables_of_independent_repeats_have_a_mark(n: int
     tables, cells = 1500, 30
     drawn = random.binomial(29, 0.3, (tables * cells, n)) if ties else random.normal(size=(tables * cells, n))
     values = np.asarray(drawn, dtype=np.float64)
-    result = np.nan_to_num(order.p_values(values), nan=1.0).reshape(tables, cells)
-    marked = np.mean([(order.corrected(item) < 0.05).any() for item in result])
+    result = np.nan_to_num(independence.p_values(values), nan=1.0).reshape(tables, cells)
+    marked = np.mean([(independence.corrected(item) < 0.05).any() for item in result])
     assert 0.03 < marked < 0.08
 
 
 @pytest.mark.parametrize(("n", "kept", "result"), [(10, 0.8, 48), (20, 0.8, 86), (40, 0.8, 99), (20, 0.5, 51)])
 def test_the_power_for_dependent_repeats_is_that_of_the_docs(n: int, kept: float, result: float) -> None:
     values = autoregressive(np.random.default_rng(4), 4000, n, kept)
-    assert 100 * (order.p_values(values) < 0.05).mean() == pytest.approx(result, abs=2.5)
+    assert 100 * (independence.p_values(values) < 0.05).mean() == pytest.approx(result, abs=2.5)
 
 
 def test_too_few_repeats_or_values_are_not_tested() -> None:
-    assert np.isnan(order.p_values(np.arange(9.0)[None])).all()
-    assert np.isnan(order.p_values(np.array([[1.0, 2.0] * 10]))).all()
-    assert order.p_values(np.arange(10.0)[None]) < 1e-6
+    assert np.isnan(independence.p_values(np.arange(9.0)[None])).all()
+    assert np.isnan(independence.p_values(np.array([[1.0, 2.0] * 10]))).all()
+    assert independence.p_values(np.arange(10.0)[None]) < 1e-6
 
 
 def rows(times_s: list[float]) -> list[RepeatRow]:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from fieldkit.analysis import planning
+from fieldkit.analysis import sample_size
 from fieldkit.analysis.statistics import Intervals, shares
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import Interval
@@ -59,7 +59,7 @@ def test_the_planned_number_gives_the_wanted_width(rate: float, spread: float) -
 
     now = cells(20)
     wanted = float(np.median(now.high - now.low)) / 2 / 3
-    more = int(np.median(planning.more_wanted(now, 20, wanted, Kind.COUNTED)))
+    more = int(np.median(sample_size.more_wanted(now, 20, wanted, Kind.COUNTED)))
     then = cells(20 + more)
     assert 100 < more < 260
     assert float(np.median(then.high - then.low)) / 2 == pytest.approx(wanted, rel=0.05)
@@ -81,7 +81,7 @@ def test_no_more_repeats_are_needed_for_a_narrow_interval(kind: Kind) -> None:
 
 
 def test_a_single_repeat_gives_no_number() -> None:
-    assert np.isnan(planning.more_wanted(shares([[3]], [[36]]), 1, 0.1, Kind.COUNTED)).all()
+    assert np.isnan(sample_size.more_wanted(shares([[3]], [[36]]), 1, 0.1, Kind.COUNTED)).all()
 
 
 def test_an_interval_without_width_is_refused() -> None:

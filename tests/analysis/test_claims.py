@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.analysis import claims, expectations, judgements
+from fieldkit.analysis import expectations, judgements, sample_size
 from fieldkit.analysis.judgements import Ruling
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.core.columns import Kind
@@ -18,7 +18,7 @@ KNOWN = (PACKETS, GAP, BACK, RATE, RETRIES)
 
 
 def warning(text: str, repeats: int) -> str:
-    return " ".join(claims.unmet_requirements([expectations.parse(text, KNOWN)], KNOWN, repeats))
+    return " ".join(sample_size.unmet_requirements([expectations.parse(text, KNOWN)], KNOWN, repeats))
 
 
 @pytest.mark.parametrize(

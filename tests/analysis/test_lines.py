@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.analysis import lines, repeats, tables
+from fieldkit.analysis import repeats, result_tables, table_lines
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY, quantities
 from fieldkit.cli import main
@@ -33,24 +33,26 @@ def cells_of(table: Sequence[RepeatRow]) -> tuple[Cell, ...]:
     return aggregate(repeats.parse(rows.to_csv(table, trial_columns()).encode(), trial_columns()))
 
 
-def shown(cells: Sequence[Cell], chosen: Sequence[lines.TableLine]) -> dict[str, list[str]]:
+def shown(cells: Sequence[Cell], chosen: Sequence[table_lines.TableLine]) -> dict[str, list[str]]:
     return {line.label: [line.amount(cell, line.scale(cells)) for cell in cells] for line in chosen}
 
 
 def test_a_round_trip_time_has_the_payload_size() -> None:
-    figures = shown(cells := cells_of([TCP, PINGED]), lines.lines(cells))
+    figures = shown(cells := cells_of([TCP, PINGED]), table_lines.lines(cells))
     assert figures["RTT, 502-byte ping, median"] == ["10.00 ms", ""]
     assert figures["RTT, 8192-byte ping, median"] == ["", "10.00 ms"]
 
 
 def test_the_label_has_the_range_of_payload_sizes() -> None:
-    figures = shown(cells := cells_of([PINGED, replace(PINGED, repeat=2, rtt_payload_bytes=56)]), lines.lines(cells))
+    figures = shown(
+        cells := cells_of([PINGED, replace(PINGED, repeat=2, rtt_payload_bytes=56)]), table_lines.lines(cells)
+    )
     assert [label for label in figures if "RTT" in label] == ["RTT, 56- to 8192-byte ping, median"]
 
 
 @pytest.mark.parametrize("form", ["markdown", "latex"])
 def test_tables_for_papers_have_payload_size_and_number_of_repeats(form: str) -> None:
-    made = {"markdown": tables.to_markdown, "latex": tables.to_latex}[form]
+    made = {"markdown": result_tables.to_markdown, "latex": result_tables.to_latex}[form]
     table = [
         PINGED,
         *(replace(PINGED, repeat=2 + n, rtt_loss=1.0, rtt_received=0, rtt_median_s=None) for n in (0, 1)),
@@ -74,10 +76,10 @@ def test_a_condition_without_any_reply_is_shown(tmp_path: Path, capsys: pytest.C
 
 def test_radio_losses_of_tcp_and_udp_are_one_line_unless_a_condition_has_both() -> None:
     cells = cells_of([TCP, PINGED])
-    figures = shown(cells, lines.with_radio_loss(lines.operator_lines(cells), cells))
+    figures = shown(cells, table_lines.with_radio_loss(table_lines.operator_lines(cells), cells))
     assert figures["radio loss"] == ["1.00 %", "4.63 %"]
     together = cells_of([replace(PINGED, tcp_byte_loss=0.01)])
-    labels = shown(together, lines.with_radio_loss(lines.operator_lines(together), together))
+    labels = shown(together, table_lines.with_radio_loss(table_lines.operator_lines(together), together))
     assert {"IP packet loss", "TCP byte loss before retransmission"} <= labels.keys()
     assert "radio loss" not in labels
 
@@ -89,7 +91,7 @@ def test_lines_for_an_operator_include_expected_and_additional_quantities() -> N
     row["probe.level"] = -60.0
     content = rows.to_csv([row], columns).encode()
     cells = aggregate(repeats.parse(content, columns))
-    labels = [line.label for line in lines.operator_lines(cells)]
+    labels = [line.label for line in table_lines.operator_lines(cells)]
     assert "probe: level, median" in labels
     others = {
         "jitter_s": "last jitter value (RFC 3550), median",
@@ -98,7 +100,7 @@ def test_lines_for_an_operator_include_expected_and_additional_quantities() -> N
     }
     for name, label in others.items():
         assert label not in labels
-        assert label in [line.label for line in lines.operator_lines(cells, {name})]
+        assert label in [line.label for line in table_lines.operator_lines(cells, {name})]
     assert labels.index("file loss") < labels.index("ping loss") < labels.index("RTT, 8192-byte ping, median")
 
 
@@ -107,15 +109,15 @@ def test_figures_of_equal_rank_are_in_the_order_of_columns() -> None:
     columns = (*trial_columns(), *additional)
     row = replace(PINGED) | {column.name: 7.4 for column in additional}
     cells = aggregate(repeats.parse(rows.to_csv([row], columns).encode(), columns))
-    labels = [line.label for line in lines.operator_lines(cells)]
+    labels = [line.label for line in table_lines.operator_lines(cells)]
     assert [label for label in labels if label.startswith("m")] == [f"m{n}, median" for n in range(12)]
 
 
 def test_all_lines_are_shown_if_none_is_for_an_operator() -> None:
     bare = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
-    assert [line.label for line in lines.operator_lines(cells_of([bare]))] == ["transfer time, median"]
+    assert [line.label for line in table_lines.operator_lines(cells_of([bare]))] == ["transfer time, median"]
 
 
 def test_sent_packets_are_summed_over_all_valid_repeats() -> None:
     cells = cells_of([TCP, PINGED, replace(PINGED, repeat=2), replace(PINGED, repeat=3, status="void")])
-    assert lines.sent(cells) == {"packets sent": ["40", "432"]}
+    assert table_lines.sent(cells) == {"packets sent": ["40", "432"]}

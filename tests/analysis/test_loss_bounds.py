@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from fieldkit.analysis import bounds
+from fieldkit.analysis import one_sided_bounds
 from tests.analysis.test_coverage import lost_in_bursts
 
 
@@ -15,46 +15,46 @@ def test_shares_of_repeats_equal_clopper_and_pearson(met: int, n: int) -> None:
     assume(met <= n)
     low = 0.0 if met == 0 else stats.beta.ppf(0.05, met, n - met + 1)
     high = 1.0 if met == n else stats.beta.ppf(0.95, met + 1, n - met)
-    assert bounds.share_low(met, n) == pytest.approx(low, abs=1e-9)
-    assert bounds.share_high(met, n) == pytest.approx(high, abs=1e-9)
+    assert one_sided_bounds.share_low(met, n) == pytest.approx(low, abs=1e-9)
+    assert one_sided_bounds.share_high(met, n) == pytest.approx(high, abs=1e-9)
 
 
 @given(st.floats(0.001, 0.9999))
 def test_the_number_of_repeats_for_a_share_is_minimal(share: float) -> None:
-    n = bounds.repeats_for(share)
-    assert bounds.share_low(n, n) >= share * (1 - 1e-9)
-    assert n == 1 or bounds.share_low(n - 1, n - 1) < share
+    n = one_sided_bounds.repeats_for(share)
+    assert one_sided_bounds.share_low(n, n) >= share * (1 - 1e-9)
+    assert n == 1 or one_sided_bounds.share_low(n - 1, n - 1) < share
 
 
 def test_29_repeats_are_needed_for_90_percent() -> None:
     """Wilks 1941, Ann. Math. Stat. 12:91: 29 for 90 %, 59 for 95 %, 299 for 99 %."""
-    assert [bounds.repeats_for(share) for share in (0.9, 0.95, 0.99)] == [29, 59, 299]
+    assert [one_sided_bounds.repeats_for(share) for share in (0.9, 0.95, 0.99)] == [29, 59, 299]
 
 
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=20))
 def test_the_loss_is_garwoods_bound_with_the_worst_repeat_as_burst_length(lost: list[int]) -> None:
-    burst, total = max([*lost, bounds.SHORTEST_BURST]), 1000 * len(lost)
+    burst, total = max([*lost, one_sided_bounds.SHORTEST_BURST]), 1000 * len(lost)
     expected = burst * stats.gamma.ppf(0.95, sum(lost) / burst + 1) / total
-    assert bounds.loss_high(lost, [1000] * len(lost)) == pytest.approx(min(expected, 1), rel=1e-9)
+    assert one_sided_bounds.loss_high(lost, [1000] * len(lost)) == pytest.approx(min(expected, 1), rel=1e-9)
 
 
 @given(st.lists(st.tuples(st.integers(0, 500), st.integers(0, 500)), min_size=1, max_size=20), st.integers(500, 5000))
 def test_fewer_losses_never_make_the_bound_larger(pairs: list[tuple[int, int]], sent: int) -> None:
     fewer, more = ([pick(pair) for pair in pairs] for pick in (min, max))
     each = [sent] * len(pairs)
-    assert bounds.loss_high(fewer, each) <= bounds.loss_high(more, each) * (1 + 1e-12)
-    assert bounds.loss_high([0] * len(pairs), each) <= bounds.loss_high(fewer, each)
+    assert one_sided_bounds.loss_high(fewer, each) <= one_sided_bounds.loss_high(more, each) * (1 + 1e-12)
+    assert one_sided_bounds.loss_high([0] * len(pairs), each) <= one_sided_bounds.loss_high(fewer, each)
 
 
 def test_duplicates_are_no_negative_losses() -> None:
-    assert bounds.loss_high([-50, 0], [1000, 1000]) == bounds.loss_high([0, 0], [1000, 1000])
-    assert bounds.loss_high([0], [0]) == 1
+    assert one_sided_bounds.loss_high([-50, 0], [1000, 1000]) == one_sided_bounds.loss_high([0, 0], [1000, 1000])
+    assert one_sided_bounds.loss_high([0], [0]) == 1
 
 
 @pytest.mark.parametrize("bound", [0.001, 0.02, 0.3])
 def test_the_number_of_packets_without_a_loss_is_minimal(bound: float) -> None:
-    n = bounds.packets_for(bound)
-    assert bounds.loss_high([0], [n]) < bound <= bounds.loss_high([0], [n - 1])
+    n = one_sided_bounds.packets_for(bound)
+    assert one_sided_bounds.loss_high([0], [n]) < bound <= one_sided_bounds.loss_high([0], [n - 1])
 
 
 @pytest.mark.parametrize("burst", [0, 1, 5])
@@ -62,13 +62,13 @@ def test_the_number_of_packets_without_a_loss_is_minimal(bound: float) -> None:
 def test_the_bound_is_above_the_true_loss_in_95_percent_of_runs(burst: int, rate: float) -> None:
     """6 repeats of 1,250 datagrams on a Gilbert-Elliott link, as an iperf3 test of 3 s."""
     lost = lost_in_bursts(np.random.default_rng(21), rate, burst, (400, 6), 1250)
-    held = np.mean([bounds.loss_high(run, [1250] * 6) >= rate for run in lost])
+    held = np.mean([one_sided_bounds.loss_high(run, [1250] * 6) >= rate for run in lost])
     assert held >= 0.94  # 95 % minus a standard error
 
 
 @pytest.mark.parametrize("bursts_per_run", [0.5, 3, 20])
 def test_bursts_of_the_assumed_length_have_the_stated_coverage(bursts_per_run: float) -> None:
     random = np.random.default_rng(22)
-    lost = bounds.SHORTEST_BURST * random.poisson(bursts_per_run / 6, (1000, 6))
-    rate = bounds.SHORTEST_BURST * bursts_per_run / (6 * 1250)
-    assert np.mean([bounds.loss_high(run, [1250] * 6) >= rate for run in lost]) >= 0.94
+    lost = one_sided_bounds.SHORTEST_BURST * random.poisson(bursts_per_run / 6, (1000, 6))
+    rate = one_sided_bounds.SHORTEST_BURST * bursts_per_run / (6 * 1250)
+    assert np.mean([one_sided_bounds.loss_high(run, [1250] * 6) >= rate for run in lost]) >= 0.94

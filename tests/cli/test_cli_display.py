@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli import main
-from fieldkit.cli.commands import robots
+from fieldkit.cli.commands import listings
 from fieldkit.cli.display import table, words_of
 from fieldkit.core.events import CampaignPlanned, CampaignWent, RepeatEnded
 from fieldkit.core.model import Status
@@ -94,7 +94,7 @@ def test_finished_campaign_shows_no_time_and_no_disk_space() -> None:
 
 
 def test_paths_in_the_list_of_robots_are_not_wrapped(capsys: pytest.CaptureFixture[str]) -> None:
-    robots.run(argparse.Namespace(profile=None))
+    listings.run_robots(argparse.Namespace(profile=None))
     head, _, *rows = capsys.readouterr().out.splitlines()
     assert head.split() == ["name", "file", "summary"]
     assert any(str(ROOT / "robots" / "duckiedrone.yaml") in row for row in rows)

@@ -12,7 +12,7 @@ import pytest
 from fieldkit import cli
 from fieldkit.cli import main
 from fieldkit.cli.parser import Parser
-from fieldkit.pytest.options import as_pytest_option
+from fieldkit.pytest.plugin_options import as_pytest_option
 from tests.helpers.paths import ROOT
 
 # As in `cli.hints`: lower-case words are commands, the rest are their arguments.

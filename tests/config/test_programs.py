@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.config import programs, schema
-from fieldkit.config.programs import LabProgram, NamedProgram
+from fieldkit.config import program_files, schema
+from fieldkit.config.program_files import LabProgram, NamedProgram
 from fieldkit.config.schema import Strict
 from fieldkit.core.errors import ConfigurationError
 
@@ -89,7 +89,11 @@ def test_a_link_inside_of_the_lab_is_followed() -> None:
         ("loop", lambda: Path("loop").symlink_to("loop"), "cannot be read: Too many levels"),
         ("procedures", lambda: None, "is a folder"),
         ("pipe", lambda: os.mkfifo("pipe"), "cannot be read: it is a pipe"),
-        ("large", lambda: write_program("large", bytes(programs.MOST_BYTES + 1)), "more than 8.4 MB; install it"),
+        (
+            "large",
+            lambda: write_program("large", bytes(program_files.MOST_BYTES + 1)),
+            "more than 8.4 MB; install it",
+        ),
     ],
 )
 def test_invalid_program_is_rejected_with_its_line(name: str, make: Callable[[], None], message: str) -> None:
@@ -100,8 +104,8 @@ def test_invalid_program_is_rejected_with_its_line(name: str, make: Callable[[],
 
 
 def test_program_of_the_maximum_size_is_accepted() -> None:
-    write_program("large", bytes(programs.MOST_BYTES))
-    assert put("large").size_bytes == programs.MOST_BYTES
+    write_program("large", bytes(program_files.MOST_BYTES))
+    assert put("large").size_bytes == program_files.MOST_BYTES
 
 
 def test_changed_or_missing_program_is_rejected() -> None:

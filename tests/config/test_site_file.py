@@ -10,9 +10,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.config import profiles, site_file
+from fieldkit.config import profiles
 from fieldkit.config.documents import with_value
-from fieldkit.config.site import load_site
+from fieldkit.config.site import create_site_file, load_site, pin_host_key
 from fieldkit.core.errors import ConfigurationError
 
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
@@ -38,7 +38,7 @@ def test_pinning_changes_nothing_else(text: str, tmp_path: Path) -> None:
     path = tmp_path / "site.yaml"
     path.write_bytes(text.encode())
     before = yaml.safe_load(text)
-    site_file.pin(path, "a", KEY)
+    pin_host_key(path, "a", KEY)
     after = path.read_bytes().decode()
     before["robots"]["a"]["host_key"] = KEY
     assert yaml.safe_load(after) == before
@@ -85,7 +85,7 @@ def test_file_that_cannot_be_edited_is_unchanged(tmp_path: Path) -> None:
     text = "robots:\n  a:\n    profile: |\n      x\n  b: {profile: y}\n"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigurationError, match="cannot be inserted") as caught:
-        site_file.pin(path, "a", KEY)
+        pin_host_key(path, "a", KEY)
     assert caught.value.remedy == f"add it in an editor: host_key: {KEY}"
     assert path.read_text(encoding="utf-8") == text
 
@@ -95,7 +95,7 @@ def test_permissions_and_symbolic_links_are_kept(tmp_path: Path) -> None:
     real.write_text(LAYOUTS["block"], encoding="utf-8")
     real.chmod(0o640)
     link.symlink_to(real)
-    site_file.pin(link, "a", KEY)
+    pin_host_key(link, "a", KEY)
     assert link.is_symlink()
     assert KEY in real.read_text(encoding="utf-8")
     assert stat.S_IMODE(real.stat().st_mode) == 0o640
@@ -111,14 +111,14 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr("fieldkit.core.files.os.fsync", disk_full)
     with pytest.raises(ConfigurationError, match="No space left"):
-        site_file.pin(path, "a", KEY)
+        pin_host_key(path, "a", KEY)
     assert path.read_text(encoding="utf-8") == LAYOUTS["block"]
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_template_is_valid_and_every_line_has_a_comment(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
-    site_file.create(path)
+    create_site_file(path)
     site, _ = load_site(path)
     for robot in site.robots.values():
         profiles.load_profile(robot.profile)
@@ -132,5 +132,5 @@ def test_a_site_file_is_never_overwritten(tmp_path: Path) -> None:
     path = tmp_path / "fieldkit.yaml"
     path.write_text("mine", encoding="utf-8")
     with pytest.raises(ConfigurationError, match="not overwritten"):
-        site_file.create(path)
+        create_site_file(path)
     assert path.read_text(encoding="utf-8") == "mine"

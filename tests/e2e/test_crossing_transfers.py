@@ -10,8 +10,8 @@ import pytest
 from fieldkit.core.columns import Value
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.captures.ip import TCP, UDP
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.captures.headers import TCP, UDP
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.trial import gates, store
 from fieldkit.trial.plan import Plan
 from tests.helpers.dissected import Row, dissected

@@ -19,7 +19,7 @@ from rosbags.rosbag1 import Reader
 
 from fieldkit.cli import lab_shells, main
 from fieldkit.core.deadline import Deadline
-from fieldkit.lab import client, folder
+from fieldkit.lab import folder, requests
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.ros.types import shipped
@@ -71,7 +71,7 @@ def plain(lab_folder: Path, *argv: str) -> str:
 
 
 def process_of(lab_folder: Path) -> int:
-    return client.state(folder.of_directory(lab_folder)).pid
+    return requests.state(folder.of_directory(lab_folder)).pid
 
 
 def test_ps_shows_robots_roles_addresses_positions_and_programs(lab: Path) -> None:
@@ -161,13 +161,13 @@ def test_a_robot_that_is_moved_away_is_unreachable_until_it_is_back(lab: Path) -
     moved = fieldkit(lab, "lab", "move", "air-1", "--by", "-100m", "-0.1km", "100m")
     assert moved.out == "air-1 is at 102.5, 97.5, 100.2 (m east, north, up)\n"
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "3", "-i", "0.2", "-W", "1", "air-1").code == 1
-    above = client.overview(lab_folder)
+    above = requests.overview(lab_folder)
     assert above.robots == {"ground-1": (197.5, 197.5), "air-1": (102.5, 97.5)}
     assert not above.links[0].linked
     assert fieldkit(lab, "lab", "plot").out == "lab.svg\n"
     assert f">{above.links[0].snr_db:.0f} dB<" in (lab / "lab.svg").read_text(encoding="utf-8")
     assert fieldkit(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
-    assert client.state(lab_folder).robots[1].place_m == (207.5, 197.5, 0.2)
+    assert requests.state(lab_folder).robots[1].place_m == (207.5, 197.5, 0.2)
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "1", "-w", "30", "-i", "0.2", "air-1").code == 0
 
 
@@ -216,10 +216,10 @@ def test_an_invalid_move_does_not_move_the_robot(
 ) -> None:
     monkeypatch.chdir(lab)
     lab_folder = folder.of_directory(lab)
-    before = client.state(lab_folder).robots
+    before = requests.state(lab_folder).robots
     assert main(["lab", "move", *words.split()]) == 2
     assert output in capsys.readouterr().err
-    assert [robot.place_m for robot in client.state(lab_folder).robots] == [robot.place_m for robot in before]
+    assert [robot.place_m for robot in requests.state(lab_folder).robots] == [robot.place_m for robot in before]
 
 
 def test_a_command_in_a_shell_keeps_its_exit_code(lab: Path) -> None:
@@ -274,7 +274,7 @@ def test_an_invalid_request_gets_no_response(lab: Path, request_: str) -> None:
         confused.connect(str(folder.of_directory(lab).socket))
         confused.sendall(f"{request_}\n".encode())
         assert confused.recv(1) == b""
-    assert len(client.state(folder.of_directory(lab)).robots) == 2
+    assert len(requests.state(folder.of_directory(lab)).robots) == 2
 
 
 def test_a_silent_client_does_not_block_others_for_long(lab: Path) -> None:
@@ -290,7 +290,7 @@ def test_down_leaves_nothing(tmp_path: Path, untouched: Untouched) -> None:
     process = process_of(tmp_path)
     lived = {process} | descendants(process)
     assert len(lived) > 4 * 3
-    state = client.state(folder.of_directory(tmp_path))
+    state = requests.state(folder.of_directory(tmp_path))
     assert [robot.name for robot in state.robots] == ["robot-1", "robot-2", "robot-3", "robot-4"]
     assert {robot.profile for robot in state.robots} == {"duckiedrone"}
     assert fieldkit(tmp_path, "lab", "down").out == "the robots are down\n"
@@ -331,7 +331,7 @@ def test_a_lab_rejects_control_over_the_radio(tmp_path: Path, robots: tuple[str,
     assert up.code == 0, up.err
     try:
         assert "note: control: radio applies to trials; in a lab SSH bypasses the radio" in up.err
-        name = client.state(folder.of_directory(tmp_path)).robots[0].name
+        name = requests.state(folder.of_directory(tmp_path)).robots[0].name
         assert fieldkit(tmp_path, "lab", "move", name, "--to", "0m", "0m").code == 0
         assert fieldkit(tmp_path, "lab", "shell", name, "hostname").out == f"{name}\n"
     finally:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.captures.ip import ICMP
+from fieldkit.measure.captures.headers import ICMP
 from tests.helpers.labs import BOX, copy_shipped
 from tests.helpers.runs import fieldkit, only_trial, rows
 

@@ -18,11 +18,11 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.core.prompts import Question
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import ping, reception
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts, recorded, where
-from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.evidence import ping, recorded_topics
+from fieldkit.measure.positions import position_columns, position_files, position_sources
+from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import drive_log
 from fieldkit.motion.steps.driving import DriveLease
 from fieldkit.remote.jobs import Job
@@ -33,8 +33,8 @@ from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
 from tests.helpers.casts import CAST, los_plan
-from tests.measure.evidence.test_reception import ROS2, log, write
-from tests.measure.positions.test_recorded import BEGAN_NS, S, fix, odometry, transform, written
+from tests.measure.evidence.test_recorded_topics import ROS2, log, write
+from tests.measure.positions.test_position_files import BEGAN_NS, S, fix, odometry, transform, written
 from tests.motion.logs.test_drive_log import drive
 
 _ENDS: Final = (Role.SENDER, Role.RECEIVER)
@@ -117,7 +117,7 @@ def _judge_needs(data: bytes, _: Path) -> None:
 
 def _accounts_text(sender: Account, receiver: Account) -> bytes:
     clocks = {Role.SENDER: Offset(0.2, 0.01), Role.RECEIVER: Offset(-0.2, 0.01)}
-    return accounts.text(Accounts({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
+    return position_sources.text(Accounts({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
 
 
 @cache
@@ -147,16 +147,16 @@ def _read_bag(data: bytes, place: Path) -> None:
     for stamps in ("header", "received"):
         account = Account(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
         with suppress(EvidenceError):
-            found = recorded.read_topic(path, account)
+            found = position_files.read_topic(path, account)
             _check_samples(found)
             if found.yaws_rad is not None:
-                _check_samples(recorded.to_placement_frame(found, account))
+                _check_samples(position_files.to_placement_frame(found, account))
 
 
 def _read_positions_file(ending: str, data: bytes, place: Path) -> None:
     path = place / f"walk.{ending}"
     path.write_bytes(data)
-    _check_samples(recorded.read_file(path))
+    _check_samples(position_files.read_file(path))
 
 
 def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
@@ -167,18 +167,18 @@ def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
     (place / "positions-receiver.gpx").write_bytes(_GPX)
     (place / "positions-receiver.csv").write_bytes(_CSV)
     folder = place if of_trial else attempt
-    (folder / accounts.FILE).write_bytes(data)
+    (folder / position_sources.FILE).write_bytes(data)
     evidence = AttemptEvidence(attempt)
     times_ns = [BEGAN_NS + S, BEGAN_NS + 3 * S]
-    found = where.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
+    found = position_columns.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
     assert all(math.isfinite(float(value)) for value in found.values.values())  # gates reject excessive distances
-    where.distances_m(evidence, _ENDS)
-    where.readable_samples(evidence)
-    said = accounts.read(folder / accounts.FILE)
-    (place / "again.json").write_text(accounts.text(said), encoding="utf-8")
-    assert accounts.read(place / "again.json") == said
-    where.sources_text(evidence)
-    assert math.isfinite(where.clock_error_s(evidence) or 0.0)
+    position_columns.distances_m(evidence, _ENDS)
+    position_columns.readable_samples(evidence)
+    said = position_sources.read(folder / position_sources.FILE)
+    (place / "again.json").write_text(position_sources.text(said), encoding="utf-8")
+    assert position_sources.read(place / "again.json") == said
+    position_columns.sources_text(evidence)
+    assert math.isfinite(position_columns.clock_error_s(evidence) or 0.0)
 
 
 def _accounts() -> tuple[bytes, ...]:
@@ -204,8 +204,8 @@ def _read_reception(data: bytes, place: Path) -> None:
     """Measure when topics were received, with a mutated log and an intact bag."""
     (place / "log").write_bytes(data)
     (place / "scan.bag").write_bytes(_recorded_bag())
-    measured = reception.measure(reception.read(place, "log", "scan.bag", ["/scan"], 5.0))
-    for column in reception.COLUMNS:
+    measured = recorded_topics.measure(recorded_topics.read(place, "log", "scan.bag", ["/scan"], 5.0))
+    for column in recorded_topics.COLUMNS:
         assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
 
 

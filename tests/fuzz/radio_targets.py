@@ -11,7 +11,7 @@ from typing import Final
 from fieldkit.core.columns import cell
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
-from fieldkit.measure.evidence import iw, link, link_samples, printed
+from fieldkit.measure.evidence import link, link_samples, program_output
 from tests.fuzz.harness import Target
 from tests.helpers.paths import DATA
 
@@ -56,27 +56,27 @@ def _read_robot_samples(name: str, data: bytes, place: Path) -> None:
 
 def _parse_iw(data: bytes, _: Path) -> None:
     text = data.decode(errors="replace")
-    iw.stations(text)
-    iw.cell(text)
-    iw.channel(text)
+    link_samples.parse_stations(text)
+    link_samples.parse_cell(text)
+    link_samples.parse_channel(text)
     for line in text.split("\n"):
-        iw.wireless(line)
+        link_samples.parse_wireless(line)
 
 
 def _evaluate_path(data: bytes, place: Path) -> None:
     """Evaluate a path of any length, as given by the author of a procedure."""
     path_text = data.decode(errors="replace")
     (place / "run.txt").write_text(json.dumps(_PRINTED), encoding="ascii")
-    if printed.path_error(path_text) is None:
+    if program_output.path_error(path_text) is None:
         with suppress(EvidenceError):
-            printed.at_path(place / "run.txt", path_text)
+            program_output.at_path(place / "run.txt", path_text)
 
 
 def _match_expression(data: bytes, place: Path) -> None:
     expression = data.decode(errors="replace")
     (place / "run.txt").write_text("rtt = 12.5 ms\nloss: 3%\n" + "a" * 5000 + "b\n", encoding="ascii")
-    if printed.expression_error(expression) is None:
-        printed.by_expression(place / "run.txt", expression)
+    if program_output.expression_error(expression) is None:
+        program_output.by_expression(place / "run.txt", expression)
 
 
 def radio_targets() -> Iterator[Target]:

@@ -22,7 +22,7 @@ from fieldkit.core.columns import Column
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
-from fieldkit.measure import offsets
+from fieldkit.measure import robot_clock
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.checks import topic_captures, topic_checks
@@ -34,18 +34,17 @@ from fieldkit.measure.evidence import (
     endings,
     host,
     iperf3,
-    lateness,
-    medium,
+    oracle_delays,
+    outage,
     ping,
-    printed,
-    recovery,
+    program_output,
     tcpdump_log,
     track,
 )
-from fieldkit.measure.evidence.confined import ReaderError
-from fieldkit.measure.positions.accounts import Account
-from fieldkit.measure.transfers import topic_log, topics
-from fieldkit.measure.transfers.topics import TopicTraffic
+from fieldkit.measure.evidence.sandbox import ReaderError
+from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.transfers import topic_columns, topic_samples
+from fieldkit.measure.transfers.topic_columns import TopicTraffic
 from fieldkit.motion.logs import tlog, tlog_positions
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
@@ -131,15 +130,15 @@ def _parse_capture(data: bytes, _: Path) -> None:
 
 def _measure_fault(data: bytes, place: Path) -> None:
     for kind in FaultKind:
-        for name in (recovery.note_file(kind), recovery.observed_file(kind)):
+        for name in (outage.note_file(kind), outage.observed_file(kind)):
             stored = next(SELFHEAL.glob(f"repeats/*/{name}"), None)
             (place / name).write_bytes(stored.read_bytes() if stored is not None else data)
-        (place / recovery.observed_file(kind)).write_bytes(data)
+        (place / outage.observed_file(kind)).write_bytes(data)
         for which in (kind, None):
             try:
-                recovery.measure(kind, recovery.read(place, kind) if which else None)
+                outage.measure(kind, outage.read(place, kind) if which else None)
             finally:
-                (place / recovery.note_file(kind)).write_bytes(data)
+                (place / outage.note_file(kind)).write_bytes(data)
 
 
 def _judge_sections(data: bytes, _: Path) -> None:
@@ -201,7 +200,7 @@ def _read_replies(data: bytes, place: Path) -> None:
         for ask in (locks.holder, partial(jobs.list_running, deadline=Deadline.after(1)), _call_script):
             with suppress(RobotError):
                 ask(shell)
-    offsets.parse_date(data.decode("ascii", "replace"))
+    robot_clock.parse_date(data.decode("ascii", "replace"))
     printable(data)
 
 
@@ -333,12 +332,12 @@ def _measure_tlog(path: Path) -> None:
 
 
 def _measure_topic_log(path: Path) -> None:
-    result = topic_log.read(path)
+    result = topic_samples.read_log(path)
     flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
     plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, on_ports=True)
     list(topic_checks.check_logs(plan, result, result))
     list(topic_captures.check_captures(plan, result, result, CapturedTopic(None, None, complete=False)))
-    topics.measure(flow, result, result, None, None)
+    topic_columns.measure(flow, result, result, None, None)
 
 
 def _read_printed(data: bytes, place: Path) -> None:
@@ -346,13 +345,16 @@ def _read_printed(data: bytes, place: Path) -> None:
     path = place / "run.txt"
     path.write_bytes(data)
     readings = (
-        *(partial(printed.at_path, path, where) for where in ("[0].a[1].b", "end.sum.bytes", "@", "*", "[].a[]")),
-        *(partial(printed.by_expression, path, what) for what in (r"(a+)+$", r"= ([0-9]+)", r"(?s)(.*)")),
+        *(
+            partial(program_output.at_path, path, where)
+            for where in ("[0].a[1].b", "end.sum.bytes", "@", "*", "[].a[]")
+        ),
+        *(partial(program_output.by_expression, path, what) for what in (r"(a+)+$", r"= ([0-9]+)", r"(?s)(.*)")),
     )
     for reading in readings:
         for unit in ("V", "count", "ns", "share", "bool", "text"):
             with suppress(EvidenceError):
-                printed.value(Column("x", unit, "X."), reading())
+                program_output.value(Column("x", unit, "X."), reading())
 
 
 def _all_targets() -> Iterator[Target]:
@@ -373,8 +375,16 @@ def _all_targets() -> Iterator[Target]:
     yield Target("ping", (*pings, *_stored_attempts("ping.txt")), partial(_parse_text, _measure_ping), 3)
     yield Target("tcpdump-log", _stored("tcpdump/*/*.log"), partial(_parse_text, tcpdump_log.parse))
     yield Target("host", _stored_attempts("*-before.txt", "*-after.txt"), partial(_read_evidence, _read_host))
-    yield Target("lateness", _stored_attempts(lateness.FILE), partial(_read_evidence, lateness.read))
-    yield Target("medium", _stored_attempts(medium.FILE), partial(_read_evidence, medium.read))
+    yield Target(
+        "lateness",
+        _stored_attempts(oracle_delays.LATENESS_FILE),
+        partial(_read_evidence, oracle_delays.read_lateness),
+    )
+    yield Target(
+        "medium",
+        _stored_attempts(oracle_delays.AIR_DELAY_FILE),
+        partial(_read_evidence, oracle_delays.read_air_delay),
+    )
     yield Target("track", _stored_attempts(track.FILE), partial(_read_evidence, _measure_track))
     yield Target("fault", _stored_attempts("fault-*.txt"), _measure_fault)
     yield Target("iperf3", _stored("iperf3/*/*.json"), partial(_read_evidence, _measure_iperf3))

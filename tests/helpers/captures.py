@@ -8,7 +8,7 @@ from ipaddress import IPv4Address
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from tests.helpers.paths import DATA
 
 SENDER = "10.9.0.1"

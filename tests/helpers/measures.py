@@ -7,10 +7,10 @@ from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import lateness, ping, recovery, tcpdump_log, track
-from fieldkit.measure.transfers import columns as of_transfers
-from fieldkit.measure.transfers import figures
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.evidence import oracle_delays, outage, ping, tcpdump_log, track
+from fieldkit.measure.transfers import transfer_columns as of_transfers
+from fieldkit.measure.transfers import transfer_measures
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.trial.columns import measures
 
 
@@ -40,14 +40,16 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
     pings = evidence.read_or_none(ping.read, ping.FILE)
     positions = evidence.read_or_none(track.read, track.FILE)
     reply_times_ns = [at for answer in pings.answers if (at := answer.at_utc_ns)] if pings else []
-    measured = lateness.measure(evidence.read_or_none(lateness.read, lateness.FILE)) | ping.measure(pings)
+    measured = oracle_delays.measure_lateness(
+        evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
+    ) | ping.measure(pings)
     measured |= track.measure(positions, ping.MOTION_COLUMNS, (Role.SENDER, Role.RECEIVER), reply_times_ns)
     if transfer is not None:
-        measured |= figures.measure(evidence, transfer) | _captures(evidence)
+        measured |= transfer_measures.measure(evidence, transfer) | _captures(evidence)
         assert not {column.name for column in of_transfers.COLUMNS} - measured.values.keys() - measured.missing.keys()
     for kind in FaultKind:
         try:
-            measured |= recovery.measure(kind, evidence.read(recovery.read, "", kind))
+            measured |= outage.measure(kind, evidence.read(outage.read, "", kind))
         except EvidenceError:
             continue
     assert not measured.values.keys() & measured.missing.keys()

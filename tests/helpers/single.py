@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fieldkit.analysis import planning, statistics
+from fieldkit.analysis import sample_size, statistics
 from fieldkit.analysis.statistics import Intervals
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import Interval
@@ -35,7 +35,7 @@ def median(values: ArrayLike, least: float = -math.inf) -> Interval | None:
 
 def more_wanted(interval: Interval, n: int, half_width: float, kind: Kind) -> int:
     intervals = Intervals(*(np.array([bound]) for bound in (interval.value, interval.low, interval.high)))
-    return int(planning.more_wanted(intervals, n, half_width, kind)[0])
+    return int(sample_size.more_wanted(intervals, n, half_width, kind)[0])
 
 
 def _single(intervals: Intervals) -> Interval | None:

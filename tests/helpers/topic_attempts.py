@@ -13,8 +13,8 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.checks import topic_captures, topic_checks
 from fieldkit.measure.checks.topic_captures import CapturedTopic
 from fieldkit.measure.checks.topic_checks import TopicPlan
-from fieldkit.measure.transfers import sample_heads, topic_log, topics
-from fieldkit.measure.transfers.topics import TopicTraffic
+from fieldkit.measure.transfers import topic_columns, topic_samples
+from fieldkit.measure.transfers.topic_columns import TopicTraffic
 from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4
 
 US: Final = 1_000
@@ -144,14 +144,14 @@ def write(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> 
 def judge_attempt(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> tuple[list[str], Measured]:
     """The contradictions in an attempt, and its measured values."""
     write(topic_attempt, folder, signed=signed)
-    sent, came = (topic_log.read(folder / f"{role}-topic.bin") for role in ("sender", "receiver"))
+    sent, came = (topic_samples.read_log(folder / f"{role}-topic.bin") for role in ("sender", "receiver"))
     flows, packets = [], []
     for role, address in (("sender", SENDER), ("receiver", RECEIVER)):
         path, is_publisher = folder / f"{role}.pcap", role == "sender"
         packets.append(pcap.read(path).packets)
-        headers = sample_heads.find(path, topic_attempt.plan.size_bytes)
+        headers = topic_samples.find_heads(path, topic_attempt.plan.size_bytes)
         flows.append(
-            sample_heads.flow(
+            topic_samples.sample_flow(
                 packets[-1],
                 headers,
                 frozenset({PORT}),
@@ -168,8 +168,8 @@ def judge_attempt(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = T
     reasons = [f"{end.foreign} foreign" for end in (sent, came) if end.foreign]  # as the step reports it
     reasons += topic_checks.check_logs(topic_attempt.plan, sent, came)
     reasons += [] if reasons else topic_captures.check_captures(topic_attempt.plan, sent, came, captured)
-    measured = topics.measure(TRAFFIC, sent, came, *packets)
-    arrived = topics.first_arrivals(came)
+    measured = topic_columns.measure(TRAFFIC, sent, came, *packets)
+    arrived = topic_columns.first_arrivals(came)
     withheld = topic_captures.withheld(
         measured.values, arrived, captured, reliable=topic_attempt.plan.reliable, deadline_s=TRAFFIC.deadline_s
     )

@@ -10,7 +10,7 @@ from fieldkit.core import columns
 from fieldkit.core.columns import Column, Figure, Kind, Value, with_step_name
 from fieldkit.core.model import Protocol
 from fieldkit.measure.evidence import ping
-from fieldkit.measure.transfers.columns import COLUMNS
+from fieldkit.measure.transfers.transfer_columns import COLUMNS
 from fieldkit.trial import rows
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.plan import Plan

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import pytest
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
-from fieldkit.lab import answers
-from fieldkit.lab.answers import LabState, RobotState
+from fieldkit.lab import requests
 from fieldkit.lab.protocol import Destination, LabLink, Outline, Overview
+from fieldkit.lab.requests import LabState, RobotState
 
 STATE = LabState(
     pid=4711,
@@ -21,21 +21,21 @@ OVERVIEW = Overview(
     robots={"a": (1.0, 2.0), "b": (4.0, 2.0)},
     links=[LabLink(("a", "b"), 31.5, True, ("tree",))],
 )
-READERS = [answers.state, answers.overview, answers.place_m]
+READERS = [requests.unpack_state, requests.unpack_overview, requests.unpack_place_m]
 
 
 def test_packed_answers_are_read_unchanged() -> None:
-    assert answers.state(answers.pack_state(STATE)) == STATE
-    assert answers.overview(answers.pack_overview(OVERVIEW)) == OVERVIEW
-    assert answers.place_m(answers.pack_place((1.0, -2.0, 0.5))) == (1.0, -2.0, 0.5)
+    assert requests.unpack_state(requests.pack_state(STATE)) == STATE
+    assert requests.unpack_overview(requests.pack_overview(OVERVIEW)) == OVERVIEW
+    assert requests.unpack_place_m(requests.pack_place((1.0, -2.0, 0.5))) == (1.0, -2.0, 0.5)
 
 
 @pytest.mark.parametrize("up_m", [None, 1.5])
 def test_destination_is_one_line(up_m: float | None) -> None:
     to = Destination(east_m=3.0, north_m=-1.0, up_m=up_m, relative=True)
-    request = answers.pack_destination(to)
+    request = requests.pack_destination(to)
     assert "\n" not in request
-    assert answers.destination(request) == to
+    assert requests.unpack_destination(request) == to
 
 
 @pytest.mark.parametrize("read", READERS)
@@ -47,7 +47,7 @@ def test_packed_error_is_raised_by_reader(
     read: Callable[[bytes], object], packed: type[FieldkitError], raised: type[FieldkitError]
 ) -> None:
     with pytest.raises(raised, match="no such place") as caught:
-        read(answers.pack_error(packed("no such place", remedy="look at the map")))
+        read(requests.pack_error(packed("no such place", remedy="look at the map")))
     assert type(caught.value) is raised
     assert caught.value.remedy == "look at the map"
 
@@ -64,4 +64,4 @@ def test_invalid_answer_is_value_error(read: Callable[[bytes], object], answer: 
 )
 def test_invalid_destination_is_value_error(request_: str) -> None:
     with pytest.raises(ValueError, match=r"\S"):
-        answers.destination(request_)
+        requests.unpack_destination(request_)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.measure.offsets import Exchange, offset, parse_date
+from fieldkit.measure.robot_clock import Exchange, offset, parse_date
 
 S = 10**9
 OFFSET_S = st.floats(min_value=-1e5, max_value=1e5)

@@ -11,7 +11,7 @@ import pytest
 from fieldkit.core.model import Protocol, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
-from fieldkit.measure.transfers import delay, figures, paper
+from fieldkit.measure.transfers import delay, transfer_measures
 from tests.helpers.captures import (
     PORT,
     RECEIVER,
@@ -186,7 +186,9 @@ def test_captures_around_another_step_are_not_used_for_a_transfer(tmp_path: Path
     """The captures belong to a ping after the transfer, so their content shows nothing about the transfer."""
     _udp_folder(tmp_path)
     (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
-    measures = figures.measure(AttemptEvidence(tmp_path), replace(transfer(protocol), captures=(None, None)))
+    measures = transfer_measures.measure(
+        AttemptEvidence(tmp_path), replace(transfer(protocol), captures=(None, None))
+    )
     of_captures = {name for name in LAYERS if name in measures.missing}
     assert measures.values.keys().isdisjoint(LAYERS | {"paper_packets", "paper_received"})
     assert {measures.missing[name] for name in of_captures} == {"there are no complete captures of both ends"}
@@ -225,7 +227,7 @@ def test_an_interrupted_ping_gives_times_but_no_loss(tmp_path: Path) -> None:
     [(36, 0.016, 0.576), (207, 0.005, 1.035), (36, 0.013, 0.468), (207, 0.0045, 0.9315)],
 )
 def test_figures_printed_in_the_paper(packets: int, delay_s: float, transfer_s: float) -> None:
-    assert paper.transfer_s(packets, delay_s) == pytest.approx(transfer_s)
+    assert transfer_measures.paper_transfer_s(packets, delay_s) == pytest.approx(transfer_s)
 
 
 @pytest.mark.emulated

@@ -7,7 +7,7 @@ import pytest
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Note, PhaseStarted, TrialStarted
 from fieldkit.pytest.evidence import LOG, EvidenceFolder, EvidenceKeeper
-from fieldkit.pytest.options import Keep
+from fieldkit.pytest.plugin_options import Keep
 
 
 def test_a_folder_is_created_on_first_use(tmp_path: Path) -> None:

@@ -8,16 +8,16 @@ import pytest
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.prompts import UNATTENDED
 from fieldkit.pytest.evidence import LOG, EvidenceKeeper
-from fieldkit.pytest.lab import OpenedLab
-from fieldkit.pytest.options import Keep, LabOptions
+from fieldkit.pytest.lab_fixture import OpenedLab
+from fieldkit.pytest.plugin_options import Keep, LabOptions
 from tests.helpers import suites
 from tests.helpers.sshd import free_port, make_key
 
 ASKS = "def test_asks(robots):\n    pass\n"
 TOLD = """
 def test_told(lab_options, pytestconfig):
-    from fieldkit.pytest import options
-    said = lab_options, options.output(pytestconfig), options.keep(pytestconfig)
+    from fieldkit.pytest import plugin_options
+    said = lab_options, plugin_options.output(pytestconfig), plugin_options.keep(pytestconfig)
     print(*(f"[{one}]" for one in said), sep="\\n")
 """
 OTHERS = """
@@ -61,8 +61,8 @@ OPERATOR = """
 import pytest
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.prompts import NOBODY
-from fieldkit.pytest.operator import operator_of
-from fieldkit.pytest.options import LabOptions
+from fieldkit.pytest.lab_fixture import operator_of
+from fieldkit.pytest.plugin_options import LabOptions
 
 
 def test_operator(pytestconfig):

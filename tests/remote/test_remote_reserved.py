@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fieldkit.core import laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
-from fieldkit.measure.transfers import fault_times
+from fieldkit.measure.transfers import recoveries
 from fieldkit.remote import fetching
 from fieldkit.trial.owners import FileOwners
 from tests.helpers.casts import los_plan
@@ -21,7 +21,7 @@ OWNERS = FileOwners.of(PLAN.procedure, PLAN.scene(RepeatId(Protocol.UDP, 1), "")
 OF_THE_LAPTOP = (
     *("medium.txt", "track.csv", "link.csv", "lateness.txt", "MANIFEST.sha256", "air.pcap", "air.csv"),
     *("answer-grass.txt", "receiver-unfetched.txt", "positions.json", "trial.yaml", "trial.csv", "journal.jsonl"),
-    *(fault_times.file(kind) for kind in FaultKind),
+    *(recoveries.fault_times_file(kind) for kind in FaultKind),
 )
 
 

@@ -13,14 +13,13 @@ from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats, read
 from fieldkit.core.columns import fault_column_name
 from fieldkit.core.model import FaultKind
-from fieldkit.measure.evidence import ping, recovery
+from fieldkit.measure.evidence import outage, ping
 from fieldkit.report import distance, distribution, dots, figures
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
-from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
-from fieldkit.report.evidence import load_evidence
-from fieldkit.report.points import needs_log
+from fieldkit.report.series import Identities, needs_log
 from fieldkit.report.theme import Style
+from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
 from tests.helpers import lawns
@@ -165,7 +164,7 @@ def test_axis_of_a_distribution_is_logarithmic_for_a_wide_range(longest_s: float
 
 
 def test_flag_is_drawn_as_a_share_of_repeats(tmp_path: Path) -> None:
-    columns = trial_columns(recovery.declared(FaultKind.REBOOT))
+    columns = trial_columns(outage.declared(FaultKind.REBOOT))
     name = fault_column_name(FaultKind.REBOOT, "recovered")
     rows = [{**row, name: n > 1} for metres in (10, 20) for n, row in enumerate(at(metres, 4))]
     path = tmp_path / "trial.csv"

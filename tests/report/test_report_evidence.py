@@ -11,10 +11,10 @@ from fieldkit.cli import main
 from fieldkit.config import schema
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import track
-from fieldkit.report import bursts, distribution, timeline
-from fieldkit.report.conditions import Identities
+from fieldkit.report import distribution, packet_rasters, timeline
 from fieldkit.report.contents import put_together, repeat_to_draw
-from fieldkit.report.evidence import load_evidence
+from fieldkit.report.series import Identities
+from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial import sources, store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded
@@ -44,7 +44,7 @@ def test_links_lead_to_existing_folders(trial: Path, monkeypatch: pytest.MonkeyP
 
 def test_lost_packets_are_marked_at_their_positions(trial: Path) -> None:
     evidence = load_evidence(sources.find([trial], print).read())
-    ((raster,),) = (group.rasters for group in bursts.groups(aggregate(evidence.repeats), evidence))
+    ((raster,),) = (group.rasters for group in packet_rasters.groups(aggregate(evidence.repeats), evidence))
     assert raster.lines == 1
     assert raster.columns == recorded.PACKETS
     assert raster.runs == [(0, 3, 2), (0, 17, 1)]

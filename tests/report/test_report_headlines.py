@@ -8,8 +8,8 @@ import pytest
 from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
 from fieldkit.report.coverage import everything_lost
-from fieldkit.report.evidence import Evidence, load_evidence
 from fieldkit.report.headlines import Headline, headlines
+from fieldkit.report.trial_folders import Evidence, load_evidence
 from fieldkit.trial import sources, store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import lawns, recorded

@@ -18,14 +18,14 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import iperf3, ping
-from fieldkit.measure.transfers import fates, load, tcp, topics
-from fieldkit.measure.transfers.transfer import Transfer
-from fieldkit.report import bursts, distance, distribution, figures, headlines, strips, summary, timeline
+from fieldkit.measure.transfers import fates, iperf3_load, tcp, topic_columns
+from fieldkit.measure.transfers.transfer_spec import Transfer
+from fieldkit.report import distance, distribution, figures, headlines, packet_rasters, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
-from fieldkit.report.conditions import Identities
 from fieldkit.report.contents import put_together
-from fieldkit.report.evidence import load_evidence
+from fieldkit.report.series import Identities
 from fieldkit.report.theme import Style
+from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
 from tests.helpers import lawns, tables
@@ -113,7 +113,7 @@ def test_damaged_capture_is_not_read(tmp_path: Path) -> None:
 @given(st.lists(st.booleans(), max_size=50))
 def test_runs_cover_the_marked_packets(marked: list[bool]) -> None:
     drawn = np.zeros(len(marked), dtype=np.bool_)
-    runs = bursts._runs(np.array(marked, dtype=np.bool_))
+    runs = packet_rasters._runs(np.array(marked, dtype=np.bool_))
     for start, length in runs:
         assert not drawn[max(0, start - 1) : start + length].any()
         drawn[start : start + length] = True
@@ -256,7 +256,7 @@ def test_headline_of_several_steps_names_the_step_of_each_extreme(tmp_path: Path
 
 def test_report_of_topics_has_their_headlines_and_charts(tmp_path: Path) -> None:
     topic = {"topic_sent": 20, "topic_received": 18, "topic_loss": 0.1, "topic_delay_median_s": 0.03}
-    columns = trial_columns(topics.COLUMNS)
+    columns = trial_columns(topic_columns.COLUMNS)
     path = tmp_path / "trial.csv"
     far = {"distance": "20ft", "distance_m": 6.096}
     rows = [{**lawns.row(number), **topic, **place} for place in ({}, far) for number in (1, 2)]
@@ -276,7 +276,7 @@ def test_report_of_topics_has_their_headlines_and_charts(tmp_path: Path) -> None
 def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> None:
     tested = {"iperf3_throughput_bit_s": 5e6, "iperf3_loss": 0.1, "iperf3_captured_loss": 0.12}
     counts = {"iperf3_datagrams_sent": 100, "iperf3_datagrams_received": 90}
-    columns = trial_columns((*iperf3.COLUMNS, *load.COLUMNS))
+    columns = trial_columns((*iperf3.COLUMNS, *iperf3_load.COLUMNS))
     path = tmp_path / "trial.csv"
     far = {"distance": "20ft", "distance_m": 6.096}
     rows = [{**lawns.row(number), **tested, **counts, **place} for place in ({}, far) for number in (1, 2)]

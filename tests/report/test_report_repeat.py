@@ -9,7 +9,7 @@ import pytest
 from fieldkit.analysis.cells import aggregate
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.report.contents import repeat_to_draw
-from fieldkit.report.evidence import Evidence
+from fieldkit.report.trial_folders import Evidence
 from tests.helpers.tables import ROW, RepeatRow, parsed, replace
 
 TCP = replace(

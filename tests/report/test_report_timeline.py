@@ -11,11 +11,11 @@ from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import host, track
-from fieldkit.measure.transfers import topic_log
+from fieldkit.measure.transfers import topic_samples
 from fieldkit.report import timeline
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import repeat_to_draw
-from fieldkit.report.evidence import load_evidence
+from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial import procedure, sources, store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded
@@ -150,7 +150,7 @@ def test_a_topic_has_a_panel_of_its_delays_and_losses(trial: Path) -> None:
         samples = [
             record(1, n, begin_ns + n * 10**8, begin_ns + n * 10**8 + late_ns + (n == 3) * 5 * 10**6) for n in numbers
         ]
-        content = topic_log.MAGIC + b"".join(samples) + record(7, len(numbers), 0, begin_ns + 10**9)
+        content = topic_samples.LOG_MAGIC + b"".join(samples) + record(7, len(numbers), 0, begin_ns + 10**9)
         (folder / name).write_bytes(content)
 
     log("sender-topic.bin", (0, 1, 2, 3, 4), 0)

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.positions import accounts
-from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions import position_sources
+from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.view import View
@@ -24,7 +24,7 @@ DEGREE_M = 110_574.28
 
 def stood(folder: Path, receiver: Account, sender: Account) -> AttemptEvidence:
     stored = Accounts({Role.SENDER: sender, Role.RECEIVER: receiver})
-    (folder / accounts.FILE).write_text(accounts.text(stored), encoding="utf-8")
+    (folder / position_sources.FILE).write_text(position_sources.text(stored), encoding="utf-8")
     return AttemptEvidence(folder)
 
 
@@ -68,7 +68,7 @@ def test_satellite_positions_have_the_tolerance_of_their_error(
 def test_missing_positions_contradict_nothing(tmp_path: Path) -> None:
     assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
     lone = Accounts({Role.RECEIVER: Account(place=(300.0, 0.0, 0.0), frame=LOCAL)})
-    (tmp_path / accounts.FILE).write_text(accounts.text(lone), encoding="utf-8")
+    (tmp_path / position_sources.FILE).write_text(position_sources.text(lone), encoding="utf-8")
     assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
     assert placements.contradiction(replace(SCENE, placement=None), in_metres(tmp_path, 300.0)) is None
 

@@ -9,7 +9,7 @@ from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Role
 from fieldkit.measure.evidence import ping
-from fieldkit.measure.positions.accounts import Account
+from fieldkit.measure.positions.position_sources import Account
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.trial import journal, manifest, positions
 from tests.helpers.runs import rows

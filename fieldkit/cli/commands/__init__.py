@@ -1,17 +1,17 @@
 """Every command with its help line, in a module of its name: `add` declares its arguments, `run` runs it.
 
+Commands that list items share the module `listings`, with a pair of functions for each, such as `add_robots`.
 A module is imported when its command is used. Slow imports are inside of the functions that need them, so that help
 and Tab completion do not wait for them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.cli import outside
-from fieldkit.cli.parser import Commands, Parser
+from fieldkit.cli.parser import Commands, Parser, add_plugin_command, plugin_targets
 
 COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -42,22 +42,28 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
     }
 )
 """In the order in which the help lists them."""
+LISTINGS: Final = ("robots", "procedures", "columns")
+"""Commands in the module `listings`."""
 
 FROM_ENTRY_POINTS: Final = frozenset({"stop"})
-"""Commands whose modules are found by entry points, as `fieldkit.cli.outside`; without these the help omits them."""
+"""Commands whose modules are found by entry points (`plugin_targets`); without these the help omits them."""
 
 
 def add_all(commands: Commands) -> None:
     """Add a parser for each command. Its arguments are declared at first use."""
-    installed = outside.names()
+    installed = plugin_targets()
     for name, help_line in COMMANDS.items():
         if name in FROM_ENTRY_POINTS:
             if name in installed:
-                outside.add(commands, name, installed[name], help_line)
+                add_plugin_command(commands, name, installed[name], help_line)
             continue
         parser: Parser = commands.add_parser(name, help=help_line)
         parser.declare = partial(_declare, name)
 
 
 def _declare(name: str, parser: Parser) -> None:
-    import_module(f"{__name__}.{name}").add(parser)
+    if name in LISTINGS:
+        add: Callable[[Parser], None] = getattr(import_module(f"{__name__}.listings"), f"add_{name}")
+    else:
+        add = import_module(f"{__name__}.{name}").add
+    add(parser)

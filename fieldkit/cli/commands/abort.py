@@ -10,7 +10,7 @@ from fieldkit.cli.terminal import confirmed
 from fieldkit.core import runtime
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.events import Note
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 
 
@@ -38,12 +38,12 @@ _ENDS: Final = (
 
 def run(arguments: argparse.Namespace) -> int:
     """Abort, and print the terminated jobs robot by robot."""
-    from fieldkit.cli import options
+    from fieldkit.cli import cli_options
     from fieldkit.remote.motion_states import STATE_TEXTS, MotionState
     from fieldkit.trial.running import locks
 
     with watching(as_json=False) as sink:
-        _, backend = options.backend(arguments, sink)
+        _, backend = cli_options.backend(arguments, sink)
         with backend.persistent_shells(sink=sink) as robots:
             if not robots:
                 sink(Note(_NONE))

@@ -13,8 +13,7 @@ from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import EvidenceError, FieldkitError, shell_command
-from fieldkit.core.printing import print_text
-from fieldkit.core.text import json_text
+from fieldkit.core.text import json_text, print_text
 from fieldkit.core.units import format_bytes, format_count, format_duration
 
 STORAGES: Final = ("mcap", "sqlite3")

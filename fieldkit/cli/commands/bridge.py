@@ -21,8 +21,7 @@ from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
-from fieldkit.core.printing import print_text
-from fieldkit.core.text import json_text
+from fieldkit.core.text import json_text, print_text
 from fieldkit.core.units import format_bytes
 from fieldkit.ros import bridge
 from fieldkit.ros.bridge import Carrier, Side

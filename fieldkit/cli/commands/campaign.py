@@ -39,10 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.campaign import plan
     from fieldkit.campaign.journal import CampaignJournal
     from fieldkit.campaign.runner import CampaignRun
-    from fieldkit.cli import options, results
+    from fieldkit.cli import cli_options, results
 
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
-        name, backend = options.backend(arguments, sink)
+        name, backend = cli_options.backend(arguments, sink)
         planned, document = plan.make_plan(arguments.file, name)
         folder = arguments.out / f"campaign_{planned.campaign.name}"
         started = plan.begun(folder, planned, document)
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         campaign.announce()
         if arguments.dry_run:
             return 0
-        with options.operator(arguments, sink) as operator:
+        with cli_options.operator(arguments, sink) as operator:
             outcome = campaign.run(operator, stop)
     results.write_junit(arguments, outcome.folders)
     return _exit_code(outcome, arguments.file, folder)

@@ -37,13 +37,13 @@ _CLOSE = Distance(metres=1.0, label="check")
 
 def run(arguments: argparse.Namespace) -> int:
     """Check, print every finding, and return 0 if a trial could start."""
-    from fieldkit.cli import options
+    from fieldkit.cli import cli_options
     from fieldkit.trial.request import make_plan
     from fieldkit.trial.running import preflight
 
-    request = options.request(arguments, _CLOSE)
+    request = cli_options.request(arguments, _CLOSE)
     with watching(as_json=arguments.json) as sink:
-        name, backend = options.backend(arguments, sink)
+        name, backend = cli_options.backend(arguments, sink)
         cast = backend.cast(request.chosen_topology)
         plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC), lab_bytes=backend.lab_bytes)
         with backend.open(plan.cast, seed=plan.seed, sink=sink, operator=Unattended()) as lab:

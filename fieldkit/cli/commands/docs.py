@@ -6,7 +6,7 @@ import webbrowser
 from fieldkit.cli.display import table
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 
 
 def add(parser: Parser) -> None:

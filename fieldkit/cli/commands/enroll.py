@@ -9,7 +9,7 @@ from fieldkit.cli.terminal import confirmed
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, did_you_mean, shell_command
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.remote.identity import Address, HostKey
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Pin the key, unless it is pinned already."""
-    from fieldkit.config import site_file
+    from fieldkit.config.site import pin_host_key
     from fieldkit.remote.link import over_tcp
     from fieldkit.remote.login import offered_key
     from fieldkit.remote.ssh import CONNECT_S
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.yes and not confirmed("pin it", unasked="compare the fingerprints, then add --yes"):
         print_text("not pinned")
         return FieldkitError.exit_code
-    site_file.pin(path, name, offered.text)
+    pin_host_key(path, name, offered.text)
     print_text(f"pinned in {path}")
     return 0
 

@@ -11,7 +11,7 @@ from fieldkit.cli.display import show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, shell_command
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import format_bytes
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from pathlib import Path
 from fieldkit.cli.parser import Parser
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.errors import shell_command
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 
 
 def add(parser: Parser) -> None:
@@ -20,11 +20,10 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the file and print the next commands."""
-    from fieldkit.config import site_file
-    from fieldkit.config.site import load_site
+    from fieldkit.config.site import create_site_file, load_site
 
     path: Path = arguments.out
-    site_file.create(path)
+    create_site_file(path)
     site, _ = load_site(path)
     option = () if path == Path(SITE_FILE) else ("--site", path)
     steps = [

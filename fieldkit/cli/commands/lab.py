@@ -16,10 +16,9 @@ from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Vector
-from fieldkit.core.printing import print_text
-from fieldkit.core.text import json_text
+from fieldkit.core.text import json_text, print_text
 from fieldkit.core.units import format_count, format_duration, parse_offset_m
-from fieldkit.lab import background, folder
+from fieldkit.lab import folder
 from fieldkit.lab.folder import LabFolder
 
 if TYPE_CHECKING:
@@ -116,7 +115,7 @@ _NEXT: Final = "fieldkit lab ps | shell ROBOT | move ROBOT | ssh-config | down"
 
 def up(arguments: argparse.Namespace) -> int:
     """Start the robots, and return when they are up, or with --foreground when they are down."""
-    from fieldkit.lab import server
+    from fieldkit.lab import daemon
 
     here, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
@@ -124,29 +123,29 @@ def up(arguments: argparse.Namespace) -> int:
         print_text(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
-        server.run(here, backend, seed=arguments.seed, sink=_show_note, ready=announce)
+        daemon.run(here, backend, seed=arguments.seed, sink=_show_note, ready=announce)
         return 0
 
-    def serve(leave: background.OnReady) -> int:
+    def serve(leave: daemon.OnReady) -> int:
         def ready(robots: "Lab") -> None:
             print_text(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
             leave(here.log)
 
         try:
-            server.run(here, backend, seed=arguments.seed, sink=_show_note, ready=ready)
+            daemon.run(here, backend, seed=arguments.seed, sink=_show_note, ready=ready)
         except FieldkitError as error:
             show_error(str(error))
             return error.exit_code
         return 0
 
-    return background.run_detached(serve)
+    return daemon.run_detached(serve)
 
 
 def list_robots(arguments: argparse.Namespace) -> int:
     """List the robots."""
-    from fieldkit.lab import client
+    from fieldkit.lab import requests
 
-    state = client.state(_here())
+    state = requests.state(_here())
     if arguments.json:
         print_text(json_text(asdict(state)))
         return 0
@@ -168,7 +167,7 @@ def list_robots(arguments: argparse.Namespace) -> int:
 
 def move(arguments: argparse.Namespace) -> int:
     """Move the robot and print its position."""
-    from fieldkit.lab import client
+    from fieldkit.lab import requests
     from fieldkit.lab.protocol import Destination
 
     relative = arguments.to is None
@@ -177,17 +176,17 @@ def move(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"{option} takes EAST NORTH [UP], not {' '.join(words)!r}", remedy=_EXAMPLE)
     east_m, north_m, *up_m = map(parse_offset_m, words)
     to = Destination(east_m, north_m, up_m[0] if up_m else None, relative)
-    place_m = client.move(_here(), arguments.robot, to)
+    place_m = requests.move(_here(), arguments.robot, to)
     print_text(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
     return 0
 
 
 def shell(arguments: argparse.Namespace) -> int:
     """Replace this process by ssh to the robot."""
-    from fieldkit.lab import client, protocol
+    from fieldkit.lab import protocol, requests
 
     here = _here()
-    names = [robot.name for robot in client.state(here).robots]
+    names = [robot.name for robot in requests.state(here).robots]
     if arguments.robot not in names:
         raise protocol.unknown_robot(arguments.robot, names)
     program = shutil.which("ssh")
@@ -200,19 +199,19 @@ def shell(arguments: argparse.Namespace) -> int:
 
 def print_ssh_config(_: argparse.Namespace) -> int:
     """Print the configuration."""
-    from fieldkit.lab import client
+    from fieldkit.lab import requests
 
     here = _here()
-    client.state(here)
+    requests.state(here)
     print_text(here.ssh_config.read_text(encoding="utf-8"), end="")
     return 0
 
 
 def down(_: argparse.Namespace) -> int:
     """Stop the robots."""
-    from fieldkit.lab import client
+    from fieldkit.lab import requests
 
-    client.end(_here())
+    requests.end(_here())
     print_text("the robots are down")
     return 0
 
@@ -236,11 +235,11 @@ def _place(place_m: Vector) -> str:
 
 def _overview(arguments: argparse.Namespace) -> "Overview":
     """Return the lab that is up, or the lab that `up` would start if none is up or options choose its robots."""
-    from fieldkit.lab import client
+    from fieldkit.lab import requests
 
     if arguments.robots is None and arguments.site is None and arguments.backend is None:
-        with suppress(client.NoLabError):
-            return client.overview(_here())
+        with suppress(requests.NoLabError):
+            return requests.overview(_here())
     return _backend(arguments).overview()
 
 

@@ -10,8 +10,7 @@ from fieldkit.cli.display import show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import print_text
-from fieldkit.core.text import sanitized
+from fieldkit.core.text import print_text, sanitized
 from fieldkit.core.units import BYTES_PER_UNIT, parse_quantity
 from fieldkit.ros import configurations
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import parse_duration_s
 
 if TYPE_CHECKING:

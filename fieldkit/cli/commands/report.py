@@ -11,7 +11,7 @@ from fieldkit.cli.display import show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, shell_command
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 
 
 def add(parser: Parser) -> None:
@@ -60,7 +60,7 @@ _PAGE: Final = b"<!DOCTYPE html>"
 def run(arguments: argparse.Namespace) -> int:
     """Write the page, and with --figures the figures."""
     # matplotlib takes half a second to import, so other commands must not import it.
-    from fieldkit.campaign.unmeasured import unmeasured
+    from fieldkit.campaign.plan import unmeasured
     from fieldkit.report import contents, figures, page
     from fieldkit.trial import sources
 

@@ -46,16 +46,16 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the trial at each distance and print the table of each."""
-    from fieldkit.cli import dry_run, options
+    from fieldkit.cli import cli_options, dry_run
     from fieldkit.trial.request import make_plan
 
     requests = [
-        options.request(arguments, parse_distance(text), seed=arguments.seed, notes=arguments.notes)
+        cli_options.request(arguments, parse_distance(text), seed=arguments.seed, notes=arguments.notes)
         for text in arguments.distances
     ]
     topology = requests[0].chosen_topology
     with watching(as_json=arguments.json) as sink, interruptible() as stop:
-        name, backend = options.backend(arguments, sink)
+        name, backend = cli_options.backend(arguments, sink)
         cast = backend.cast(topology)
         run_id = secrets.token_hex(8)
         plans = [
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
         from fieldkit.trial.running import opening
 
         sink(Note(_announce(plans)))
-        with options.operator(arguments, sink) as operator:
+        with cli_options.operator(arguments, sink) as operator:
             outcomes = opening.run(
                 plans, backend, plans[0].cast, arguments.out, sink=sink, operator=operator, stop=stop
             )

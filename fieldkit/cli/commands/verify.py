@@ -6,7 +6,7 @@ from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 
 

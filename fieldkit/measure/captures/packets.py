@@ -22,8 +22,7 @@ from fieldkit.measure.captures.arrays import (
     layout,
     row_hashes,
 )
-from fieldkit.measure.captures.ip import ICMP, SCTP, TCP, UDP, Addresses, address, headers
-from fieldkit.measure.captures.links import network
+from fieldkit.measure.captures.headers import ICMP, SCTP, TCP, UDP, Addresses, address, ip_headers, network
 
 FIN: Final = 0x01
 SYN: Final = 0x02
@@ -149,7 +148,7 @@ for _name, _storage_type in _STORAGE_TYPES.items():
 
 def decode(integers: Integers, frames: Frames) -> Packets:
     """Return the IP packets among `frames`; frames of other protocols or truncated in the IP header are omitted."""
-    ip = headers(integers, frames, network(integers, frames))
+    ip = ip_headers(integers, frames, network(integers, frames))
     if len(ip) < len(frames):
         frames = frames.where(ip.frame)
     transport, payload, protocol = ip.payload_at, ip.payload_bytes, ip.protocol

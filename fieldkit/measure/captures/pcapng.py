@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import BIG, LITTLE, NO_TIME, Buffer, Chunk, Frames, Integers, Ints, Mask, Order
-from fieldkit.measure.captures.links import check_link_type
+from fieldkit.measure.captures.headers import check_link_type
 
 MAGIC: Final = b"\x0a\x0d\x0d\x0a"
 """First four bytes of a file in either byte order: the block type of a section header."""

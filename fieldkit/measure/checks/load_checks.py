@@ -16,13 +16,12 @@ import numpy as np
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Ints
-from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.headers import TCP
 from fieldkit.measure.captures.packets import ACK, NOT_CAPTURED, SYN, Packets
 from fieldkit.measure.evidence.host import Counters
 from fieldkit.measure.evidence.iperf3 import IperfTest
-from fieldkit.measure.transfers.load import LoadFlow
-from fieldkit.measure.transfers.load_streams import COOKIE_BYTES
-from fieldkit.measure.transfers.streams import LONGEST_BYTES
+from fieldkit.measure.transfers.iperf3_load import COOKIE_BYTES, LoadFlow
+from fieldkit.measure.transfers.tcp_streams import LONGEST_BYTES
 
 EARLY_NS: Final = 300_000_000
 LATE_NS: Final = 500_000_000

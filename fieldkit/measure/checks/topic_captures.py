@@ -1,6 +1,6 @@
 """Contradictions between the logs of a topic and the captures of its ends.
 
-A capture shows the head of most samples: number and time of sending (`sample_heads`). Each sample in a log is
+A capture shows the head of most samples: number and time of sending (`topic_samples`). Each sample in a log is
 therefore compared with its packet. The clock is the same, because both were recorded on the same robot. If TCP or a
 middleware put several samples into one packet, so that the capture shows no heads, counts and bytes are compared.
 """
@@ -14,14 +14,13 @@ import numpy as np
 from fieldkit.core.columns import Value
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
-from fieldkit.measure.captures.ip import UDP
+from fieldkit.measure.captures.headers import UDP
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES
 from fieldkit.measure.checks.topic_checks import TopicPlan
 from fieldkit.measure.transfers.delay import LARGEST_ERROR
 from fieldkit.measure.transfers.match import match
-from fieldkit.measure.transfers.sample_heads import SampleFlow, SampleHeads
-from fieldkit.measure.transfers.topic_log import TopicLog, TopicSamples
-from fieldkit.measure.transfers.topics import first_arrivals
+from fieldkit.measure.transfers.topic_columns import first_arrivals
+from fieldkit.measure.transfers.topic_samples import SampleFlow, SampleHeads, TopicLog, TopicSamples
 
 STAMP_NS: Final = 2_000
 """tcpdump truncates times to microseconds, and the kernel may stamp a packet with a time read 1 us later."""

@@ -10,10 +10,11 @@ from typing import Final
 
 import numpy as np
 
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.model import Role
 from fieldkit.core.units import format_count
-from fieldkit.measure.transfers import topic_log
-from fieldkit.measure.transfers.topic_log import TopicLog
+from fieldkit.measure.transfers import topic_samples
+from fieldkit.measure.transfers.topic_samples import TopicLog
 
 MAX_SLEW_NS: Final = 1_000_000
 """Largest difference by which two consecutive times of one program may be reversed by a slewed clock."""
@@ -24,7 +25,7 @@ SETTLES_NS: Final = 500_000_000
 PADDING_BYTES: Final = 3
 """DDS pads a sample to a multiple of 4 bytes, and some implementations do not report this."""
 
-_NAMES: Final = {topic_log.PUBLISHER: "publisher", topic_log.SUBSCRIBER: "subscriber"}
+_NAMES: Final = {topic_samples.PUBLISHER: "publisher", topic_samples.SUBSCRIBER: "subscriber"}
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,8 @@ def check_logs(plan: TopicPlan, sent: TopicLog, received: TopicLog) -> Iterator[
         sent: Complete log of the publisher.
         received: Complete log of the subscriber.
     """
-    yield from _wrong_end(plan, sent, topic_log.PUBLISHER)
-    yield from _wrong_end(plan, received, topic_log.SUBSCRIBER)
+    yield from _wrong_end(plan, sent, topic_samples.PUBLISHER)
+    yield from _wrong_end(plan, received, topic_samples.SUBSCRIBER)
     yield from _publisher_problems(plan, sent)
     yield from _wrong_sizes(plan, received, PADDING_BYTES, "subscriber")
     if plan.in_order and (reversed_s := _reversed_s(received)):
@@ -102,8 +103,10 @@ def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
         yield f"the {name}'s log was written by the {_NAMES.get(log.end, 'unknown end')} of the topic"
     if log.topic_sum is not None and log.topic_sum != zlib.crc32(plan.topic.encode()):
         yield f"the {name}'s log is of another topic than {plan.topic}"
-    has_valid_count = (log.kinds.get(topic_log.BEGUN) == 1, log.kinds.get(topic_log.MATCHED, 0) <= 1)
-    unexpected_kinds = (topic_log.FOREIGN,) if end == topic_log.PUBLISHER else (topic_log.REFUSED, topic_log.SKIPPED)
+    has_valid_count = (log.kinds.get(topic_samples.BEGUN) == 1, log.kinds.get(topic_samples.MATCHED, 0) <= 1)
+    unexpected_kinds = (
+        (topic_samples.FOREIGN,) if end == topic_samples.PUBLISHER else (topic_samples.REFUSED, topic_samples.SKIPPED)
+    )
     if not all(has_valid_count) or any(log.kinds.get(kind) for kind in unexpected_kinds):
         yield f"the {name}'s log has records that no {name} writes"
     times_ns = log.times_ns
@@ -144,3 +147,73 @@ def _reversed_s(log: TopicLog) -> float:
     """Return the largest time by which a sample is earlier than the previous one; 0 if none is."""
     reversed_ns = -int(np.diff(log.samples.at_ns).min(initial=0))
     return reversed_ns / 1e9 if reversed_ns > MAX_SLEW_NS else 0.0
+
+
+_SAME_FILE: Final = "the same file: checksum and count of samples"
+
+CROSS_CHECKS: Final = (
+    CrossCheck(
+        "samples sent",
+        ("topic_sent", "topic_refused", "topic_skipped", "topic_loss"),
+        "`ROLE-topic.bin` of the publisher: samples",
+        ("the rate and duration of the procedure", "the publisher's capture: heads of samples", _SAME_FILE),
+        "none: every number from 0 on is sent, refused or skipped; a sample in the capture is in the log",
+    ),
+    CrossCheck(
+        "samples received",
+        ("topic_received", "topic_loss", "topic_repeated"),
+        "`ROLE-topic.bin` of the subscriber: samples",
+        (
+            "the publisher's log: numbers, sizes and times of sending",
+            "the subscriber's capture: heads, packets and bytes of samples",
+            _SAME_FILE,
+        ),
+        "a sample that arrived may be missing if the subscriber's queue overflowed, if an earlier one is missing and "
+        "the middleware preserves the order, or within 0.3 s of the match or of the end",
+    ),
+    CrossCheck(
+        "time of sending of each sample",
+        ("topic_delay_*", "topic_age_*", "topic_jitter_s"),
+        "`ROLE-topic.bin` of both ends: time in the sample",
+        ("the publisher's capture: time in the sample, and time of its packet", "the subscriber's capture"),
+        "the packet of the fastest sample leaves within 5 ms (20 ms if there are fewer than 20 samples)",
+    ),
+    CrossCheck(
+        "time of arrival of each sample",
+        ("topic_delay_*", "topic_age_*", "topic_jitter_s"),
+        "`ROLE-topic.bin` of the subscriber: time of the record",
+        ("the subscriber's capture: time of the packet with the sample", "the robot's clock around the attempt"),
+        "no record is earlier than its packet; the fastest is at most 5 ms later (20 ms if there are fewer than 20)",
+    ),
+    CrossCheck(
+        "delay added by the subscriber's program",
+        ("topic_delay_*", "topic_age_*", "topic_jitter_s", "topic_deadline_misses"),
+        "`ROLE-topic.bin` of the subscriber: time of the record",
+        ("the subscriber's capture: time of the packet with the sample",),
+        "up to 20 ms, or a tenth of the figure: a busy robot delays single samples",
+        CheckOutcome.WITHHELD,
+    ),
+    CrossCheck(
+        "discovery",
+        ("topic_discovered", "topic_discovery_s"),
+        "`ROLE-topic.bin` of the publisher: start and match",
+        ("the robot's clock around the attempt", "the first sample, 0.5 s after the match"),
+        "a first sample that is up to 0.1 s late, as on a busy robot; if it is later, the discovery time is withheld",
+    ),
+    CrossCheck(
+        "completeness of a topic's captures",
+        ("topic_capture_withheld",),
+        "`ROLE-capture.log`: packets dropped before tcpdump",
+        ("`ROLE.pcap`: number of packets, which is in the log too",),
+        "none: if a packet was dropped, all columns that need the captures are empty; those of the logs remain",
+        CheckOutcome.WITHHELD,
+    ),
+    CrossCheck(
+        "packets and bytes of a topic",
+        ("topic_data_*", "topic_discovery_packets", "topic_discovery_bytes", "topic_packet_loss"),
+        "the captures: packets of its ports",
+        (),
+        "the logs give a lower bound of the data packets; only the captures contain discovery",
+        CheckOutcome.UNCHECKED,
+    ),
+)

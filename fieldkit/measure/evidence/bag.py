@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence.confined import Json, ReaderError, SandboxedReader
+from fieldkit.measure.evidence.sandbox import Json, ReaderError, SandboxedReader
 
 METADATA: Final = "metadata.yaml"
 """File that a ROS 2 recorder writes next to its data file when it closes the bag."""

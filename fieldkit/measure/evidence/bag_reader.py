@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosbags import rosbag1
 
-from fieldkit.measure.evidence import bag, confined
-from fieldkit.measure.evidence.confined import Json
+from fieldkit.measure.evidence import bag, sandbox
+from fieldkit.measure.evidence.sandbox import Json
 
 if TYPE_CHECKING:
     from rosbags import rosbag2
@@ -191,4 +191,4 @@ def _checked_topic(value: object) -> str:
 
 
 if __name__ == "__main__":
-    confined.serve(answer)
+    sandbox.serve(answer)

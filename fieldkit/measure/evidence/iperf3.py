@@ -19,8 +19,16 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.text import shorten
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.evidence.iperf3_summary import IperfStart, IperfTotals, parse_start, parse_totals
-from fieldkit.measure.evidence.json_fields import count, items, mapping, number
+from fieldkit.measure.evidence.iperf3_json import (
+    IperfStart,
+    IperfTotals,
+    count,
+    items,
+    mapping,
+    number,
+    parse_start,
+    parse_totals,
+)
 
 COLUMNS: Final = columns(
     100,

@@ -15,7 +15,7 @@ import numpy as np
 
 from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.evidence.survivors import quantile_of_sent
+from fieldkit.measure.evidence.delay_quantiles import quantile_of_sent
 
 FILE: Final = "ping.txt"
 """Standard output of ping."""

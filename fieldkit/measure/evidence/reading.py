@@ -1,9 +1,11 @@
-"""Reading of evidence files, with errors that contain a remedy."""
+"""Reading of evidence files, with errors that contain a remedy, and checks that a file is complete."""
 
 import json
 import os
+import re
 import stat
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -114,3 +116,69 @@ def _open_regular(path: Path) -> Iterator[BinaryIO]:
 
 def _open_nonblocking(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK)
+
+
+_COUNT: Final = re.compile(r"# lines ([0-9]{1,9})\n", re.ASCII)
+
+
+def counted_csv_text(header: str, lines: Iterable[str]) -> str:
+    """Return the text of a file with this header and these lines."""
+    listed = list(lines)
+    return "".join(f"{line}\n" for line in (f"# lines {len(listed)}", header, *listed))
+
+
+def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: str) -> list[re.Match[str]]:
+    """Return the matches of a pattern with the lines of a file.
+
+    Args:
+        path: The file.
+        header: Its header line.
+        pattern: Pattern that all other lines must match.
+        error: Message if they do not: `is not a track of robots`.
+
+    Raises:
+        EvidenceError: The file is missing, truncated, or has other contents.
+    """
+    content = text(path)
+    count = _COUNT.match(content)
+    first, *lines = content[count.end() if count else 0 :].split("\n")
+    matches = [match for line in lines[:-1] if (match := pattern.fullmatch(line)) is not None]
+    if first != header or lines[-1:] != [""] or len(matches) < len(lines) - 1:
+        raise EvidenceError(error, where=str(path))
+    if count and int(count[1]) != len(matches):
+        raise EvidenceError(f"has {len(matches)} lines of {count[1]}: truncated", where=str(path))
+    return matches
+
+
+_END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
+
+
+def numbered_lines_problem(path: Path) -> str | None:
+    """Return why a log is not complete; None if it is, or if its lines have no numbers, as in older versions.
+
+    Raises:
+        EvidenceError: As `reading.text`.
+    """
+    log_text = text(path)
+    lines = log_text.splitlines(keepends=True)
+    numbers = [_number(line) for line in lines]
+    if all(number is None for number in numbers):
+        return None
+    if numbers != list(range(len(lines))):
+        return "its lines are not numbered without a gap: some are missing or were changed"
+    end = _END.fullmatch(lines[-1].rstrip("\n"))
+    if end is None or not lines[-1].endswith("\n"):
+        return "its last line is missing: its writer was killed"
+    head = "".join(lines[:-1]) + end[1] + "}"
+    return (
+        None if zlib.crc32(head.encode("utf-8", "replace")) == int(end[2]) else "was changed: its checksum is wrong"
+    )
+
+
+def _number(line: str) -> int | None:
+    try:
+        value: Any = json.loads(line)
+    except JSON_ERRORS:
+        return None
+    number = value.get("n") if isinstance(value, dict) else None
+    return number if type(number) is int else None

@@ -16,7 +16,7 @@ from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role, TrackPoint, Vector
-from fieldkit.measure.evidence import counted_csv
+from fieldkit.measure.evidence import reading
 
 FILE: Final = laptop_files.TRACK
 
@@ -49,7 +49,7 @@ class Separation:
 
 def text(track: Iterable[TrackPoint]) -> str:
     """Return the file text of a track, with a resolution of 0.1 mm."""
-    return counted_csv.text(_HEADER, map(_format_line, track))
+    return reading.counted_csv_text(_HEADER, map(_format_line, track))
 
 
 def _format_line(entry: TrackPoint) -> str:
@@ -69,7 +69,7 @@ def read(path: Path) -> tuple[TrackPoint, ...]:
         EvidenceError: The file is missing, truncated, or has other contents.
     """
     message = "is not a track of robots"
-    track = tuple(map(_parse_line, counted_csv.read(path, _HEADER, _LINE, message)))
+    track = tuple(map(_parse_line, reading.read_counted_csv(path, _HEADER, _LINE, message)))
     if any(before.utc_ns > after.utc_ns for before, after in pairwise(track)):
         raise EvidenceError(message, where=str(path))
     return track

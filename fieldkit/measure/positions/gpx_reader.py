@@ -1,11 +1,11 @@
-"""Reader of GPX files with gpxpy, run by `recorded` in a separate process. The only module that imports gpxpy."""
+"""Reader of GPX files with gpxpy, run by `position_files` in a separate process. No other module imports gpxpy."""
 
 from pathlib import Path
 
 import gpxpy
 
-from fieldkit.measure.evidence import confined
-from fieldkit.measure.evidence.confined import Json
+from fieldkit.measure.evidence import sandbox
+from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.measure.positions.samples import utc_ns
 
 
@@ -31,4 +31,4 @@ def answer(request: Json) -> Json:
 
 
 if __name__ == "__main__":
-    confined.serve(answer)
+    sandbox.serve(answer)

@@ -1,31 +1,158 @@
-"""Cross-checks between the sources of positions of robots."""
+"""Sources of robots' positions, as stored in `positions.json` of an attempt or of a whole trial.
 
-from typing import Final
+Steps that follow robots write the attempt's file, `fieldkit positions` the trial's. If both have the position of one
+robot, the trial's file takes precedence.
+"""
 
-from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path, PurePosixPath
+from types import MappingProxyType
+from typing import Any, Final
 
-OF_POSITIONS: Final = (
-    CrossCheck(
-        "planned positions in the record",
-        ("positions_from",),
-        "`positions.json`: positions and their start times",
-        ("the placement in `trial.yaml`",),
-        "1 mm of rounding: the laptop wrote both",
-    ),
-    CrossCheck(
-        "recorded positions",
-        ("*_distance_*", "*_relative_speed_m_s", "*_sender_speed_m_s"),
-        "positions that a step or a person recorded",
-        ("the placement in `trial.yaml`",),
-        "10 % of the distance plus 2 m, or plus 15 m by satellites: distances are paced off, receivers have errors",
-        CheckOutcome.WITHHELD,
-    ),
-    CrossCheck(
-        "error of the robots' clocks",
-        ("positions_clock_error_s",),
-        "`positions.json`: clocks, read before and after",
-        (),
-        "only the laptop reads them",
-        CheckOutcome.UNCHECKED,
-    ),
-)
+from fieldkit.core import laptop_files
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Role, Vector
+from fieldkit.core.text import JSON_ERRORS
+from fieldkit.measure.evidence import reading
+from fieldkit.measure.positions.samples import PLACED
+from fieldkit.measure.robot_clock import Offset
+
+FILE: Final = laptop_files.POSITIONS
+Place = tuple[float, float, float | None]
+"""Metres along three axes, or latitude and longitude in degrees and height in metres; the height may be None."""
+GAP_S: Final = 3.0
+"""Default for the longest time between two samples over which a position is interpolated. A satellite receiver that
+reports once a second has then missed two positions."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """Source of one robot's position: a fixed place or a file.
+
+    Attributes:
+        place: Fixed place; None if a file is the source.
+        frame: Frame of the place.
+        file: Path next to `positions.json`: a bag, telemetry log, GPX or CSV file.
+        topic: Topic in a bag, or message type in a telemetry log.
+        child: Child frame of the robot in a tree of transforms.
+        stamps: `header` for the time stamps in messages, `received` for the recorder's times of reception.
+        offset_s: Added to the times of a GPX or CSV file to get the laptop's; times in a bag are the robot's.
+        gap_s: Longest time between two samples over which the position is interpolated.
+        start: Place of the robot at the start of odometry.
+        heading_rad: Heading at the start of odometry, from the frame's first axis towards its second; may be None.
+        began_utc_ns: Start of odometry by the laptop's clock.
+        clock: Role of the robot whose clock gives the times; empty for the robot itself.
+        system: MAVLink system id of the autopilot in a telemetry log; 0 if the log has only one.
+    """
+
+    place: Place | None = None
+    frame: str = PLACED
+    file: str = ""
+    topic: str = ""
+    child: str = ""
+    stamps: str = "header"
+    offset_s: float = 0.0
+    gap_s: float = GAP_S
+    start: Vector = (0.0, 0.0, 0.0)
+    heading_rad: float | None = None
+    began_utc_ns: int = 0
+    clock: str = ""
+    system: int = 0
+
+    @property
+    def description(self) -> str:
+        """Short text for reports: `/odom`, `positions-receiver.gpx`, `48.1, 11.5 in WGS 84`, `as placed`."""
+        if self.place is None:
+            return self.topic or self.file
+        return (
+            self.frame
+            if self.frame == PLACED
+            else f"{', '.join(f'{metres:.9g}' for metres in self.place if metres is not None)} in {self.frame}"
+        )
+
+
+@dataclass(frozen=True)
+class Accounts:
+    """Sources of the positions of several robots.
+
+    Attributes:
+        robots: Sources by role.
+        clocks: Offsets of the robots' clocks from the laptop's, if they were measured.
+        heights: True if heights above the ellipsoid are used; they are often wrong by 10 m.
+    """
+
+    robots: Mapping[Role, Account] = field(default_factory=lambda: MappingProxyType({}))
+    clocks: Mapping[Role, Offset] = field(default_factory=lambda: MappingProxyType({}))
+    heights: bool = False
+
+
+def merge(base: Accounts, override: Accounts) -> Accounts:
+    """Combine two sets of sources. `override` takes precedence, except if it only has the planned placement."""
+    robots = {**base.robots}
+    for role, account in override.robots.items():
+        if role not in robots or account.frame != PLACED or account.place is None:
+            robots[role] = account
+    return Accounts(robots, {**base.clocks, **override.clocks}, base.heights or override.heights)
+
+
+def text(accounts: Accounts) -> str:
+    """Return the sources as JSON for `read`."""
+    defaults = asdict(Account())
+    robots = {
+        role: {name: value for name, value in asdict(account).items() if value != defaults[name]}
+        for role, account in accounts.robots.items()
+    }
+    clocks = {role: asdict(offset) for role, offset in accounts.clocks.items()}
+    return json.dumps({"robots": robots, "clocks": clocks, "heights": accounts.heights}, indent=2) + "\n"
+
+
+def read(path: Path) -> Accounts:
+    """Return the sources in a file.
+
+    Raises:
+        EvidenceError: The file is missing or was not written by `text`.
+    """
+    try:
+        data = json.loads(reading.text(path))
+        robots = {Role(role): _record_from_json(Account, account) for role, account in data.pop("robots").items()}
+        clocks = {Role(role): _record_from_json(Offset, offset) for role, offset in data.pop("clocks").items()}
+        heights = data.pop("heights")
+    except JSON_ERRORS as error:
+        raise EvidenceError("is not a valid list of position sources", where=str(path)) from error
+    if data or not isinstance(heights, bool):
+        raise EvidenceError("is not a valid list of position sources: it has unknown keys", where=str(path))
+    return Accounts(robots, clocks, heights)
+
+
+def _record_from_json(record: type[Any], values: Mapping[str, Any]) -> Any:  # noqa: ANN401 (an instance of the type)
+    """Return an instance of the data class `record` from JSON values.
+
+    Raises:
+        ValueError: A value or key is invalid.
+        TypeError: A value is missing.
+    """
+    checked = {field.name: _value(field.type, values[field.name]) for field in fields(record) if field.name in values}
+    parts = PurePosixPath(checked.get("file", "")).parts  # two parts are allowed: a ROS 2 bag is a folder
+    if len(checked) < len(values) or len(parts) > 2 or {"..", "/"} & {*parts}:
+        raise ValueError
+    if clock := checked.get("clock"):
+        Role(clock)  # raises ValueError if it is not a role
+    return record(**checked)
+
+
+def _value(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any JSON value)
+    """Return a JSON value converted to the type `kind`, or raise `ValueError`."""
+    if kind is str and isinstance(value, str):
+        return value
+    if kind is int and type(value) is int and 0 <= value < 2**62:
+        return value
+    if kind in {float, float | None} and type(value) in {int, float} and math.isfinite(value) and abs(value) < 1e10:
+        return float(value)
+    if kind in {Vector, Place | None} and isinstance(value, list) and len(value) == 3:
+        if value[2] is None and kind is not Vector:
+            return (_value(float, value[0]), _value(float, value[1]), None)
+        return tuple(_value(float, part) for part in value)
+    raise ValueError

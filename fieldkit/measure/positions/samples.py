@@ -1,4 +1,4 @@
-"""Samples of one robot's positions, and the reader for CSV files from a lab's tracking system."""
+"""Samples of one robot's positions, the reader for CSV files from a lab's tracking system, conversion to metres."""
 
 import csv
 import math
@@ -198,3 +198,37 @@ def utc_ns(moment: datetime) -> int:
     """Return an aware datetime as nanoseconds since 1970 UTC, without rounding errors."""
     whole = moment.replace(microsecond=0)
     return round(whole.timestamp()) * 10**9 + moment.microsecond * 1000
+
+
+SEMI_MAJOR_M: Final = 6_378_137.0
+"""Semi-major axis of the ellipsoid (NIMA TR8350.2, table 3.1)."""
+FLATTENING: Final = 1 / 298.257223563
+"""Flattening of the ellipsoid (the same table)."""
+
+_ECCENTRICITY_2: Final = FLATTENING * (2 - FLATTENING)
+
+
+def ecef_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
+    """Return earth-centred, earth-fixed coordinates in metres (ECEF; TR8350.2, equation 4-14).
+
+    The straight line between two such points has its true length. Over 1 km it is 1 um shorter than the path along
+    the ground: d^3 / 24 R^2.
+
+    Args:
+        latitude_deg: Degrees north. Shape (n,).
+        longitude_deg: Degrees east. Shape (n,).
+        height_m: Metres above the ellipsoid. Shape (n,).
+
+    Returns:
+        Shape (n, 3).
+    """
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    prime_vertical_m = SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY_2 * np.sin(latitude) ** 2)
+    from_axis_m = (prime_vertical_m + height_m) * np.cos(latitude)
+    return np.column_stack(
+        (
+            from_axis_m * np.cos(longitude),
+            from_axis_m * np.sin(longitude),
+            ((1 - _ECCENTRICITY_2) * prime_vertical_m + height_m) * np.sin(latitude),
+        )
+    )

@@ -7,14 +7,14 @@ import numpy as np
 from fieldkit.core.columns import CLOCK_DIFFERENCE_BOUNDS_S, Figure, Kind, Measured, columns
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
-from fieldkit.measure.captures.ip import UDP
+from fieldkit.measure.captures.headers import UDP
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.evidence.survivors import quantile_of_sent
+from fieldkit.measure.evidence.delay_quantiles import quantile_of_sent
 from fieldkit.measure.transfers import tcp, udp
-from fieldkit.measure.transfers.clocks import QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
+from fieldkit.measure.transfers.clock_offset import QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
 from fieldkit.measure.transfers.match import Match, match
-from fieldkit.measure.transfers.ranges import Pieces
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.tcp_streams import Pieces
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 COLUMNS: Final = columns(
     10,

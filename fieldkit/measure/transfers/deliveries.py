@@ -16,11 +16,10 @@ import numpy as np
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.packets import ACK, SYN, Packets
-from fieldkit.measure.transfers import delay, ranges, udp
-from fieldkit.measure.transfers.clocks import StampPairs
-from fieldkit.measure.transfers.datagrams import NO_DATAGRAM
+from fieldkit.measure.transfers import delay, tcp_streams, udp
+from fieldkit.measure.transfers.clock_offset import StampPairs
 from fieldkit.measure.transfers.tcp import TcpFrames
-from fieldkit.measure.transfers.udp import UdpPackets
+from fieldkit.measure.transfers.udp import NO_DATAGRAM, UdpPackets
 
 MIN_STALL_S: Final = 0.2
 """Minimum length of a stall: the minimum retransmission timeout of Linux (TCP_RTO_MIN). A loss that TCP repairs by a
@@ -159,12 +158,12 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
         frames: Frames of one TCP connection in one direction, in the order of the capture.
 
     Raises:
-        EvidenceError: As for `ranges.cut`.
+        EvidenceError: As for `tcp_streams.cut`.
     """
     # SYN frames are included, because they define the position of the first byte. The number in an RST is arbitrary.
     relevant = np.flatnonzero((frames.tcp_payload_bytes > 0) | (frames.tcp_flags & SYN != 0))
     chosen = frames.where(relevant)
-    _, pieces = ranges.cut(chosen.where(slice(0, 0)), chosen)
+    _, pieces = tcp_streams.cut(chosen.where(slice(0, 0)), chosen)
     no_frame = len(chosen)
     count = int(pieces.range_id.max(initial=-1)) + 1
     first, size_bytes = np.full(count, no_frame), np.zeros(count, dtype=np.int64)

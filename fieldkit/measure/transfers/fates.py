@@ -1,17 +1,21 @@
-"""Which packets of one transfer were lost or sent again, from the captures of both ends."""
+"""Fates of the packets of one transfer, from the captures of both ends: times, losses and retransmissions."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
+from numpy.ma import MaskedArray
 from numpy.typing import NDArray
 
+from fieldkit.core.columns import columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers import strangers, udp
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers import altered_packets, delay, tcp, udp
+from fieldkit.measure.transfers.clock_offset import StampPairs
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +53,7 @@ def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets
     sender, receiver = (capture.packets for capture in captures if capture is not None)
     if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
         raise EvidenceError("a capture lacks times", where=str(evidence.folder))
-    if why := strangers.reason(sender, receiver, transfer):
+    if why := altered_packets.reason(sender, receiver, transfer):
         raise EvidenceError(f"the captures of the transfer cannot be compared: {why}", where=str(evidence.folder))
     return sender, receiver
 
@@ -66,13 +70,13 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
     """
     try:
         sender, receiver = both_packets(evidence, transfer)
-        fates = {Protocol.UDP: _udp, Protocol.TCP: _tcp}[transfer.protocol](sender, receiver, transfer)
+        fates = {Protocol.UDP: _udp_fates, Protocol.TCP: _tcp_fates}[transfer.protocol](sender, receiver, transfer)
     except EvidenceError:
         return None
     return fates if fates and len(fates.sent_ns) else None
 
 
-def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
+def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
     packets = udp.match_transfer(sender, receiver, transfer)
     chosen, sent_index = packets.chosen, packets.match.sent_index
     if (chosen & packets.match.ambiguous).any():
@@ -88,7 +92,7 @@ def _udp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None
     )
 
 
-def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
+def _tcp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
     """Offload makes the frames at the two ends differ, so retransmissions are identified by sequence range."""
     sent, received = (
         packets.where((packets.dport == transfer.port) & (packets.tcp_payload_bytes > 0))
@@ -109,3 +113,140 @@ def _tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
 def _relative_seq(base: int, tcp_seq: Ints) -> NDArray[np.int64]:
     """Return 32-bit sequence numbers relative to `base`, between -2**31 and 2**31 - 1."""
     return (tcp_seq - base + 2**31) % 2**32 - 2**31
+
+
+CROSSING_COLUMNS: Final = columns(
+    0,
+    ("sent_ns", "ns", "Time of sending by the sender's clock, since 1970 UTC."),
+    (
+        "received_ns",
+        "ns",
+        (
+            "Time at which its first copy arrived, by the receiver's clock; for a TCP frame the last byte's. Empty if"
+            " it was lost, if it is ambiguous, and if offload joined it to others."
+        ),
+    ),
+    (
+        "lost",
+        "bool",
+        "True if it did not arrive, or for a TCP frame if any byte did not; empty if ambiguous.",
+    ),
+    ("sent_again", "bool", "True if any of its bytes had been sent before. Empty for UDP."),
+    ("wire_bytes", "B", "Length of the frame at the sender."),
+    ("payload_bytes", "B", "Length after the IP header."),
+    (
+        "delay_s",
+        "s",
+        "One-way delay by the estimated clock offset; empty if received_ns or that offset is unknown.",
+    ),
+    (
+        "delay_error_s",
+        "s",
+        "Maximum error of delay_s from the clocks, equal for all packets that have one.",
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Packets that a transfer sent, in the order of the sender's capture; the fields are those of `COLUMNS`.
+
+    For TCP, only frames with payload are included. All arrays have shape (n,); empty values are masked.
+    """
+
+    sent_ns: MaskedArray
+    received_ns: MaskedArray
+    lost: MaskedArray
+    sent_again: MaskedArray
+    wire_bytes: MaskedArray
+    payload_bytes: MaskedArray
+    delay_s: MaskedArray
+    delay_error_s: MaskedArray
+
+
+@dataclass(frozen=True, eq=False)
+class _MatchedPackets:
+    """Packets sent, shape (n,), and received, with their matches.
+
+    Attributes:
+        sent: Packets in the sender's capture.
+        received: Packets in the receiver's capture.
+        chosen: Mask of the sent packets that belong to the transfer.
+        lost: As `Crossings.lost`.
+        sent_again: As `Crossings.sent_again`.
+        copies: Indices of matched sent packets, and of their copies among the received packets.
+    """
+
+    sent: Packets
+    received: Packets
+    chosen: Mask
+    lost: MaskedArray
+    sent_again: MaskedArray
+    copies: tuple[Ints, Ints]
+
+
+def read_crossings(evidence: AttemptEvidence, transfer: Transfer) -> Crossings:
+    """Return the packets of a transfer.
+
+    Args:
+        evidence: The attempt's evidence.
+        transfer: Identifies the packets of the transfer.
+
+    Raises:
+        EvidenceError: As for `both_packets` and `tcp_streams.cut`.
+    """
+    sender, receiver = both_packets(evidence, transfer)
+    packets = {Protocol.UDP: _udp_crossings, Protocol.TCP: _tcp_crossings}[transfer.protocol](
+        sender, receiver, transfer
+    )
+    sent_index, received_index = packets.copies
+    pairs = StampPairs(packets.sent.time_ns[sent_index], packets.received.time_ns[received_index])
+    received_ns = _no_crossings(len(packets.sent), np.int64)
+    delay_s, error_s = (_no_crossings(len(packets.sent), np.float64) for _ in range(2))
+    received_ns[sent_index] = pairs.receiver_ns
+    if (delays := delay.packet_delays(pairs, sender, receiver, transfer)) is not None:
+        delay_s[sent_index], error_s[sent_index] = delays
+    return Crossings(
+        sent_ns=np.ma.array(packets.sent.time_ns[packets.chosen]),
+        received_ns=received_ns[packets.chosen],
+        lost=packets.lost[packets.chosen],
+        sent_again=packets.sent_again[packets.chosen],
+        wire_bytes=np.ma.array(packets.sent.wire_bytes[packets.chosen]),
+        payload_bytes=np.ma.array(packets.sent.ip_payload_bytes[packets.chosen]),
+        delay_s=delay_s[packets.chosen],
+        delay_error_s=error_s[packets.chosen],
+    )
+
+
+def _no_crossings(rows: int, kind: type[np.generic]) -> MaskedArray:
+    return np.ma.array(np.zeros(rows, kind), mask=True)
+
+
+def _udp_crossings(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
+    crossing = udp.match_transfer(sender, receiver, transfer)
+    # Each received packet that may be a copy may hide the loss of another packet.
+    hidden = np.append(crossing.chosen, False)[crossing.match.sent_index] & crossing.match.possible_copy
+    return _MatchedPackets(
+        sent=crossing.sent,
+        received=crossing.received,
+        chosen=crossing.chosen,
+        lost=np.ma.array(~crossing.match.arrived, mask=crossing.match.ambiguous | hidden.any()),
+        sent_again=_no_crossings(len(crossing.sent), np.bool_),
+        copies=delay.udp_copies(crossing),
+    )
+
+
+def _tcp_crossings(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
+    crossing = tcp.match_transfer(sender, receiver, transfer)
+    pieces, match = crossing.payload.sent, crossing.payload.match
+    lost, ambiguous = np.zeros((2, len(crossing.sent)), dtype=np.bool_)
+    lost[pieces.frame[~match.arrived]] = True
+    ambiguous[pieces.frame[match.ambiguous]] = True
+    return _MatchedPackets(
+        sent=crossing.sent,
+        received=crossing.received,
+        chosen=crossing.sent.tcp_payload_bytes > 0,
+        lost=np.ma.array(lost, mask=ambiguous | match.possible_copy.any()),
+        sent_again=np.ma.array(tcp.sent_again(crossing)),
+        copies=delay.tcp_copies(crossing),
+    )

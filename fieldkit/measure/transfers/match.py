@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import Ints, Keys, Mask, row_hashes
-from fieldkit.measure.captures.ip import TCP
+from fieldkit.measure.captures.headers import TCP
 from fieldkit.measure.captures.packets import NO_STAMP, NOT_CAPTURED, RST, Packets
-from fieldkit.measure.transfers import ranges
-from fieldkit.measure.transfers.ranges import Pieces
+from fieldkit.measure.transfers import tcp_streams
+from fieldkit.measure.transfers.tcp_streams import Pieces
 
 NONE: Final = -1
 """Index that means: no packet."""
@@ -89,7 +89,7 @@ def match(sent: Packets, received: Packets) -> Match:
         received: Packets captured at the receiver; its clock may have any offset.
 
     Raises:
-        EvidenceError: As for `ranges.cut`.
+        EvidenceError: As for `tcp_streams.cut`.
     """
     frames = _match_frames(sent, received)
     if not sent.tcp_payload_bytes.any() and not received.tcp_payload_bytes.any():
@@ -119,7 +119,7 @@ def match_payload(sent: Packets, received: Packets) -> Payload:
         received: Packets captured at the receiver; its clock may have any offset.
 
     Raises:
-        EvidenceError: As for `ranges.cut`.
+        EvidenceError: As for `tcp_streams.cut`.
     """
     return _match_pieces(sent, received, _match_frames(sent, received))
 
@@ -217,7 +217,7 @@ def _match_frames(sent: Packets, received: Packets) -> Match:
 
 
 def _match_pieces(sent: Packets, received: Packets, frames: Match) -> Payload:
-    sent_pieces, received_pieces = ranges.cut(sent, received)
+    sent_pieces, received_pieces = tcp_streams.cut(sent, received)
     stamp, received_stamp = usable_stamps(sent, received)
     key = row_hashes(sent_pieces.range_id, stamp[sent_pieces.frame])
     received_key = row_hashes(received_pieces.range_id, received_stamp[received_pieces.frame])

@@ -17,7 +17,7 @@ from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.packets import FIN, SYN, Packets
 from fieldkit.measure.transfers import tcp, udp
 from fieldkit.measure.transfers.match import NONE
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 COLUMNS: Final = columns(
     100,

@@ -4,19 +4,83 @@ The laptop records start and end of the cause by its clock. Exchanges of time st
 clock and its maximum error.
 """
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, fault_column_name
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Role
+from fieldkit.measure.evidence import reading
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.measure.transfers import stalls
 from fieldkit.measure.transfers.deliveries import Delivery
-from fieldkit.measure.transfers.fault_times import FaultTimes
+
+_SECONDS: Final = r"-?[0-9]{1,12}\.[0-9]{9}"
+_FAULT_FILE: Final = re.compile(
+    r"began_utc_ns (?P<began>[0-9]{1,19})\nended_utc_ns (?P<ended>[0-9]{1,19}|unknown)\n"
+    rf"(?P<ahead>(?:ahead_s [a-z0-9_]{{1,40}} {_SECONDS} {_SECONDS}\n)*)\Z"
+)
+
+
+def fault_times_file(kind: FaultKind) -> str:
+    """Return the name of the file with the times of a fault."""
+    return laptop_files.fault_times_file(kind)
+
+
+@dataclass(frozen=True)
+class FaultTimes:
+    """Times of a fault.
+
+    Attributes:
+        began_ns: Start of its cause, nanoseconds since 1970 UTC by the laptop's clock.
+        ended_ns: End of its cause; None if unknown.
+        ahead: Offset of each robot's clock from the laptop's, by role.
+    """
+
+    began_ns: int
+    ended_ns: int | None
+    ahead: Mapping[Role, Offset]
+
+
+def fault_times_text(times: FaultTimes) -> str:
+    """Return the content of a file that `read_fault_times` reads."""
+    ended = "unknown" if times.ended_ns is None else str(times.ended_ns)
+    lines = (f"ahead_s {role} {offset.offset_s:.9f} {offset.error_s:.9f}\n" for role, offset in times.ahead.items())
+    return f"began_utc_ns {times.began_ns}\nended_utc_ns {ended}\n{''.join(lines)}"
+
+
+def read_fault_times(path: Path) -> FaultTimes:
+    """Return the times in a file.
+
+    Raises:
+        EvidenceError: The file is missing or incomplete.
+    """
+    try:
+        return parse_fault_times(reading.text(path))
+    except EvidenceError as error:
+        raise EvidenceError(error.what, where=str(path)) from error
+
+
+def parse_fault_times(content: str) -> FaultTimes:
+    """Return the times in the content of a file.
+
+    Raises:
+        EvidenceError: The content is incomplete.
+    """
+    match = _FAULT_FILE.match(content)
+    if match is None:
+        raise EvidenceError("does not contain the start and end of the fault")
+    words = (line.split() for line in match["ahead"].splitlines())
+    ahead = {Role(role): Offset(float(offset_s), float(error_s)) for _, role, offset_s, error_s in words}
+    return FaultTimes(int(match["began"]), None if match["ended"] == "unknown" else int(match["ended"]), ahead)
+
 
 FLOWS: Final = ("transfer", "iperf3", "soak", "topic")
 """Kinds of flow that can be active during a fault."""

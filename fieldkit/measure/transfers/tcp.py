@@ -11,8 +11,8 @@ import numpy as np
 from fieldkit.measure.captures.arrays import Mask
 from fieldkit.measure.captures.packets import SYN, Packets
 from fieldkit.measure.transfers.match import NONE, Payload, match_payload, reordered
-from fieldkit.measure.transfers.ranges import Pieces
-from fieldkit.measure.transfers.transfer import Transfer, span_s
+from fieldkit.measure.transfers.tcp_streams import Pieces
+from fieldkit.measure.transfers.transfer_spec import Transfer, span_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> Tc
     an earlier transfer, which may last minutes after that was aborted.
 
     Raises:
-        EvidenceError: As for `ranges.cut`.
+        EvidenceError: As for `tcp_streams.cut`.
     """
     sent, received = (
         forward.where(forward.dport == transfer.port)

@@ -11,7 +11,7 @@ from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.evidence.confined import ReaderError, SandboxedReader
+from fieldkit.measure.evidence.sandbox import ReaderError, SandboxedReader
 
 SUFFIX: Final = ".tlog"
 GLOBAL: Final = "GLOBAL_POSITION_INT"

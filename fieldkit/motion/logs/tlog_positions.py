@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.positions.accounts import Account
-from fieldkit.measure.positions.recorded import MOST_STALE_S
+from fieldkit.measure.positions.position_files import MOST_STALE_S
+from fieldkit.measure.positions.position_sources import Account
 from fieldkit.measure.positions.samples import PLACED, WGS84, Samples, require_increasing
 from fieldkit.motion.logs import tlog
 

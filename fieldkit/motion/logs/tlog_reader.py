@@ -15,8 +15,8 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from fieldkit.measure.evidence import confined, sequence
-from fieldkit.measure.evidence.confined import Json
+from fieldkit.measure.evidence import sandbox, sequence
+from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.motion.logs import periodic, tlog
 from fieldkit.motion.logs.periodic import StreamMessage
 
@@ -264,4 +264,4 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
 
 
 if __name__ == "__main__":
-    confined.serve(answer)
+    sandbox.serve(answer)

@@ -15,7 +15,7 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Control, OnAbort, Protocol, Role
 from fieldkit.core.units import format_duration
-from fieldkit.measure.evidence import numbered_lines
+from fieldkit.measure.evidence import reading
 from fieldkit.motion.logs import fly_checks, fly_log, motion_sources
 from fieldkit.motion.steps import piloting
 from fieldkit.motion.steps.arming_need import arming_need
@@ -330,7 +330,7 @@ class FlyStep(Nest):
         """Yield a reason if the log of the flight is damaged, or contradicts the plan or the telemetry."""
         try:
             log = view.evidence.read(fly_log.read, self._log)
-            damage = view.evidence.read(numbered_lines.problem, self._log)
+            damage = view.evidence.read(reading.numbered_lines_problem, self._log)
         except EvidenceError as error:
             yield f"{self._log}: {error.what}"
             return

@@ -16,9 +16,9 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures.arrays import Floats
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts, position_sources
-from fieldkit.measure.positions.accounts import GAP_S, Account, Accounts
+from fieldkit.measure.positions import position_checks, position_sources
+from fieldkit.measure.positions.position_sources import GAP_S, Account, Accounts
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import motion_sources, tlog
 from fieldkit.motion.logs.tlog import GLOBAL, LOCAL, Tlog
 from fieldkit.motion.steps.link_need import link_need
@@ -92,7 +92,7 @@ class MavlinkStep(Nest):
         during: Steps that run meanwhile.
     """
 
-    cross_checks = (*motion_sources.OF_TELEMETRY, *position_sources.OF_POSITIONS)
+    cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.OF_POSITIONS)
 
     robot: Role
     at: Role | None = None
@@ -210,7 +210,7 @@ class MavlinkStep(Nest):
 
     @override
     def laptop_files(self) -> tuple[str, ...]:
-        return (accounts.FILE,) if self.positions else ()
+        return (position_sources.FILE,) if self.positions else ()
 
     @property
     def _file(self) -> str:

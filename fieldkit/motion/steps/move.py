@@ -12,8 +12,8 @@ from fieldkit.core import geometry, model
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import numbered_lines
-from fieldkit.measure.positions import farthest
+from fieldkit.measure.evidence import reading
+from fieldkit.measure.positions import position_columns
 from fieldkit.motion.logs import drive_checks, drive_log, motion_sources
 from fieldkit.motion.steps import driving
 from fieldkit.motion.steps.lease import run_inside
@@ -217,7 +217,7 @@ class MoveStep(Nest):
             return
         try:
             log = view.evidence.read(drive_log.read, self._log)
-            damage = view.evidence.read(numbered_lines.problem, self._log)
+            damage = view.evidence.read(reading.numbered_lines_problem, self._log)
         except EvidenceError as error:
             yield f"{self._log}: {error.what}"
             return
@@ -237,7 +237,9 @@ class MoveStep(Nest):
             return measured
         during_ns = (log[0].utc_ns, log[-1].utc_ns) if log[0].utc_ns else None
         away_m = max(moment.off_m for moment in log)
-        why = farthest.contradiction(view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns)
+        why = position_columns.distance_contradiction(
+            view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns
+        )
         return measured.without({name: why for name in measured.values if name != "drive_ended"}) if why else measured
 
     @override

@@ -20,10 +20,10 @@ from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotE
 from fieldkit.core.model import FaultKind, Protocol, Role
 from fieldkit.core.threads import run_parallel
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import recovery
-from fieldkit.measure.offsets import Offset, offset
-from fieldkit.measure.transfers import fault_times, recoveries
-from fieldkit.measure.transfers.fault_times import FaultTimes
+from fieldkit.measure.evidence import outage
+from fieldkit.measure.robot_clock import Offset, offset
+from fieldkit.measure.transfers import recoveries
+from fieldkit.measure.transfers.recoveries import FaultTimes
 from fieldkit.remote import jobs
 from fieldkit.steps import across, clocks
 from fieldkit.steps.base import StepEntry
@@ -71,7 +71,7 @@ class FaultStep(Nest):
         during: Steps during which the fault occurs.
     """
 
-    columns = recovery.COLUMNS
+    columns = outage.COLUMNS
     cross_checks = (
         CrossCheck(
             "outage and recovery",
@@ -190,12 +190,14 @@ class FaultStep(Nest):
         # A lasting fault started `lasted_s` ago; a reboot or a kill lasts from the request until now.
         began_ns = now_ns - round(1e9 * lasted_s) if lasted_s else asked_ns
         times = FaultTimes(began_ns, None if lasted_s is None else now_ns, ahead)
-        path = scene.laptop_folder / self.prefixed_name(fault_times.file(self.kind))
-        path.write_text(fault_times.text(times), encoding="ascii")
+        path = scene.laptop_folder / self.prefixed_name(recoveries.fault_times_file(self.kind))
+        path.write_text(recoveries.fault_times_text(times), encoding="ascii")
 
     def times(self, evidence: AttemptEvidence) -> FaultTimes | None:
         """Return the recorded times of the fault; see `CausesFault.times`."""
-        return evidence.read_or_none(fault_times.read, self.prefixed_name(fault_times.file(self.kind)))
+        return evidence.read_or_none(
+            recoveries.read_fault_times, self.prefixed_name(recoveries.fault_times_file(self.kind))
+        )
 
     def _run_inside(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         for entry in self.during:
@@ -238,26 +240,26 @@ class FaultStep(Nest):
 
     @override
     def files(self) -> tuple[str, ...]:
-        names = (recovery.note_file, recovery.observed_file, recovery.log_file)
+        names = (outage.note_file, outage.observed_file, outage.log_file)
         return tuple(self.prefixed_name(name(self.kind)) for name in names)
 
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the observer's files are incomplete or do not show the fault."""
         try:
-            view.evidence.read(recovery.read, "", self.kind, self.prefix)
+            view.evidence.read(outage.read, "", self.kind, self.prefix)
         except EvidenceError as error:
             yield f"{PurePath(error.where).name}: {error.what}"
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of this kind of fault, and of the recoveries of the flows inside."""
-        return (*recovery.declared(self.kind), *across.declared(self))
+        return (*outage.declared(self.kind), *across.declared(self))
 
     @override
     def measure(self, view: View) -> Measured:
-        observed = view.evidence.read_or_none(recovery.read, "", self.kind, self.prefix)
-        return recovery.measure(self.kind, observed) | across.measure(self, view)
+        observed = view.evidence.read_or_none(outage.read, "", self.kind, self.prefix)
+        return outage.measure(self.kind, observed) | across.measure(self, view)
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

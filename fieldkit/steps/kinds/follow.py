@@ -11,10 +11,10 @@ from fieldkit.core.columns import Measured, columns
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Role
 from fieldkit.core.threads import run_parallel
-from fieldkit.measure.offsets import Exchange, Offset, offset
-from fieldkit.measure.positions import accounts, where
-from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions import position_columns, position_sources
+from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import PLACED
+from fieldkit.measure.robot_clock import Exchange, Offset, offset
 from fieldkit.remote import jobs
 from fieldkit.steps import clocks
 from fieldkit.steps.base import Step
@@ -90,11 +90,11 @@ def follow(
     codes = _stop(testbed, recordings)
     if scene.laptop_folder is not None and make_accounts is not None:
         offsets = {role: offset(results) for role, results in exchanges.items() if results}
-        path = scene.laptop_folder / accounts.FILE
+        path = scene.laptop_folder / position_sources.FILE
         # Steps inside may have written the sources for other robots.
-        earlier = accounts.read(path) if path.exists() else Accounts()
-        merge = accounts.merge(earlier, make_accounts(began_utc_ns, offsets))
-        path.write_text(accounts.text(merge), encoding="utf-8")
+        earlier = position_sources.read(path) if path.exists() else Accounts()
+        merge = position_sources.merge(earlier, make_accounts(began_utc_ns, offsets))
+        path.write_text(position_sources.text(merge), encoding="utf-8")
     return list(zip(recordings, codes, strict=True))
 
 
@@ -133,14 +133,14 @@ def placement_error(what: str, within: Sequence[Nest]) -> str | None:
 def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
     """Yield the reasons why the recorded positions of robots cannot be used."""
     try:
-        sources = where.position_accounts(view.evidence)
+        sources = position_columns.position_accounts(view.evidence)
         for role in roles:
-            where.samples_of(view.evidence, role)
+            position_columns.samples_of(view.evidence, role)
     except EvidenceError as error:
         yield error.what
         return
     if not sources.robots:
-        yield f"{accounts.FILE} is missing"
+        yield f"{position_sources.FILE} is missing"
     yield from _place_problems(view, sources)
 
 
@@ -153,13 +153,13 @@ def _place_problems(view: View, sources: Accounts) -> Iterator[str]:
             continue
         deviation_m = math.dist(planned_m, [metres or 0.0 for metres in recorded_m])
         if deviation_m > _ROUNDING_M:
-            yield f"{accounts.FILE} has the {role} {deviation_m:.1f} m from where it was placed"
+            yield f"{position_sources.FILE} has the {role} {deviation_m:.1f} m from where it was placed"
 
 
 def measure(view: View) -> Measured:
     """Return the values of `COLUMNS`: source of the positions, and error of the clocks."""
     values = {
-        "positions_from": where.sources_text(view.evidence),
-        "positions_clock_error_s": where.clock_error_s(view.evidence),
+        "positions_from": position_columns.sources_text(view.evidence),
+        "positions_clock_error_s": position_columns.clock_error_s(view.evidence),
     }
-    return Measured.from_optional(values, f"{accounts.FILE} does not contain it")
+    return Measured.from_optional(values, f"{position_sources.FILE} does not contain it")

@@ -15,17 +15,16 @@ from fieldkit.config.schema import Bool, Bytes, Duration, Field
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure import job_times
+from fieldkit.measure import robot_clock
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.checks import iperf3_checks, load_checks
 from fieldkit.measure.checks.iperf3_checks import IperfSettings
 from fieldkit.measure.checks.load_checks import LoadEvidence
 from fieldkit.measure.evidence import iperf3
 from fieldkit.measure.evidence.iperf3 import IperfTest
-from fieldkit.measure.transfers import load, load_streams, stalls
+from fieldkit.measure.transfers import iperf3_load, stalls
 from fieldkit.measure.transfers.deliveries import Delivery
-from fieldkit.measure.transfers.load import LoadFlow
-from fieldkit.measure.transfers.load_streams import LoadStreams
+from fieldkit.measure.transfers.iperf3_load import LoadFlow, LoadStreams
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.along import AlongStep
@@ -62,7 +61,7 @@ class Iperf3Step(LoadOptions, AlongStep):
     flow_kind: ClassVar[str] = "iperf3"
     cross_checks = (
         *iperf3_checks.CROSS_CHECKS,
-        *load_streams.JITTER_CROSS_CHECKS,
+        *iperf3_load.JITTER_CROSS_CHECKS,
         *stalls.cross_checks("iperf3"),
     )
 
@@ -191,7 +190,7 @@ class Iperf3Step(LoadOptions, AlongStep):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of iperf3, which only trials with this step have."""
-        return (*iperf3.COLUMNS, *load.COLUMNS, *load_streams.JITTER, *_STALLS)
+        return (*iperf3.COLUMNS, *iperf3_load.COLUMNS, *iperf3_load.JITTER, *_STALLS)
 
     @override
     def check(self, view: View) -> Iterator[str]:
@@ -261,14 +260,14 @@ class Iperf3Step(LoadOptions, AlongStep):
         data = self._data_streams(view)
         return (
             iperf3.measure(protocol, sent, received)
-            | load.measure(flow, *packets)
-            | load_streams.measure_jitter(data, *packets)
-            | load_streams.measure("iperf3", data, *packets)
+            | iperf3_load.measure_totals(flow, *packets)
+            | iperf3_load.measure_jitter(data, *packets)
+            | iperf3_load.measure_stalls("iperf3", data, *packets)
         )
 
     def deliveries(self, view: View) -> Sequence[Delivery]:
         """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
-        return load_streams.read(self._data_streams(view), *self._packets(view))
+        return iperf3_load.read_deliveries(self._data_streams(view), *self._packets(view))
 
     def _packets(self, view: View) -> tuple[Packets | None, Packets | None]:
         """Return the packets in the captures of source and destination."""
@@ -285,7 +284,7 @@ class Iperf3Step(LoadOptions, AlongStep):
             reverse=self.reverse,
             ports=ports,
             lasts_s=self._duration_s if self.size is None else None,
-            until_ns=job_times.ended_ns(view.evidence, self.destination, job),
+            until_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
         )
 
     def _report(self, view: View, role: Role) -> IperfTest | None:

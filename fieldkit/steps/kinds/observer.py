@@ -5,7 +5,7 @@ from typing import Final
 
 from fieldkit.core.columns import step_prefixed
 from fieldkit.core.model import Fault, FaultKind, Role
-from fieldkit.measure.evidence import recovery
+from fieldkit.measure.evidence import outage
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.kinds import ping
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF_OR_LIMIT, Planned, Scene
@@ -94,8 +94,8 @@ class Observer:
             name=step_prefixed(self.name, f"fault-{self.fault.kind}-heals"),
             argv=("sh", "-c", _HEALS, "sh", *arguments),
             limit_s=limit_s,
-            log=step_prefixed(self.name, recovery.log_file(self.fault.kind)),
-            stdout=step_prefixed(self.name, recovery.note_file(self.fault.kind)),
+            log=step_prefixed(self.name, outage.log_file(self.fault.kind)),
+            stdout=step_prefixed(self.name, outage.note_file(self.fault.kind)),
         )
         return Planned(self.role, job, program="grep", permitted_causes=BY_ITSELF_OR_LIMIT)
 
@@ -105,7 +105,7 @@ class Observer:
 
     @property
     def _file(self) -> str:
-        return step_prefixed(self.name, recovery.observed_file(self.fault.kind))
+        return step_prefixed(self.name, outage.observed_file(self.fault.kind))
 
     @property
     def _interval_s(self) -> float:

@@ -15,13 +15,12 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Mask
-from fieldkit.measure.captures.ip import ICMP
+from fieldkit.measure.captures.headers import ICMP
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
 from fieldkit.measure.checks import ping_checks
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.evidence.ping import Ping
-from fieldkit.measure.positions import where
-from fieldkit.measure.transfers import echoes
+from fieldkit.measure.positions import position_columns
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
@@ -209,7 +208,7 @@ class PingStep(AlongStep):
             capture = view.capture(role)
             if capture is None or result.payload_bytes is None or (capture.packets.time_ns == NO_TIME).any():
                 continue
-            candidates = echoes.captured_pings(capture.packets, source, destination, result.payload_bytes)
+            candidates = ping_checks.captured_pings(capture.packets, source, destination, result.payload_bytes)
             on_sender = role == self.sender
             reasons = [
                 list(ping_checks.compare_with_capture(result, candidate, self.interval, role, asks=on_sender))
@@ -269,7 +268,11 @@ class PingStep(AlongStep):
         replied_ns = [at_ns for reply in result.answers if (at_ns := reply.at_utc_ns)] if result else []
         ends = self.sender, self.receiver
         gap = ping.measure_gap(result, self.interval) if self.gap else Measured()
-        return ping.measure(result) | gap | where.measure(view.evidence, ping.MOTION_COLUMNS, ends, replied_ns)
+        return (
+            ping.measure(result)
+            | gap
+            | position_columns.measure(view.evidence, ping.MOTION_COLUMNS, ends, replied_ns)
+        )
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

@@ -14,7 +14,7 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import ConfigurationError, EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role, Verdict
-from fieldkit.measure.evidence import bag, reception
+from fieldkit.measure.evidence import bag, recorded_topics
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
@@ -242,14 +242,14 @@ class RecordStep(Step):
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        return reception.COLUMNS if self.reception else ()
+        return recorded_topics.COLUMNS if self.reception else ()
 
     @override
     def measure(self, view: View) -> Measured:
         if not self.reception:
             return Measured()
         arguments = self._log, self.bag(view.scene.robot(self.robot)), self.topics, self.duration
-        return reception.measure(view.evidence.read_or_none(reception.read, "", *arguments))
+        return recorded_topics.measure(view.evidence.read_or_none(recorded_topics.read, "", *arguments))
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

@@ -9,13 +9,13 @@ from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
-from fieldkit.config.programs import NamedProgram
+from fieldkit.config.program_files import NamedProgram
 from fieldkit.config.schema import AfterValidator, Bool, Bytes, Duration, Field, Int, Number, Strict
 from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import host, printed
+from fieldkit.measure.evidence import host, program_output
 from fieldkit.remote import jobs, programs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import arguments
@@ -30,13 +30,13 @@ _Word = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 
 
 def _is_path(text: str) -> str:
-    if why := printed.path_error(text):
+    if why := program_output.path_error(text):
         raise schema.validation_error(f"{text!r} is not a valid JMESPath: {why}")
     return text
 
 
 def _is_expression(text: str) -> str:
-    if why := printed.expression_error(text):
+    if why := program_output.expression_error(text):
         raise schema.validation_error(f"{text!r} is not a regular expression (RE2) with one group: {why}")
     return text
 
@@ -95,10 +95,10 @@ class PrintedColumn(Strict):
             EvidenceError: The file has no valid value.
         """
         if self.path is not None:
-            content = view.evidence.read(printed.at_path, file, self.path)
+            content = view.evidence.read(program_output.at_path, file, self.path)
         else:
-            content = view.evidence.read(printed.by_expression, file, self.expression or "")
-        return printed.value(self.column, content)
+            content = view.evidence.read(program_output.by_expression, file, self.expression or "")
+        return program_output.value(self.column, content)
 
 
 class Bounds(Strict):
@@ -256,7 +256,7 @@ class RunStep(Step):
             limit_s=self.limit,
             log=self._log,
             stdout=self._output,
-            output_limit_bytes=printed.MAX_OUTPUT_BYTES,
+            output_limit_bytes=program_output.MAX_OUTPUT_BYTES,
         )
         remedy = f"install {argv[0]}, or correct the command of this run in the procedure"
         # Preflight searches for the program; a copied program does not exist on the robot yet.
@@ -337,7 +337,7 @@ class RunStep(Step):
         if ending is not None and ending.code is not None and ending.code not in self.expect.code:
             yield f"{view.scene.robot(self.robot).name}: {self._program_name} ended with exit code {ending.code}"
         try:
-            view.evidence.read(printed.text, self._output)
+            view.evidence.read(program_output.text, self._output)
         except EvidenceError as error:
             yield f"{self._output}: {error.what}"
             return

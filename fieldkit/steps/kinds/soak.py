@@ -11,7 +11,7 @@ from fieldkit.config.schema import Field, Int
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.transfers import load_streams, recoveries, stalls
+from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
 from fieldkit.measure.transfers.deliveries import Delivery
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
@@ -131,7 +131,9 @@ class SoakStep(LoadOptions, Nest):
         """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
         sent, received = (view.capture(role) for role in (self.sender, self.receiver))
         load = self.data_streams(view.scene)
-        return load_streams.read(load, sent.packets if sent else None, received.packets if received else None)
+        return iperf3_load.read_deliveries(
+            load, sent.packets if sent else None, received.packets if received else None
+        )
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:

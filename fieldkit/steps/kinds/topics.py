@@ -11,7 +11,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.model import Protocol, Role, sort_roles
 from fieldkit.core.threads import run_parallel
-from fieldkit.measure.checks import topic_sources
+from fieldkit.measure.checks import topic_checks
 from fieldkit.measure.transfers import stalls
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
@@ -36,8 +36,8 @@ from fieldkit.steps.view import View
 if TYPE_CHECKING:
     from fieldkit.measure.captures.packets import Packets
     from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
-    from fieldkit.measure.transfers.topic_log import TopicLog
-    from fieldkit.measure.transfers.topics import TopicTraffic
+    from fieldkit.measure.transfers.topic_columns import TopicTraffic
+    from fieldkit.measure.transfers.topic_samples import TopicLog
 
 
 MASTER: Final = "rosmaster"
@@ -68,7 +68,7 @@ class TopicsStep(StreamOptions, AlongStep):
     directions. Leaves `ROLE-topic.bin` and `ROLE-topic.log`, and `ROLE-serve.log` of a router or a master.
     """
 
-    cross_checks = (*topic_sources.CROSS_CHECKS, *stalls.cross_checks("topic"))
+    cross_checks = (*topic_checks.CROSS_CHECKS, *stalls.cross_checks("topic"))
     kept_bytes = KEPT_BYTES
     capture_buffer_kib = BUFFER_KIB
     needs_complete_capture = False
@@ -224,9 +224,9 @@ class TopicsStep(StreamOptions, AlongStep):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of topics, which only trials with this step have."""
-        from fieldkit.measure.transfers import topic_stalls, topics  # noqa: PLC0415 (needed only by this step)
+        from fieldkit.measure.transfers import stalls, topic_columns  # noqa: PLC0415 (needed only by this step)
 
-        return (*topics.COLUMNS, *topic_stalls.COLUMNS)
+        return (*topic_columns.COLUMNS, *stalls.TOPIC_COLUMNS)
 
     @override
     def check(self, view: View) -> Iterator[str]:
@@ -243,23 +243,25 @@ class TopicsStep(StreamOptions, AlongStep):
 
     @override
     def measure(self, view: View) -> Measured:
-        from fieldkit.measure.transfers import topic_stalls, topics  # noqa: PLC0415 (as above)
+        from fieldkit.measure.transfers import stalls, topic_columns  # noqa: PLC0415 (as above)
         from fieldkit.steps import topic_evidence  # noqa: PLC0415 (as above)
 
         logs, _ = topic_evidence.read(self, view, self._logs)
         ends = logs.get(self.sender), logs.get(self.receiver)
         flow, packets = self._traffic(view), self._packets(view)
-        stall_values = topic_stalls.measure(flow, ends, packets, self._schedule)
-        measured = topics.measure(flow, *ends, *packets) | stall_values
-        measured = measured.without(topics.withheld_reasons(measured, topic_evidence.dropped(self, view)))
+        stall_values = stalls.measure_topic(flow, ends, packets, self._schedule)
+        measured = topic_columns.measure(flow, *ends, *packets) | stall_values
+        measured = measured.without(topic_columns.withheld_reasons(measured, topic_evidence.dropped(self, view)))
         measured = topic_evidence.checked(self, view, logs, measured)
-        return measured | topics.withheld_mark(topic_evidence.dropped(self, view))
+        return measured | topic_columns.withheld_mark(topic_evidence.dropped(self, view))
 
     def deliveries(self, view: View) -> "Sequence[Delivery]":
         """Return the deliveries of the stream; see `SendsFlow.deliveries`."""
-        from fieldkit.measure.transfers import topic_stalls  # noqa: PLC0415 (as above)
+        from fieldkit.measure.transfers import stalls  # noqa: PLC0415 (as above)
 
-        return topic_stalls.read(self._traffic(view), self._both_logs(view), self._packets(view), self._schedule)
+        return stalls.read_topic_deliveries(
+            self._traffic(view), self._both_logs(view), self._packets(view), self._schedule
+        )
 
     @property
     def destination(self) -> Role:
@@ -267,9 +269,9 @@ class TopicsStep(StreamOptions, AlongStep):
         return self.receiver
 
     def _traffic(self, view: View) -> "TopicTraffic":
-        from fieldkit.measure.transfers import topics  # noqa: PLC0415 (as above)
+        from fieldkit.measure.transfers import topic_columns  # noqa: PLC0415 (as above)
 
-        return topics.TopicTraffic(
+        return topic_columns.TopicTraffic(
             sender_address=view.scene.robot(self.sender).address,
             receiver_address=view.scene.robot(self.receiver).address,
             data_ports=self.wire_ports.data,

@@ -15,9 +15,9 @@ from fieldkit.config.schema import Duration, Field, Number, Strict
 from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts, position_sources, samples
-from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions import position_checks, position_sources, samples
+from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.kinds.record import SUBSCRIBE_S, RecordStep
@@ -96,7 +96,7 @@ class TrackedRobot(Strict):
     facing: Literal["away", "towards", "left", "right"] | None = None
     child: str | None = None
     times: Literal["header", "received"] = "header"
-    gap: Annotated[Duration, Field(gt=0)] = accounts.GAP_S
+    gap: Annotated[Duration, Field(gt=0)] = position_sources.GAP_S
     at: Spot | None = None
 
     @schema.model_validator(mode="after")
@@ -122,7 +122,7 @@ class TrackStep(Nest):
         during: Steps that run meanwhile.
     """
 
-    cross_checks = position_sources.OF_POSITIONS
+    cross_checks = position_checks.OF_POSITIONS
 
     robots: Annotated[dict[Role, TrackedRobot], Field(min_length=1)]
     heights: schema.Bool = False
@@ -243,11 +243,14 @@ class TrackStep(Nest):
 
     @override
     def files(self) -> tuple[str, ...]:
-        return (accounts.FILE, *(name for recorder in self._recorders(1.0).values() for name in recorder.files()))
+        return (
+            position_sources.FILE,
+            *(name for recorder in self._recorders(1.0).values() for name in recorder.files()),
+        )
 
     @override
     def laptop_files(self) -> tuple[str, ...]:
-        return (accounts.FILE,)
+        return (position_sources.FILE,)
 
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:

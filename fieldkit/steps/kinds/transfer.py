@@ -16,14 +16,14 @@ from fieldkit.config.schema import Duration, Field, Int
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.checks import contradictions
-from fieldkit.measure.checks.cross_checks import CROSS_CHECKS
-from fieldkit.measure.evidence import host, medium, reading
+from fieldkit.measure.checks import transfer_checks
+from fieldkit.measure.checks.transfer_checks import CROSS_CHECKS
+from fieldkit.measure.evidence import host, oracle_delays, reading
 from fieldkit.measure.evidence.endings import Cause, Ending
-from fieldkit.measure.transfers import figures, paper, stalls, transfer_stalls
-from fieldkit.measure.transfers.columns import COLUMNS
+from fieldkit.measure.transfers import stalls, transfer_measures
 from fieldkit.measure.transfers.deliveries import Delivery
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_columns import COLUMNS
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
@@ -216,8 +216,8 @@ class TransferStep(Step):
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.laptop_folder is not None:
             after = oracle.delays(*flow)
-            (scene.laptop_folder / self.prefixed_name(medium.FILE)).write_text(
-                medium.text(before, after), encoding="ascii"
+            (scene.laptop_folder / self.prefixed_name(oracle_delays.AIR_DELAY_FILE)).write_text(
+                oracle_delays.air_delay_text(before, after), encoding="ascii"
             )
 
     def _late_start(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
@@ -243,7 +243,7 @@ class TransferStep(Step):
 
     @override
     def laptop_files(self) -> tuple[str, ...]:
-        return (self.prefixed_name(medium.FILE),)
+        return (self.prefixed_name(oracle_delays.AIR_DELAY_FILE),)
 
     @property
     def _into(self) -> str:
@@ -288,12 +288,12 @@ class TransferStep(Step):
         listened, sent = (ending if ending and ending.cause is Cause.ITSELF else None for ending in endings)
         if not view.evidence.has(self._into):
             yield f"{self._into} is missing"
-        elif why := figures.incomparable(view.evidence, transfer):
+        elif why := transfer_measures.incomparable(view.evidence, transfer):
             yield why
         else:
             finished = listened is not None and listened.code == 0
             was_stopped = endings[0] is not None and listened is None
-            yield from contradictions.find(view.evidence, transfer, finished=finished, cut=was_stopped)
+            yield from transfer_checks.find(view.evidence, transfer, finished=finished, cut=was_stopped)
         texts = [view.evidence.read_or_none(reading.text, log) for log in self._logs]
         if listened is not None and netcat.listener_failed(listened.code, texts[0]):
             yield f"{self._logs[0]}: netcat was terminated by a signal, or could not write {self._into}"
@@ -311,11 +311,15 @@ class TransferStep(Step):
 
     @override
     def measure(self, view: View) -> Measured:
-        measured = figures.measure(view.evidence, self.transfer(view.scene, view.within), self.prefixed_name(_LISTEN))
+        measured = transfer_measures.measure(
+            view.evidence, self.transfer(view.scene, view.within), self.prefixed_name(_LISTEN)
+        )
         if self._shares_udp_counters(view.scene):
             measured = host.without_shared_counters(measured)
         if self._shares_port(view):
-            measured = measured.without(dict.fromkeys(paper.COUNTED, "the paper's filter counts another flow, too"))
+            measured = measured.without(
+                dict.fromkeys(transfer_measures.PAPER_COUNTS, "the paper's filter counts another flow, too")
+            )
         return measured
 
     @property
@@ -325,7 +329,7 @@ class TransferStep(Step):
 
     def deliveries(self, view: View) -> Sequence[Delivery]:
         """Return the deliveries of the transfer; see `SendsFlow.deliveries`."""
-        return transfer_stalls.read(
+        return stalls.read_transfer_deliveries(
             view.evidence, self.transfer(view.scene, view.within), self.prefixed_name(_LISTEN)
         )
 

@@ -3,7 +3,7 @@
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.measure.offsets import Offset, offset
+from fieldkit.measure.robot_clock import Offset, offset
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import clocks
 from fieldkit.trial.check.report import Report

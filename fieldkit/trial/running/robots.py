@@ -23,7 +23,7 @@ from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.core.text import encodable
 from fieldkit.core.threads import run_parallel
-from fieldkit.measure.evidence import lateness, link_samples, track
+from fieldkit.measure.evidence import link_samples, oracle_delays, track
 from fieldkit.remote import evidence, fetching, jobs, programs
 from fieldkit.remote.fetching import FetchProgress, LateError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
@@ -115,7 +115,9 @@ class Robots:
         if scene.laptop_folder is not None:
             (scene.laptop_folder / track.FILE).write_text(track.text(where), encoding="ascii")
             (scene.laptop_folder / link_samples.FILE).write_text(link_samples.text(links), encoding="ascii")
-            (scene.laptop_folder / lateness.FILE).write_text(lateness.text(before, after), encoding="ascii")
+            (scene.laptop_folder / oracle_delays.LATENESS_FILE).write_text(
+                oracle_delays.lateness_text(before, after), encoding="ascii"
+            )
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         with self._watched(), motion_control.guarded(self._plan, scene, self.shells):

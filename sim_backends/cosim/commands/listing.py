@@ -5,8 +5,7 @@ from typing import Final
 
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import FieldkitError
-from fieldkit.core.printing import print_text
-from fieldkit.core.text import json_text
+from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
 from sim_backends.cosim.policies.registry import POLICIES
 from sim_backends.cosim.scenario.loading import load_scenario, scenario_files

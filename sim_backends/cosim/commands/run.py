@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from fieldkit.cli.display import show_note, working
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.results import FORMATION, SeedResult, formation_values

@@ -6,7 +6,7 @@ from typing import Final
 
 from fieldkit.cli.display import show_note, working
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count, parse_quantity
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter

@@ -11,8 +11,7 @@ from typing import Final
 
 from fieldkit.cli.display import table
 from fieldkit.core.columns import csv_text
-from fieldkit.core.printing import print_text
-from fieldkit.core.text import json_text
+from fieldkit.core.text import json_text, print_text
 
 Value = str | int | float | None
 """A cell; nan and None are missing values."""

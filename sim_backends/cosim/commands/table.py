@@ -6,7 +6,7 @@ from functools import partial
 from typing import Final
 
 from fieldkit.cli.display import working
-from fieldkit.core.printing import print_text
+from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.config import catalog, schema
-from fieldkit.config.meanings import attributes, description, without_links
+from fieldkit.config.documentation import attribute_meanings, class_description, without_links
 from fieldkit.config.schema import Strict
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.cosim.scenario.checks import check
@@ -21,8 +21,8 @@ def editor_schema() -> dict[str, Any]:
         model = models.get(part["title"])
         if model is None:
             continue  # an enumeration
-        part["description"] = without_links(description(model))
-        meanings = attributes(model)
+        part["description"] = without_links(class_description(model))
+        meanings = attribute_meanings(model)
         for key, value in part["properties"].items():
             value.pop("title", None)
             value["description"] = without_links(meanings[key])

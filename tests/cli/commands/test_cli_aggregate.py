@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.analysis import tables
+from fieldkit.analysis import result_tables
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.cli import main
@@ -121,7 +121,9 @@ def test_different_ping_sizes_in_one_condition_cause_a_note(
 def test_csv_equals_the_summary_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [*tcp_repeats(replace(ROW, protocol="tcp"), 3), *repeats(ROW, 3)]
     write(tmp_path / "one", rows)
-    assert output_of(capsys, str(tmp_path), "--format", "csv") == tables.to_csv(DEFAULT_BY, aggregate(parsed(rows)))
+    assert output_of(capsys, str(tmp_path), "--format", "csv") == result_tables.to_csv(
+        DEFAULT_BY, aggregate(parsed(rows))
+    )
 
 
 def test_json_and_csv_agree(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.captures.links import LINKS
+from fieldkit.measure.captures.headers import LINKS
 from tests.helpers.captures import TCPDUMP, file_bytes, segment, timed
 
 

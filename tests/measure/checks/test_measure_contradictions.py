@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.checks import contradictions
+from fieldkit.measure.checks import transfer_checks
 from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, ipv4, segment, transfer
 
 SYN, FIN, ACK = 0x02, 0x01, 0x10
@@ -62,7 +62,7 @@ class Link:
                 (folder / name).write_bytes(content)
             evidence = AttemptEvidence(folder)
             a_transfer = transfer(protocol) if captured else replace(transfer(protocol), captures=(None, None))
-            return list(contradictions.find(evidence, a_transfer, finished=finished))
+            return list(transfer_checks.find(evidence, a_transfer, finished=finished))
 
 
 def file_of(frames: Iterable[Frame]) -> bytes:
@@ -160,7 +160,7 @@ def test_bytes_that_were_not_captured_at_the_sender(monkeypatch: pytest.MonkeyPa
     reasons = link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True)
     assert reasons == ["100 bytes arrived without being in the sender's capture"]
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True, captured=False) == []
-    monkeypatch.setattr(contradictions, "LONGEST_BYTES", 300)
+    monkeypatch.setattr(transfer_checks, "LONGEST_BYTES", 300)
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(300), finished=True) == [], "numbers went round"
 
 

@@ -13,7 +13,7 @@ from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.measure.checks import topic_captures, topic_checks
-from fieldkit.measure.transfers import sample_heads, topic_log, topics
+from fieldkit.measure.transfers import topic_columns, topic_samples
 from tests.helpers import topic_attempts
 from tests.helpers.captures import Frame
 from tests.helpers.topic_attempts import MS, PERIOD, PLAN, SAMPLES, SECOND, Row, TopicAttempt, attempt, best_effort
@@ -164,7 +164,7 @@ def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp
     topic_attempts.write(made, tmp_path, signed=signed)
     sent = (tmp_path / "sender-topic.bin").read_bytes()
     (tmp_path / "receiver-topic.bin").write_bytes(sent)
-    log = topic_log.read(tmp_path / "receiver-topic.bin")
+    log = topic_samples.read_log(tmp_path / "receiver-topic.bin")
     reasons = list(topic_checks.check_logs(PLAN, log, log))
     assert "the subscriber's log is a copy of the publisher's" in reasons
     assert ("the subscriber's log was written by the publisher of the topic" in reasons) is signed
@@ -172,7 +172,7 @@ def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp
 
 def test_the_log_of_another_topic_is_noticed(tmp_path: Path) -> None:
     topic_attempts.write(KINDS["over TCP"], tmp_path)
-    sent, came = (topic_log.read(tmp_path / f"{role}-topic.bin") for role in ("sender", "receiver"))
+    sent, came = (topic_samples.read_log(tmp_path / f"{role}-topic.bin") for role in ("sender", "receiver"))
     (publisher, subscriber) = topic_checks.check_logs(replace(PLAN, topic="/other"), sent, came)
     assert "publisher's log is of another topic" in publisher
     assert "subscriber's log is of another topic" in subscriber
@@ -180,7 +180,7 @@ def test_the_log_of_another_topic_is_noticed(tmp_path: Path) -> None:
 
 def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
     topic_attempts.write(KINDS["over TCP"], tmp_path)
-    log = topic_log.read(tmp_path / "sender-topic.bin")
+    log = topic_samples.read_log(tmp_path / "sender-topic.bin")
     role = Role.SENDER
     first, last = int(log.times_ns.min()), int(log.times_ns.max())
     assert not list(topic_checks.check_times({role: log}, {role: (first, last)}))
@@ -315,7 +315,7 @@ def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int,
     content[place % len(content)] ^= 1 << bit
     path.write_bytes(content)
     try:
-        log = topic_log.read(path)
+        log = topic_samples.read_log(path)
     except EvidenceError:
         return
     assert not log.whole, "a changed log passes for whole"
@@ -324,12 +324,12 @@ def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int,
 def test_constants_equal_those_of_the_agent() -> None:
     assert int(stream.SETTLES_S * 1e9) == topic_checks.SETTLES_NS
     assert (stream.MAGIC, stream.LEAST_BYTES) == (
-        sample_heads.MAGIC,
-        sample_heads.HEAD_BYTES,
+        topic_samples.MAGIC,
+        topic_samples.HEAD_BYTES,
     )
 
 
 def test_every_time_of_a_topic_is_compared_with_the_capture() -> None:
     """Columns added later are included."""
-    times = {column.name for column in topics.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
+    times = {column.name for column in topic_columns.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
     assert times | {"topic_deadline_misses"} == topic_captures.SHARE_FIGURES.keys()

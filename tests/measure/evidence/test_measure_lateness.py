@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness
-from fieldkit.measure.evidence import lateness
+from fieldkit.measure.evidence import oracle_delays
 from sim_backends.emulated.medium.ports import rounded_up
 from tests.helpers.measures import Measures, measure
 
@@ -52,7 +52,7 @@ def test_without_packets_there_is_no_lateness(tmp_path: Path) -> None:
 def test_other_contents_are_refused(tmp_path: Path, other: str) -> None:
     path = file(tmp_path, other.encode())
     with pytest.raises(EvidenceError):
-        lateness.read(path)
+        oracle_delays.read_lateness(path)
     assert measure(tmp_path, None) == Measures()
 
 
@@ -62,23 +62,23 @@ def test_packets_between_two_readings_are_written_and_read(
 ) -> None:
     first = Lateness(bound_ns=bound_ns, packets=before)
     second = Lateness(bound_ns=bound_ns, packets=Counter(before) + Counter(came))
-    path = file(tmp_path_factory.getbasetemp(), lateness.text(first, second).encode())
-    assert lateness.read(path) == Lateness(bound_ns=bound_ns, packets=came)
+    path = file(tmp_path_factory.getbasetemp(), oracle_delays.lateness_text(first, second).encode())
+    assert oracle_delays.read_lateness(path) == Lateness(bound_ns=bound_ns, packets=came)
 
 
 @given(st.integers(0, 10**6))
 def test_a_truncated_file_is_refused(tmp_path_factory: pytest.TempPathFactory, at: int) -> None:
     came = Lateness(bound_ns=5000, packets={1000: 98, 6000: 1, 8000: 1})
-    whole = lateness.text(Lateness(bound_ns=5000, packets={}), came).encode()
+    whole = oracle_delays.lateness_text(Lateness(bound_ns=5000, packets={}), came).encode()
     path = file(tmp_path_factory.getbasetemp(), whole[: at % len(whole)])
     with pytest.raises(EvidenceError):
-        lateness.read(path)
+        oracle_delays.read_lateness(path)
 
 
 @given(st.lists(st.integers(0, 10**10), min_size=1, max_size=300), st.floats(0.01, 1.0))
 def test_quantiles_are_those_of_the_packets_rounded_up(late_ns: list[int], share: float) -> None:
     counted = Lateness(bound_ns=1, packets=Counter(map(rounded_up, late_ns)))
-    quantile_ns = lateness.quantile_ns(counted, share)
+    quantile_ns = oracle_delays.lateness_quantile_ns(counted, share)
     true_ns = int(np.quantile(late_ns, share, method="inverted_cdf"))
     assert quantile_ns is not None
     assert true_ns < quantile_ns <= true_ns * 9 / 8 + 1

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import DelayParts, Protocol
-from fieldkit.measure.evidence import medium
+from fieldkit.measure.evidence import oracle_delays
 from tests.helpers.captures import transfer
 from tests.helpers.measures import Measures, measure
 
@@ -31,7 +31,7 @@ def file(folder: Path, content: bytes) -> Path:
 
 
 def test_delays_of_a_transfer_are_read(tmp_path: Path) -> None:
-    assert medium.read(file(tmp_path, TEXT.encode())) == PARTS
+    assert oracle_delays.read_air_delay(file(tmp_path, TEXT.encode())) == PARTS
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_delays_of_a_transfer_are_read(tmp_path: Path) -> None:
 def test_other_contents_are_refused(tmp_path: Path, other: str) -> None:
     path = file(tmp_path, other.encode())
     with pytest.raises(EvidenceError):
-        medium.read(path)
+        oracle_delays.read_air_delay(path)
     assert measure(tmp_path, UDP) == NOBODY_KNOWS
 
 
@@ -61,7 +61,7 @@ def test_other_contents_are_refused(tmp_path: Path, other: str) -> None:
 def test_bytes_are_refused_or_read(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
     folder = tmp_path_factory.getbasetemp()
     try:
-        parts = medium.read(file(folder, content))
+        parts = oracle_delays.read_air_delay(file(folder, content))
     except EvidenceError:
         return
     assert text(parts).encode() == content
@@ -87,5 +87,5 @@ def test_without_delivered_packets_there_is_no_delay(tmp_path: Path) -> None:
 
 def test_without_a_file_the_columns_are_missing(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
-        medium.read(tmp_path / "medium.txt")
+        oracle_delays.read_air_delay(tmp_path / "medium.txt")
     assert measure(tmp_path, UDP) == NOBODY_KNOWS

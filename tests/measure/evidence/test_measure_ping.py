@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import ping
+from fieldkit.measure.evidence.delay_quantiles import quantile_of_sent
 from fieldkit.measure.evidence.ping import AnswerGap, Ping, Problem, Reply
-from fieldkit.measure.evidence.survivors import quantile_of_sent
 from tests.helpers.paths import DATA
 
 OUTPUTS = DATA / "ping" / "20221126"

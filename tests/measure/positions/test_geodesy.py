@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 
-from fieldkit.measure.positions.geodesy import ecef_m
+from fieldkit.measure.positions.samples import ecef_m
 
 EARTH = Geod(ellps="WGS84")
 TO_CENTRE = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.positions import recorded
+from fieldkit.measure.positions import position_files
 from fieldkit.measure.positions.samples import LOCAL, WGS84, read_csv
 
 S = 10**9
@@ -109,7 +109,7 @@ def test_any_content_raises_only_evidence_error(tmp_path_factory: pytest.TempPat
 
 
 def test_gpx_tracks_are_read(tmp_path: Path) -> None:
-    samples = recorded.read_file(written(tmp_path, GPX, "walk.GPX"))
+    samples = position_files.read_file(written(tmp_path, GPX, "walk.GPX"))
     assert samples.frame == WGS84
     assert (samples.times_ns - NOON_NS).tolist() == [0, 1_250_000_000, 3_000_000_000]
     assert samples.values[:, :2].tolist() == [[48.1374, 11.5755], [48.1375, 11.5756], [48.1376, 11.5757]]
@@ -134,7 +134,7 @@ def test_gpx_tracks_are_read(tmp_path: Path) -> None:
 def test_gpx_without_valid_positions_and_times_is_rejected(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in GPX
     with pytest.raises(EvidenceError, match=message):
-        recorded.read_file(written(tmp_path, GPX.replace(old, new), "walk.gpx"))
+        position_files.read_file(written(tmp_path, GPX.replace(old, new), "walk.gpx"))
 
 
 def test_gpx_that_expands_while_it_is_read_is_rejected(tmp_path: Path) -> None:
@@ -143,9 +143,9 @@ def test_gpx_that_expands_while_it_is_read_is_rejected(tmp_path: Path) -> None:
         f'<?xml version="1.0"?><!DOCTYPE gpx [<!ENTITY e0 "boom">{entities}]><gpx><trk><name>&e9;</name></trk></gpx>'
     )
     with pytest.raises(EvidenceError, match="cannot be read as GPX"):
-        recorded.read_file(written(tmp_path, bomb, "walk.gpx"))
+        position_files.read_file(written(tmp_path, bomb, "walk.gpx"))
 
 
 def test_other_file_types_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="neither GPX nor CSV"):
-        recorded.read_file(written(tmp_path, GPX, "walk.kml"))
+        position_files.read_file(written(tmp_path, GPX, "walk.kml"))

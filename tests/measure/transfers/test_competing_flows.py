@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.checks import contradictions
-from fieldkit.measure.transfers import figures
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.checks import transfer_checks
+from fieldkit.measure.transfers import transfer_measures
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4, transfer
 
 MTU_BYTES = 1480
@@ -124,9 +124,9 @@ def test_each_transfer_counts_its_own_packets_even_with_equal_ids(
         air(Path(place), flows, random.Random(seed), loss)
         evidence = AttemptEvidence(Path(place))
         for flow in flows:
-            assert figures.incomparable(evidence, flow.transfer) is None
-            assert not list(contradictions.find(evidence, flow.transfer, finished=True))
-            values = figures.measure(evidence, flow.transfer).values
+            assert transfer_measures.incomparable(evidence, flow.transfer) is None
+            assert not list(transfer_checks.find(evidence, flow.transfer, finished=True))
+            values = transfer_measures.measure(evidence, flow.transfer).values
             counted = ("ip_packets_sent", "ip_packets_received", "datagrams_sent", "datagrams_received")
             assert [values[name] for name in counted] == [flow.sent, flow.arrived, flow.datagrams, flow.whole]
             assert values["file_loss"] == 1 - len(flow.received) / flow.size_bytes

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
-from fieldkit.measure.transfers import delay, load_streams, stalls
+from fieldkit.measure.transfers import delay, iperf3_load, stalls
 from fieldkit.measure.transfers.deliveries import FlowSchedule
-from fieldkit.measure.transfers.load_streams import COOKIE_BYTES, LoadStreams
+from fieldkit.measure.transfers.iperf3_load import COOKIE_BYTES, LoadStreams
 from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame
 from tests.helpers.streams import ISN, MS, SECOND, START, Stream, captured
 
@@ -25,7 +25,7 @@ GAP = (100, 150)
 
 
 def measured(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
-    result = load_streams.measure("iperf3", load, *captured(streams))
+    result = iperf3_load.measure_stalls("iperf3", load, *captured(streams))
     assert result.values.keys() | result.missing.keys() == {
         column.name for column in stalls.declare_columns("iperf3", "iperf3", 0)
     }
@@ -123,7 +123,7 @@ def test_a_clock_that_is_set_forward_is_not_a_stall(end: str) -> None:
 
 
 def test_without_captures_or_packets_the_columns_are_empty() -> None:
-    assert not load_streams.measure("iperf3", UDP, None, captured([data()])[1]).values
+    assert not iperf3_load.measure_stalls("iperf3", UDP, None, captured([data()])[1]).values
     assert not measured(UDP, [])
     assert not measured(TCP, [control()])
 
@@ -152,8 +152,8 @@ def jittered(delays_ms: Sequence[float], sport: int = 40000) -> Stream:
 
 
 def jitter(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
-    result = load_streams.measure_jitter(load, *captured(streams))
-    assert result.values.keys() | result.missing.keys() == {column.name for column in load_streams.JITTER}
+    result = iperf3_load.measure_jitter(load, *captured(streams))
+    assert result.values.keys() | result.missing.keys() == {column.name for column in iperf3_load.JITTER}
     return {name.removeprefix("iperf3_captured_"): value for name, value in result.values.items()}
 
 

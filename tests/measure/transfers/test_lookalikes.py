@@ -12,7 +12,7 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.transfers import fates, tcp, udp
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from tests.helpers import links
 from tests.helpers.captures import Frame, file_bytes, packets, segment, timed, transfer
 from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Link, PacketFates

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from fieldkit.measure.captures.arrays import Floats, Ints
-from fieldkit.measure.transfers.clocks import MAX_SKEW, QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
+from fieldkit.measure.transfers.clock_offset import MAX_SKEW, QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -17,7 +17,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import delay, tcp, udp
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 from tests.helpers.captures import RECEIVER, SENDER, TCPDUMP, Frame, datagram, ipv4, packets, segment, transfer
 from tests.helpers.measures import Measures
 

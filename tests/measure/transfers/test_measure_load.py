@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
-from fieldkit.measure.transfers import load
-from fieldkit.measure.transfers.load import LoadFlow
+from fieldkit.measure.transfers import iperf3_load
+from fieldkit.measure.transfers.iperf3_load import LoadFlow
 from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, packets, segment, timed
 
 PAYLOAD_BYTES = 1000
@@ -38,8 +38,8 @@ def tcp_frames(count: int, *, again: tuple[int, ...] = ()) -> list[Frame]:
 
 
 def measured(flow: LoadFlow, sent: list[Frame], received: list[Frame]) -> dict[str, object]:
-    result = load.measure(flow, packets(sent), packets(received))
-    assert result.values.keys() | result.missing.keys() == {column.name for column in load.COLUMNS}
+    result = iperf3_load.measure_totals(flow, packets(sent), packets(received))
+    assert result.values.keys() | result.missing.keys() == {column.name for column in iperf3_load.COLUMNS}
     return dict(result.values)
 
 
@@ -107,4 +107,4 @@ def test_a_connection_without_a_captured_syn_has_no_rate() -> None:
 
 
 def test_without_both_captures_the_columns_are_empty() -> None:
-    assert not load.measure(UDP, None, packets(udp_frames(3))).values
+    assert not iperf3_load.measure_totals(UDP, None, packets(udp_frames(3))).values

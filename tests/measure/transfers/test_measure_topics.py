@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scapy.layers.inet import IP, UDP, fragment
 
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers import topics
-from fieldkit.measure.transfers.topic_log import TopicLog, TopicSamples
-from fieldkit.measure.transfers.topics import TopicTraffic
+from fieldkit.measure.transfers import topic_columns
+from fieldkit.measure.transfers.topic_columns import TopicTraffic
+from fieldkit.measure.transfers.topic_samples import TopicLog, TopicSamples
 from tests.helpers.captures import RECEIVER, SENDER, Frame, datagram, ipv4, packets
 
 MS = 1_000_000
@@ -61,8 +61,10 @@ def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, P
 
 
 def measured(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> dict[str, object]:
-    result = topics.measure(FLOW, sent, received, *(captured or (None, None))) | topics.withheld_mark("")
-    assert result.values.keys() | result.missing.keys() == {column.name for column in topics.COLUMNS}
+    result = topic_columns.measure(FLOW, sent, received, *(captured or (None, None))) | topic_columns.withheld_mark(
+        ""
+    )
+    assert result.values.keys() | result.missing.keys() == {column.name for column in topic_columns.COLUMNS}
     return dict(result.values)
 
 
@@ -136,7 +138,7 @@ def test_without_captures_there_is_no_delay() -> None:
 def test_age_of_late_and_reordered_samples() -> None:
     """Sent at 0, 1, 2 and 3 s; the third overtakes the second, which then does not reduce the age."""
     at_s, delay_s = np.array([0.5, 2.5, 2.75, 3.5]), np.array([0.5, 0.5, 1.75, 0.5])
-    mean_s, peak_s = topics.age_s(at_s, delay_s)
+    mean_s, peak_s = topic_columns.age_s(at_s, delay_s)
     # The age rises from 0.5 to 2.5 in 2 s, drops to 0.5 and rises to 1.5 in 1 s.
     assert mean_s == pytest.approx(((0.5 + 2.5) / 2 * 2 + (0.5 + 1.5) / 2 * 1) / 3)
     assert peak_s == pytest.approx((2.5 + 1.5) / 2)
@@ -146,7 +148,7 @@ def test_age_of_late_and_reordered_samples() -> None:
 def test_the_mean_age_is_the_area_under_the_sawtooth(gaps: list[float], delays: list[float]) -> None:
     at_s = np.cumsum(gaps)
     delay_s = np.array(delays[: len(gaps)])
-    mean_s, _ = topics.age_s(at_s, delay_s)
+    mean_s, _ = topic_columns.age_s(at_s, delay_s)
     if mean_s is None:
         return
     # The age at times in between: time since the newest arrived sample was sent.
@@ -162,7 +164,7 @@ def test_the_mean_age_is_the_area_under_the_sawtooth(gaps: list[float], delays: 
     [([0, 100, 200], 0), ([0, 150], 0), ([0, 151], 1), ([0, 300, 350], 1), ([0, 460], 3), ([0], 0)],
 )
 def test_each_deadline_without_a_sample_is_missed(at_ms: list[int], missed: int) -> None:
-    assert topics.deadline_misses(np.array(at_ms, dtype=np.int64) * MS, 0.15) == missed
+    assert topic_columns.deadline_misses(np.array(at_ms, dtype=np.int64) * MS, 0.15) == missed
 
 
 def test_traffic_is_identified_by_its_ports() -> None:
@@ -220,7 +222,7 @@ def test_two_streams_of_one_pair_have_separate_fragments(seed: int) -> None:
     )
     for port in (DATA, OTHER_DATA):
         flow = replace(FLOW, data_ports=frozenset({port}))
-        result = topics.measure(flow, None, None, publisher, subscriber).values
+        result = topic_columns.measure(flow, None, None, publisher, subscriber).values
         data = [packet for _, packet_port, packet in sent if packet_port == port]
         assert result["topic_data_packets"] == len(data)
         assert result["topic_data_bytes"] == sum(map(len, data))
@@ -232,10 +234,12 @@ def test_two_streams_of_one_pair_have_separate_fragments(seed: int) -> None:
 
 
 def test_only_columns_that_need_the_captures_are_withheld() -> None:
-    without = topics.measure(FLOW, published(10), arrived(range(10)), None, None)
-    reasons = topics.withheld_reasons(without, "packets were dropped")
+    without = topic_columns.measure(FLOW, published(10), arrived(range(10)), None, None)
+    reasons = topic_columns.withheld_reasons(without, "packets were dropped")
     assert set(reasons) == without.missing.keys() - {"topic_deadline_misses"}
     assert set(reasons.values()) == {"packets were dropped"}
     assert without.values.keys() >= {"topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
-    assert topics.withheld_reasons(without, "") == {}
-    assert topics.withheld_mark("packets were dropped").values == {"topic_capture_withheld": "packets were dropped"}
+    assert topic_columns.withheld_reasons(without, "") == {}
+    assert topic_columns.withheld_mark("packets were dropped").values == {
+        "topic_capture_withheld": "packets were dropped"
+    }

@@ -11,7 +11,7 @@ from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import tcp
 from fieldkit.measure.transfers.match import match
-from fieldkit.measure.transfers.transfer import Transfer
+from fieldkit.measure.transfers.transfer_spec import Transfer
 
 pytestmark = pytest.mark.emulated
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Role
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.transfers import fault_times, recoveries
+from fieldkit.measure.robot_clock import Offset
+from fieldkit.measure.transfers import recoveries
 from fieldkit.measure.transfers.deliveries import Delivery
-from fieldkit.measure.transfers.fault_times import FaultTimes
+from fieldkit.measure.transfers.recoveries import FaultTimes
 
 MS = 1_000_000
 SECOND = 1_000_000_000
@@ -118,8 +118,8 @@ def test_times_are_read_as_they_were_written(began_ns: int, ended_ns: int | None
     written = FaultTimes(
         began_ns, ended_ns, {role: Offset(offset_us / 1e6, 0.25) for role, offset_us in ahead.items()}
     )
-    text = fault_times.text(written)
-    parsed = fault_times.parse(text)
+    text = recoveries.fault_times_text(written)
+    parsed = recoveries.parse_fault_times(text)
     assert (parsed.began_ns, parsed.ended_ns, parsed.ahead.keys()) == (began_ns, ended_ns, ahead.keys())
     for role, offset in parsed.ahead.items():
         assert offset.offset_s == pytest.approx(written.ahead[role].offset_s, abs=1e-9)
@@ -131,4 +131,4 @@ def test_times_are_read_as_they_were_written(began_ns: int, ended_ns: int | None
 def test_a_truncated_file_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "times.txt").write_text(text, encoding="ascii")
     with pytest.raises(EvidenceError, match="does not contain the start and end of the fault"):
-        fault_times.read(tmp_path / "times.txt")
+        recoveries.read_fault_times(tmp_path / "times.txt")

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.packets import Packets
-from fieldkit.measure.transfers import stalls, tcp, transfer_stalls, udp
+from fieldkit.measure.transfers import stalls, tcp, udp
 from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
 from tests.helpers.captures import transfer
 from tests.helpers.streams import MS, SECOND, START, Stream, captured
@@ -23,11 +23,11 @@ STEP_NS = 10 * MS
 
 
 def of_tcp(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[Delivery]:
-    return transfer_stalls.of_tcp(tcp.match_transfer(sender, receiver, TCP), TCP.backward(sender), schedule)
+    return stalls.tcp_deliveries(tcp.match_transfer(sender, receiver, TCP), TCP.backward(sender), schedule)
 
 
 def of_udp(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[Delivery]:
-    return transfer_stalls.of_udp(udp.match_transfer(sender, receiver, UDP), schedule)
+    return stalls.udp_deliveries(udp.match_transfer(sender, receiver, UDP), schedule)
 
 
 def measured(deliveries: list[Delivery]) -> dict[str, Any]:

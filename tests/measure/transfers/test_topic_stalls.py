@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.measure.transfers import stalls, topic_stalls
+from fieldkit.measure.transfers import stalls
 from fieldkit.measure.transfers.deliveries import FlowSchedule
-from fieldkit.measure.transfers.topic_log import TopicLog
+from fieldkit.measure.transfers.topic_samples import TopicLog
 from tests.measure.transfers.test_measure_topics import FLOW, arrived, captures, log, published
 
 EXPECTED = FlowSchedule(interval_s=0.1, lasts_s=9.9)
@@ -21,8 +21,8 @@ SECOND = 1_000_000_000
 def measured(sent: TopicLog | None, received: TopicLog | None, **changes: Any) -> dict[str, Any]:  # noqa: ANN401
     near, far = captures()
     schedule = replace(EXPECTED, **changes)
-    result = topic_stalls.measure(FLOW, (sent, received), (near, far), schedule)
-    assert result.values.keys() | result.missing.keys() == {column.name for column in topic_stalls.COLUMNS}
+    result = stalls.measure_topic(FLOW, (sent, received), (near, far), schedule)
+    assert result.values.keys() | result.missing.keys() == {column.name for column in stalls.TOPIC_COLUMNS}
     return {name.removeprefix("topic_"): value for name, value in result.values.items()}
 
 
@@ -67,7 +67,7 @@ def test_a_clock_that_was_set_is_rejected() -> None:
     assert not measured(published(100), replace(received, samples=replace(received.samples, at_ns=at_ns)))
     near, far = captures()
     forward = replace(far, time_ns=far.time_ns + 3600 * SECOND * (np.arange(len(far)) > len(far) // 2))
-    result = topic_stalls.measure(FLOW, (published(100), arrived(list(range(100)))), (near, forward), EXPECTED)
+    result = stalls.measure_topic(FLOW, (published(100), arrived(list(range(100)))), (near, forward), EXPECTED)
     assert not result.values
 
 
@@ -78,4 +78,4 @@ def test_without_complete_logs_the_columns_are_empty() -> None:
 
 def test_its_columns_equal_those_of_other_flows() -> None:
     own = [column.name for column in stalls.declare_columns("topic", "the topic", 0)]
-    assert [column.name for column in topic_stalls.COLUMNS] == own
+    assert [column.name for column in stalls.TOPIC_COLUMNS] == own

@@ -16,8 +16,8 @@ from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Leg, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import numbered_lines, track
-from fieldkit.measure.positions import farthest
+from fieldkit.measure.evidence import reading, track
+from fieldkit.measure.positions import position_columns
 from fieldkit.motion.logs import drive_checks, drive_log
 from fieldkit.motion.logs.drive_checks import DrivePlan
 from tests.motion.logs.test_drive_log import drive
@@ -50,7 +50,7 @@ def written(folder: Path, lines_: list[dict[str, Any]], *, numbered: bool = True
 
 def reasons(path: Path) -> list[str]:
     log = drive_log.read(path)
-    return [*filter(None, (numbered_lines.problem(path),)), *drive_checks.contradictions(log, PLAN)]
+    return [*filter(None, (reading.numbered_lines_problem(path),)), *drive_checks.contradictions(log, PLAN)]
 
 
 @pytest.mark.parametrize("numbered", [True, False])
@@ -142,7 +142,7 @@ def test_any_flipped_bit_is_detected(place: int, bit: int, tmp_path_factory: pyt
     content[place % len(content)] ^= 1 << bit
     path.write_bytes(content)
     try:
-        assert numbered_lines.problem(path) is not None
+        assert reading.numbered_lines_problem(path) is not None
     except EvidenceError:
         return
 
@@ -160,7 +160,7 @@ def oracle(folder: Path, far_m: float) -> AttemptEvidence:
 @pytest.mark.parametrize(("far_m", "agrees"), [(2.0, True), (2.1, True), (8.0, False), (0.0, False)])
 def test_the_farthest_position_agrees_with_the_testbed(far_m: float, agrees: bool, tmp_path: Path) -> None:
     during_ns = (START_NS, START_NS + 9 * 10**9)
-    why = farthest.contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
+    why = position_columns.distance_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
     assert (why is None) is agrees
     if why:
         assert why == f"it was 2.0 m from its place by its odometry, and {far_m:.1f} m by track.csv"

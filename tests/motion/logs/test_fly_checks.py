@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence import numbered_lines
+from fieldkit.measure.evidence import reading
 from fieldkit.motion.logs import fly_checks, fly_log
 from fieldkit.motion.logs.fly_checks import POSITION_ERROR_M, FlyPlan
 
@@ -58,7 +58,7 @@ def written(folder: Path, lines_: list[dict[str, Any]], *, ended: bool = True) -
 
 def reasons(path: Path) -> list[str]:
     log = fly_log.read(path)
-    return [*filter(None, (numbered_lines.problem(path),)), *fly_checks.contradictions(log, PLAN)]
+    return [*filter(None, (reading.numbered_lines_problem(path),)), *fly_checks.contradictions(log, PLAN)]
 
 
 def test_an_unchanged_log_has_no_contradiction(tmp_path: Path) -> None:

@@ -16,10 +16,10 @@ from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence.track import Separation
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions import accounts, trajectories, where
-from fieldkit.measure.positions.accounts import Account, Accounts
+from fieldkit.measure.positions import position_columns, position_sources, trajectories
+from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import WGS84
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import tlog_reader
 from fieldkit.motion.steps.mavlink import MavlinkStep
 from fieldkit.steps.scene import Flow, Scene
@@ -112,7 +112,7 @@ def attempt(
 ) -> View:
     """Return an attempt with this log, which has 10 messages per second from `START_US` on."""
     began = step._accounts(SCENE, START_NS + round(1e9 * START_S), {Role.SENDER: clock} if clock else {})
-    (tmp_path / accounts.FILE).write_text(accounts.text(began), encoding="utf-8")
+    (tmp_path / position_sources.FILE).write_text(position_sources.text(began), encoding="utf-8")
     (tmp_path / "mavlink.tlog").write_bytes(log)
     all_counters = {"frames": 203, "left_out": 0, "ended_us": START_US + 10_000_000, "refused": {}} | counters
     (tmp_path / "mavlink.json").write_text(json.dumps(all_counters), encoding="utf-8")
@@ -120,7 +120,7 @@ def attempt(
 
 
 def apart(view: View, from_s: float, to_s: float) -> Separation:
-    source, destination = where.trajectories_of_pair(view.evidence, (Role.SENDER, Role.RECEIVER))
+    source, destination = position_columns.trajectories_of_pair(view.evidence, (Role.SENDER, Role.RECEIVER))
     began_ns = START_NS + round(1e9 * START_S)
     return trajectories.separation_between(
         source, destination, began_ns + round(from_s * 1e9), began_ns + round(to_s * 1e9)
@@ -145,7 +145,7 @@ def test_local_frame_is_rotated_into_frame_of_placement(tmp_path: Path) -> None:
 def test_times_use_clock_of_the_recorder(tmp_path: Path) -> None:
     step = mavlink(f"at: sender, {LOCAL}")
     view = attempt(tmp_path, step, flight(10, 1.0), Offset(0.5, 0.001))
-    assert where.samples_of(view.evidence, Role.RECEIVER).times_ns[0] == START_NS + 500_000 - 500_000_000
+    assert position_columns.samples_of(view.evidence, Role.RECEIVER).times_ns[0] == START_NS + 500_000 - 500_000_000
 
 
 def test_delayed_messages_count_at_time_in_header(tmp_path: Path) -> None:
@@ -169,8 +169,10 @@ def test_global_positions_with_fixed_position_on_the_earth(tmp_path: Path) -> No
     view = attempt(tmp_path, step, stamped(frames), counters={"frames": 102})
     assert not list(step.check(view))
     fixed = Account(place=(0.0, 0.0, 0.0), frame=WGS84)
-    robots = {**accounts.read(tmp_path / accounts.FILE).robots, Role.SENDER: fixed}
-    (tmp_path / accounts.FILE).write_text(accounts.text(Accounts(robots, heights=True)), encoding="utf-8")
+    robots = {**position_sources.read(tmp_path / position_sources.FILE).robots, Role.SENDER: fixed}
+    (tmp_path / position_sources.FILE).write_text(
+        position_sources.text(Accounts(robots, heights=True)), encoding="utf-8"
+    )
     distances = apart(View(SCENE, AttemptEvidence(tmp_path)), 2 - START_S, 8 - START_S)
     assert distances.distance_start_m == pytest.approx(math.hypot(30, 2), abs=0.02)
     assert distances.distance_max_m == pytest.approx(math.hypot(30, 8), abs=0.02)
@@ -199,6 +201,6 @@ def test_sources_of_steps_inside_are_kept() -> None:
     placed, topic, file = Account(place=(0.0, 0.0, 0.0)), Account(file="a.bag", topic="/odom"), Account(file="b.tlog")
     inner = Accounts({Role.SENDER: topic, Role.RECEIVER: placed})
     outer = Accounts({Role.SENDER: placed, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True)
-    both = accounts.merge(inner, outer)
+    both = position_sources.merge(inner, outer)
     assert both.robots == {Role.SENDER: topic, Role.RECEIVER: file}
     assert (both.clocks, both.heights) == (outer.clocks, True)

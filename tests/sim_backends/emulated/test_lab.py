@@ -15,7 +15,7 @@ from fieldkit.config.schema import Document, parse, validate
 from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Scenario, Vector
-from fieldkit.lab import answers
+from fieldkit.lab import requests
 from fieldkit.lab.protocol import Destination
 from fieldkit.report import figures
 from sim_backends.emulated.backend import EmulatedBackend
@@ -96,7 +96,7 @@ def test_a_robot_stays_in_the_world_and_above_its_ground(to: Destination, messag
 def test_an_overview_survives_packing_and_unpacking() -> None:
     above = backend("emulated: {world: baylands}\n").overview()
     assert above.outlines
-    assert answers.overview(answers.pack_overview(above)) == above
+    assert requests.unpack_overview(requests.pack_overview(above)) == above
 
 
 def test_a_link_has_the_snr_of_its_closed_form() -> None:

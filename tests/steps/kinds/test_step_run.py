@@ -13,7 +13,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Distance, Placement, Protocol, Role, Scenario, Topology
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import printed
+from fieldkit.measure.evidence import program_output
 from fieldkit.remote import jobs
 from fieldkit.remote.shell import Completed
 from fieldkit.steps.kinds.run import RunStep
@@ -150,7 +150,7 @@ def test_summary_of_bool_is_as_in_the_table() -> None:
         ('{"cells": [{"V": "high"}]}', "battery.json: no volts: it is 'high', not a number"),
         ('{"cells": [{"V"', "battery.json: no volts: is not JSON"),
         (None, "battery.json: cannot be read"),
-        (" " * printed.MAX_OUTPUT_BYTES, "battery.json: the program printed more than 1 MiB"),
+        (" " * program_output.MAX_OUTPUT_BYTES, "battery.json: the program printed more than 1 MiB"),
     ],
 )
 def test_missing_or_out_of_bounds_value_makes_repeat_void(tmp_path: Path, output: str | None, problem: str) -> None:
@@ -204,9 +204,9 @@ def test_output_and_exit_code_of_the_program(
 @pytest.mark.parametrize("userland", USERLANDS)
 def test_program_with_endless_output_is_stopped(tmp_path: Path, userland: str) -> None:
     result = run_script(tmp_path, userland, "yes")
-    assert (result.exit_code, len(result.stdout)) == (128 + signal.SIGPIPE, printed.MAX_OUTPUT_BYTES)
+    assert (result.exit_code, len(result.stdout)) == (128 + signal.SIGPIPE, program_output.MAX_OUTPUT_BYTES)
     result = run_script(tmp_path / "bin", userland, "yes >&2")
-    assert (result.exit_code, len(result.stderr)) == (128 + signal.SIGPIPE, printed.MAX_OUTPUT_BYTES)
+    assert (result.exit_code, len(result.stderr)) == (128 + signal.SIGPIPE, program_output.MAX_OUTPUT_BYTES)
 
 
 @pytest.mark.parametrize("userland", USERLANDS)

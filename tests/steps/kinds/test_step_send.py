@@ -10,7 +10,7 @@ from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Protocol, Role, Verdict
-from fieldkit.measure.transfers.columns import COLUMNS
+from fieldkit.measure.transfers.transfer_columns import COLUMNS
 from fieldkit.remote import jobs
 from fieldkit.steps.kinds.send import SendStep
 from fieldkit.steps.scene import CommandResult, Scene

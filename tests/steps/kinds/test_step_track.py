@@ -10,9 +10,9 @@ from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.measure.offsets import Offset
-from fieldkit.measure.positions.accounts import Account
+from fieldkit.measure.positions.position_sources import Account
 from fieldkit.measure.positions.samples import WGS84
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.steps.kinds.track import TrackStep
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure

@@ -9,7 +9,7 @@ import pytest
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import DelayParts, Lateness, LinkSample, Protocol, Role, TrackPoint
-from fieldkit.measure.evidence import medium
+from fieldkit.measure.evidence import oracle_delays
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.kinds.transfer import TransferStep
@@ -115,7 +115,7 @@ def _parts(n: int) -> DelayParts:
 def test_delays_of_the_oracle_are_stored(tmp_path: Path, packets: int) -> None:
     delays = _parts(1000), _parts(1000 + packets)
     transfer(Protocol.TCP, LocalShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver"), delays)
-    assert medium.read(tmp_path / "medium.txt") == _parts(packets)
+    assert oracle_delays.read_air_delay(tmp_path / "medium.txt") == _parts(packets)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
 from fieldkit.measure.evidence.bag import Bag
-from fieldkit.measure.offsets import Offset
+from fieldkit.measure.robot_clock import Offset
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial import size
 from fieldkit.trial.check import contact, radio, software, system, topics

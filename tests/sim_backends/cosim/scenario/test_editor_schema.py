@@ -6,7 +6,7 @@ import jsonschema
 import pytest
 
 from fieldkit.config import schema
-from fieldkit.config.meanings import attributes
+from fieldkit.config.documentation import attribute_meanings
 from sim_backends.cosim.scenario.faults import JammerFault
 from sim_backends.cosim.scenario.loading import editor_schema, scenario_files
 
@@ -54,4 +54,6 @@ def test_every_key_has_a_meaning() -> None:
     for part in (SCHEMA, *SCHEMA["$defs"].values()):
         for key, value in part.get("properties", {}).items():
             assert value["description"].endswith("."), key
-    assert attributes(JammerFault)["to"] == "Time when it ends; if omitted, it lasts until the end of the run."
+    assert (
+        attribute_meanings(JammerFault)["to"] == "Time when it ends; if omitted, it lasts until the end of the run."
+    )

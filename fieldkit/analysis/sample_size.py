@@ -1,0 +1,177 @@
+"""Sample sizes: the repeats or packets that the expectations of a trial need, and more repeats of a cell.
+
+Expectations are checked before the trial runs. The additional repeats are those that narrow the interval of a cell to
+a wanted width.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fieldkit.analysis import one_sided_bounds
+from fieldkit.analysis.expectations import Expectation, Scope
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, NORMAL, Intervals, student
+from fieldkit.core.columns import Kind
+
+if TYPE_CHECKING:  # a plan needs no tables of trials, which take long to import
+    from fieldkit.analysis.cells import Cell
+
+_USUAL_SHARE = 0.9
+"""Share of all repeats that is used to show the difference between `every` repeat of a trial and all repeats."""
+
+
+def unmet_requirements(
+    expectations: Iterable[Expectation], figures: Iterable[Quantity], repeats: int
+) -> Iterator[str]:
+    """Yield a sentence for each expectation that needs more repeats or packets than a trial has.
+
+    Args:
+        expectations: Expectations of the trial.
+        figures: Quantities that its repeats measure, including those of the expectations.
+        repeats: Number of repeats per protocol.
+    """
+    by_name = {quantity.name: quantity for quantity in figures}
+    for expectation in expectations:
+        if needs := _needs(expectation, by_name[expectation.quantity], repeats):
+            yield f"expected {expectation.text}: {needs}"
+
+
+def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
+    has = f"this trial has {repeats}"
+    if expectation.scope is Scope.PACKETS:
+        packets = one_sided_bounds.packets_for(expectation.bound)
+        return f"needs at least {packets} packets per condition for 95 % confidence, if none is lost"
+    if expectation.scope is Scope.SHARE and expectation.share is not None:
+        needed = one_sided_bounds.repeats_for(expectation.share)
+        text = f"needs at least {needed} repeats for 95 % confidence, if all meet it; {has}"
+        return text if repeats < needed else ""
+    if expectation.scope is Scope.EVERY:
+        needed, shown = one_sided_bounds.repeats_for(_USUAL_SHARE), one_sided_bounds.share_low(repeats, repeats)
+        return (
+            f"is about the repeats of this trial; over {100 * _USUAL_SHARE:.0f} % of all repeats it needs at least "
+            f"{needed} for 95 % confidence, and {repeats} show it for {math.floor(100 * shown)} %"
+            if repeats < needed
+            else ""
+        )
+    needed = _for_interval(expectation, quantity)
+    if repeats < needed:
+        alternative = f"; for these packets alone: {expectation.text} of all packets"
+        has_alternative = quantity.kind is Kind.COUNTED and expectation.is_below
+        return f"needs at least {needed} repeats for 95 % confidence, {_best_case(quantity)}; {has}" + (
+            alternative if has_alternative else ""
+        )
+    if quantity.kind is Kind.MEDIAN and repeats < MIN_FOR_ORDER_STATISTICS:
+        coverage = f"{100 * CONFIDENCE:.0f} % confidence for any distribution of the repeats"
+        return f"needs at least {MIN_FOR_ORDER_STATISTICS} repeats for {coverage}; {has}"
+    return ""
+
+
+def _best_case(quantity: Quantity) -> str:
+    """Return a description of the best results, for which this number of repeats is enough."""
+    if quantity.kind is Kind.FLAG:
+        return "if it is true in all of them"
+    return "even if nothing is lost" if quantity.unit == "share" else "which give an interval"
+
+
+def _for_interval(expectation: Expectation, quantity: Quantity) -> int:
+    """Return the smallest number of repeats with which the 95 % interval of a figure can be within the bound.
+
+    For shares this is the score interval of repeats without any loss (Wilson 1927), whose end is z²/(n + z²).
+    """
+    if quantity.unit != "share" or quantity.kind is Kind.MEDIAN:
+        return 2
+    width = expectation.bound if expectation.is_below else 1 - expectation.bound
+    if not 0 < width < 1 or (quantity.kind is not Kind.FLAG and not expectation.is_below):
+        return 2
+    return max(math.floor(NORMAL**2 * (1 / width - 1) * (1 + 1e-12)) + 1, 2)
+
+
+_BISECTIONS: Final = 60  # enough for every number of repeats that a float represents exactly
+
+
+def more_wanted_of(cells: "Sequence[Cell]", half_widths: Mapping[str, float]) -> tuple[Mapping[str, int], ...]:
+    """Return `more_wanted` of all estimates: for each cell, by name of the quantity.
+
+    Args:
+        cells: Cells with estimates of any quantities.
+        half_widths: Wanted half-width by unit. Quantities with other units, and estimates without an interval, are
+            not in the result.
+    """
+    more_by_cell: tuple[dict[str, int], ...] = tuple({} for _ in cells)
+    quantities = {estimate.quantity for cell in cells for estimate in cell.estimates.values()}
+    for quantity in (quantity for quantity in quantities if quantity.unit in half_widths):
+        indices = [index for index, cell in enumerate(cells) if quantity.name in cell.estimates]
+        estimates = [cells[index].estimates[quantity.name] for index in indices]
+        ends = np.array([(estimate.value, estimate.low, estimate.high) for estimate in estimates], dtype=np.float64)
+        n = [estimate.n for estimate in estimates]
+        more = more_wanted(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind, quantity.unit)
+        for index, count in zip(indices, more.tolist(), strict=True):
+            if not math.isnan(count):
+                more_by_cell[index][quantity.name] = int(count)
+    return more_by_cell
+
+
+def more_wanted(
+    intervals: Intervals, n: ArrayLike, half_width: ArrayLike, kind: Kind, unit: str = "share"
+) -> NDArray[np.float64]:
+    """Return the number of additional repeats until the half-width of an interval is at most `half_width`.
+
+    It is assumed that further repeats have the same dispersion as the existing ones, so from few repeats the number
+    is a rough estimate. For a share, the effective number of trials per repeat follows from the formula of the score
+    interval, even without any loss. For other quantities, the width decreases with the square root of the number. The
+    decrease of Student's quantile is taken into account.
+
+    Args:
+        intervals: Intervals as returned by `statistics` or `cells`, shape (cells,).
+        n: Number of repeats of each.
+        half_width: Wanted half-width, in the unit of the value.
+        kind: Kind of the quantity.
+        unit: Unit of the quantity.
+
+    Returns:
+        Whole numbers, shape (cells,); 0 if the interval is narrow enough, NaN without an interval.
+
+    Raises:
+        ValueError: A wanted half-width is not above 0.
+    """
+    n, wanted = np.asarray(n, dtype=np.float64), np.asarray(half_width, dtype=np.float64)
+    if not (wanted > 0).all():
+        raise ValueError(f"half-width {wanted}: it must be above 0")
+    value, half = intervals.value, (intervals.high - intervals.low) / 2
+    is_share = kind is not Kind.MEDIAN and unit == "share"
+    bounded = is_share & (intervals.low >= 0) & (intervals.high <= 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(bounded, _inverse_trials(value, half) / _inverse_trials(value, wanted), (half / wanted) ** 2)
+    ratio = np.maximum(ratio, 1)
+    # Intervals that use no estimated variance have the normal quantile instead of Student's.
+    if is_share:
+        estimated = (kind is not Kind.FLAG) & (value > 0) & (value < 1)
+    else:
+        estimated = (n < MIN_FOR_ORDER_STATISTICS) | (kind is Kind.MEAN)
+    with_normal = np.ceil(n * ratio * (1 - 1e-12))  # rounding must not increase a ratio of 1
+    total = np.where(estimated, _with_student(n, ratio, with_normal), with_normal)
+    return np.asarray(total - n)
+
+
+def _inverse_trials(share: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return quantile²/trials of a score interval with a half-width, which is always below 1/2."""
+    spread, square = share * (1 - share), half**2
+    a, b = 0.25 - square, spread - 2 * square
+    return np.where(half < 0.5, (np.sqrt(b * b + 4 * a * square) - b) / (2 * a), np.inf)
+
+
+def _with_student(
+    n: NDArray[np.float64], ratio: NDArray[np.float64], enough: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the smallest N with quantile(N)²/N <= quantile(n)²/n / ratio; `enough` is an upper bound of N."""
+    low, high = np.broadcast_to(n, enough.shape), enough
+    goal = student(np.maximum(n - 1, 1)) ** 2 / n / ratio * (1 + 1e-12)
+    for _ in range(_BISECTIONS):
+        middle = np.floor((low + high) / 2)
+        fits = student(np.maximum(middle - 1, 1)) ** 2 / middle <= goal
+        low, high = np.where(fits, low, middle + 1), np.where(fits, middle, high)
+    return high

@@ -1,0 +1,189 @@
+"""Describe errors in YAML files for users who know YAML but not the classes, with hints about wrong indentation."""
+
+import difflib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Final, get_args
+
+from fieldkit.config.documents import Document, Location
+from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.units import format_count
+
+Fields = Mapping[str, Any]
+"""Types by key of a mapping, from its model."""
+
+_ALIKE: Final = 0.8
+"""Similarity (`difflib`) from which a name counts as a misspelling of another."""
+_DEEPEST: Final = 10
+"""Maximum nesting of generic types that is searched."""
+
+
+def misplaced_hint(key: str, data: Mapping[Any, Any], fields: Fields, outer: Sequence[Fields]) -> tuple[str, int]:
+    """Return a hint about an unknown key, and the enclosing mapping in which the key is valid.
+
+    Args:
+        key: The key.
+        data: The mapping that contains it.
+        fields: The valid keys of that mapping.
+        outer: The valid keys of the enclosing mappings, the outermost first.
+
+    Returns:
+        The hint, and an index into `outer`, or -1 if the key is not valid in any of them.
+    """
+    preceding = list(data)[: list(data).index(key)]
+    parents = [name for name, kind in fields.items() if any(key in keys for keys in _inner_keys(kind))]
+    if parents:
+        # A line with too little indentation most likely follows the mapping that it belongs to.
+        name = next((name for name in reversed(preceding) if name in parents), parents[0])
+        return f"it is a key of {name}: indent it below {name}:", -1
+    for index in reversed(range(len(outer))):
+        if key in outer[index]:
+            return "", index
+    valid = f"valid keys: {', '.join(fields)}"
+    if preceding and _is_opaque_mapping(fields.get(preceding[-1])):
+        similar = [f"did you mean {name!r}? " for name in difflib.get_close_matches(key, fields, n=1, cutoff=_ALIKE)]
+        return (
+            f"{''.join(similar) or f'{valid}; '}if it is a key of {preceding[-1]}, indent it below {preceding[-1]}:",
+            -1,
+        )
+    return did_you_mean(key, fields, valid), -1
+
+
+def _inner_keys(kind: Any, depth: int = 0) -> Iterator[Sequence[str]]:  # noqa: ANN401 (any type)
+    """Yield the valid keys of each model that a type allows, without lists of mappings and mappings by name."""
+    fields = getattr(kind, "model_fields", None)
+    if fields is not None:
+        yield [field.alias or name for name, field in fields.items()]
+        return
+    if getattr(kind, "__origin__", kind) in {list, tuple, dict} or depth == _DEEPEST:
+        return
+    for part in get_args(kind):
+        yield from _inner_keys(part, depth + 1)
+
+
+def _is_opaque_mapping(kind: Any) -> bool:  # noqa: ANN401 (any type)
+    """Return True if a type is a mapping whose keys another package validates."""
+    return any(get_args(part) == (str, object) for part in (kind, *get_args(kind)))
+
+
+SHAPES: Final[dict[str, str]] = {}
+"""Description of the texts that match a pattern, by pattern; see `schema.shaped`."""
+
+_WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
+_MOST_SHOWN: Final = 60
+_NOTHING: Final = ", and there are none; indent the keys that belong to this line more than this line"
+_MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
+
+
+def explain(problems: Sequence[Any], document: Document) -> ConfigurationError:
+    """Return the first problem in a document, with file, line and key path.
+
+    Args:
+        problems: All problems, as `ErrorDetails` of pydantic.
+        document: The document.
+    """
+
+    def line(problem: Any) -> int:  # noqa: ANN401 (as in `explain`)
+        return int(document.where(_location(problem)).rsplit(":", 1)[1])
+
+    problems = sorted(_without_echoes(problems), key=line)
+    first = problems[0]
+    location = _location(first)
+    place: Location = first["loc"]
+    missing = _missing_key(first)
+    if missing:
+        message = f"required key {missing!r} is missing"
+    elif place and place[-1] == "[key]":
+        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {_message(first)}"
+    elif first.get("ctx", {}).get("outer"):
+        message = _misindented(first, document)
+    else:
+        message = _message(first)
+    path = ".".join(str(part) for part in (*document.place, *document.known(place)))
+    remedy = f"add {missing}: to it" if missing else "correct this line"
+    # A value with several valid forms has one problem per form at the same location.
+    others = len({(document.known(_location(problem)), _missing_key(problem)) for problem in problems}) - 1
+    more = f" ({others} more after this one)" if others else ""
+    return ConfigurationError(
+        f"{f'in {path}: ' if path else ''}{message}{more}",
+        where=document.where(location),
+        remedy=f"{remedy}; keys of every file: fieldkit docs reference",
+    )
+
+
+def _misindented(problem: Any, document: Document) -> str:  # noqa: ANN401 (as in `explain`)
+    """Return the message for a key of an enclosing mapping, with the indentation of that mapping's keys."""
+    place, context = problem["loc"], problem["ctx"]
+    key, outer = context["key"], context["outer"]
+    depth = max((depth for depth, part in enumerate(place) if part in outer), default=0)
+    names = [part for part in document.known(place[:depth]) if isinstance(part, str)]
+    owner = f"of {names[-1]}" if names else "of the whole file"
+    return f"unknown key {key} here; it is a key {owner}: indent it like {place[depth]}:"
+
+
+def _missing_key(problem: Any) -> str:  # noqa: ANN401 (as in `explain`)
+    """Return the key that a mapping lacks, or an empty string for another problem."""
+    last = problem["loc"][-1] if problem["loc"] else None
+    return last if problem["type"] == "missing" and isinstance(last, str) else ""
+
+
+def _without_echoes(problems: Sequence[Any]) -> list[Any]:
+    """Return the problems without those of lists that are too short only because of an error in their items."""
+
+    def is_echo(problem: Any) -> bool:  # noqa: ANN401 (as in `explain`)
+        depth = len(problem["loc"])
+        return problem["type"] == "too_short" and any(
+            other["loc"][:depth] == problem["loc"] and len(other["loc"]) > depth for other in problems
+        )
+
+    return [problem for problem in problems if not is_echo(problem)]
+
+
+def _location(problem: Any) -> Location:  # noqa: ANN401 (as in `explain`)
+    location: Location = problem["loc"]
+    context = problem.get("ctx", {})
+    key = context.get("key")
+    return (*location, *context.get("at", ()), *(() if key is None else (key,)))
+
+
+def _message(problem: Mapping[str, Any]) -> str:
+    message: str = _MESSAGES.get(problem["type"], problem["msg"])
+    value, context = problem["input"], problem.get("ctx", {})
+    match problem["type"]:
+        case "model_type" | "dict_type":
+            message = f"keys with values are needed here{_NOTHING * (value is None)}"
+        case "value_error":
+            message = str(context["error"])
+        case "union_tag_not_found":
+            message = f"required key {context['discriminator']} is missing"
+        case "union_tag_invalid":
+            kinds = re.findall(r"'([^']+)'", context["expected_tags"])
+            message = f"there is no kind {context['tag']!r}; {did_you_mean(context['tag'], kinds, _kinds(kinds))}"
+        case "string_pattern_mismatch":
+            message = _pattern_message(str(value), context["pattern"])
+        case "too_short":
+            least, short = context["min_length"], context["actual_length"]
+            message = f"at least {format_count(least, 'item')} are needed here, not {short}"
+        case "string_type" if isinstance(value, bool | int | float):
+            message = f"{message}; put it in quotes"
+        case "bool_type" if isinstance(value, str):
+            message = f"{message}; write true or false"
+        case "int_type" if isinstance(value, str):
+            message = f"{message}, in digits only and without quotes"
+    return message
+
+
+def _kinds(names: Sequence[str]) -> str:
+    return f"kinds: {', '.join(names)}"
+
+
+def _pattern_message(text: str, pattern: str) -> str:
+    """Return the message about a text that does not match a pattern."""
+    quoted = repr(text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}...")
+    if words := _WORDS.fullmatch(pattern):
+        choices = words[1].split("|")
+        return f"{quoted} is not one of: {', '.join(choices)}"
+    if pattern in SHAPES:
+        return f"{quoted} is not {SHAPES[pattern]}"
+    return f"{quoted} should match pattern {pattern!r}"

@@ -1,0 +1,293 @@
+"""MCAP messages from the robots' recordings of one attempt; each robot's times are by its clock.
+
+The packets of a capture are messages, each with its fate if it is known.
+"""
+
+import heapq
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import LinkSample, Protocol, Role
+from fieldkit.export import schemas
+from fieldkit.export.mcap import Channel, Json, Message
+from fieldkit.export.schemas import Level, time
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures.arrays import NO_TIME
+from fieldkit.measure.captures.headers import address_text
+from fieldkit.measure.captures.packets import NO_PORT, Packets
+from fieldkit.measure.captures.pcap import Capture
+from fieldkit.measure.evidence import bag, ping
+from fieldkit.measure.transfers import altered_packets
+from fieldkit.measure.transfers.match import Match, match
+from fieldkit.measure.transfers.transfer_spec import Transfer
+from fieldkit.trial.journal import Attempt
+from fieldkit.trial.plan import Plan
+
+NOT_KNOWN: Final = -1
+_SLICE: Final = 1 << 14
+"""Number of packets that are converted to Python objects at a time."""
+
+_LOST: Final[tuple[dict[str, bool], ...]] = ({"lost": False}, {"lost": True}, {})  # index -1 (NOT_KNOWN) is the last
+_COPY: Final[tuple[dict[str, bool], ...]] = ({"copy": False}, {"copy": True}, {})
+
+
+@dataclass(frozen=True, eq=False)
+class MarkedPackets:
+    """The packets captured by one robot, with their fates.
+
+    Attributes:
+        packets: The packets in the order of the file.
+        lost: 1 if a packet that this robot sent was lost, 0 if not, `NOT_KNOWN` otherwise. Shape (n,).
+        copy: 1 if a packet that it received is a duplicate, 0 if not, `NOT_KNOWN` otherwise. Shape (n,).
+    """
+
+    packets: Packets
+    lost: NDArray[np.int8]
+    copy: NDArray[np.int8]
+
+
+def packet_messages(channel: Channel, repeat: str, captured: MarkedPackets) -> Iterator[Message]:
+    """Yield a message per packet whose time is known, in the order of time.
+
+    Args:
+        channel: The channel.
+        repeat: Name of the repeat's folder.
+        captured: The packets.
+    """
+    time_ns = captured.packets.time_ns
+    order = np.argsort(time_ns, kind="stable")
+    order = order[time_ns[order] != NO_TIME]
+    for start in range(0, len(order), _SLICE):
+        chosen = order[start : start + _SLICE]
+        packets = captured.packets.where(chosen)
+        fates = (captured.lost[chosen].tolist(), captured.copy[chosen].tolist())
+        for t_ns, fields, lost, copy in zip(packets.time_ns.tolist(), _contents(packets), *fates, strict=True):
+            fate = _LOST[lost] | _COPY[copy]
+            yield Message(channel, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | fields | fate)
+
+
+def _contents(packets: Packets) -> Iterator[dict[str, object]]:
+    """Yield the header fields of each packet."""
+    columns = {
+        "protocol": packets.protocol.tolist(),
+        "source": [address_text(*halves) for halves in packets.src.tolist()],
+        "destination": [address_text(*halves) for halves in packets.dst.tolist()],
+        "source_port": packets.sport.tolist(),
+        "destination_port": packets.dport.tolist(),
+        "wire_bytes": packets.wire_bytes.tolist(),
+        "payload_bytes": packets.ip_payload_bytes.tolist(),
+        "fragment_offset": packets.fragment_offset.tolist(),
+    }
+    for values in zip(*columns.values(), strict=True):
+        yield {name: value for name, value in zip(columns, values, strict=True) if value != NO_PORT}
+
+
+# Largest IP payload of a frame that offload did not join: the MTU of Ethernet and Wi-Fi without the shortest header.
+_LARGEST_PAYLOAD_BYTES: Final = 1480
+
+
+def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
+    """Return the fates of the packets of each capture, as far as they belong to transfers captured at both ends.
+
+    Args:
+        captures: The captures by file.
+        transfers: The packet filter of each transfer.
+    """
+    marked = {file: _unknown(capture.packets) for file, capture in captures.items()}
+    by_path: dict[tuple[str, str, str, str], list[Transfer]] = {}
+    for transfer in transfers:
+        here, there = transfer.captures
+        if here is not None and there is not None and {here, there} <= captures.keys():
+            by_path.setdefault((here, there, transfer.sender_address, transfer.receiver_address), []).append(transfer)
+    for (here, there, sender, receiver), same_path in by_path.items():
+        matched = _matched(captures[here], captures[there], same_path)
+        if matched is None:
+            continue
+        sent, received = marked[here], marked[there]
+        forward = sent.packets.are_from(sender) & sent.packets.are_to(receiver) & ~matched.ambiguous
+        sent.lost[forward] = ~matched.arrived[forward]
+        is_ambiguous = np.append(matched.ambiguous, False)[matched.sent_index]  # the last entry is for match.NONE
+        forward = received.packets.are_from(sender) & received.packets.are_to(receiver) & ~is_ambiguous
+        received.copy[forward] = matched.duplicates[forward]
+    return marked
+
+
+def _unknown(packets: Packets) -> MarkedPackets:
+    lost, copy = np.full((2, len(packets)), NOT_KNOWN, np.int8)
+    return MarkedPackets(packets, lost, copy)
+
+
+def _matched(here: Capture, there: Capture, same_path: Sequence[Transfer]) -> Match | None:
+    """Return the matching packets of two captures, or None if they cannot be matched for all transfers of a path."""
+    sent, received = here.packets, there.packets
+    if here.damage or there.damage:
+        return None
+    is_tcp = any(transfer.protocol is Protocol.TCP for transfer in same_path)
+    if is_tcp and (_is_offloaded(sent) or _is_offloaded(received)):
+        return None
+    if any(altered_packets.reason(sent, received, transfer) for transfer in same_path):
+        return None
+    try:
+        return match(sent, received)
+    except EvidenceError:
+        return None
+
+
+def _is_offloaded(captured: Packets) -> bool:
+    """Return True if a capture has frames of several segments; they differ between the two ends."""
+    return bool((captured.ip_payload_bytes > _LARGEST_PAYLOAD_BYTES).any())
+
+
+@dataclass(frozen=True, eq=False)
+class AttemptRecord:
+    """The readable recordings of an attempt; missing or unreadable ones are left out.
+
+    Attributes:
+        plan: The trial.
+        attempt: The attempt.
+        captures: The captures by file; of a damaged capture the part before the damage.
+        pings: The outputs of ping by file.
+        bags: The recorded bags.
+        links: The samples of the radios' links.
+    """
+
+    plan: Plan
+    attempt: Attempt
+    captures: Mapping[str, Capture]
+    pings: Mapping[str, ping.Ping]
+    bags: Mapping[Role, bag.Bag]
+    links: Mapping[Role, Sequence[LinkSample]]
+
+    @property
+    def transfers(self) -> tuple[Transfer, ...]:
+        """The packet filter of each of its transfers."""
+        return self.plan.transfers(self.attempt.repeat.protocol)
+
+
+def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
+    """Return the readable recordings of an attempt."""
+    captures = {name: evidence.read_or_none(pcap.read, name) for name in plan.captures()}
+    pings = {pinging.file: evidence.read_or_none(ping.read, pinging.file) for pinging in plan.pingings()}
+    bags = {role: evidence.read_or_none(bag.read, name) for role, name in plan.bags().items()}
+    return AttemptRecord(
+        plan=plan,
+        attempt=attempt,
+        captures={name: capture for name, capture in captures.items() if capture},
+        pings={name: output for name, output in pings.items() if output},
+        bags={role: content for role, content in bags.items() if content},
+        links={role: evidence.links(role) for role in plan.cast},
+    )
+
+
+def flaws(record: AttemptRecord) -> Iterator[Json]:
+    """Yield a log message for each part of the evidence that the other messages do not contain."""
+
+    def line(text: str, file: str) -> Json:
+        name, t_ns = str(record.attempt.repeat), record.attempt.started_utc_ns
+        return schemas.log(t_ns, Level.WARNING, text, name=name, file=f"repeats/{record.attempt.folder}/{file}")
+
+    for file, capture in record.captures.items():
+        if capture.damage:
+            yield line(capture.damage, file)
+    for file, pings in record.pings.items():
+        if untimed := sum(reply.at_utc_ns is None for reply in pings.replies):
+            yield line(f"{untimed} replies have no time stamp and are left out", file)
+
+
+def messages(record: AttemptRecord) -> Iterator[Message]:
+    """Return the messages of the robots' recordings, in the order of their times as far as their clocks agree."""
+    streams = []
+    marked = packet_fates(record.captures, record.transfers)
+    for file, role in record.plan.captures().items():
+        if file in record.captures:
+            topic, meaning = (
+                _named("packets", _step(file)),
+                "What its capture holds: IP packets, frames of offload.",
+            )
+            channel = _channel(record, role, topic, schemas.PACKET, meaning)
+            streams.append(packet_messages(channel, record.attempt.folder, marked[file]))
+    for role in record.plan.cast:
+        short = [*_phases(record, role), *_links(record, role), *_rtts(record, role)]
+        streams.append(iter(sorted(short, key=attrgetter("time_ns"))))
+    return heapq.merge(*streams, key=attrgetter("time_ns"))
+
+
+def _channel(record: AttemptRecord, role: Role, topic: str, schema: Json, meaning: str) -> Channel:
+    return Channel(f"/{role}/{topic}", schema, f"{role} {record.plan.cast[role].name}", meaning)
+
+
+def _named(topic: str, step: str) -> str:
+    """Return the name of a topic below that of its robot: `rtt`, or `rtt/busy` for a step with a name."""
+    return f"{topic}/{step}" if step else topic
+
+
+def _step(file: str) -> str:
+    """Return the name of the step of a capture, empty if it has none."""
+    return Path(file).stem.rpartition(".")[0]
+
+
+def _rtts(record: AttemptRecord, role: Role) -> Iterator[Message]:
+    """Yield the replies to ping that a robot printed, and ICMP errors, at the times of their output."""
+    for pinging in record.plan.pingings():
+        if pinging.role == role and pinging.file in record.pings:
+            yield from _replies(record, role, pinging.name, pinging.file)
+
+
+def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterator[Message]:
+    repeat, pings = record.attempt.folder, record.pings[file]
+    channel = _channel(record, role, _named("rtt", step), schemas.RTT, "Each reply to ping, when it was printed.")
+    for reply in pings.replies:
+        if reply.at_utc_ns is not None:
+            yield Message(channel, reply.at_utc_ns, schemas.rtt(reply.at_utc_ns, repeat, reply))
+    log = _channel(record, role, "log", schemas.LOG, "ICMP errors in place of a reply to ping.")
+    for problem in pings.problems:
+        if problem.at_utc_ns is not None:
+            text = f"icmp_seq={problem.seq}: {problem.source} says {problem.text}"
+            yield Message(
+                log,
+                problem.at_utc_ns,
+                schemas.log(problem.at_utc_ns, Level.WARNING, text, name=repeat, file=file),
+            )
+
+
+def _links(record: AttemptRecord, role: Role) -> Iterator[Message]:
+    channel = _channel(record, role, "link", schemas.LINK, "What its radio told of its links, five times a second.")
+    for sample in record.links[role]:
+        yield Message(channel, sample.utc_ns, schemas.link(record.attempt.folder, sample))
+
+
+def _phases(record: AttemptRecord, role: Role) -> Iterator[Message]:
+    """Yield when a robot started and stopped recording, sending or receiving, and ping; named steps are separate."""
+    meaning = "What it began to do, by the first and last stamp of its evidence."
+    for step, phase, begin_ns, end_ns in _spans(record, role):
+        channel = _channel(record, role, _named("phase", step), schemas.PHASE, meaning)
+        for t_ns, name in ((begin_ns, phase), (end_ns, "idle")):
+            yield Message(channel, t_ns, schemas.phase(t_ns, record.attempt.folder, name))
+
+
+def _spans(record: AttemptRecord, role: Role) -> Iterator[tuple[str, str, int, int]]:
+    """Yield the phases of a robot: the step's name (empty if it has none), the phase, start and end."""
+    if recorded := record.bags.get(role):
+        yield "", "record", recorded.started_utc_ns, recorded.started_utc_ns + round(recorded.duration_s * 1e9)
+    for transfer in record.transfers:
+        for end, file in zip((transfer.source, transfer.destination), transfer.captures, strict=True):
+            if end == role and file is not None and file in record.captures:
+                forward = transfer.forward(record.captures[file].packets)
+                # Other transfers may have the same direction at the same time as one with a name.
+                times_ns = (forward.where(forward.dport == transfer.port) if transfer.name else forward).time_ns
+                if len(times_ns) and times_ns.min() != NO_TIME:
+                    yield transfer.name, "transfer", int(times_ns.min()), int(times_ns.max())
+    for pinging in record.plan.pingings():
+        if pinging.role == role and pinging.file in record.pings:
+            replies = record.pings[pinging.file].replies
+            stamps_ns = [reply.at_utc_ns for reply in replies if reply.at_utc_ns is not None]
+            if stamps_ns:
+                yield pinging.name, "ping", min(stamps_ns), max(stamps_ns)

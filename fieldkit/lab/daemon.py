@@ -1,0 +1,253 @@
+"""The lab's process: moves to the background, starts the robots, answers on a Unix socket, and stops the robots."""
+
+import os
+import shlex
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from fieldkit.core import runtime
+from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.events import Sink
+from fieldkit.core.runtime import NameHeldError
+from fieldkit.lab import requests
+from fieldkit.lab.folder import LabFolder, make, remove
+from fieldkit.lab.protocol import Lab, LabBackend, Login, unknown_robot
+from fieldkit.lab.requests import LabState, RobotState
+
+OnReady = Callable[[Path], None]
+"""Called when start-up is complete, with the log file for all further output."""
+
+_READY: Final = b"+"
+
+
+def run_detached(work: Callable[[OnReady], int]) -> int:
+    """Run `work` in a child process; return when its start-up is complete or it has exited.
+
+    During start-up the child keeps this terminal: its output is shown here, and it receives Ctrl-C.
+
+    Args:
+        work: Receives a function that it calls with its log file when start-up is complete; after that call it has no
+            terminal. Returns its exit code.
+
+    Returns:
+        0 if start-up is complete, the exit code of `work` if it exited before.
+    """
+    reader, writer = os.pipe()
+    sys.stdout.flush()  # otherwise the child would write the buffered text again
+    pid = os.fork()
+    if pid == 0:
+        os.close(reader)
+        code = 1
+        try:
+            code = work(lambda log: _leave(writer, log))
+        except BaseException:  # noqa: BLE001 (reported as by the interpreter; the parent does its own clean-up)
+            sys.excepthook(*sys.exc_info())
+        sys.stdout.flush()
+        os._exit(code)
+    os.close(writer)
+    try:
+        with os.fdopen(reader, "rb") as ready:
+            if ready.read() == _READY:
+                return 0
+    except BaseException:
+        os.kill(pid, signal.SIGTERM)
+        os.waitpid(pid, 0)
+        raise
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def _leave(writer: int, log: Path) -> None:
+    """Detach from the terminal and the current directory, and notify the parent that start-up is complete."""
+    sys.stdout.flush()
+    os.setsid()
+    os.chdir("/")
+    null = os.open(os.devnull, os.O_RDONLY)
+    output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    for source, target in ((null, 0), (output, 1), (output, 2)):
+        os.dup2(source, target)
+    os.close(null)
+    os.close(output)
+    os.write(writer, _READY)
+    os.close(writer)
+
+
+REQUEST_S: Final = 5.0
+"""Timeout for a client to send its request, and for a robot to accept a connection."""
+
+_REQUEST_BYTES: Final = 4096
+
+
+def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready: Callable[[Lab], None]) -> None:
+    """Run the robots of a backend until SIGINT, SIGTERM or SIGHUP, then remove them completely.
+
+    Call it in the main thread: the robots are terminated when the thread that started them exits.
+
+    Args:
+        folder: The folder of the lab.
+        backend: Starts the robots.
+        seed: Seed of all random numbers of the lab.
+        sink: Receives the names of phases.
+        ready: Called when the robots can be reached.
+
+    Raises:
+        ConfigurationError: A lab of this directory is already up.
+        FieldkitError: As `LabBackend.open_lab`.
+    """
+    with (
+        _until_signal(),
+        _claimed(folder),
+        _listening(folder) as listener,
+        backend.open_lab(seed=seed, sink=sink) as robots,
+    ):
+        began_s = time.monotonic()
+        write_ssh_config(folder, robots.login)
+        ready(robots)
+        while True:
+            client, _ = listener.accept()
+            _serve(client, robots, began_s)
+
+
+@contextmanager
+def _claimed(folder: LabFolder) -> Iterator[None]:
+    """Hold the lock that allows only one lab per directory."""
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(runtime.hold_lock(folder.claim))
+        except NameHeldError as error:
+            raise ConfigurationError("this directory has a lab that is up", remedy="fieldkit lab down") from error
+        yield
+
+
+@contextmanager
+def _listening(folder: LabFolder) -> Iterator[socket.socket]:
+    make(folder)
+    try:
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(folder.socket))
+            folder.socket.chmod(0o600)
+            listener.listen(128)
+            yield listener
+    finally:
+        remove(folder)
+
+
+@contextmanager
+def _until_signal() -> Iterator[None]:
+    """Leave the body at the first signal. Later signals are ignored, so that the clean-up is not interrupted."""
+    is_stopping = False
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        nonlocal is_stopping
+        if not is_stopping:
+            is_stopping = True
+            raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    except KeyboardInterrupt:
+        return
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _serve(client: socket.socket, robots: Lab, began_s: float) -> None:
+    """Answer one request; errors of the connection and invalid requests are ignored."""
+    with closing(client):
+        client.settimeout(REQUEST_S)
+        try:
+            command, _, arguments = client.recv(_REQUEST_BYTES).decode().strip().partition(" ")
+            match command:
+                case "connect":
+                    _pass_socket(client, robots, arguments)
+                case "state":
+                    client.sendall(requests.pack_state(_state(robots, time.monotonic() - began_s)))
+                case "overview":
+                    client.sendall(requests.pack_overview(robots.overview()))
+                case "move":
+                    client.sendall(_move(robots, *arguments.split(" ", 1)))
+        except (OSError, TypeError, ValueError):
+            return
+
+
+def _pass_socket(client: socket.socket, robots: Lab, name: str) -> None:
+    """Pass a client the socket to a robot, or send it the error message."""
+    try:
+        stream = robots.connect(name, REQUEST_S)
+    except KeyError:
+        client.sendall(f"there is no robot {name!r} in this lab".encode())
+    except (OSError, FieldkitError) as error:
+        client.sendall(f"{name} does not answer: {error}".encode())
+    else:
+        with closing(stream):
+            stream.setblocking(True)
+            socket.send_fds(client, [b"+"], [stream.fileno()])
+
+
+def _move(robots: Lab, name: str, to: str) -> bytes:
+    """Move a robot; return the answer, which is its new position or an error."""
+    try:
+        if name not in robots.members:
+            raise unknown_robot(name, robots.members)
+        return requests.pack_place(robots.move(name, requests.unpack_destination(to)))
+    except FieldkitError as error:
+        return requests.pack_error(error)
+
+
+def _state(robots: Lab, up_s: float) -> LabState:
+    rows = (
+        RobotState(
+            name=name,
+            profile=member.profile.name,
+            roles=member.roles,
+            address=member.address,
+            place_m=robots.place_m(name),
+            programs=robots.programs(name),
+        )
+        for name, member in robots.members.items()
+    )
+    return LabState(os.getpid(), up_s, tuple(rows))
+
+
+_CONNECT: Final = Path(__file__).with_name("connect.py")
+
+
+def write_ssh_config(folder: LabFolder, login: Login) -> None:
+    """Write key, host keys and configuration into the lab's folder, readable for this user only."""
+    hosts = "".join(f"{name} {key}\n" for name, key in login.host_keys.items())
+    for path, text in (
+        (folder.key, login.private_key),
+        (folder.known_hosts, hosts),
+        (folder.ssh_config, ssh_config(folder, login.user, login.host_keys)),
+    ):
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+
+
+def ssh_config(folder: LabFolder, user: str, robots: Iterable[str]) -> str:
+    """Return a configuration for `ssh -F`: robots by name, with pinned host keys, over Unix sockets."""
+    # -I ignores modules in the current directory and Python's environment variables.
+    words = (sys.executable, "-I", str(_CONNECT), str(folder.socket))
+    command = shlex.join(words).replace("%", "%%")
+    return f"""\
+Host {" ".join(robots)}
+    User {user}
+    IdentityFile "{folder.key}"
+    IdentitiesOnly yes
+    IdentityAgent none
+    UserKnownHostsFile "{folder.known_hosts}"
+    GlobalKnownHostsFile none
+    StrictHostKeyChecking yes
+    UpdateHostKeys no
+    ProxyCommand {command} %n
+    ProxyUseFdpass yes
+"""

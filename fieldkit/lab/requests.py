@@ -1,0 +1,214 @@
+"""Requests to the process of a lab: the messages, one JSON document each way, and the client that sends them."""
+
+import json
+import os
+import select
+import signal
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final, TypeVar
+
+from fieldkit.config.schema import Codec
+from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError
+from fieldkit.core.model import Vector
+from fieldkit.lab.folder import LabFolder
+from fieldkit.lab.protocol import Destination, Overview
+
+_FAMILIES: Final = {family.__name__: family for family in (ConfigurationError, LinkError)}
+
+
+@dataclass(frozen=True)
+class RobotState:
+    """State of a robot of a lab.
+
+    Attributes:
+        name: Its name.
+        profile: Name of its profile.
+        roles: Its roles in trials.
+        address: Its address on the radio.
+        place_m: Position of its antenna, metres east, north, up.
+        programs: Names of the programs that run on it; empty if the robot has terminated.
+    """
+
+    name: str
+    profile: str
+    roles: tuple[str, ...]
+    address: str
+    place_m: Vector
+    programs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class LabState:
+    """State of a lab.
+
+    Attributes:
+        pid: Process id.
+        up_s: Time since it has been up.
+        robots: Its robots.
+    """
+
+    pid: int
+    up_s: float
+    robots: tuple[RobotState, ...]
+
+
+@dataclass(frozen=True)
+class _Place:
+    place_m: Vector
+
+
+@dataclass(frozen=True)
+class _Refusal:
+    error: str
+    what: str
+    remedy: str
+
+
+_STATE: Final = Codec(LabState)
+_OVERVIEW: Final = Codec(Overview)
+_DESTINATION: Final = Codec(Destination)
+_PLACE: Final = Codec(_Place)
+_REFUSAL: Final = Codec(_Refusal)
+
+
+def pack_state(state: LabState) -> bytes:
+    """Return the state of a lab as JSON."""
+    return json.dumps(_STATE.dump(state)).encode()
+
+
+def pack_overview(overview: Overview) -> bytes:
+    """Return a plan view of a lab as JSON."""
+    return json.dumps(_OVERVIEW.dump(overview)).encode()
+
+
+def pack_destination(destination: Destination) -> str:
+    """Return a destination as one line of JSON, for a request."""
+    return json.dumps(_DESTINATION.dump(destination))
+
+
+def pack_place(place_m: Vector) -> bytes:
+    """Return a position as JSON."""
+    return json.dumps(_PLACE.dump(_Place(place_m))).encode()
+
+
+def pack_error(error: FieldkitError) -> bytes:
+    """Return an error as JSON, which the client raises."""
+    family = type(error).__name__ if type(error).__name__ in _FAMILIES else LinkError.__name__
+    return json.dumps(_REFUSAL.dump(_Refusal(family, error.what, error.remedy))).encode()
+
+
+def unpack_state(answer: bytes) -> LabState:
+    """Return the state in an answer.
+
+    Raises:
+        FieldkitError: The answer is an error.
+        ValueError: The answer is invalid.
+    """
+    return _STATE.parse(_read(answer))
+
+
+def unpack_place_m(answer: bytes) -> Vector:
+    """Return the position in an answer; raises as `state`."""
+    return _PLACE.parse(_read(answer)).place_m
+
+
+def unpack_overview(answer: bytes) -> Overview:
+    """Return the plan view of the lab in an answer; raises as `state`."""
+    return _OVERVIEW.parse(_read(answer))
+
+
+def unpack_destination(request: str) -> Destination:
+    """Return the destination in a request.
+
+    Raises:
+        ValueError: The request is invalid.
+    """
+    return _DESTINATION.parse(json.loads(request))
+
+
+def _read(answer: bytes) -> object:
+    content = json.loads(answer)
+    if isinstance(content, dict) and "error" in content:
+        refusal = _REFUSAL.parse(content)
+        raise _FAMILIES.get(refusal.error, LinkError)(refusal.what, remedy=refusal.remedy)
+    return content
+
+
+Answer = TypeVar("Answer")
+
+_REPLY_S: Final = 20.0
+_END_S: Final = 20.0
+_NO_LAB: Final = "this directory has no lab that is up"
+
+
+class NoLabError(ConfigurationError):
+    """The directory has no lab that is up."""
+
+
+def state(folder: LabFolder) -> LabState:
+    """Return the state of the lab.
+
+    Raises:
+        NoLabError: No lab is up.
+        LinkError: It does not answer.
+    """
+    return _request(folder, "state", unpack_state)
+
+
+def overview(folder: LabFolder) -> Overview:
+    """Return the current plan view of the lab. Errors as `state`."""
+    return _request(folder, "overview", unpack_overview)
+
+
+def move(folder: LabFolder, robot: str, to: Destination) -> Vector:
+    """Move a robot instantly and return the new position of its antenna in metres. Errors as `state`.
+
+    Raises:
+        ConfigurationError: There is no such robot, or the destination is not in the world.
+    """
+    return _request(folder, f"move {robot} {pack_destination(to)}", unpack_place_m)
+
+
+def end(folder: LabFolder) -> None:
+    """Terminate the lab's process with its robots; return when it has exited.
+
+    Raises:
+        NoLabError: No lab is up.
+        LinkError: It does not exit.
+    """
+    with _connected(folder) as lab:
+        # The kernel reports which process listens on the socket, so that no other process is killed.
+        credentials = lab.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+        process = os.pidfd_open(struct.unpack("3i", credentials)[0])
+    try:
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            signal.pidfd_send_signal(process, number)
+            if select.select([process], [], [], _END_S)[0]:
+                return
+    finally:
+        os.close(process)
+    raise LinkError("the lab does not exit, not even after SIGKILL", remedy="see what blocks it: ps axf")
+
+
+def _request(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -> Answer:
+    with _connected(folder) as lab:
+        try:
+            lab.sendall(f"{request}\n".encode())
+            return read(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
+        except (OSError, ValueError) as error:
+            raise LinkError(f"the lab does not answer: {error}", remedy="fieldkit lab down") from error
+
+
+@contextmanager
+def _connected(folder: LabFolder) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX) as lab:
+        lab.settimeout(_REPLY_S)
+        try:
+            lab.connect(str(folder.socket))
+        except OSError as error:
+            raise NoLabError(_NO_LAB, remedy="fieldkit lab up") from error
+        yield lab

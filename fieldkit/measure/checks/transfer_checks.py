@@ -1,0 +1,259 @@
+"""Sources of the columns of a transfer, and contradictions between its two captures and two files.
+
+A contradiction shows that a capture or a file is incomplete, whatever the link loses, duplicates or reorders, and for
+any clock offset.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
+from fieldkit.core.model import Protocol
+from fieldkit.core.units import format_count
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures.arrays import Keys, row_hashes
+from fieldkit.measure.captures.packets import NO_PORT, RST, SYN, UDP_HEADER_BYTES, Packets
+from fieldkit.measure.checks import udp_file_checks
+from fieldkit.measure.evidence import reading
+from fieldkit.measure.transfers.tcp_streams import LONGEST_BYTES, Connections
+from fieldkit.measure.transfers.transfer_spec import Transfer
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Sizes of both files of a transfer, and the length of their common prefix."""
+
+    sent_bytes: int
+    received_bytes: int
+    common_bytes: int
+
+    @property
+    def are_equal(self) -> bool:
+        return self.sent_bytes == self.received_bytes == self.common_bytes
+
+
+def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, cut: bool = False) -> Iterator[str]:
+    """Yield each contradiction as a sentence. Incomplete evidence contradicts nothing.
+
+    Args:
+        evidence: The attempt's evidence.
+        transfer: The transfer.
+        finished: True if the listener is known to have ended without being stopped.
+        cut: True if the listener is known to have been stopped before it was finished.
+    """
+    files = _files(evidence, transfer)
+    if files and transfer.protocol is Protocol.TCP and files.common_bytes < files.received_bytes:
+        yield f"{transfer.received_file} is not a prefix of {transfer.sent_file}, although TCP changes no byte"
+    sender, receiver = map(evidence.whole_capture, transfer.captures)
+    if sender is None or receiver is None:
+        return
+    if earlier_packets := _earlier_traffic(sender.packets, receiver.packets, transfer):
+        yield f"packets of an earlier attempt were still on the way: {earlier_packets}"
+    elif transfer.protocol is Protocol.UDP:
+        size_problems = list(_udp(sender.packets, receiver.packets, files, transfer))
+        yield from size_problems or udp_file_checks.find(
+            evidence, transfer, sender.packets, receiver.packets, cut=cut
+        )
+    elif files is None or max(files.sent_bytes, files.received_bytes) < LONGEST_BYTES:
+        yield from _tcp(sender.packets, receiver.packets, files, transfer, finished=finished)
+
+
+def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
+    sent = evidence.read_or_none(reading.size, transfer.sent_file)
+    received = evidence.read_or_none(reading.size, transfer.received_file)
+    common = evidence.read_or_none(reading.common_prefix_bytes, "", transfer.sent_file, transfer.received_file)
+    return None if sent is None or received is None or common is None else _Files(sent, received, common)
+
+
+def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
+    """Return a description of packets of an earlier transfer, or None; in one transfer each netcat has one port.
+
+    Such packets arrive with payload from a port from which nothing was sent; or they were delayed in the sender, and
+    are sent from another port than that of the last start. Retransmissions of an aborted connection are no start.
+    """
+    sent, received = (
+        packets.where(packets.dport == transfer.port) for packets in map(transfer.forward, (sender, receiver))
+    )
+    has_payload = (received.tcp_payload_bytes > 0) | (received.udp_bytes > 0)
+    if stray := int((has_payload & ~np.isin(received.sport, sent.sport)).sum()):
+        return f"{format_count(stray, 'packet')} to the transfer's port came from a port from which none was sent"
+    starts = sent if transfer.protocol is Protocol.UDP else sent.where(sent.tcp_flags & SYN != 0)
+    ports, first = np.unique(starts.sport, return_index=True)
+    if len(ports) > 1:
+        delayed = int((starts.sport != ports[first.argmax()]).sum())
+        return f"{format_count(delayed, 'packet')} left for the transfer's port before its sender started"
+    return None
+
+
+def _amounts(files: _Files, captured_bytes: int, arrived_bytes: int, transfer: Transfer) -> Iterator[str]:
+    """Yield contradictions if captures contain more bytes than were sent, or fewer than were received."""
+    if captured_bytes > files.sent_bytes:
+        yield f"{captured_bytes} bytes left the {transfer.source}, but {transfer.sent_file} has {files.sent_bytes}"
+    if files.received_bytes > arrived_bytes:
+        captured = f"contains {arrived_bytes} bytes of the transfer"
+        file = f"{transfer.received_file} has {files.received_bytes}"
+        yield f"the {transfer.destination}'s capture {captured}, but {file}"
+
+
+def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer) -> Iterator[str]:
+    both = transfer.forward(sender), transfer.forward(receiver)
+    # A capture also contains later fragments of other programs' datagrams.
+    ids = np.concatenate([packets.ip_id[packets.dport == transfer.port] for packets in both])
+    sent, received = (
+        packets.where((packets.dport == transfer.port) | (packets.dport == NO_PORT) & np.isin(packets.ip_id, ids))
+        for packets in both
+    )
+    first, first_received = sent.dport == transfer.port, received.dport == transfer.port
+    keys, keys_received = _packet_keys(sent), _packet_keys(received)
+    if unsent := int((~np.isin(keys_received[first_received], keys[first])).sum()):
+        yield f"{format_count(unsent, 'datagram')} arrived without being in the {transfer.source}'s capture"
+    if files is None:
+        return
+    # The arrived bytes are at most those announced by the first fragments, and at most those in all fragments.
+    announced = received.udp_bytes[first_received]
+    arrived_bytes = min(int(announced.sum()), int(received.ip_payload_bytes.sum())) - UDP_HEADER_BYTES * len(
+        announced
+    )
+    sent_bytes = int((sent.udp_bytes[first] - UDP_HEADER_BYTES).sum())
+    yield from _amounts(files, sent_bytes, arrived_bytes, transfer)
+    # Copies can compensate for missing packets in the sum, but not packet by packet. A later fragment whose id
+    # another transfer uses too cannot be assigned.
+    others = np.concatenate(
+        [packets.ip_id[(packets.dport != transfer.port) & (packets.dport != NO_PORT)] for packets in both]
+    )
+    certain = first | ~np.isin(sent.ip_id, others)
+    missing = int((~np.isin(keys[certain], keys_received)).sum())
+    if missing and files.are_equal and files.received_bytes <= arrived_bytes:
+        missing_text = f"lacks {format_count(missing, 'packet')} of it"
+        yield f"{transfer.received_file} is complete, but the {transfer.destination}'s capture {missing_text}"
+
+
+def _packet_keys(packets: Packets) -> Keys:
+    """Return a key per packet that is equal at both ends and practically unique."""
+    return row_hashes(packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes, packets.sport + 1)
+
+
+def _tcp(
+    sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer, *, finished: bool
+) -> Iterator[str]:
+    sent, received = (
+        packets.where(packets.dport == transfer.port)
+        for packets in (transfer.forward(sender), transfer.forward(receiver))
+    )
+    answers_received, answers_sent = (
+        packets.where(packets.sport == transfer.port)
+        for packets in (transfer.backward(sender), transfer.backward(receiver))
+    )
+    if _is_refused(sent, answers_received):
+        what = f"the {transfer.destination} refused the connection"
+        yield f"{what}: no program listened when the {transfer.source} started"
+        return
+    connections_by_role = {
+        transfer.source: Connections.from_syn(sent),
+        transfer.destination: Connections.from_syn(received),
+    }
+    data_ports = np.unique(received.sport[received.tcp_payload_bytes > 0])
+    has_syn = {role: connections.includes(data_ports) for role, connections in connections_by_role.items()}
+    for role, mask in has_syn.items():
+        # If the SYN is in neither capture, these are retransmissions of an earlier transfer.
+        if (~mask & np.logical_or(*has_syn.values())).any():
+            yield f"bytes arrived on a connection whose SYN is not in the {role}'s capture"
+            return
+    connections = connections_by_role[transfer.source]
+    if unsent := connections.payload(received).bytes_not_in(connections.payload(sent)):
+        yield f"{format_count(unsent, 'byte')} arrived without being in the {transfer.source}'s capture"
+    answers = Packets.concatenated((answers_received, answers_sent))
+    acknowledged = connections.acknowledged(answers)
+    for frames, role in ((sent, transfer.source), (received, transfer.destination)):
+        if missing := acknowledged.bytes_not_in(connections.numbers(frames)):
+            yield f"{format_count(missing, 'byte')} were acknowledged that are not in the {role}'s capture"
+    if files is None:
+        return
+    arrived_bytes = connections.payload(received).size_bytes
+    yield from _amounts(files, connections.payload(sent).size_bytes, arrived_bytes, transfer)
+    ended = not connections.numbers(sent).bytes_not_in(acknowledged)
+    # If a program stops reading before the end, the kernel rejects the rest with a reset.
+    refused = (answers.tcp_flags & RST != 0).any()
+    if finished and (ended or refused) and files.received_bytes < arrived_bytes:
+        arrived = f"{arrived_bytes} bytes arrived, but {transfer.received_file} has {files.received_bytes}"
+        yield f"{arrived}, although its listener ended normally"
+
+
+def _is_refused(sent: Packets, answers: Packets) -> bool:
+    """Return True if the sender's only SYN was refused and none accepted; a repeated SYN may be due to the link."""
+    resets = answers.where(answers.tcp_flags & RST != 0)
+    if not len(resets) or (answers.tcp_flags & SYN != 0).any():
+        return False
+    syn_packets = sent.where((sent.tcp_flags & SYN != 0) & (sent.time_ns <= resets.time_ns.min()))
+    return len(syn_packets) == 1
+
+
+CROSS_CHECKS: Final = (
+    udp_file_checks.CROSS_CHECK,
+    CrossCheck(
+        "file received over TCP",
+        ("received_bytes", "file_loss", "hash_match", "goodput_bit_s", "completion_s"),
+        "`recv.bag`",
+        ("`scan.bag`: the same content up to there", "both captures: bytes that arrived", "how the listener ended"),
+        "bytes that its listener did not read before its time limit",
+    ),
+    CrossCheck(
+        "file sent",
+        ("sent_bytes", "bag_messages", "bag_duration_s"),
+        "`scan.bag`",
+        ("sender's capture: bytes that left", "the procedure: topics and duration"),
+        "half of the duration, because a recorder needs time to subscribe",
+    ),
+    CrossCheck(
+        "packets sent and received",
+        (
+            *("ip_*", "datagram*", "byte_loss", "tcp_*", "paper_packets", "paper_received", "paper_loss"),
+            *("transfer_s", "transfer_from", "throughput_bit_s", "paper_window_bytes"),
+        ),
+        "`sender.pcap`, `receiver.pcap`",
+        ("each other", "`ROLE-capture.log`: tcpdump's counters", "TCP's acknowledgments", "both files"),
+        "none: losses, copies and reordering on the link are no contradictions",
+    ),
+    CrossCheck(
+        "delay and its variation",
+        ("one_way_*", "delay_variation_*", "jitter_s", "clock_*"),
+        "times in `sender.pcap` and `receiver.pcap`",
+        ("packets in both directions: offset and skew of the clocks", "each robot's clock before and after"),
+        "withheld if the error of the offset is above a tenth of the delay, or the clocks were unsteady",
+        CheckOutcome.WITHHELD,
+    ),
+    CrossCheck(
+        "the paper's delay",
+        ("paper_delay_s", "paper_transfer_s"),
+        "`ping.txt`: `time=`",
+        ("as for the round-trip time of the step ping",),
+        "as for the step ping",
+    ),
+    CrossCheck(
+        "datagrams that the kernel refused",
+        ("receiver_udp_buffer_errors", "receiver_reassembly_failures"),
+        "`ROLE-before.txt`, `ROLE-after.txt`: /proc/net/snmp",
+        (),
+        "only the kernel counts them; a counter that is missing or decreased is withheld",
+        CheckOutcome.UNCHECKED,
+    ),
+    CrossCheck(
+        "components of the delay in the emulator",
+        ("delay_s", "delay_*_s", "delay_packets"),
+        "`medium.txt`",
+        (),
+        "only the testbed knows them; the file is rejected if a robot provides it",
+        CheckOutcome.UNCHECKED,
+    ),
+    CrossCheck(
+        "distance and speed during the transfer",
+        ("transfer_distance_*", "transfer_*_speed_m_s"),
+        "`track.csv` of the testbed, else `positions.json`",
+        (),
+        "compared if steps move robots or record positions",
+        CheckOutcome.UNCHECKED,
+    ),
+)

@@ -1,0 +1,117 @@
+"""Parts of iperf3's JSON: fields, each checked for its type before use, parameters (`start`) and totals (`end`)."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+_MAX_COUNT: Final = 2**53
+
+
+def mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return the object under a key; an empty one if there is no object."""
+    value = document.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def items(document: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
+    """Return the objects of the list under a key; an empty list if there is no list."""
+    value = document.get(key)
+    return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
+
+
+def number(document: Mapping[str, Any], key: str) -> float | None:
+    """Return the number under a key; None if it is missing, not finite, negative, or not below 2**53."""
+    value = document.get(key)
+    fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _MAX_COUNT
+    return float(value) if fits and value is not None and math.isfinite(value) else None
+
+
+def count(document: Mapping[str, Any], key: str) -> int | None:
+    """Return the number under a key as an integer; None under the conditions of `number`."""
+    value = number(document, key)
+    return None if value is None else int(value)
+
+
+@dataclass(frozen=True)
+class IperfStart:
+    """Parameters of a test; None, or an empty text, if the JSON does not contain them.
+
+    Attributes:
+        cookie: Random text that is the same at both ends of a test.
+        began_utc_s: Start, in seconds since 1970 UTC.
+        protocol: `tcp` or `udp`.
+        streams: Number of parallel streams.
+        block_bytes: Bytes per write; for UDP, the payload of a datagram.
+        reverse: Whether the server sends.
+    """
+
+    cookie: str = ""
+    began_utc_s: int | None = None
+    protocol: str = ""
+    streams: int | None = None
+    block_bytes: int | None = None
+    reverse: bool | None = None
+
+
+@dataclass(frozen=True)
+class IperfTotals:
+    """Totals in `end`; None if unknown.
+
+    Attributes:
+        sent_bytes: Payload sent.
+        received_bytes: Payload received.
+        datagrams: UDP datagrams that the receiver expected.
+        lost: Of these, the datagrams that it did not receive.
+        jitter_s: Jitter at the receiver, in seconds.
+        retransmits: Retransmitted segments.
+        out_of_order: Datagrams of all streams that arrived out of order, duplicates included.
+        ends_s: End times of all summaries, in seconds from the start.
+    """
+
+    sent_bytes: int | None = None
+    received_bytes: int | None = None
+    datagrams: int | None = None
+    lost: int | None = None
+    jitter_s: float | None = None
+    retransmits: int | None = None
+    out_of_order: int = 0
+    ends_s: tuple[float, ...] = ()
+
+
+def parse_start(document: Mapping[str, Any]) -> IperfStart:
+    """Return the parameters of a test."""
+    start = mapping(document, "start")
+    test = mapping(start, "test_start")
+    cookie, protocol, reverse = start.get("cookie"), test.get("protocol"), number(test, "reverse")
+    return IperfStart(
+        cookie=cookie if isinstance(cookie, str) else "",
+        began_utc_s=count(mapping(start, "timestamp"), "timesecs"),
+        protocol=protocol.lower() if isinstance(protocol, str) else "",
+        streams=count(test, "num_streams"),
+        block_bytes=count(test, "blksize"),
+        reverse=None if reverse is None else bool(reverse),
+    )
+
+
+def parse_totals(document: Mapping[str, Any]) -> IperfTotals:
+    """Return the totals of a test."""
+    end = mapping(document, "end")
+    both, sent, received = (mapping(end, name) for name in ("sum", "sum_sent", "sum_received"))
+    udp_part = received if count(received, "packets") else both
+    return IperfTotals(
+        sent_bytes=count(sent or both, "bytes") or None,
+        received_bytes=count(received, "bytes") or None,
+        datagrams=count(udp_part, "packets") or None,
+        lost=count(udp_part, "lost_packets") if count(udp_part, "packets") else None,
+        jitter_s=next((ms / 1e3 for part in (received, both) if (ms := number(part, "jitter_ms"))), None),
+        retransmits=count(sent, "retransmits"),
+        out_of_order=sum(count(mapping(stream, "udp"), "out_of_order") or 0 for stream in items(end, "streams")),
+        ends_s=tuple(_ends_s(end)),
+    )
+
+
+def _ends_s(end: Mapping[str, Any]) -> Iterator[float]:
+    sums = [mapping(end, name) for name in ("sum", "sum_sent", "sum_received")]
+    parts = [mapping(stream, name) for stream in items(end, "streams") for name in ("udp", "sender", "receiver")]
+    yield from (end_s for part in (*sums, *parts) if (end_s := number(part, "end")) is not None)

@@ -1,0 +1,148 @@
+"""Position samples of one robot from a bag, a telemetry log, a GPX file or a CSV file."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core import plugins
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence import bag, reading
+from fieldkit.measure.evidence.sandbox import ReaderError, SandboxedReader
+from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.samples import MOST_SAMPLES, PLACED, WGS84, Samples, read_csv, require_increasing
+
+MOST_STALE_S: Final = 10.0
+"""If stamps and reception times differ by more than this, the stamps are from another clock."""
+
+PositionReader = Callable[[Path, Account], Samples]
+"""Returns the samples of a source in a file, with the errors of `read_bag`."""
+
+_GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
+
+
+def read_file(path: Path) -> Samples:
+    """Return the samples in a GPX or CSV file, distinguished by the file name's suffix. Times are the file's.
+
+    Raises:
+        EvidenceError: The file has another suffix or is invalid.
+    """
+    match path.suffix.lower():
+        case ".csv":
+            return read_csv(path)
+        case ".gpx":
+            return _read_gpx(path)
+    raise EvidenceError("is neither GPX nor CSV", where=str(path), remedy="name a file that ends in .gpx or .csv")
+
+
+def _read_gpx(path: Path) -> Samples:
+    try:
+        points = _GPX_READER.query({"path": str(path.absolute())}, reading.size(path))["points"]
+    except ReaderError as error:
+        raise EvidenceError(f"cannot be read as GPX: {error}", where=str(path)) from error
+    if len(points) > MOST_SAMPLES:
+        raise EvidenceError(f"has more than {MOST_SAMPLES} points", where=str(path), remedy="cut it to the trial")
+    try:
+        require_increasing(
+            [at_ns for at_ns, *_ in points], [f"point {number}" for number in range(1, len(points) + 1)]
+        )
+    except EvidenceError as error:
+        where = ", ".join(filter(None, (str(path), error.where)))
+        raise EvidenceError(error.what, where=where, remedy=error.remedy) from error
+    values = np.array(
+        [[math.nan if value is None else value for value in point[1:]] for point in points], dtype=float
+    )
+    if not (np.isfinite(values[:, :2]).all() and (abs(values[:, :2]) <= (90, 180)).all()):
+        raise EvidenceError("has a point with invalid coordinates", where=str(path), remedy="export the track again")
+    return Samples(np.array([at_ns for at_ns, *_ in points]), values, WGS84)
+
+
+def read_topic(path: Path, account: Account) -> Samples:
+    """Return the samples in a topic of a bag, or of a message type in a telemetry log. Times are the recorder's.
+
+    Raises:
+        EvidenceError: The file cannot be read or has no positions.
+    """
+    point = _readers().get(path.suffix)
+    reader: PositionReader = read_bag if point is None else plugins.load(point)
+    return reader(path, account)
+
+
+@cache
+def _readers() -> Mapping[str, EntryPoint]:
+    """Return the readers of files other than bags, by the suffix of the files."""
+    return {f".{point.name}": point for point in plugins.entry_points(plugins.POSITIONS)}
+
+
+def read_bag(path: Path, account: Account) -> Samples:
+    """Return the samples in a topic of a bag. Times are the robot's.
+
+    If several messages have the same time, the first is used.
+
+    Raises:
+        EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or its stamps
+            are from another clock.
+    """
+    topic = account.topic
+    topic_data = bag.positions(path, topic, account.child)
+    if not topic_data["rows"]:
+        raise EvidenceError(
+            f"no position in {topic}", where=str(path), remedy="check that a node publishes the topic"
+        )
+    ((kind, *other_kinds), (frame, *other_frames)) = topic_data["types"], topic_data["frames"]
+    if other_kinds or other_frames:
+        raise EvidenceError(
+            f"{topic} has positions in several frames: {', '.join(topic_data['frames'])}",
+            where=str(path),
+            remedy="name the child frame",
+        )
+    times = np.array([row[:2] for row in topic_data["rows"]], dtype=np.int64)
+    values = np.array([row[2:] for row in topic_data["rows"]], dtype=float)
+    stamped = account.stamps == "header"
+    stale_s = abs(np.median(times[:, 0] - times[:, 1])) / 1e9
+    if stamped and stale_s > MOST_STALE_S:
+        raise EvidenceError(
+            f"the stamps of {topic} differ by {stale_s:.0f} s from the times of reception",
+            where=str(path),
+            remedy="write times: received, in the step",
+        )
+    times_ns, first = np.unique(times[:, 0 if stamped else 1], return_index=True)
+    frames = {"sensor_msgs/msg/NavSatFix": WGS84, "nav_msgs/msg/Odometry": PLACED}
+    is_odometry = frames.get(kind) == PLACED
+    yaws_rad = values[first, 3] if is_odometry else None
+    return Samples(times_ns, values[first, :3], frames.get(kind, f"frame {frame}"), yaws_rad)
+
+
+def to_placement_frame(samples: Samples, account: Account) -> Samples:
+    """Transform odometry to the frame of the placement, with the robot's place and heading at the start of the step.
+
+    Args:
+        samples: Odometry with times by the laptop's clock.
+        account: Has the start time, place and heading.
+
+    Raises:
+        EvidenceError: The heading is unknown, or odometry has no sample at the start.
+    """
+    assert samples.yaws_rad is not None
+    if account.heading_rad is None:
+        raise EvidenceError(f"{account.topic} has no absolute direction, and the robot's initial heading is unknown")
+    at = int(np.searchsorted(samples.times_ns, account.began_utc_ns, side="right")) - 1
+    if at < 0:
+        late_s = (int(samples.times_ns[0]) - account.began_utc_ns) / 1e9
+        raise EvidenceError(f"{account.topic} begins {late_s:.1f} s after the step started, so the start is unknown")
+    turn_rad = account.heading_rad - float(samples.yaws_rad[at])
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    from_start_m = samples.values - samples.values[at]
+    turned = np.column_stack(
+        (
+            cos * from_start_m[:, 0] - sin * from_start_m[:, 1],
+            sin * from_start_m[:, 0] + cos * from_start_m[:, 1],
+            from_start_m[:, 2],
+        )
+    )
+    return replace(samples, values=turned + np.array(account.start))

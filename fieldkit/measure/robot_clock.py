@@ -1,0 +1,91 @@
+"""The clock of a robot: its offset from the laptop's clock with the maximum error, and end times of jobs by it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fieldkit.core.model import Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import clock, host
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """One exchange of timestamps as in RFC 5905, section 8, with no processing time on the robot.
+
+    Attributes:
+        asked_ns: The laptop's clock before the request, nanoseconds since 1970 UTC.
+        robot_ns: The robot's clock at some moment in between.
+        answered_ns: The laptop's clock when the answer had arrived.
+        resolution_ns: Resolution of `robot_ns`: the robot's clock was at most this much later. 0 if it is exact.
+    """
+
+    asked_ns: int
+    robot_ns: int
+    answered_ns: int
+    resolution_ns: int = 0
+
+    @property
+    def width_ns(self) -> int:
+        """Width of the interval that contains the offset."""
+        return self.answered_ns - self.asked_ns + self.resolution_ns
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Offset of a robot's clock from the laptop's.
+
+    Attributes:
+        offset_s: Best estimate in seconds; positive if the robot's clock is ahead.
+        error_s: Maximum error of the estimate, whatever the delays of request and answer were.
+    """
+
+    offset_s: float
+    error_s: float
+
+
+def offset(exchanges: Sequence[Exchange]) -> Offset:
+    """Return the offset from the exchange with the narrowest interval: its midpoint, and half its width as the error.
+
+    The robot read its clock at some moment between request and answer, so its offset lies between
+    `robot - answered` and `robot + resolution - asked`.
+
+    Raises:
+        ValueError: There is no exchange.
+    """
+    best = min(exchanges, key=lambda exchange: exchange.width_ns)
+    middle_ns = best.robot_ns + best.resolution_ns / 2 - best.asked_ns - (best.answered_ns - best.asked_ns) / 2
+    return Offset(offset_s=middle_ns / 1e9, error_s=best.width_ns / 2e9)
+
+
+def parse_date(text: str) -> tuple[int, int] | None:
+    """Return the time printed by `date -u +%s.%N` and its resolution, in nanoseconds since 1970, or None if invalid.
+
+    busybox does not support `%N` and prints it literally or omits it; the resolution is then one second.
+    """
+    seconds, _, fraction = text.strip().partition(".")
+    if not (seconds.isascii() and seconds.isdigit() and len(seconds) <= 11):
+        return None
+    if len(fraction) == 9 and fraction.isascii() and fraction.isdigit():
+        return int(seconds) * 10**9 + int(fraction), 0
+    return int(seconds) * 10**9, 10**9
+
+
+def job_end_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
+    """Return the time at which a job ended, in nanoseconds since 1970 UTC by the robot's clock, to about 20 ms.
+
+    None if the robot did not record it, rebooted, or had its clock set during the attempt.
+
+    Args:
+        evidence: The attempt.
+        role: Role of the robot that ran the job.
+        job: The job's name.
+    """
+    before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
+    if before is None or after is None or before.boot != after.boot:
+        return None
+    if before.clock is None or after.clock is None or clock.step_description(before.clock, after.clock):
+        return None
+    ending = (after.endings or {}).get(job)
+    if ending is None or ending.ended_s is None:
+        return None
+    return round(1e9 * ending.ended_s) + (after.clock.lowest_ns + after.clock.highest_ns) // 2

@@ -1,0 +1,151 @@
+"""Packets of a transfer that were altered between sender and receiver.
+
+A router that translates addresses or ports (NAT), changes ids or sequence numbers, or fragments packets differently,
+alters them so that they match nothing in the sender's capture and would count as lost. With complete captures, the
+receiver has no packet of the transfer that is not in the sender's capture.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from fieldkit.measure.captures.arrays import Keys, Mask, row_hashes
+from fieldkit.measure.captures.headers import TCP, address_text
+from fieldkit.measure.captures.packets import NO_PORT, SYN, Packets
+from fieldkit.measure.transfers.match import connection_keys, usable_stamps
+from fieldkit.measure.transfers.transfer_spec import Transfer
+
+MAX_ALTERED_SHARE: Final = 0.05
+"""Largest permitted share of received packets that are not in the sender's capture: a few may be earlier traffic."""
+
+_MAX_STRAGGLERS: Final = 3
+"""A connection that was aborted earlier may still send up to this many packets from its port to the transfer's."""
+
+_DUPLICATE_NS: Final = 1_000_000
+"""No sender retransmits a packet within this time with the same IP id."""
+
+
+def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
+    """Return the reason why two complete captures cannot be compared, or None if they can.
+
+    Args:
+        sender: Packets of the sender's capture.
+        receiver: Packets of the receiver's capture.
+        transfer: Identifies the packets of the transfer; only those with a port are used.
+    """
+    forward_sent, forward_received = transfer.forward(sender), transfer.forward(receiver)
+    sent, received = (packets.where(packets.dport == transfer.port) for packets in (forward_sent, forward_received))
+    if why := _capture_problem(forward_sent, forward_received, sent):
+        return why
+    if not len(sent):
+        return None
+    has_port = np.zeros(1 << 16, dtype=np.bool_)
+    has_port[sent.sport] = True
+    expected, other_port = received.where(has_port[received.sport]), received.where(~has_port[received.sport])
+    matches_sent = np.isin(_address_free_keys(other_port), _address_free_keys(sent))
+    is_earlier_traffic = matches_sent.sum() <= MAX_ALTERED_SHARE * len(other_port)
+    if is_earlier_traffic and len(other_port) > _MAX_STRAGGLERS and not len(expected):
+        return (
+            f"none of its {len(sent)} packets reached the receiver, but {len(other_port)} others did"
+            f" {_most_common_ends(other_port)}: packets of an earlier attempt were still on the way,"
+            " or a router changed the port and more"
+        )
+    if is_earlier_traffic or len(other_port) <= _MAX_STRAGGLERS:
+        other_port = other_port.where(matches_sent)
+    altered = Packets.concatenated((other_port, _with_other_address(sender, receiver, sent, expected, transfer)))
+    changed = int((~_were_sent(sent, expected)).sum())
+    arrived = len(expected) + len(altered)
+    if len(altered) > MAX_ALTERED_SHARE * arrived:
+        return (
+            f"{len(altered)} of its {arrived} packets left {_most_common_ends(sent)} and reached the receiver"
+            f" {_most_common_ends(altered)}: a router on the path translates an address or a port"
+        )
+    if changed > MAX_ALTERED_SHARE * arrived:
+        return (
+            f"{changed} of its {arrived} packets at the receiver are not in the sender's capture:"
+            " they were changed on the path, or the sender's capture is incomplete"
+        )
+    return None
+
+
+def _capture_problem(sent_forward: Packets, received_forward: Packets, sent: Packets) -> str | None:
+    """Return the reason why one of the captures cannot be compared with any other, or None."""
+    for end, packets in (("sender", sent_forward), ("receiver", received_forward)):
+        if truncated := _truncated_count(packets):
+            return f"{truncated} packets in the {end}'s capture were truncated in their TCP or UDP header"
+    if (duplicates := _duplicate_count(sent)) > MAX_ALTERED_SHARE * len(sent):
+        reason_start = f"{duplicates} of its {len(sent)} packets in the sender's capture occur twice"
+        return f"{reason_start}, as if captured on two interfaces of the path"
+    return None
+
+
+def _truncated_count(packets: Packets) -> int:
+    """Return the number of packets that were truncated before the end of their TCP or UDP header."""
+    last_field = np.where(packets.protocol == TCP, packets.tcp_flags, packets.udp_bytes)
+    return int(((packets.fragment_offset == 0) & (last_field == 0)).sum())
+
+
+def _duplicate_count(sent: Packets) -> int:
+    """Return the number of packets that occur exactly twice, with the same IP id, within `_DUPLICATE_NS`."""
+    with_id = sent.where(sent.ip_id != 0)
+    key = row_hashes(connection_keys(with_id), _ip_keys(with_id), with_id.tcp_seq)
+    order = np.lexsort((with_id.time_ns, key))
+    key, time_ns = key[order], with_id.time_ns[order]
+    edges = np.flatnonzero(np.append(True, key[1:] != key[:-1])) if len(key) else key.astype(np.int64)
+    pairs = edges[np.diff(np.append(edges, len(key))) == 2]
+    return int((time_ns[pairs + 1] - time_ns[pairs] < _DUPLICATE_NS).sum())
+
+
+def _with_other_address(
+    sender: Packets, receiver: Packets, sent: Packets, expected: Packets, transfer: Transfer
+) -> Packets:
+    """Return received packets that equal sent, not received packets except for an address."""
+    # One end of the transfer must be unaltered.
+    from_it, to_it = receiver.are_from(transfer.sender_address), receiver.are_to(transfer.receiver_address)
+    others = (from_it | to_it | (receiver.dport == transfer.port)) & (receiver.sport != NO_PORT)
+    others &= (receiver.protocol == sent.protocol[0]) & ~(from_it & to_it & (receiver.dport == transfer.port))
+    candidates = receiver.where(others)
+    if not len(candidates):
+        return candidates
+    candidates = candidates.where(~np.isin(connection_keys(candidates), connection_keys(sender)))
+    sent_keys, expected_keys, candidate_keys = (
+        _address_free_keys(packets) for packets in (sent, expected, candidates)
+    )
+    return candidates.where(np.isin(candidate_keys, sent_keys) & ~np.isin(candidate_keys, expected_keys))
+
+
+def _were_sent(sent: Packets, received: Packets) -> Mask:
+    """Return a mask of the received packets that were sent, by addresses and ports of the transfer."""
+    if sent.protocol[0] != TCP:
+        return np.isin(_ip_keys(received), _ip_keys(sent))
+    # Offload cuts and joins frames, but does not change their time stamps and the range of sequence numbers.
+    sent_stamps, received_stamps = usable_stamps(sent, received)
+    base = np.zeros(1 << 16, dtype=np.int64)
+    # If an index occurs several times, numpy stores the last value: here the earliest.
+    base[sent.sport[::-1]] = sent.tcp_seq[::-1]
+    has_syn = np.zeros(1 << 16, dtype=np.bool_)
+    has_syn[sent.sport[sent.tcp_flags & SYN != 0]] = True
+    # SYN and FIN consume one sequence number each.
+    stream_bytes = np.bincount(sent.sport, weights=sent.tcp_payload_bytes, minlength=1 << 16) + 2
+    inside = (received.tcp_seq - base[received.sport]) % 2**32 <= stream_bytes[received.sport]
+    return np.isin(received_stamps, sent_stamps) & (inside | ~has_syn[received.sport])
+
+
+def _address_free_keys(packets: Packets) -> Keys:
+    """Return a key that does not change when an address or a port is translated."""
+    if len(packets) and packets.protocol[0] == TCP:
+        # Offload cuts and joins frames, so their lengths may differ.
+        return row_hashes(packets.tcp_seq, packets.tcp_flags & SYN)
+    return _ip_keys(packets)
+
+
+def _ip_keys(packets: Packets) -> Keys:
+    return row_hashes(packets.ip_payload_bytes, packets.ip_id, packets.fragment_offset)
+
+
+def _most_common_ends(packets: Packets) -> str:
+    """Return the most common addresses and ports of these packets."""
+    _, first, count = np.unique(connection_keys(packets), return_index=True, return_counts=True)
+    packet = packets.where(first[[count.argmax()]])
+    ends = ((packet.src, packet.sport), (packet.dst, packet.dport))
+    return "as " + " > ".join(f"{address_text(*halves[0].tolist())}:{port[0]}" for halves, port in ends)

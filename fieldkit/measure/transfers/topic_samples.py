@@ -1,0 +1,319 @@
+"""Samples of topics: those in logs that the agent writes on a robot, and those in a capture, by their heads.
+
+Logs (`fieldkit.agent.records`) are fixed-size records after a magic. A log whose writer was killed ends with zeros,
+because the file grows by blocks.
+
+The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
+by the head (`fieldkit.agent.stream`): magic, sequence number and time of sending. The head is visible if that part of
+the packet was captured: always if a sample starts a packet, but not if TCP or a middleware put it after another
+sample.
+"""
+
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from mmap import mmap
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.captures.arrays import LITTLE, Buffer, Frames, Integers, Ints, Mask, Table
+from fieldkit.measure.captures.headers import TCP, ip_headers, network
+from fieldkit.measure.captures.packets import ACK, UDP_HEADER_BYTES, Packets
+from fieldkit.measure.captures.pcap import CHUNK_BYTES, READERS
+from fieldkit.measure.evidence import reading
+from fieldkit.measure.transfers.udp import with_ports
+
+LOG_MAGIC: Final = b"fieldkit topic 1"
+
+_RECORD: Final = np.dtype(
+    [("kind", "<u2"), ("none", "<u2"), ("size", "<u4"), ("sequence", "<i8"), ("sent_ns", "<i8"), ("at_ns", "<i8")]
+)
+RECORD_BYTES: Final = _RECORD.itemsize
+
+_KINDS: Final = range(1, 9)
+_SAMPLE, BEGUN, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN = _KINDS
+PUBLISHER: Final = 1
+SUBSCRIBER: Final = 2
+_HAS_CHECKSUM: Final = 1
+"""Value in an end record whose size field is a checksum; logs of versions without origin records have no checksum."""
+_SIZE_AT: Final = 4
+
+
+@dataclass(frozen=True, eq=False)
+class TopicSamples(Table):
+    """Samples in the order of the log; times by the clocks of two robots.
+
+    Attributes:
+        sequence: Sequence number, from 0.
+        size_bytes: Serialized size.
+        sent_ns: Time of sending by the sender's clock, stored in the sample, nanoseconds since 1970 UTC.
+        at_ns: Time at which the middleware accepted it, or at which it arrived, by the clock of the log's robot.
+    """
+
+    sequence: Ints
+    size_bytes: Ints
+    sent_ns: Ints
+    at_ns: Ints
+
+
+@dataclass(frozen=True)
+class TopicLog:
+    """Log of one end of a topic.
+
+    Attributes:
+        samples: Samples that the middleware accepted, or that arrived.
+        begun_ns: Time at which the middleware started discovery; None if it is not recorded.
+        matched_ns: Time at which the other end was discovered; None if it never was.
+        refused: Number of samples that the middleware did not accept.
+        skipped: Number of samples whose time passed while an earlier one was being written.
+        foreign: Number of received messages that are not samples of the stream.
+        whole: True if the log has its end record.
+        kinds: Number of records of each kind.
+        times_ns: Time of every record in the order of the log, by the writer's clock.
+        numbers: Sequence number of each sample that was passed to the middleware or arrived, including refused ones.
+        end: `PUBLISHER` or `SUBSCRIBER`; None in a log of a version without origin records.
+        topic_sum: CRC-32 of the topic's name; None in a log of a version without origin records.
+    """
+
+    samples: TopicSamples
+    begun_ns: int | None
+    matched_ns: int | None
+    refused: int
+    skipped: int
+    foreign: int
+    whole: bool
+    kinds: Mapping[int, int] = field(default_factory=dict)
+    times_ns: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    numbers: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    end: int | None = None
+    topic_sum: int | None = None
+
+
+def read_log(path: Path) -> TopicLog:
+    """Read a log. A record that is truncated or has no time is ignored.
+
+    Raises:
+        EvidenceError: The file is missing or not such a log, the number of samples in its end record is wrong, or it
+            was changed after the end record was written.
+    """
+    content = reading.mapped(path)
+    if content[: len(LOG_MAGIC)] != LOG_MAGIC:
+        raise EvidenceError("is not a log of a topic", where=str(path), remedy="repeat the measurement")
+    count = (len(content) - len(LOG_MAGIC)) // RECORD_BYTES
+    records = np.frombuffer(content, _RECORD, count, offset=len(LOG_MAGIC))
+    records = records[records["at_ns"] != 0]
+    if len(unknown := np.setdiff1d(records["kind"], _KINDS)):
+        reason = f"has a record of kind {unknown[0]}, which no agent writes"
+        raise EvidenceError(reason, where=str(path), remedy="repeat the measurement")
+
+    by_kind = {kind: records[records["kind"] == kind] for kind in _KINDS}
+    samples, ends = by_kind[_SAMPLE], by_kind[_END]
+    if len(ends) and (len(ends) > 1 or records["kind"][-1] != _END or ends["sequence"][0] != len(samples)):
+        raise EvidenceError(
+            "does not have the number of samples in its end record", where=str(path), remedy="repeat the measurement"
+        )
+    started, matched, origin = by_kind[BEGUN], by_kind[MATCHED], by_kind[_ORIGIN]
+    if len(ends) and not _is_intact(content, ends[0], required=len(origin) > 0):
+        raise EvidenceError("was changed: its checksum is wrong", where=str(path), remedy="repeat the measurement")
+    offered = records[(records["kind"] == _SAMPLE) | (records["kind"] == REFUSED)]
+    return TopicLog(
+        samples=TopicSamples(*(samples[name].astype(np.int64) for name in ("sequence", "size", "sent_ns", "at_ns"))),
+        begun_ns=int(started["at_ns"][0]) if len(started) else None,
+        matched_ns=int(matched["at_ns"][0]) if len(matched) else None,
+        refused=len(by_kind[REFUSED]),
+        skipped=int(by_kind[SKIPPED]["sequence"].sum()),
+        foreign=len(by_kind[FOREIGN]),
+        whole=bool(len(ends)),
+        kinds={kind: len(records_of_kind) for kind, records_of_kind in by_kind.items()},
+        times_ns=records["at_ns"].astype(np.int64),
+        numbers=offered["sequence"].astype(np.int64),
+        end=int(origin["sequence"][0]) if len(origin) else None,
+        topic_sum=int(origin["size"][0]) if len(origin) else None,
+    )
+
+
+def _is_intact(content: bytes | mmap, end: np.void, *, required: bool) -> bool:
+    """Return True if the checksum in the end record is correct, or missing and not required."""
+    if end["sent_ns"] != _HAS_CHECKSUM:
+        return not required
+    record = end.tobytes()
+    starts_at = content.rfind(record)
+    blank = record[:_SIZE_AT] + bytes(4) + record[_SIZE_AT + 4 :]
+    return zlib.crc32(blank, zlib.crc32(memoryview(content)[:starts_at])) == int(end["size"])
+
+
+_WORD_BYTES: Final = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Occurrences(Table):
+    """Occurrences of a pattern in the order of the capture.
+
+    Attributes:
+        packet: Index of the packet in the result of `pcap.read`.
+        offset: Position of the pattern in the packet's IP payload, in bytes.
+        first: Little-endian integer in the 8 bytes after the pattern.
+        second: Integer in the next 8 bytes.
+    """
+
+    packet: Ints
+    offset: Ints
+    first: Ints
+    second: Ints
+
+
+def find_bytes(path: Path, pattern: bytes) -> Occurrences:
+    """Return each captured occurrence of a pattern with the two integers after it.
+
+    Occurrences that start in a later IP fragment, or that the snap length truncated, are not found.
+
+    Raises:
+        EvidenceError: As for `pcap.read`.
+    """
+    data = reading.mapped(path)
+    integers = Integers(data)
+    reader = READERS.get(bytes(data[:4]))
+    parts, packets = [_no_occurrences()], 0
+    for chunk in reader(data, where=str(path), chunk_bytes=CHUNK_BYTES) if reader else ():
+        ip = ip_headers(integers, chunk.frames, network(integers, chunk.frames))
+        frames = chunk.frames.where(ip.frame)
+        matches = _positions(data, frames, pattern)
+        row = np.searchsorted(frames.start, matches, side="right") - 1
+        ends = frames.start[row] + frames.captured_bytes[row]
+        inside = (matches >= ip.payload_at[row]) & (matches + len(pattern) + 2 * _WORD_BYTES <= ends)
+        inside &= ip.fragment_offset[row] == 0
+        matches, row = matches[inside], row[inside]
+        little, after = integers.with_order(LITTLE), matches + len(pattern)
+        numbers = (little.u64(after + at).astype(np.int64) for at in (0, _WORD_BYTES))
+        parts.append(Occurrences(packets + row, matches - ip.payload_at[row], *numbers))
+        packets += len(frames)
+    return Occurrences.concatenated(parts)
+
+
+def _no_occurrences() -> Occurrences:
+    return Occurrences(*(np.empty(0, dtype=np.int64) for _ in range(4)))
+
+
+def _positions(data: Buffer, frames: Frames, pattern: bytes) -> Ints:
+    """Return the positions of the pattern in the file, between the first frame and the end of the last."""
+    positions: list[int] = []
+    if len(frames):
+        at, end = int(frames.start[0]), int(frames.start[-1] + frames.captured_bytes[-1])
+        while (at := data.find(pattern, at, end)) >= 0:
+            positions.append(at)
+            at += 1
+    return np.array(positions, dtype=np.int64)
+
+
+MAGIC: Final = b"fieldkit"
+HEAD_BYTES: Final = 24
+_LAYOUT: Final = struct.Struct("<III")
+
+
+@dataclass(frozen=True, eq=False)
+class SampleHeads(Table):
+    """Heads of samples in the order of a capture, including those of retransmitted samples.
+
+    Attributes:
+        sequence: Sequence number of the sample.
+        sent_ns: Time of sending stored in the sample, by the publisher's clock.
+        at_ns: Time of capture of the packet.
+        whole: True if the packet contains the whole sample.
+        end: TCP sequence number after the sample, modulo 2**32; 0 for UDP.
+        sport: Source port of the packet.
+        dport: Destination port of the packet.
+    """
+
+    sequence: Ints
+    sent_ns: Ints
+    at_ns: Ints
+    whole: Mask
+    end: Ints
+    sport: Ints
+    dport: Ints
+
+    def first(self) -> "SampleHeads":
+        """Return the first head of each sample, in the order of sequence numbers."""
+        _, index = np.unique(self.sequence, return_index=True)
+        return self.where(index)
+
+
+@dataclass(frozen=True, eq=False)
+class SampleFlow:
+    """Packets of a topic in one capture.
+
+    Attributes:
+        heads: Samples from publisher to subscriber whose head was captured.
+        packets: All packets of the topic's data from publisher to subscriber; fragments have the ports of the first.
+        reverse: All packets of the topic's data from subscriber to publisher; likewise.
+    """
+
+    heads: SampleHeads
+    packets: Packets
+    reverse: Packets
+
+    @property
+    def is_tcp(self) -> bool:
+        """True if the data are sent over TCP."""
+        return bool((self.packets.protocol == TCP).any())
+
+    def connection(self) -> tuple[Packets, Packets] | None:
+        """Return the packets with payload of the TCP connection of the samples, and the acknowledgements.
+
+        None if the samples are in several connections, or in none.
+        """
+        ports = np.unique(np.column_stack((self.heads.sport, self.heads.dport)), axis=0)
+        if len(ports) != 1:
+            return None
+        ((sport, dport),) = ports.tolist()
+        packets, reverse = self.packets, self.reverse
+        data = packets.where((packets.sport == sport) & (packets.dport == dport) & (packets.tcp_payload_bytes > 0))
+        return data, reverse.where(
+            (reverse.sport == dport) & (reverse.dport == sport) & (reverse.tcp_flags & ACK != 0)
+        )
+
+
+def find_heads(path: Path, size_bytes: int) -> Occurrences:
+    """Return the heads of samples with `size_bytes` of data in a capture; raises as `find_bytes`."""
+    return find_bytes(path, _LAYOUT.pack(0, 0, size_bytes) + MAGIC)
+
+
+def sample_flow(
+    packets: Packets,
+    occurrences: Occurrences,
+    ports: frozenset[int],
+    size_bytes: int,
+    is_forward: Callable[[Packets], Mask],
+) -> SampleFlow:
+    """Return the packets of a topic in a capture.
+
+    Args:
+        packets: Packets of the capture.
+        occurrences: Result of `find` for the same capture.
+        ports: Ports of the topic's data.
+        size_bytes: Data bytes of a sample.
+        is_forward: Returns a mask of the packets from publisher to subscriber.
+    """
+    packets_with_ports = with_ports(packets)
+    data = np.isin(packets_with_ports.dport, list(ports)) | np.isin(packets_with_ports.sport, list(ports))
+    forward = data & is_forward(packets)
+    occurrences = occurrences.where(forward[occurrences.packet])
+    carrier = packets.where(occurrences.packet)
+    tcp_header_bytes = carrier.ip_payload_bytes - carrier.tcp_payload_bytes
+    is_tcp = carrier.protocol == TCP
+    begins = occurrences.offset + _LAYOUT.size - np.where(is_tcp, tcp_header_bytes, UDP_HEADER_BYTES)
+    ends = begins + size_bytes
+    heads = SampleHeads(
+        sequence=occurrences.first,
+        sent_ns=occurrences.second,
+        at_ns=carrier.time_ns,
+        whole=np.where(is_tcp, carrier.tcp_payload_bytes, carrier.ip_payload_bytes - UDP_HEADER_BYTES) >= ends,
+        end=np.where(is_tcp, (carrier.tcp_seq + ends) % (1 << 32), 0),
+        sport=carrier.sport,
+        dport=carrier.dport,
+    )
+    return SampleFlow(heads, packets_with_ports.where(forward), packets_with_ports.where(data & ~is_forward(packets)))

@@ -1,0 +1,223 @@
+"""Columns of one transfer: loss on each layer, duration, delay, and the paper's figures."""
+
+from typing import Final
+
+from fieldkit.core.columns import NEGATIVE_LOSS_BOUNDS, Column, Figure, Kind, columns
+from fieldkit.measure.evidence import host, oracle_delays
+from fieldkit.measure.transfers import delay, rates, stalls
+
+FILES: Final = columns(
+    10,
+    ("sent_bytes", "B", "Size of the bag on the sender."),
+    ("received_bytes", "B", "Size of the file that the listener wrote."),
+    (
+        "file_loss",
+        "share",
+        "1 - received_bytes/sent_bytes, the bytes that the application missed.",
+        Figure("file loss", Kind.MEAN, rank=14),
+        NEGATIVE_LOSS_BOUNDS,
+    ),
+    ("hash_match", "bool", "True if the received file equals the bag byte for byte."),
+    ("bag_messages", "count", "Messages in the bag."),
+    ("bag_duration_s", "s", "Time from the bag's first message to its last."),
+)
+LAYERS: Final = columns(
+    10,
+    (
+        "ip_packets_sent",
+        "count",
+        "IP packets of the transfer that left the sender (its capture), each fragment separately.",
+    ),
+    (
+        "ip_packets_received",
+        "count",
+        "ip_packets_sent that are in the receiver's capture, matched by IP id and offset; TCP: all frames captured.",
+    ),
+    (
+        "ip_loss",
+        "share",
+        "UDP: 1 - ip_packets_received/ip_packets_sent. Empty for TCP: see tcp_byte_loss.",
+        Figure("IP packet loss", Kind.COUNTED, "ip_packets_received", "ip_packets_sent", rank=10),
+    ),
+    (
+        "ip_packets_duplicated",
+        "count",
+        "Further copies of ip_packets_sent in the receiver's capture. Empty for TCP: see tcp_duplicated_bytes.",
+    ),
+    (
+        "ip_packets_reordered",
+        "count",
+        (
+            "ip_packets_received that arrived after a packet that was sent later (RFC 4737, section 3)."
+            " Empty if packets are ambiguous, and for TCP: see tcp_reordered_segments."
+        ),
+    ),
+    (
+        "ip_packets_doubtful",
+        "count",
+        (
+            "ip_packets_sent that are ambiguous: equal in headers and content to others that were sent at nearly the"
+            " same time, and only some of which arrived. Empty for TCP."
+        ),
+    ),
+    (
+        "ip_loss_bursts",
+        "count",
+        (
+            "Runs of lost packets among ip_packets_sent, in the order of sending. Empty for TCP, and if packets"
+            " are ambiguous and some were lost."
+        ),
+    ),
+    ("ip_loss_longest_burst", "count", "Packets in the longest of these runs; empty in the same cases."),
+    ("datagrams_sent", "count", "UDP datagrams that left the sender. Empty for TCP."),
+    (
+        "datagrams_received",
+        "count",
+        "UDP datagrams all of whose fragments reached the receiver's interface. Empty for TCP.",
+    ),
+    (
+        "datagram_loss",
+        "share",
+        "1 - datagrams_received/datagrams_sent. Empty for TCP.",
+        Figure("UDP datagram loss", Kind.COUNTED, "datagrams_received", "datagrams_sent", rank=11),
+    ),
+    (
+        "byte_loss",
+        "share",
+        "Share of the transfer's payload bytes that never reached the receiver's interface.",
+        Figure("payload byte loss", Kind.MEAN, rank=13),
+    ),
+    ("tcp_sent_bytes", "B", "TCP payload bytes sent, retransmissions included. Empty for UDP."),
+    ("tcp_unique_bytes", "B", "TCP payload bytes sent, each sequence number once. Empty for UDP."),
+    (
+        "tcp_received_bytes",
+        "B",
+        (
+            "tcp_sent_bytes that are in the receiver's capture; further copies of bytes that were sent fewer times "
+            "do not count. Empty if a copy may hide a loss, and for UDP."
+        ),
+    ),
+    (
+        "tcp_byte_loss",
+        "share",
+        "1 - tcp_received_bytes/tcp_sent_bytes: the loss on the radio, repaired by TCP. Empty for UDP.",
+        Figure("TCP byte loss before retransmission", Kind.MEAN, rank=12),
+    ),
+    (
+        "tcp_retransmitted_segments",
+        "count",
+        "Data frames sent whose sequence range had been sent before, completely or partly. Empty for UDP.",
+    ),
+    (
+        "tcp_spurious_segments",
+        "count",
+        (
+            "tcp_retransmitted_segments that were not needed: an earlier copy of every byte reached the receiver's "
+            "interface, before or after. Empty if segments are ambiguous, and for UDP."
+        ),
+    ),
+    (
+        "tcp_duplicated_bytes",
+        "B",
+        "TCP payload bytes in the receiver's capture beyond the first copy of each. Empty for UDP.",
+    ),
+    (
+        "tcp_reordered_segments",
+        "count",
+        (
+            "Data frames received whose first byte was sent before one that had arrived; a retransmission counts as "
+            "sent when it was retransmitted. Empty if segments are ambiguous, and for UDP."
+        ),
+    ),
+    (
+        "tcp_doubtful_segments",
+        "count",
+        (
+            "Data frames sent with bytes that were sent several times and arrived, if neither time stamps nor IP "
+            "ids nor the time between them show which copy arrived. Empty for UDP."
+        ),
+    ),
+    (
+        "tcp_superframes",
+        "count",
+        (
+            "Data frames in either capture with more payload than the largest MSS in a SYN: offload joined several "
+            "segments. Empty for UDP, and if no SYN has an MSS."
+        ),
+    ),
+    (
+        "transfer_s",
+        "s",
+        "Time from the first frame of the transfer to its last with payload, both in the capture of transfer_from.",
+        Figure("transfer time", Kind.MEDIAN, rank=35),
+    ),
+    ("transfer_from", "text", "Robot whose capture gives transfer_s: receiver."),
+)
+DISTANCE: Final = columns(
+    35,
+    (
+        "transfer_distance_start_m",
+        "m",
+        (
+            "Distance between sender and receiver when the transfer's first packet was sent. This and the next "
+            "eleven are empty if no positions are known, as in the field."
+        ),
+    ),
+    ("transfer_distance_min_m", "m", "Smallest distance from that packet to the last one sent."),
+    ("transfer_distance_mean_m", "m", "Mean distance over that time."),
+    ("transfer_distance_max_m", "m", "Largest distance in that time."),
+    ("transfer_sender_speed_m_s", "m/s", "Mean speed of the sender over that time."),
+    (
+        "transfer_relative_speed_m_s",
+        "m/s",
+        "Mean magnitude of the sender's velocity relative to the receiver over that time.",
+    ),
+)
+PAPER: Final = columns(
+    60,
+    (
+        "paper_packets",
+        "count",
+        "Frames counted at the sender by the paper's filter, src and port of the transfer.",
+    ),
+    (
+        "paper_received",
+        "count",
+        "Frames counted at the receiver by the paper's filter, dst and port of the transfer.",
+    ),
+    ("paper_window_bytes", "B", "Ping payload that the paper uses for the protocol: TCP 502, UDP 8192."),
+    ("paper_delay_s", "s", "Mean RTT with that payload; empty if the ping had another."),
+    ("paper_transfer_s", "s", "paper_packets * paper_delay_s."),
+    (
+        "paper_loss",
+        "share",
+        "1 - paper_received/paper_packets; counts first fragments only.",
+        Figure("paper's loss (eq. 1)", Kind.COUNTED, "paper_received", "paper_packets", rank=15),
+        NEGATIVE_LOSS_BOUNDS,
+    ),
+)
+STALLS: Final = stalls.declare_columns("transfer", "the transfer", 36)
+
+COLUMNS: Final[tuple[Column, ...]] = (
+    *FILES,
+    *LAYERS,
+    *delay.COLUMNS,
+    *oracle_delays.AIR_DELAY_COLUMNS,
+    *DISTANCE,
+    *PAPER,
+    *host.COLUMNS,
+    *host.SYSTEM,
+    *rates.COLUMNS,
+    *STALLS,
+    *delay.SENT_COLUMNS,
+)
+
+TIMES: Final = [column for column in LAYERS if column.name in {"transfer_s", "transfer_from"}]
+"""Columns that depend on one clock only, the receiver's."""
+
+OF_TCP: Final = frozenset(column.name for column in LAYERS if column.name.startswith("tcp_"))
+OF_UDP: Final = frozenset(
+    column.name
+    for column in LAYERS
+    if column.name.startswith(("ip_", "datagram")) and column.name not in {"ip_packets_sent", "ip_packets_received"}
+)

@@ -1,0 +1,68 @@
+"""A transfer under test: the addresses, port and files that identify its packets."""
+
+from dataclasses import dataclass
+from typing import Final
+
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
+from fieldkit.measure.captures.headers import TCP, UDP
+from fieldkit.measure.captures.packets import Packets
+
+_IP_PROTOCOL: Final = {Protocol.TCP: TCP, Protocol.UDP: UDP}
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """One transfer of one file.
+
+    Attributes:
+        protocol: Transport protocol.
+        source: Role of the sending robot.
+        destination: Role of the receiving robot.
+        sender_address: Address of the sender on the link under test.
+        receiver_address: Address of the receiver on the link under test.
+        port: Port that the receiver listens on.
+        sent_file: Name of the sent file in the attempt's folder.
+        received_file: Name of the file that the listener wrote, in the same folder.
+        captures: Names of the sender's and the receiver's capture in the same folder; None without a capture.
+        name: Name of its step, which is the prefix of its other files; empty without one.
+    """
+
+    protocol: Protocol
+    source: Role
+    destination: Role
+    sender_address: str
+    receiver_address: str
+    port: int
+    sent_file: str
+    received_file: str
+    captures: tuple[str | None, str | None] = (None, None)
+    name: str = ""
+
+    @property
+    def captured(self) -> bool:
+        """True if both ends captured."""
+        return None not in self.captures
+
+    def forward(self, packets: Packets) -> Packets:
+        """Return the packets of its protocol from sender to receiver, of any port."""
+        return packets.where(
+            packets.are_from(self.sender_address)
+            & packets.are_to(self.receiver_address)
+            & (packets.protocol == _IP_PROTOCOL[self.protocol])
+        )
+
+    def backward(self, packets: Packets) -> Packets:
+        """Return the packets of its protocol from receiver to sender, of any port."""
+        return packets.where(
+            packets.are_from(self.receiver_address)
+            & packets.are_to(self.sender_address)
+            & (packets.protocol == _IP_PROTOCOL[self.protocol])
+        )
+
+
+def span_s(time_ns: Ints, carries_payload: Mask) -> float | None:
+    """Return the seconds from the first frame to the last with payload; None without payload or without times."""
+    if not carries_payload.any() or (time_ns == NO_TIME).any():
+        return None
+    return float(time_ns[carries_payload].max() - time_ns.min()) / 1e9

@@ -1,0 +1,336 @@
+"""Times and flows in one attempt on the clock of the first sending robot.
+
+Times are those of packets, pings, jobs, faults and moves. Flows over time are the rate of iperf3, the samples of
+topics and the payload of transfers.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.core.columns import plain_name, step_prefixed
+from fieldkit.core.model import FaultKind, Protocol, Role, StationSample
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import bag, host, iperf3, link, outage, ping, track
+from fieldkit.measure.positions import position_columns
+from fieldkit.measure.transfers import fates, topic_samples
+from fieldkit.measure.transfers.fates import Fates
+from fieldkit.measure.transfers.transfer_spec import Transfer
+from fieldkit.report.charts import Panel, Series
+from fieldkit.report.theme import Colour, Style
+from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure import PlacedStep
+
+_SHOWN_BY_EVIDENCE: Final = frozenset(("record", "send", "listen", "ping"))
+"""Jobs whose evidence has more exact times."""
+_HEALS: Final = "-heals"
+_LONGEST_PAUSE_NS: Final = 1_000_000_000
+"""Longest time between two changes of position of a moving robot."""
+
+
+@dataclass(frozen=True)
+class Activity:
+    """An activity with start and end.
+
+    Attributes:
+        name: Its name.
+        start_ns: Its start, in nanoseconds since 1970 UTC.
+        stop_ns: Its end.
+        colour: Colour of its bar.
+    """
+
+    name: str
+    start_ns: int
+    stop_ns: int
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Times from the evidence of one attempt, all of them on the clock of the first sending robot.
+
+    Attributes:
+        recorded: The bags that were sent, by file.
+        transfers: Transfers with known fates of their packets.
+        pings: Step name, role and output of each ping with an output.
+        ahead_ns: Clock offset of each role relative to the first sending robot; 0 if unknown.
+        clocks: A sentence about the source of the clock offset.
+        links: Samples of the radio link at each end.
+        distances_m: Distances between those ends, with the start time of each; empty if unknown.
+        ends: Roles of the first transfer's sender and receiver.
+        jobs: Start and end of each job on a robot, by role and name.
+        activities: Activities in order of time.
+    """
+
+    recorded: Mapping[str, bag.Bag]
+    transfers: Sequence[tuple[Transfer, Fates]]
+    pings: Sequence[tuple[str, Role, ping.Ping]]
+    ahead_ns: Mapping[Role, int]
+    clocks: str
+    links: Mapping[Role, Sequence[tuple[int, StationSample]]]
+    distances_m: Sequence[tuple[int, float | None]]
+    ends: tuple[Role, Role]
+    jobs: Mapping[tuple[Role, str], tuple[int, int]]
+    activities: Sequence[Activity] = ()
+
+
+def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> Moments:
+    """Return the times from the evidence of the attempt in a row."""
+    transfers = plan.transfers(Protocol(repeats.texts["protocol"][row]))
+    first = next(iter(transfers), None)
+    ends = (first.source, first.destination) if first else (Role.SENDER, Role.RECEIVER)
+    packets = [
+        (transfer, packet_fates)
+        for transfer in transfers
+        if (packet_fates := fates.read(evidence, transfer)) is not None
+    ]
+    bags = {transfer.sent_file: evidence.read_or_none(bag.read, transfer.sent_file) for transfer in transfers}
+    outputs = [(each.name, each.role, evidence.read_or_none(ping.read, each.file)) for each in plan.pingings()]
+    offset_ns, clocks = _clock_offset(
+        transfers, packets, ends, {transfer.name: _offset_s(repeats, row, transfer) for transfer in transfers}
+    )
+    ahead_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: offset_ns}
+    links = {role: link.link_history(evidence.links(role)) for role in ends}
+    moments = Moments(
+        recorded={file: contents for file, contents in bags.items() if contents},
+        transfers=[(transfer, _shifted(packet_fates, transfer, ahead_ns)) for transfer, packet_fates in packets],
+        pings=[(name, role, output) for name, role, output in outputs if output],
+        ahead_ns=ahead_ns,
+        clocks=clocks,
+        links={role: [(at_ns - ahead_ns[role], sample) for at_ns, sample in line] for role, line in links.items()},
+        ends=ends,
+        distances_m=position_columns.distances_m(evidence, ends),
+        jobs={
+            (role, name): (start_ns - ahead_ns[role], stop_ns - ahead_ns[role])
+            for role in plan.cast
+            for name, (start_ns, stop_ns) in (
+                evidence.read_or_none(host.job_times_ns, host.after(role)) or {}
+            ).items()
+        },
+    )
+    activities = [
+        *_activities_of_evidence(moments),
+        *_activities_of_jobs(moments),
+        *_activities_of_faults(moments, evidence),
+        *_activities_of_moves(evidence),
+    ]
+    return replace(moments, activities=sorted(activities, key=lambda each: each.start_ns))
+
+
+def _offset_s(repeats: Repeats, row: int, transfer: Transfer) -> float:
+    """Return the offset of the clock at a transfer's destination relative to its source, or NaN if it is unknown."""
+    column = repeats.numbers.get(step_prefixed(transfer.name, "clock_offset_s"))
+    return math.nan if column is None else float(column[row])
+
+
+def _clock_offset(
+    transfers: Sequence[Transfer],
+    packets: Sequence[tuple[Transfer, Fates]],
+    ends: tuple[Role, Role],
+    offsets_s: Mapping[str, float],
+) -> tuple[int, str]:
+    """Return the clock offset of the second end relative to the first in ns, and a sentence about its source."""
+    signs = {ends: 1, ends[::-1]: -1}
+    for transfer in transfers:
+        if (sign := signs.get((transfer.source, transfer.destination))) and not math.isnan(offsets_s[transfer.name]):
+            offset_s = sign * offsets_s[transfer.name]
+            return round(1e9 * offset_s), f"Times of the {ends[1]} are corrected by {-1e3 * offset_s:.3f} ms."
+    offset_ns = next(
+        (
+            sign * int(packet_fates.received_ns.min() - packet_fates.sent_ns.min())
+            for transfer, packet_fates in packets
+            if (sign := signs.get((transfer.source, transfer.destination))) and len(packet_fates.received_ns)
+        ),
+        None,
+    )
+    unknown = f"The offset between the clocks of {ends[0]} and {ends[1]} is not known"
+    if offset_ns is None:
+        return 0, f"{unknown}: each time is by the clock of its robot."
+    return offset_ns, f"{unknown}: here the first packet is assumed to take no time."
+
+
+def _shifted(packet_fates: Fates, transfer: Transfer, ahead_ns: Mapping[Role, int]) -> Fates:
+    return replace(
+        packet_fates,
+        sent_ns=packet_fates.sent_ns - ahead_ns[transfer.source],
+        received_ns=packet_fates.received_ns - ahead_ns[transfer.destination],
+    )
+
+
+def _activities_of_evidence(moments: Moments) -> Iterator[Activity]:
+    """Yield recordings, transfers and pings, which have times in their evidence."""
+    for file, recording in moments.recorded.items():
+        label = _step_label("record", Path(file).stem if len(moments.recorded) > 1 else "")
+        yield Activity(
+            label, recording.started_utc_ns, recording.started_utc_ns + round(recording.duration_s * 1e9), "sky"
+        )
+    for transfer, packets in moments.transfers:
+        sent_ns, received_ns = packets.sent_ns, packets.received_ns
+        yield Activity(_step_label("send", transfer.name), int(sent_ns.min()), int(sent_ns.max()), "blue")
+        if len(received_ns):
+            label = _step_label("receive", transfer.name)
+            yield Activity(label, int(received_ns.min()), int(received_ns.max()), "green")
+    for name, role, pings in moments.pings:
+        stamps_ns = [
+            reply.at_utc_ns - moments.ahead_ns[role] for reply in pings.answers if reply.at_utc_ns is not None
+        ]
+        # The time of the job includes requests without a reply, for which ping prints no time.
+        if times_ns := [*stamps_ns, *moments.jobs.get((role, step_prefixed(name, "ping")), ())]:
+            yield Activity(_step_label("ping", name), min(times_ns), max(times_ns), "pink")
+
+
+def _step_label(what: str, name: str) -> str:
+    """Return the label of an activity of a step: `send up`, or `send` for a step without a name."""
+    return f"{what} {name}".rstrip()
+
+
+def _activities_of_jobs(moments: Moments) -> Iterator[Activity]:
+    """Yield the jobs that no other evidence shows. Jobs of the same name on several robots are combined."""
+    shown = {each.name.partition(" ")[0] for each in _activities_of_evidence(moments)}
+    names = dict.fromkeys(name for _, name in moments.jobs)
+    for name in names:
+        what = plain_name(name)
+        if what.startswith("fault-") or (what in _SHOWN_BY_EVIDENCE and {what, "receive"} & shown):
+            continue
+        times = [span for (_, job), span in moments.jobs.items() if job == name]
+        step = name.rpartition(".")[0]
+        yield Activity(
+            _step_label(what, step), min(start for start, _ in times), max(stop for _, stop in times), "sky"
+        )
+
+
+def _activities_of_faults(moments: Moments, evidence: AttemptEvidence) -> Iterator[Activity]:
+    """Yield each fault from its start to the end of its cause, at which the job starts that waits for recovery."""
+    for (role, name), (heals_ns, _) in moments.jobs.items():
+        step, _, what = name.rpartition(".")
+        kind = what.removeprefix("fault-").removesuffix(_HEALS)
+        if what.startswith("fault-") and what.endswith(_HEALS) and kind in {str(fault) for fault in FaultKind}:
+            note = step_prefixed(step, outage.note_file(FaultKind(kind)))
+            lasted_s = evidence.read_or_none(outage.cause_lasted_s, note) or 0.0
+            yield Activity(f"fault {_step_label(kind, step)}", heals_ns - round(lasted_s * 1e9), heals_ns, "lost")
+            yield from _outage(moments, evidence, role, FaultKind(kind), step)
+
+
+def _outage(
+    moments: Moments, evidence: AttemptEvidence, role: Role, kind: FaultKind, step: str
+) -> Iterator[Activity]:
+    """Yield the longest time without an answer to the observer's pings, up to the end if no more answers came."""
+    output = evidence.read_or_none(ping.read, step_prefixed(step, outage.observed_file(kind)))
+    stamps_ns = sorted(reply.at_utc_ns for reply in output.answers if reply.at_utc_ns is not None) if output else []
+    if not stamps_ns or kind is FaultKind.KILL:
+        return
+    end_ns = moments.jobs.get((role, step_prefixed(step, f"fault-{kind}")), (0, 0))[1]
+    times_ns = [stamp_ns - moments.ahead_ns[role] for stamp_ns in stamps_ns]
+    gaps = list(pairwise([*times_ns, max(end_ns, times_ns[-1])]))
+    start_ns, stop_ns = max(gaps, key=lambda gap: gap[1] - gap[0])
+    yield Activity(f"no answer {_step_label(kind, step)}", start_ns, stop_ns, "void")
+
+
+def _activities_of_moves(evidence: AttemptEvidence) -> Iterator[Activity]:
+    """Yield the time in which each robot moved during the attempt, by the track of the testbed."""
+    places = evidence.read_or_none(track.read, track.FILE) or ()
+    for role in dict.fromkeys(sample.role for sample in places):
+        track_points = [sample for sample in places if sample.role == role]
+        changes = [
+            (before.utc_ns, after.utc_ns)
+            for before, after in pairwise(track_points)
+            if before.position_m != after.position_m and after.utc_ns - before.utc_ns < _LONGEST_PAUSE_NS
+        ]
+        if changes:
+            yield Activity(f"move {role}", changes[0][0], changes[-1][1], "orange")
+
+
+MOST_SAMPLES: Final = 1500
+"""Most samples of each kind in a panel; of more samples, every k-th is drawn."""
+_TIME: Final = "time [s]"
+_ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
+_RECEIVED: Final = Style("green", "^", "none")
+_LOST: Final = Style("lost", "x", "none")
+
+
+def flow_panels(evidence: AttemptEvidence, plan: Plan, times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield a panel for each test of iperf3 and each topic whose evidence has times.
+
+    Args:
+        evidence: Evidence of the attempt.
+        plan: Plan of its trial.
+        times: Times of the attempt.
+        zero_ns: Start of the time axis, in nanoseconds since 1970 UTC.
+    """
+    for placed in plan.procedure.walk():
+        if placed.kind == "iperf3":
+            yield from _iperf3(placed, evidence, times, zero_ns)
+        elif placed.kind == "topics":
+            yield from _topic(placed, evidence, times, zero_ns)
+
+
+def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the payload rate that each end counted per second. The first second starts with the client."""
+    step = placed.step
+    client = next((span for (_, job), span in times.jobs.items() if job == step.prefixed_name("iperf3-client")), None)
+    if client is None:
+        return
+    start_s = (client[0] - zero_ns) / 1e9
+    series, words = [], []
+    for role, style in zip((Role.SENDER, Role.RECEIVER), _ENDS, strict=True):
+        test = evidence.read_or_none(iperf3.read, step.prefixed_name(iperf3.json_file(role)))
+        if test and test.intervals:
+            at_s = start_s + np.cumsum([0.0, *(interval.lasted_s for interval in test.intervals)])
+            rates = [interval.bit_s / 1e6 for interval in test.intervals]
+            series.append(Series(role, style, at_s, [*rates, rates[-1]], join="steps"))
+            words.append(f"{role} {min(rates):.2f} to {max(rates):.2f}")
+    if series:
+        yield Panel(
+            title=f"payload of {step.prefixed_name('iperf3')}",
+            x_label=_TIME,
+            y_label="[Mbit/s]",
+            series=series,
+            words=f"Mbit/s of payload each second: {', '.join(words)}",
+        )
+
+
+def _topic(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the delays of received samples, and the lost samples, by the time of sending."""
+    step = placed.step
+    logs = {
+        role: evidence.read_or_none(topic_samples.read_log, step.prefixed_name(f"{role}-topic.bin"))
+        for verb in ("publish", "subscribe")
+        for role, job in times.jobs
+        if job == step.prefixed_name(verb)
+    }
+    complete = [log for log in logs.values() if log]
+    if len(complete) != 2:
+        return
+    publisher, _ = logs
+    sent, received = (log.samples for log in complete)
+    if not len(sent.sequence):
+        return
+    is_lost = ~np.isin(sent.sequence, received.sequence)
+    lost_s = (sent.at_ns[is_lost] - times.ahead_ns[publisher] - zero_ns) / 1e9
+    took_ms = (
+        received.at_ns - received.sent_ns
+    ) / 1e6  # measured with two clocks, so only differences are meaningful
+    excess_ms = took_ms - took_ms.min(initial=math.inf) if len(took_ms) else took_ms
+    received_s = (received.sent_ns - times.ahead_ns[publisher] - zero_ns) / 1e9
+    kinds = (
+        ("sample received", _RECEIVED, received_s, excess_ms),
+        ("sample lost", _LOST, lost_s, np.zeros(len(lost_s))),
+    )
+    series = []
+    for label, style, at_s, heights in kinds:
+        every_kth = slice(None, None, max(1, -(-len(at_s) // MOST_SAMPLES)))
+        series.append(Series(label, style, at_s[every_kth], heights[every_kth]))
+    yield Panel(
+        title=f"delay of {step.name or 'the topic'} beyond its fastest sample",
+        x_label=_TIME,
+        y_label="[ms]",
+        series=series,
+        words=f"{len(sent.sequence)} samples sent, {int(is_lost.sum())} lost, {len(received.sequence)} received",
+        top=None if len(excess_ms) else 1.0,
+    )

@@ -1,0 +1,114 @@
+"""Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.core.model import Protocol, Status
+from fieldkit.measure.captures.arrays import Mask
+from fieldkit.measure.transfers import fates
+from fieldkit.report import wording
+from fieldkit.report.series import panels
+from fieldkit.report.trial_folders import Evidence
+
+MOST_REPEATS: Final = 400
+"""Most repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""
+MOST_LINES: Final = 20
+"""Most lines of a cell."""
+MOST_COLUMNS: Final = 300
+"""Most columns of a line. A line with more packets combines several in a column, marked if any of them is."""
+
+_WHAT: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments sent again"}
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A line per repeat, a column per packet.
+
+    Attributes:
+        place: The condition, as far as it differs from the others of its group.
+        lines: Number of lines.
+        columns: Number of columns of the longest line.
+        lengths: Number of columns of each line.
+        runs: Runs of marked columns as (line, first column, number of columns).
+        words: Description for screen readers.
+    """
+
+    place: str
+    lines: int
+    columns: int
+    lengths: Sequence[int]
+    runs: Sequence[tuple[int, int, int]]
+    words: str
+
+
+@dataclass(frozen=True)
+class RasterGroup:
+    """Rasters of one protocol and topology.
+
+    Attributes:
+        title: Transfer, protocol and topology.
+        what: The meaning of a mark, and the number of packets per column.
+        rasters: One per condition whose captures are available.
+    """
+
+    title: str
+    what: str
+    rasters: Sequence[Raster]
+
+
+def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
+    """Yield the rasters of all cells whose captures are available."""
+    differing = wording.differing(cells) - {"topology"}
+    share = min(MOST_LINES, max(1, MOST_REPEATS // max(1, len(cells))))
+    for title, cells_of in panels(cells).items():
+        drawn = {
+            wording.place(cell, differing=differing): _marked_packets(cell, evidence, share) for cell in cells_of
+        }
+        for transfer in dict.fromkeys(name for lines in drawn.values() for name in lines):
+            marked = {place: lines.get(transfer, []) for place, lines in drawn.items()}
+            width = -(-max(len(line) for lines in marked.values() for line in lines) // MOST_COLUMNS)
+            what = _WHAT[transfer[1]]
+            yield RasterGroup(
+                title=", ".join(filter(None, (transfer[0], title))),
+                what=what if width == 1 else f"{what}; a column is {width} packets, marked if any of them is",
+                rasters=[_raster(place, lines, width, what) for place, lines in marked.items() if lines],
+            )
+
+
+def _marked_packets(cell: Cell, evidence: Evidence, share: int) -> dict[tuple[str, Protocol], list[Mask]]:
+    """Return the mask of marked packets of each of the first valid repeats, by name and protocol of the transfer."""
+    masks: dict[tuple[str, Protocol], list[Mask]] = {}
+    for row in evidence.rows(cell).tolist():
+        attempt, plan = evidence.attempt(row), evidence.plan(row)
+        if attempt is None or plan is None or evidence.repeats.texts["status"][row] != Status.VALID:
+            continue
+        for transfer in plan.transfers(Protocol(evidence.repeats.texts["protocol"][row])):
+            if (packets := fates.read(attempt, transfer)) is not None:
+                masks.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
+        if max(map(len, masks.values()), default=0) == share:
+            break
+    return masks
+
+
+def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
+    columns = [np.logical_or.reduceat(line, np.arange(0, len(line), width)) for line in lines]
+    longest = max((length for line in lines for _, length in _runs(line)), default=0)
+    total, marked = sum(map(len, lines)), sum(int(line.sum()) for line in lines)
+    return Raster(
+        place=place,
+        lines=len(lines),
+        columns=max(map(len, columns)),
+        lengths=[len(line) for line in columns],
+        runs=[(number, *run) for number, line in enumerate(columns) for run in _runs(line)],
+        words=f"{place}: {len(lines)} repeats, {marked} of {total} {what}, at most {longest} in a row",
+    )
+
+
+def _runs(marked: Mask) -> list[tuple[int, int]]:
+    """Return the first column and the length of each run of marked columns."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False])).astype(np.int8)))
+    return [(int(start), int(stop - start)) for start, stop in edges.reshape(-1, 2)]

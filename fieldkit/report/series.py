@@ -1,0 +1,196 @@
+"""Series of figures: panels of conditions, the style of each series in all figures, and estimates as points."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Final
+
+import numpy as np
+
+from fieldkit.analysis.cells import Cell
+from fieldkit.analysis.quantities import Quantity
+from fieldkit.analysis.wording import incomplete
+from fieldkit.core.columns import Kind
+from fieldkit.core.model import Scenario
+from fieldkit.report import wording
+from fieldkit.report.theme import CYCLE, LINES, Style
+from fieldkit.report.trial_folders import Evidence
+
+_SCENARIOS = [str(scenario) for scenario in Scenario]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Label and style of a series.
+
+    Attributes:
+        label: `LOS`, with the procedure if several have this scenario, and the backend if there are several.
+        style: Its style.
+        rank: Sort key: by scenario, within it the field backend first.
+    """
+
+    label: str
+    style: Style
+    rank: tuple[int, int]
+
+
+class Identities:
+    """The identity of the series that each cell belongs to: procedure and scenario by colour, backend by line.
+
+    Args:
+        cells: All cells of the report, so that each has the same style in every figure.
+    """
+
+    def __init__(self, cells: Sequence[Cell]) -> None:
+        kinds = sorted({_kind(cell) for cell in cells}, key=_by_scenario)
+        backends = sorted({wording.text(cell, "backend") for cell in cells}, key=lambda name: (name != "field", name))
+        # The first series with line of sight and the first without have fixed styles, even if the other is missing.
+        fixed, others = {str(scenario): rank for rank, scenario in enumerate(Scenario)}, count(len(Scenario))
+        self._kinds = {kind: fixed.pop(kind[0]) if kind[0] in fixed else next(others) for kind in kinds}
+        self._backends = {name: index for index, name in enumerate(backends)}
+        self._ambiguous = len({scenario for scenario, _ in kinds}) < len(kinds)
+
+    def of(self, cell: Cell) -> Identity:
+        """Return the identity of the series of `cell`."""
+        backend = wording.text(cell, "backend")
+        parts = (
+            wording.scenario(cell),
+            wording.procedure(cell) if self._ambiguous else "",
+            backend if len(self._backends) > 1 else "",
+        )
+        rank = self._kinds[_kind(cell)], self._backends[backend]
+        style = Style(*CYCLE[rank[0] % len(CYCLE)], LINES[rank[1] % len(LINES)])
+        return Identity(", ".join(filter(None, parts)), style, rank)
+
+
+def panels(cells: Sequence[Cell]) -> Mapping[str, Sequence[Cell]]:
+    """Return cells by the title of their panel, one per protocol and topology: `UDP, master`."""
+    groups: dict[tuple[str, str], list[Cell]] = {}
+    for cell in cells:
+        groups.setdefault((wording.text(cell, "protocol"), wording.text(cell, "topology")), []).append(cell)
+    return {
+        ", ".join(filter(None, (protocol.upper(), topology))) or "all": group
+        for (protocol, topology), group in sorted(groups.items())
+    }
+
+
+def _kind(cell: Cell) -> tuple[str, str]:
+    return wording.text(cell, "scenario"), wording.text(cell, "procedure")
+
+
+def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
+    """Return the sort key of a kind: first kinds whose procedure is named after the scenario."""
+    scenario, procedure = kind
+    index = _SCENARIOS.index(scenario) if scenario in _SCENARIOS else len(_SCENARIOS)
+    return scenario != procedure, index, scenario, procedure
+
+
+MOST_BEHIND: Final = 100
+"""Most single repeats behind one estimate; of more repeats, every k-th is drawn."""
+_LEAST_TOP_PERCENT: Final = 1.0
+_MOST_LENGTH: Final = 2.0
+"""Most length of the axis, as a multiple of the largest value. Wider intervals are cut there."""
+_MARGIN: Final = 0.25
+"""Margins of an axis that does not start at 0, as a share of the range of values."""
+_LOG_FROM_DECADES: Final = 1.5
+_VAGUE_FROM: Final = 0.5
+"""Width from which an interval is too wide for a curve, as a share of the axis."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One estimate in the unit of the axis.
+
+    Attributes:
+        cell: The condition.
+        value: The figure.
+        low: Lower end of its 95 % interval, None without one.
+        high: Upper end, None without one.
+        repeats: Values of single repeats, some of them if there are many.
+        bounds: True for each of these that is only a lower bound.
+        is_bound: True if the figure is only a lower bound because of them.
+        note: Number of valid repeats with a value, if not all have one: `2 of 3`.
+    """
+
+    cell: Cell
+    value: float
+    low: float | None
+    high: float | None
+    repeats: tuple[float, ...]
+    bounds: tuple[bool, ...] = ()
+    is_bound: bool = False
+    note: str = ""
+
+    @property
+    def protocol(self) -> str:
+        """The protocol of the condition."""
+        return wording.text(self.cell, "protocol")
+
+    @property
+    def metres(self) -> float:
+        """The distance of the condition."""
+        return wording.metres(self.cell)
+
+    @property
+    def top(self) -> float:
+        """The largest of value, interval and repeats."""
+        return max(self.value, *self.repeats, *([] if self.high is None else [self.high]))
+
+    @property
+    def bottom(self) -> float:
+        """The smallest of value, interval and repeats."""
+        return min(self.value, *self.repeats, *([] if self.low is None else [self.low]))
+
+    def singles(self, are_bounds: bool) -> list[float]:
+        """Return the values of single repeats that are only lower bounds, or of those that are not."""
+        return [value for value, is_bound in zip(self.repeats, self.bounds, strict=True) if is_bound is are_bounds]
+
+    def is_vague(self, ends: tuple[float, float]) -> bool:
+        """Return True if the point has no interval, an open one, or one as wide as half of the axis."""
+        if self.low is None or self.high is None or self.is_bound:
+            return True
+        return self.high - self.low > _VAGUE_FROM * (ends[1] - ends[0])
+
+
+def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> Point:
+    """Return the estimate of a quantity under one condition, with values multiplied by `factor`.
+
+    A flag has no single repeats, since each is either 0 or 1.
+    """
+    estimate = cell.estimates[quantity.name]
+    low, high = (None if end is None else factor * end for end in (estimate.low, estimate.high))
+    values, is_bound = evidence.observed(cell, quantity)
+    every_kth = slice(None, None, max(-(-len(values) // MOST_BEHIND), 1))
+    if quantity.kind is Kind.FLAG:
+        values = values[:0]
+    return Point(
+        cell,
+        factor * estimate.value,
+        low,
+        high,
+        repeats=tuple((factor * values[every_kth]).tolist()),
+        bounds=tuple(is_bound[every_kth].tolist())[: len(values)],
+        is_bound=estimate.is_lower_bound,
+        note=incomplete(estimate),
+    )
+
+
+def ends(points: Sequence[Point], unit: str) -> tuple[float, float]:
+    """Return the ends of an axis for these points. It starts at 0 unless a value is negative, as in dBm."""
+    if min(each.bottom for each in points) < 0:
+        values = [value for each in points for value in (each.value, *each.repeats)]
+        low, high = min(values), max(values)
+        margin = _MARGIN * (high - low) or 1.0
+        return low - margin, high + margin
+    largest, highest = max(each.value for each in points), max(each.top for each in points)
+    top = min(highest, _MOST_LENGTH * largest) if largest > 0 else highest
+    return 0.0, max(1.08 * top, _LEAST_TOP_PERCENT if unit == "%" else 0.0) or 1.0
+
+
+def needs_log(values: Iterable[float]) -> bool:
+    """Return True if values need a logarithmic axis: all above 0, over more than 1.5 decades."""
+    finite = np.fromiter(values, np.float64)
+    finite = finite[np.isfinite(finite)]
+    if not len(finite) or finite.min() <= 0:
+        return False
+    return bool(np.log10(finite.max() / finite.min()) > _LOG_FROM_DECADES)

@@ -1,0 +1,204 @@
+"""Packets that are altered between the captures are detected and reported, and give no counts."""
+
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldkit.core.model import Protocol
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.transfers import altered_packets, fates
+from tests.helpers import links
+from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, file_bytes, packets, timed, transfer
+from tests.helpers.casts import los_plan
+from tests.helpers.links import Link
+from tests.helpers.measures import measure
+from tests.helpers.plans import problems
+
+Change = Callable[[bytes], bytes]
+
+ROUTER = "10.9.0.77"
+TRANSLATED = "a router on the path translates an address or a port"
+CHANGED = "they were changed on the path, or the sender's capture is incomplete"
+
+
+def _put(at: int, form: str, value: int) -> Change:
+    def change(packet: bytes) -> bytes:
+        whole = bytearray(packet)
+        struct.pack_into(form, whole, at, value)
+        return bytes(whole)
+
+    return change
+
+
+def _added(at: int, form: str, more: int) -> Change:
+    def change(packet: bytes) -> bytes:
+        (old,) = struct.unpack_from(form, packet, at)
+        return _put(at, form, (old + more) % 256 ** struct.calcsize(form))(packet)
+
+    return change
+
+
+def _port(packet: bytes) -> bytes:
+    """Change the port of packets that have one: only the first fragment of a datagram."""
+    return packet if packet[6:8] not in {b"\0\0", b"\x20\0", b"\x40\0"} else _put(20, ">H", 55_555)(packet)
+
+
+source = _put(12, ">I", int.from_bytes(bytes((10, 9, 0, 77))))
+target = _put(16, ">I", int.from_bytes(bytes((10, 9, 0, 78))))
+WAYS: dict[str, tuple[Change, str]] = {
+    "the source's address": (source, TRANSLATED),
+    "the target's address": (target, TRANSLATED),
+    "the source's address and port": (lambda packet: _port(source(packet)), TRANSLATED),
+    "the source's port": (_port, TRANSLATED),
+}
+
+
+def _udp(change: Change, *, kept_of: int = 10, ip_id: int | None = None) -> tuple[list[Frame], list[Frame]]:
+    """36 datagrams of six fragments; one in `kept_of` packets is lost."""
+    cut = [packet for number in range(36) for packet in datagram(number if ip_id is None else ip_id, 8192)]
+    sent = timed(cut)
+    return sent, [
+        Frame(frame.time_ns, change(frame.data), 2000) for at, frame in enumerate(sent) if at % kept_of != 3
+    ]
+
+
+def _tcp(change: Change, *, stamped: bool = True) -> tuple[list[Frame], list[Frame]]:
+    truth = links.tcp(Link(4, loss=0.1), 200, ids=True, offload=10, stamped=stamped)
+    return truth.sender, [Frame(frame.time_ns, change(frame.data), frame.wire_bytes) for frame in truth.receiver]
+
+
+def _why(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> str | None:
+    sender, receiver = map(packets, captures)
+    return altered_packets.reason(sender, receiver, transfer(protocol))
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+@pytest.mark.parametrize("what", WAYS)
+def test_a_translated_address_or_port_is_reported(what: str, protocol: Protocol) -> None:
+    change, why = WAYS[what]
+    reason = _why(_udp(change) if protocol is Protocol.UDP else _tcp(change), protocol)
+    assert reason
+    assert reason.endswith(why)
+    assert f"as {SENDER}:40000 > {RECEIVER}:{PORT} and reached the receiver as " in reason
+    assert not what.endswith("port") or ":55555 > " in reason
+
+
+@pytest.mark.parametrize(
+    "change", [_added(24, ">I", 1 << 31), _added(44, ">I", 77_777)], ids=["sequence numbers", "time stamps"]
+)
+def test_changed_sequence_numbers_are_reported(change: Change) -> None:
+    reason = _why(_tcp(change), Protocol.TCP)
+    assert reason
+    assert reason.endswith(CHANGED)
+
+
+def test_changed_ids_are_reported() -> None:
+    reason = _why(_udp(_added(4, ">H", 30_000)), Protocol.UDP)
+    assert reason
+    assert reason.endswith(CHANGED)
+
+
+def test_a_port_that_changes_during_the_transfer_is_reported() -> None:
+    """Like a router that lost its state for the flow: half of the packets arrive as they were sent."""
+    sent, received = _udp(lambda packet: packet)
+    half = len(received) // 2
+    later = [Frame(frame.time_ns, _port(frame.data), 2000) for frame in received[half:]]
+    reason = _why((sent, [*received[:half], *later]), Protocol.UDP)
+    assert reason
+    assert reason.endswith(TRANSLATED)
+
+
+def test_packets_missing_in_the_senders_capture_are_reported() -> None:
+    sent, received = _udp(lambda packet: packet)
+    assert str(_why((sent[60:], received), Protocol.UDP)).endswith(CHANGED)
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+def test_packets_captured_on_two_interfaces_are_reported(protocol: Protocol) -> None:
+    """As with `-i any` if packets pass a bridge or a VLAN: they would appear as lost or retransmitted."""
+    sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
+    twice = [packet for frame in sent for packet in (frame, replace(frame, time_ns=frame.time_ns + 5000))]
+    reason = _why((twice, received), protocol)
+    assert reason
+    assert "in the sender's capture occur twice" in reason
+    assert _why((sent, [*received, *received]), protocol) is None, "a link may duplicate packets"
+
+
+@pytest.mark.parametrize("end", ["sender", "receiver"])
+@pytest.mark.parametrize(
+    ("protocol", "kept"), [(Protocol.UDP, 2), (Protocol.UDP, 4), (Protocol.TCP, 2), (Protocol.TCP, 8)]
+)
+def test_a_snap_length_within_the_headers_does_not_appear_as_loss(protocol: Protocol, kept: int, end: str) -> None:
+    """Without ports everything appears lost or never sent; without sequence numbers TCP has no payload."""
+    sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
+    cut = [replace(packet, data=packet.data[: 20 + kept]) for packet in (sent if end == "sender" else received)]
+    reason = _why((cut, received) if end == "sender" else (sent, cut), protocol)
+    assert reason
+    assert f"in the {end}'s capture were truncated in their TCP or UDP header" in reason
+
+
+def test_similar_traffic_is_not_taken_for_a_translation() -> None:
+    sent, received = _udp(lambda packet: packet)
+    stranger = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
+    of_another = [Frame(frame.time_ns, source(frame.data), 2000) for frame in stranger]
+    translated_here = [Frame(frame.time_ns, target(frame.data), 2000) for frame in received]
+    for name, captures in {
+        "nothing": (sent, received),
+        "all of it was lost": (sent, []),
+        "another robot sends to the port": (sent, [*received, *of_another]),
+        "another robot sends, and all was lost": (sent, of_another),
+        "the receiver itself translates, and captures both": (sent, [*received, *translated_here]),
+        "one packet of something earlier": (sent, [*received, *timed(datagram(999, 10))]),
+        "one of something earlier, and all was lost": (sent, timed(datagram(999, 10, sport=9))),
+        "the transfer was not captured": ([], received),
+    }.items():
+        assert _why(captures, Protocol.UDP) is None, name
+
+
+@given(st.integers(0, 2**32), st.sampled_from((1, 40)), st.booleans(), st.booleans())
+@settings(max_examples=30)
+def test_losses_copies_and_reordering_are_not_taken_for_a_translation(
+    seed: int, offload: int, ids: bool, stamped: bool
+) -> None:
+    link = Link(seed, loss=0.3, copied=0.1, late=0.1)
+    truth = links.tcp(link, 60, ids=ids, offload=offload, again=0.1, stamped=stamped)
+    assert _why((truth.sender, truth.receiver), Protocol.TCP) is None
+
+
+@pytest.mark.parametrize("what", WAYS)
+@pytest.mark.parametrize("protocol", Protocol)
+def test_captures_that_cannot_be_compared_give_no_counts(tmp_path: Path, what: str, protocol: Protocol) -> None:
+    change, _ = WAYS[what]
+    sent, received = _udp(change) if protocol is Protocol.UDP else _tcp(change)
+    (tmp_path / "sender.pcap").write_bytes(file_bytes(sent))
+    (tmp_path / "receiver.pcap").write_bytes(file_bytes(received))
+    measures = measure(tmp_path, transfer(protocol))
+    assert TRANSLATED in measures.one_way_withheld
+    layers = ("ip_", "datagram", "byte_", "tcp_", "paper_received", "paper_loss", "jitter", "transfer_s")
+    assert not [name for name in measures if name.startswith(layers)]
+    assert fates.read(AttemptEvidence(tmp_path), transfer(protocol)) is None
+    other = measure(tmp_path, replace(transfer(protocol), port=9))
+    assert not other.ip_packets_sent
+
+
+def _planned(packet: bytes) -> bytes:
+    """A packet between the addresses of the plan's robots, 10.42.0.1 and 10.42.0.2."""
+    return _put(16, ">I", 0x0A2A0002)(_put(12, ">I", 0x0A2A0001)(packet))
+
+
+def test_a_repeat_with_translated_addresses_is_void(tmp_path: Path) -> None:
+    plan = los_plan(protocols=(Protocol.UDP,))
+    sent, received = _udp(lambda packet: source(_planned(packet)))
+    (tmp_path / "sender.pcap").write_bytes(file_bytes([Frame(frame.time_ns, _planned(frame.data)) for frame in sent]))
+    (tmp_path / "receiver.pcap").write_bytes(file_bytes(received))
+    (tmp_path / "recv.bag").write_bytes(b"x")
+    reasons = problems(plan, Protocol.UDP, tmp_path)
+    assert [reason for reason in reasons if "left as 10.42.0.1:40000 > 10.42.0.2:1234" in reason], reasons
+    (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
+    reasons = problems(plan, Protocol.UDP, tmp_path)
+    assert [reason for reason in reasons if "recv.bag is not empty, but the capture of" in reason], reasons
