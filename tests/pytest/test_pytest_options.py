@@ -60,7 +60,7 @@ def lab_options(lab_options):
 OPERATOR = """
 import pytest
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.prompts import NOBODY
+from fieldkit.core.prompts import UNATTENDED
 from fieldkit.pytest.lab_fixture import operator_of
 from fieldkit.pytest.plugin_options import LabOptions
 
@@ -70,7 +70,7 @@ def test_operator(pytestconfig):
     with pytest.raises(ConfigurationError, match="a person must carry it, but there is no terminal") as caught:
         person.ask("carry it")
     assert "--fieldkit-yes" in caught.value.remedy
-    assert operator_of(pytestconfig, LabOptions(yes=True), print) is NOBODY
+    assert operator_of(pytestconfig, LabOptions(yes=True), print) is UNATTENDED
 """
 
 

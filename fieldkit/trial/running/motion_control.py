@@ -42,7 +42,7 @@ class Permission(Protocol):
         ...
 
 
-class Control(Protocol):
+class MotionSupport(Protocol):
     """The package that moves robots."""
 
     def demand_one_place(self, plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
@@ -87,13 +87,13 @@ class _Unmoved:
 
 
 def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
-    """Call `Control.demand_one_place` if robots move in one of the trials."""
+    """Call `MotionSupport.demand_one_place` if robots move in one of the trials."""
     if any(plan.procedure.moved() for plan in plans):
         _control().demand_one_place(plans, backend, operator)
 
 
 def permission(plan: Plan, testbed: Testbed, folder: Path) -> Permission:
-    """Return the permission of a trial; raises as `Control.permission`."""
+    """Return the permission of a trial; raises as `MotionSupport.permission`."""
     # A campaign without moves in this trial may have a robot that a fault stopped in another one.
     has_journal = any((place / laptop_files.MOTION).exists() for place in (folder, folder.parent))
     return _control().permission(plan, testbed, folder) if plan.procedure.moved() or has_journal else _Unmoved()
@@ -101,7 +101,7 @@ def permission(plan: Plan, testbed: Testbed, folder: Path) -> Permission:
 
 @contextmanager
 def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
-    """Run the body within `Control.guarded` if the procedure has actions on abort."""
+    """Run the body within `MotionSupport.guarded` if the procedure has actions on abort."""
     if not plan.procedure.on_abort:
         yield
         return
@@ -109,9 +109,9 @@ def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
         yield
 
 
-def _control() -> Control:
+def _control() -> MotionSupport:
     for point in plugins.entry_points(plugins.MOTION):
-        loaded: Control = plugins.load(point)
+        loaded: MotionSupport = plugins.load(point)
         return loaded
     raise ConfigurationError(
         "robots that move by themselves need a package that is not installed",
