@@ -9,7 +9,7 @@ when the flow did: it is right-censored.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -25,10 +25,12 @@ from fieldkit.measure.transfers import delay, deliveries, tcp, udp
 from fieldkit.measure.transfers.clock_offset import StampPairs
 from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
 from fieldkit.measure.transfers.tcp import TcpFrames
-from fieldkit.measure.transfers.topic_columns import TopicTraffic
-from fieldkit.measure.transfers.topic_samples import TopicLog
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.measure.transfers.udp import UdpPackets
+
+if TYPE_CHECKING:  # a trial without topics does not import them
+    from fieldkit.measure.transfers.topic_columns import TopicTraffic
+    from fieldkit.measure.transfers.topic_samples import TopicLog
 
 RANK: Final = 120
 """Position of the columns in trial.csv: after those of earlier versions."""
@@ -159,7 +161,7 @@ TOPIC_COLUMNS = tuple(
 )
 
 
-def require_steady_clocks(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> None:
+def require_steady_clocks(flow: "TopicTraffic", sender: Packets | None, receiver: Packets | None) -> None:
     """Raise an error if the captures show that a robot's clock was set.
 
     Raises:
@@ -173,7 +175,7 @@ def require_steady_clocks(flow: TopicTraffic, sender: Packets | None, receiver: 
         raise EvidenceError(delay.UNSTEADY)
 
 
-def topic_delivery(sent: TopicLog | None, received: TopicLog | None, expected: FlowSchedule) -> Delivery:
+def topic_delivery(sent: "TopicLog | None", received: "TopicLog | None", expected: FlowSchedule) -> Delivery:
     """Return the deliveries of a topic.
 
     Args:
@@ -199,8 +201,8 @@ def topic_delivery(sent: TopicLog | None, received: TopicLog | None, expected: F
 
 
 def measure_topic(
-    flow: TopicTraffic,
-    logs: tuple[TopicLog | None, TopicLog | None],
+    flow: "TopicTraffic",
+    logs: "tuple[TopicLog | None, TopicLog | None]",
     captured: tuple[Packets | None, Packets | None],
     expected: FlowSchedule,
 ) -> Measured:
@@ -216,8 +218,8 @@ def measure_topic(
 
 
 def read_topic_deliveries(
-    flow: TopicTraffic,
-    logs: tuple[TopicLog | None, TopicLog | None],
+    flow: "TopicTraffic",
+    logs: "tuple[TopicLog | None, TopicLog | None]",
     captured: tuple[Packets | None, Packets | None],
     expected: FlowSchedule,
 ) -> list[Delivery]:
