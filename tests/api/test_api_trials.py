@@ -212,7 +212,7 @@ def test_packets_without_unchanged_evidence_are_rejected(tmp_path: Path) -> None
         fieldkit.load(alone).packets("udp-02")
     with (trial / store.REPEATS / "udp-02" / "receiver.pcap").open("ab") as capture:
         capture.write(b"more")
-    with pytest.raises(EvidenceError, match="not as it was kept"):
+    with pytest.raises(EvidenceError, match="is not available"):
         fieldkit.load(trial).packets("udp-02")
     assert fieldkit.load(trial).packets("udp-01").num_rows
 

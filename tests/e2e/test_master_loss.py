@@ -99,7 +99,7 @@ def test_a_master_out_of_range_stops_the_trial_before_its_first_repeat(tmp_path:
 
 def test_robots_with_the_built_in_ros_cannot_share_a_master(tmp_path: Path) -> None:
     run = fieldkit(lab_with_one_master(tmp_path, "builtin"), "trial", "los", "5m", "--repeats", "1")
-    assert_refused(run, 2, "with Debian's ROS alone")
+    assert_refused(run, 2, "needs Debian's ROS")
 
 
 def assert_refused(run: Run, code: int, message: str) -> None:
