@@ -49,10 +49,10 @@ LOS: Final = Placement(Scenario.LOS, Topology.MASTER, parse_distance("30ft"))
 OWNER: Final = """
 import json, os, sys
 from fieldkit.core.model import Topology
-from fieldkit.core.prompts import Nobody
+from fieldkit.core.prompts import Unattended
 from sim_backends.emulated.backend import EmulatedBackend
 backend = EmulatedBackend(None, None)
-with backend.open(backend.cast(Topology.MASTER), seed=1, sink=lambda event: None, operator=Nobody()) as lab:
+with backend.open(backend.cast(Topology.MASTER), seed=1, sink=lambda event: None, operator=Unattended()) as lab:
     robots = [robot.pid for robot in lab.robots.values()]
     print(json.dumps({"robots": robots, "medium": lab.medium.pid}), flush=True)
     sys.stdin.read()
