@@ -68,7 +68,7 @@ WRONG = [
     ("at_m: [10, 10]", "at_m: [1000001, 10]", 8, "less than or equal to 1000000"),
     ("at_m: [10, 10]", "at_m: 10", 8, "a list is needed here"),
     ("at_m: [10, 10]", "at_m: [10, 10], height: 3m", 8, "turtlebot3_burger does not fly"),
-    ("at_m: [20, 10]", "at_m: [10.1, 10]", 9, "two begins within one"),
+    ("at_m: [20, 10]", "at_m: [10.1, 10]", 9, "two starts within one"),
     (
         "kind: follow\n      leader: one\n      distance: 2m",
         "kind: station-keeping",
