@@ -115,7 +115,7 @@ def reopen_failed(folder: Path, plan: Plan) -> int:
 
 
 def remove_torn_line(folder: Path) -> None:
-    """Remove an incomplete last line that a crash has left; see `jsonl.mend`."""
+    """Remove an incomplete last line that a crash has left; see `jsonl.repair_last_line`."""
     jsonl.repair_last_line(folder / JOURNAL_FILE, _CODEC.parse)
 
 

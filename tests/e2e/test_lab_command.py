@@ -110,7 +110,7 @@ STANDS: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :
 
 
 def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
-    """The program has the driver's command line, by which `fieldkit stop` recognizes it, whoever started it."""
+    """The program has the driver's command line, by which `fieldkit stop` recognizes it in every case."""
     attempt = jobs.work_folder("trial-a", "tcp-01-1")
     argv = ("sh", "-c", STANDS, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
     driver = Job(attempt, "drive", argv, WITHIN_S, "drive.log", ready="log:up")
