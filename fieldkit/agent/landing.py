@@ -25,6 +25,8 @@ RETRY_S = 0.4
 COMMAND_TIMEOUT_S = 5.0
 """Time within which an autopilot must execute a command."""
 _POLL_S = 0.1
+_MODE_WAIT_S = 0.3
+"""Maximum wait for a heartbeat before the first command: the last one may be older than a takeover by a person."""
 _LANDING_TIMEOUT_S = 600.0
 """Time for which a drone whose motors turn is commanded to come down."""
 UNHEARD_S = 60.0
@@ -52,10 +54,11 @@ def bring_down(
 ) -> None:
     """Command a drone to `land` or `return`, and wait until its motors have stopped; if it does not return, it lands.
 
-    Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. A
-    drone that lands or returns automatically is only monitored. An autopilot without heartbeats may still receive
-    commands, and the connection may be restored: for `UNHEARD_S` its last reported mode is assumed, and commands are
-    sent. An alarm is logged as soon as heartbeats are missing.
+    Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. The
+    first command waits for a new heartbeat, because the mode may have changed since the last one. A drone that lands
+    or returns automatically is only monitored. An autopilot without heartbeats may still receive commands, and the
+    connection may be restored: for `UNHEARD_S` its last reported mode is assumed, and commands are sent. An alarm is
+    logged as soon as heartbeats are missing.
 
     Args:
         session: The session with its autopilot.
@@ -71,6 +74,7 @@ def bring_down(
     command = (drone.dialect or Px4()).bring_down_command(how)  # other families accept the commands of PX4
     number = int(command[0])
     drone.command_results.pop(number, None)
+    _wait_for_mode(session, each_iteration)
     while drone.armed:
         now_s = time.monotonic()
         if now_s > start_s + _LANDING_TIMEOUT_S:
@@ -94,6 +98,14 @@ def bring_down(
             drone.dialect is not None or drone.command_results.get(number) != ACCEPTED
         ):
             raise FlightError(TAKEN_OVER, f"another party flies it, nothing more is sent ({drone.status_text})")
+        each_iteration()
+        session.exchange(_POLL_S)
+
+
+def _wait_for_mode(session: AutopilotSession, each_iteration: Callable[[], None]) -> None:
+    """Wait for the next heartbeat, which contains the current mode, but at most `_MODE_WAIT_S`."""
+    start_s = time.monotonic()
+    while session.drone.armed and time.monotonic() - start_s < min(session.drone.heartbeat_age_s, _MODE_WAIT_S):
         each_iteration()
         session.exchange(_POLL_S)
 

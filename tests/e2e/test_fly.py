@@ -221,7 +221,7 @@ def test_stop_lands_a_drone_after_fieldkit_was_killed(outside: Outside) -> None:
     process.communicate(timeout=60)
     stopped = fieldkit(outside.folder, "stop", "--all")
     assert stopped.code == 0, stopped.err
-    assert stopped.out.splitlines() == [
+    assert sorted(stopped.out.splitlines()) == [
         "copter-1: nothing of fieldkit moves it; nothing was sent to it",
         "duckiedrone-1: coming down (land)",
     ]

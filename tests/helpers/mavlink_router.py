@@ -14,6 +14,7 @@ from typing import Final, Self
 from fieldkit.agent.mavlink_frames import COMMAND_ACK, frames, head
 
 _POLL_S: Final = 0.05
+_CLOSE_LIMIT_S: Final = 60.0
 Address = tuple[int, int]
 
 
@@ -36,6 +37,7 @@ class MavlinkRouter:
         self._max_clients = most_clients
         self.accepted = self.withheld = 0
         self._stopping = threading.Event()
+        self._is_down = threading.Event()
         self._down_until_s = 0.0
         self._autopilot_socket = socket.socket(type=socket.SOCK_DGRAM)
         self._server = socket.socket(type=socket.SOCK_DGRAM)
@@ -60,8 +62,13 @@ class MavlinkRouter:
                 end.close()
 
     def restart(self, lasts_s: float) -> None:
-        """Close all TCP connections, refuse new ones for that time, and then accept them again."""
+        """Close all TCP connections, refuse new ones for that time, and then accept them again.
+
+        Returns when the connections are closed.
+        """
+        self._is_down.clear()
         self._down_until_s = time.monotonic() + lasts_s
+        assert self._is_down.wait(_CLOSE_LIMIT_S), "the router did not close its connections"
 
     @property
     def clients(self) -> int:
@@ -88,6 +95,7 @@ class MavlinkRouter:
             self._streams.clear()
             self._last_udp_client = None
             self._addresses.clear()
+            self._is_down.set()
         elif self._listener is None:
             self._listener = socket.create_server(("127.0.0.1", self.tcp))
 

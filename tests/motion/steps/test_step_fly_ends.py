@@ -255,10 +255,21 @@ def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) ->
         assert not autopilot.vehicle.body.on_ground
 
 
-def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(shell: Shell) -> None:
+def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The guard can observe the suspended pilot before the heartbeat that reports the new mode."""
+
     def send_signal() -> None:
-        os.kill(agent_of(shell, "fly"), signal.SIGSTOP)
-        autopilot.vehicle.change_mode(Mode.LOITER)
+        pilot, advance = agent_of(shell, "fly"), autopilot.vehicle.advance
+
+        def suspend_and_take_over(now_ns: int) -> None:
+            monkeypatch.undo()
+            os.kill(pilot, signal.SIGSTOP)
+            autopilot.vehicle.change_mode(Mode.LOITER)
+            advance(now_ns)
+
+        monkeypatch.setattr(autopilot.vehicle, "advance", suspend_and_take_over)
 
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError, match="ended with exit code 137"):
