@@ -3,14 +3,16 @@
 import hashlib
 import json
 import os
+from functools import cache
 from pathlib import Path
 from typing import Final
 
 _HASH_DIGITS: Final = 16
 
 
+@cache
 def code_hash() -> str:
-    """Return the hash over the names and contents of fieldkit's source files."""
+    """Return the hash over the names and contents of fieldkit's source files, read once."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent.parent
     walked = (f"{folder}/{name}" for folder, _, names in os.walk(package) for name in names)

@@ -24,9 +24,10 @@ def remedies() -> list[tuple[str, str]]:
     """Return each remedy in the source with its location; values are shown as `X`."""
     located = []
     for path in sorted([*(ROOT / "fieldkit").rglob("*.py"), *(ROOT / "sim_backends").rglob("*.py")]):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "remedy" in text else ():
             if isinstance(node, ast.keyword) and node.arg == "remedy":
-                located += [(f"{path.relative_to(ROOT)}:{node.value.lineno}", text) for text in texts(node.value)]
+                located += [(f"{path.relative_to(ROOT)}:{node.value.lineno}", value) for value in texts(node.value)]
     return located
 
 

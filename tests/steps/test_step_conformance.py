@@ -356,7 +356,10 @@ def change(monkeypatch: pytest.MonkeyPatch, name: str, changed: Callable[[Job], 
     monkeypatch.setattr(jobs, "command", lambda verb, job: real(verb, changed(job) if job.name == name else job))
 
 
-@pytest.mark.parametrize(("kind", "job"), every_job())
+JOBS = every_job()
+
+
+@pytest.mark.parametrize(("kind", "job"), JOBS)
 def test_killed_tool_makes_attempt_void(kind: str, job: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = bench.plan(kind)
     role, _, name = job.partition(" ")
@@ -390,7 +393,7 @@ def test_interrupted_trial_is_resumed(kind: str, bench: Bench) -> None:
     assert bench.resume(plan)[:2] == ("valid", "")
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if any(other == kind for other, _ in every_job())])
+@pytest.mark.parametrize("kind", sorted({kind for kind, _ in JOBS}))
 def test_hanging_tool_is_stopped_at_its_limit(kind: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = bench.plan(kind)
     hanging = own_jobs(kind, plan)[0].job.name
