@@ -154,7 +154,7 @@ def test_the_table_of_a_shootout_can_be_plotted_again(lab: Path) -> None:
 
 def test_the_cost_of_a_bound_is_reported_with_the_fixed_windows_that_keep_it(lab: Path) -> None:
     # The husky drives at 0.9 m/s from the start, 11 mm in 12.5 ms.
-    words = ("shootout", "pass.yaml", "--bound", "--seeds", "2", "--duration", "600ms")
+    words = ("shootout", "pass.yaml", "--bound", "--seeds", "2", "--duration", "300ms")
     run = cosim(lab, *words, "--format", "csv")
     first, second = rows(run.out)
     for row in (first, second):
