@@ -13,9 +13,9 @@ from typing import Generic
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import LinkSample, StationSample, Vector
 from sim_backends.radio import delay
+from sim_backends.radio.channel import Emitter
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import TransmissionAttempt
-from sim_backends.radio.jamming import Emitter
 from sim_backends.radio.links import LinkCounters, LinkParameters, Pair
 from sim_backends.radio.losses import LOST, OUT_OF_RANGE, QUEUE_FULL, RADIO_OFF, LossLog
 from sim_backends.radio.options import RadioOptions

@@ -5,9 +5,9 @@ from itertools import product
 from typing import Protocol
 
 from fieldkit.core.model import LinkSample, Vector
+from sim_backends.radio.channel import Emitter
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import Emission, TransmissionAttempt
-from sim_backends.radio.jamming import Emitter
 from sim_backends.radio.links import LinkCounters, Pair
 from sim_backends.radio.losses import LossLog
 from sim_backends.radio.options import RadioOptions
