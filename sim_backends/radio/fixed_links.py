@@ -16,8 +16,16 @@ from sim_backends.radio import delay
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import TransmissionAttempt
-from sim_backends.radio.links import LinkCounters, LinkParameters, Pair
-from sim_backends.radio.losses import LOST, OUT_OF_RANGE, QUEUE_FULL, RADIO_OFF, LossLog
+from sim_backends.radio.links import (
+    LOST,
+    OUT_OF_RANGE,
+    QUEUE_FULL,
+    RADIO_OFF,
+    LinkCounters,
+    LinkParameters,
+    LossLog,
+    Pair,
+)
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 

@@ -1,6 +1,8 @@
-"""Parameters and counters of directed links; importable without the models that use them."""
+"""Parameters and counters of directed links, and reasons for losses; importable without the models that use them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Final
 
 Pair = tuple[str, str]
 """Transmitter and receiver."""
@@ -46,3 +48,17 @@ class LinkCounters:
     queue_dropped: int
     lost: int
     delivered: int
+
+
+LossLog = Callable[[int, Any, str, str], None]
+"""Called with the time of the loss in ns, the payload, the station that will not receive it, and the reason.
+
+For each packet passed to a model, each addressed station is reported exactly once: here, or as a delivery.
+"""
+
+OUT_OF_RANGE: Final = "out of range"
+QUEUE_FULL: Final = "queue full"
+RETRIES_EXHAUSTED: Final = "retries exhausted"
+NOT_DECODED: Final = "broadcast not decoded"
+LOST: Final = "lost on the link"
+RADIO_OFF: Final = "radio off"

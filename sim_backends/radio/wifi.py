@@ -23,8 +23,16 @@ from sim_backends.radio.frames import (
     attempt_record,
     decibel,
 )
-from sim_backends.radio.links import LinkCounters, Pair
-from sim_backends.radio.losses import NOT_DECODED, OUT_OF_RANGE, QUEUE_FULL, RADIO_OFF, RETRIES_EXHAUSTED, LossLog
+from sim_backends.radio.links import (
+    NOT_DECODED,
+    OUT_OF_RANGE,
+    QUEUE_FULL,
+    RADIO_OFF,
+    RETRIES_EXHAUSTED,
+    LinkCounters,
+    LossLog,
+    Pair,
+)
 from sim_backends.radio.meter import RadioMeter
 from sim_backends.radio.modes import (
     ACK_BYTES,

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.losses import (
+from sim_backends.radio.links import (
     LOST,
     NOT_DECODED,
     OUT_OF_RANGE,
