@@ -11,8 +11,8 @@ from typing import Final, Generic
 
 from fieldkit.core.model import LinkSample, StationSample
 from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.contention import EventQueue
 from sim_backends.radio.delay import Delay, Delivery, Payload
-from sim_backends.radio.event_queue import EventQueue
 from sim_backends.radio.frames import (
     HEADER_BYTES,
     Emission,
