@@ -33,7 +33,6 @@ from sim_backends.radio.links import (
     LossLog,
     Pair,
 )
-from sim_backends.radio.meter import RadioMeter
 from sim_backends.radio.modes import (
     ACK_BYTES,
     BASIC,
@@ -46,7 +45,7 @@ from sim_backends.radio.modes import (
 )
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.reception import Reception
-from sim_backends.radio.stations import Peer, Station
+from sim_backends.radio.stations import Peer, RadioMeter, Station
 
 # 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
 _ACK_TIMEOUT_NS: Final = SIFS_NS + SLOT_NS + 20_000
