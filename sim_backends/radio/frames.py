@@ -8,8 +8,7 @@ from typing import Any, Final, Generic
 
 from sim_backends.radio import delay
 from sim_backends.radio.delay import Delay, Payload
-from sim_backends.radio.modes import WifiMode
-from sim_backends.radio.packet_error import log_success
+from sim_backends.radio.modes import WifiMode, log_success
 from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0

@@ -3,8 +3,16 @@
 from collections.abc import Sequence
 from typing import Final, Protocol
 
-from sim_backends.radio.modes import CW_MIN, DIFS_NS, SHORT_RETRY_LIMIT, SIFS_NS, SLOT_NS, WifiMode, ack_ns
-from sim_backends.radio.packet_error import packet_error
+from sim_backends.radio.modes import (
+    CW_MIN,
+    DIFS_NS,
+    SHORT_RETRY_LIMIT,
+    SIFS_NS,
+    SLOT_NS,
+    WifiMode,
+    ack_ns,
+    packet_error,
+)
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
 

@@ -22,8 +22,8 @@ from sim_backends.radio.modes import (
     SLOT_NS,
     WifiMode,
     ack_ns,
+    packet_error,
 )
-from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import HEADERS_BYTES, NOISE_MW, STRONG_MW, FixedPowers, saturate
 
