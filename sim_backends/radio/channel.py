@@ -1,4 +1,4 @@
-"""Protocol of a radio channel, as Wi-Fi needs it: the power at which each station receives each other station; and jammers."""
+"""Protocol of a radio channel, as Wi-Fi needs it: the power of each station at each other station; and jammers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,6 +1,7 @@
 """Contention for the channel: carrier sense, inter-frame space, backoff (IEEE 802.11-2020, 10.3.4, DCF).
 
-The queue of events in virtual time also contains the start times of stations that wait for the channel."""
+The queue of events in virtual time also contains the start times of stations that wait for the channel.
+"""
 
 import heapq
 from collections.abc import Callable

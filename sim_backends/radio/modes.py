@@ -1,11 +1,11 @@
-"""Modulation and coding of 802.11g and of 802.11n with one stream in 20 MHz: airtime of frames, packet errors by noise.
+"""Modulation and coding of 802.11g and of 802.11n with one stream in 20 MHz: airtime of frames, and packet errors.
 
 Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n).
 
-Packet errors follow from the bit error rate of the modulation and from the convolutional code. The model is that of
-Pei and Henderson, "Validation of OFDM error rate model in ns-3" (2010), after Miller, "Validation of 802.11a/UWB
-coexistence simulation" (NIST, 2003): hard decisions on a channel with additive white Gaussian noise; the error
-probability of the code by the union bound over its weight spectrum.
+Packet errors by noise follow from the bit error rate of the modulation and from the convolutional code. The model is
+that of Pei and Henderson, "Validation of OFDM error rate model in ns-3" (2010), after Miller, "Validation of
+802.11a/UWB coexistence simulation" (NIST, 2003): hard decisions on a channel with additive white Gaussian noise; the
+error probability of the code by the union bound over its weight spectrum.
 """
 
 import math

@@ -1,6 +1,7 @@
-"""Propagation: mean path loss in the open, for many paths together; fast fading by multipath; slow fading by shadowing.
+"""Propagation: mean path loss in the open, for many paths together, and fading of links.
 
-Fast fading changes as the ends or the scatterers move, slow fading in space."""
+Fast fading is by multipath as the ends or the scatterers move; slow fading is by shadowing in space.
+"""
 
 import math
 from collections.abc import Sequence
