@@ -5,8 +5,7 @@ from collections.abc import Callable
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.ranges import Ranges
 from sim_backends.network.tcp.segments import MAX_SACKS, Segment
-from sim_backends.network.timer import WireTimer
-from sim_backends.network.wire import Wire
+from sim_backends.network.wire import Wire, WireTimer
 
 
 class Receiver:

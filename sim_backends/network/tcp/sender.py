@@ -13,8 +13,7 @@ from sim_backends.network.tcp.reduction import ProportionalReduction
 from sim_backends.network.tcp.round_trips import RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
 from sim_backends.network.tcp.segments import Segment
-from sim_backends.network.timer import WireTimer
-from sim_backends.network.wire import Wire
+from sim_backends.network.wire import Wire, WireTimer
 
 _CONTROLS: Final[Mapping[Congestion, tuple[type[NewReno], type[Scoreboard]]]] = {
     "cubic": (LinuxCubic, RackScoreboard),
