@@ -8,9 +8,7 @@ from sim_backends.network.tcp.cubic import Cubic
 from sim_backends.network.tcp.linux_cubic import LinuxCubic
 from sim_backends.network.tcp.messages import MessageStream
 from sim_backends.network.tcp.options import Congestion, TcpOptions
-from sim_backends.network.tcp.rack import RackScoreboard
-from sim_backends.network.tcp.reduction import ProportionalReduction
-from sim_backends.network.tcp.round_trips import RoundTrips
+from sim_backends.network.tcp.recovery import ProportionalReduction, RackScoreboard, RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
 from sim_backends.network.tcp.segments import Segment
 from sim_backends.network.wire import Wire, WireTimer

@@ -6,7 +6,7 @@ from fractions import Fraction
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.network.tcp.reduction import ProportionalReduction
+from sim_backends.network.tcp.recovery import ProportionalReduction
 
 
 def test_after_one_loss_half_as_much_is_sent_as_arrives() -> None:

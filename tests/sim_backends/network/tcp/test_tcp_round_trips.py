@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.network.tcp.options import TcpOptions
-from sim_backends.network.tcp.round_trips import RoundTrips
+from sim_backends.network.tcp.recovery import RoundTrips
 
 MS = 1_000_000
 
