@@ -4,10 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from sim_backends.network.packets import Packet
-from sim_backends.network.tcp.messages import MessageStream
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.receiver import Receiver
-from sim_backends.network.tcp.segments import Segment
+from sim_backends.network.tcp.segments import MessageStream, Segment
 from sim_backends.network.tcp.sender import Sender
 from sim_backends.network.wire import IpPacket, Wire
 

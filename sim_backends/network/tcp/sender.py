@@ -6,11 +6,10 @@ from typing import Final
 from sim_backends.network.tcp.congestion import NewReno
 from sim_backends.network.tcp.cubic import Cubic
 from sim_backends.network.tcp.linux_cubic import LinuxCubic
-from sim_backends.network.tcp.messages import MessageStream
 from sim_backends.network.tcp.options import Congestion, TcpOptions
 from sim_backends.network.tcp.recovery import ProportionalReduction, RackScoreboard, RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
-from sim_backends.network.tcp.segments import Segment
+from sim_backends.network.tcp.segments import MessageStream, Segment
 from sim_backends.network.wire import Wire, WireTimer
 
 _CONTROLS: Final[Mapping[Congestion, tuple[type[NewReno], type[Scoreboard]]]] = {
