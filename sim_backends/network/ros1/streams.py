@@ -5,8 +5,8 @@ from dataclasses import replace
 from functools import partial
 
 from sim_backends.network.packets import Packet
+from sim_backends.network.tcp.connection import Tcp
 from sim_backends.network.tcp.options import TcpOptions
-from sim_backends.network.tcp.transport import Tcp
 from sim_backends.network.wire import IpPacket, Wire
 
 Lost = Callable[[str], None]
