@@ -7,8 +7,7 @@ changed or 1/32 s has passed.
 
 from typing import ClassVar, Final
 
-from sim_backends.network.tcp.congestion import NewReno
-from sim_backends.network.tcp.cubic import cube_root
+from sim_backends.network.tcp.congestion import NewReno, cube_root
 from sim_backends.network.tcp.options import TcpOptions
 
 _NS_PER_S_CUBED: Final = 10**27

@@ -3,8 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from sim_backends.network.tcp.congestion import NewReno
-from sim_backends.network.tcp.cubic import Cubic
+from sim_backends.network.tcp.congestion import Cubic, NewReno
 from sim_backends.network.tcp.linux_cubic import LinuxCubic
 from sim_backends.network.tcp.options import Congestion, TcpOptions
 from sim_backends.network.tcp.recovery import ProportionalReduction, RackScoreboard, RoundTrips

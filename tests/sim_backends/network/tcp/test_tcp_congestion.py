@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.network.tcp.congestion import NewReno
-from sim_backends.network.tcp.cubic import Cubic, cube_root
+from sim_backends.network.tcp.congestion import Cubic, NewReno, cube_root
 from sim_backends.network.tcp.options import TcpOptions
 
 MS = 1_000_000
