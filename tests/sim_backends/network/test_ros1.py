@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.packets import Packet
-from sim_backends.network.ros1.calls import CallRetry
 from sim_backends.network.ros1.options import Ros1Flow, Ros1Options
+from sim_backends.network.ros1.streams import CallRetry
 from sim_backends.network.ros1.transport import Ros1
 from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.wire import IpPacket
