@@ -17,8 +17,7 @@ from sim_backends.network.wire import IpPacket, Transport, Wire
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.links import RADIO_OFF
 from sim_backends.radio.model import RadioModel
-from sim_backends.world.dead_reckoning import DeadReckoned
-from sim_backends.world.motion import State
+from sim_backends.world.motion import DeadReckoned, State
 
 TransportFactory = Callable[[Wire], Transport]
 
