@@ -1,6 +1,6 @@
-"""Messages of ROS 1 over TCP, a transport on top of another transport; and calls by XML-RPC between nodes and their master.
+"""Messages of ROS 1 over TCP, a transport on top of another transport; and calls by XML-RPC.
 
-Calls are requests and responses over TCP, with retries.
+Calls between nodes and their master are requests and responses over TCP, with retries.
 """
 
 from collections.abc import Callable

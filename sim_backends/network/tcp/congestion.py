@@ -1,6 +1,6 @@
-"""The congestion window: slow start and congestion avoidance of RFC 5681, and CUBIC (RFC 9438). For Linux's see `linux_cubic`.
+"""The congestion window: slow start and congestion avoidance of RFC 5681, and CUBIC (RFC 9438).
 
-CUBIC uses integer bytes and nanoseconds, so that results are equal on every machine.
+CUBIC uses integer bytes and nanoseconds, so that results are equal on every machine. For Linux's see `linux_cubic`.
 """
 
 from typing import ClassVar, Final

@@ -1,4 +1,4 @@
-"""Detection of losses and recovery from them: retransmission timeout (RFC 6298), RACK (RFC 8985), rate reduction (RFC 6937).
+"""Loss detection and recovery: retransmission timeout (RFC 6298), RACK (RFC 8985), rate reduction (RFC 6937).
 
 Time-based loss detection, RACK, works as in Linux: a segment is lost if a segment that was sent later has arrived and
 a round trip has passed since. The loss of a retransmission is therefore also detected within a round trip, without a
