@@ -6,9 +6,8 @@ from typing import Protocol
 
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.radio.channel import Emitter
-from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import Emission, TransmissionAttempt
-from sim_backends.radio.links import LinkCounters, LossLog, Pair
+from sim_backends.radio.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
 from sim_backends.radio.options import RadioOptions
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.wifi import Wifi

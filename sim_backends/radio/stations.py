@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Generic
 
 from sim_backends.radio.contention import Contention
-from sim_backends.radio.delay import Payload
 from sim_backends.radio.frames import Frame, Transmission
-from sim_backends.radio.links import LinkCounters
+from sim_backends.radio.links import LinkCounters, Payload
 from sim_backends.radio.modes import SHORT_RETRY_LIMIT
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.rate_control import RateControl

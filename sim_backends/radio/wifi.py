@@ -12,7 +12,6 @@ from typing import Final, Generic
 from fieldkit.core.model import LinkSample, StationSample
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import EventQueue
-from sim_backends.radio.delay import Delay, Delivery, Payload
 from sim_backends.radio.frames import (
     HEADER_BYTES,
     Emission,
@@ -29,9 +28,12 @@ from sim_backends.radio.links import (
     QUEUE_FULL,
     RADIO_OFF,
     RETRIES_EXHAUSTED,
+    Delay,
+    Delivery,
     LinkCounters,
     LossLog,
     Pair,
+    Payload,
 )
 from sim_backends.radio.modes import (
     ACK_BYTES,
