@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode, packet_error
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import CHANNEL_6_HZ, Antenna, WorldChannel
 

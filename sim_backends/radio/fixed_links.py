@@ -32,7 +32,7 @@ from sim_backends.radio.links import (
     Payload,
     delay_parts,
 )
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
 

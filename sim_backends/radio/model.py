@@ -8,7 +8,7 @@ from fieldkit.core.model import LinkSample, Vector
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.frames import Emission, TransmissionAttempt
 from sim_backends.radio.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import Antenna, WorldChannel

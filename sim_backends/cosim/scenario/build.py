@@ -24,10 +24,10 @@ from sim_backends.cosim.wall_time import DEADLINE_S, Stall, stalled
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
-from sim_backends.network.ros1.options import Ros1Flow, Ros1Options
+from sim_backends.network.ros1.ros1_options import Ros1Flow, Ros1Options
 from sim_backends.network.ros1.transport import Ros1
 from sim_backends.network.tcp.connection import Tcp
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.topics.discovery import DiscoveryTiming
 from sim_backends.network.topics.qos import Qos, TopicFlow
 from sim_backends.network.topics.transport import Topics

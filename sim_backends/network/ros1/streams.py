@@ -9,7 +9,7 @@ from functools import partial
 
 from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.connection import Tcp
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.wire import IpPacket, Wire
 
 Lost = Callable[[str], None]

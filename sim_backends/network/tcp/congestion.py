@@ -7,7 +7,7 @@ from typing import ClassVar, Final
 
 from typing_extensions import override
 
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.tcp_options import TcpOptions
 
 
 class NewReno:

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.packets import Packet
-from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.receiver import Receiver
 from sim_backends.network.tcp.segments import MessageStream, Segment
 from sim_backends.network.tcp.sender import Sender
+from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.wire import IpPacket, Wire
 
 

@@ -8,7 +8,7 @@ the window has changed or 1/32 s has passed.
 from typing import ClassVar, Final
 
 from sim_backends.network.tcp.congestion import NewReno, cube_root
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.tcp_options import TcpOptions
 
 _NS_PER_S_CUBED: Final = 10**27
 # bic_scale 41: C is 410 / 1024 segments per s^3.

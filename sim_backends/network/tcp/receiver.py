@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.segments import MAX_SACKS, Ranges, Segment
+from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.wire import Wire, WireTimer
 
 

@@ -10,8 +10,8 @@ Proportional rate reduction gives the bytes that may be sent in a recovery, as i
 
 from collections import deque
 
-from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.scoreboard import DUPLICATE_THRESHOLD, Scoreboard, SentSegment
+from sim_backends.network.tcp.tcp_options import TcpOptions
 
 
 class RoundTrips:

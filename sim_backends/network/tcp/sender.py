@@ -5,10 +5,10 @@ from typing import Final
 
 from sim_backends.network.tcp.congestion import Cubic, NewReno
 from sim_backends.network.tcp.linux_cubic import LinuxCubic
-from sim_backends.network.tcp.options import Congestion, TcpOptions
 from sim_backends.network.tcp.recovery import ProportionalReduction, RackScoreboard, RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
 from sim_backends.network.tcp.segments import MessageStream, Segment
+from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
 from sim_backends.network.wire import Wire, WireTimer
 
 _CONTROLS: Final[Mapping[Congestion, tuple[type[NewReno], type[Scoreboard]]]] = {

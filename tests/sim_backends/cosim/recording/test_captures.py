@@ -30,7 +30,7 @@ from sim_backends.network.udp import Udp
 from sim_backends.network.wire import IpPacket
 from sim_backends.physics.paths import Paths
 from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import WayPoints
 from tests.helpers.passing_robots import ABOUT, MS
 

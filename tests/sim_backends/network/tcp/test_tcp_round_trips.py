@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.network.tcp.options import TcpOptions
 from sim_backends.network.tcp.recovery import RoundTrips
+from sim_backends.network.tcp.tcp_options import TcpOptions
 
 MS = 1_000_000
 

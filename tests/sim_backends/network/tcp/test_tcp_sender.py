@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.connection import Tcp, TcpSample
-from sim_backends.network.tcp.options import Congestion, TcpOptions
 from sim_backends.network.tcp.segments import Segment
+from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
 from sim_backends.network.wire import IpPacket
 from tests.helpers.scripted_wire import Script, ScriptedWire, losing
 

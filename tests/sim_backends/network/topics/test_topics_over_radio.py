@@ -6,7 +6,7 @@ import pytest
 
 from sim_backends.network.disturbances import Disturbance, LinkCut
 from sim_backends.network.packets import Packet
-from sim_backends.network.ros1.options import Ros1Flow
+from sim_backends.network.ros1.ros1_options import Ros1Flow
 from sim_backends.network.ros1.transport import Ros1
 from sim_backends.network.topics.qos import Qos, TopicFlow
 from sim_backends.network.topics.transport import Topics
