@@ -25,12 +25,12 @@ from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, Node
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
 from sim_backends.network.ros1.ros1_options import Ros1Flow, Ros1Options
-from sim_backends.network.ros1.transport import Ros1
+from sim_backends.network.ros1.ros1_transport import Ros1
 from sim_backends.network.tcp.connection import Tcp
 from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.topics.discovery import DiscoveryTiming
 from sim_backends.network.topics.qos import Qos, TopicFlow
-from sim_backends.network.topics.transport import Topics
+from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.udp import Udp
 from sim_backends.physics.bodies import Bodies
 from sim_backends.radio.fixed_links import UniformLinks
