@@ -11,12 +11,20 @@ from typing import Final, NamedTuple
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot.failsafes import Fence, Reaction, VehicleState
-from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.flight import NEAR_M, STEP_NS, Airframe, Guidance, SetPoint, stop_m
+from sim_backends.emulated.autopilot.firmware import Firmware, ModeConditions
+from sim_backends.emulated.autopilot.flight import (
+    NEAR_M,
+    STEP_NS,
+    Airframe,
+    Guidance,
+    SetPoint,
+    limits_within,
+    stop_m,
+)
 from sim_backends.emulated.autopilot.mavlink_frames import dialect
 from sim_backends.emulated.autopilot.mission_plan import Item, Mission
-from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode
-from sim_backends.emulated.autopilot.onboard_estimates import Battery, PositionEstimate
+from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode, reported_mode
+from sim_backends.emulated.autopilot.onboard_estimates import Battery, LandDetector, PositionEstimate
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.physics.collisions import Footprint
 from sim_backends.physics.quadrotor import QuadrotorLimits
@@ -28,8 +36,6 @@ _PREARM_NS: Final = 30_000_000_000
 """ArduPilot repeats the reasons why it cannot be armed at this interval (AP_Arming)."""
 _OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
 """Mode when set-points are missing, by COM_OBL_RC_ACT; PX4 holds instead of a pilot's mode, which needs sticks."""
-_STARTING_FLAGS: Final = {True: 0xA7, False: 0xA5}
-"""Flags of an estimate without an origin; the key is True for ArduPilot."""
 
 
 class Refused(Exception):  # noqa: N818 (an answer of the autopilot, not an error)
@@ -57,7 +63,7 @@ class Vehicle:
     Attributes:
         body: Position and motion, relative to home.
         armed: True if its motors turn.
-        landed: True if it has detected that it is on the ground.
+        land_detector: Its detection of take-off and landing.
         mode: Its flight mode.
         mission: The mission of mode MISSION.
         battery: Its battery.
@@ -84,7 +90,8 @@ class Vehicle:
         self._parameters = parameters
         self._limits = limits
         self._obstacles = obstacles
-        self.estimate = PositionEstimate(boot_s, _STARTING_FLAGS[firmware.is_ardupilot])
+        self.estimate = PositionEstimate(boot_s, firmware.starting_flags)
+        self.land_detector = LandDetector(firmware.landed_s)
         self.fence = Fence(parameters)
         self.guidance = Guidance(firmware, parameters)
         self.mission = Mission(firmware.first_item)
@@ -108,12 +115,10 @@ class Vehicle:
             self.home_m = place_m
         self.body.home_m = self.home_m
         self.armed = False
-        self.landed = True
         self.guidance.hold(self.body.position_m)
         self.guidance.set_point_ns = None
         self.fence.reset()
-        self._flew = False
-        self._grounded_ns = self._armed_ns = now_ns
+        self.land_detector.place(now_ns)
 
     @property
     def local_m(self) -> Vector | None:
@@ -131,14 +136,7 @@ class Vehicle:
     @property
     def limits(self) -> QuadrotorLimits:
         """Limits of its airframe, within its parameters."""
-        get = self._parameters
-        return replace(
-            self._limits,
-            speed_m_s=get["MPC_XY_VEL_MAX"],
-            climb_m_s=(get["MPC_Z_VEL_MAX_DN"], get["MPC_Z_VEL_MAX_UP"]),
-            acceleration_m_s2=get["MPC_ACC_HOR"],
-            climb_m_s2=(get["MPC_ACC_DOWN_MAX"], get["MPC_ACC_UP_MAX"]),
-        )
+        return limits_within(self._limits, self._parameters)
 
     @property
     def arming_errors(self) -> list[str]:
@@ -175,15 +173,15 @@ class Vehicle:
             raise self._refusal("Arming denied: it falls")
         reasons = self.arming_errors
         if self.mode in self.firmware.unarmable:
-            reasons.append(f"{self.firmware.names[_shown(self.mode)]} mode not armable")
+            reasons.append(f"{self.firmware.names[reported_mode(self.mode)]} mode not armable")
         for reason in reasons:
             self.report(_CRITICAL, self.firmware.prearm[1] + reason)
         if reasons:
             raise self._refusal("Arming denied: Resolve system health failures first")
         self.home_m = self.body.home_m = self.body.place_m
-        self.armed, self._flew = True, False
+        self.armed = True
         self.fence.reset()
-        self._grounded_ns = self._armed_ns = self.body.now_ns
+        self.land_detector.arm(self.body.now_ns)
         self.guidance.hold(self.body.position_m)
         self.report(_INFO, "Arming motors" if self.firmware.is_ardupilot else "Armed by external command")
 
@@ -214,7 +212,7 @@ class Vehicle:
         Raises:
             Refused: The motors are off, it is flying, or the height is not allowed.
         """
-        if self.mode is Mode.TAKEOFF and (self.landed or not self.firmware.is_ardupilot):
+        if self.mode is Mode.TAKEOFF and (self.land_detector.landed or not self.firmware.is_ardupilot):
             return
         height_m = self._parameters["MIS_TAKEOFF_ALT"] if height_m is None else height_m
         if not self.armed:
@@ -279,7 +277,7 @@ class Vehicle:
         while self.body.now_ns + STEP_NS <= now_ns:
             if not self.armed and self.body.on_ground:
                 self.body.now_ns += (now_ns - self.body.now_ns) // STEP_NS * STEP_NS
-                self.landed = True
+                self.land_detector.landed = True
                 break
             self._update_ground_state()
             self.body.driven = self.armed
@@ -306,7 +304,7 @@ class Vehicle:
 
     @property
     def _state(self) -> VehicleState:
-        return VehicleState(self.body.now_ns, self.armed, self.landed, self.mode, self.battery)
+        return VehicleState(self.body.now_ns, self.armed, self.land_detector.landed, self.mode, self.battery)
 
     def _watch_failsafes(self) -> None:
         for reaction in self.failsafes.advance(self._state):
@@ -332,10 +330,7 @@ class Vehicle:
         if mode is Mode.TAKEOFF:
             self.take_off()
             return
-        if self.firmware.is_ardupilot:
-            self._check_copter_mode(mode)
-        else:
-            self._check_px4_mode(mode)
+        self._check_mode(mode)
         if mode is Mode.MISSION:
             self.mission.begin()
         self.guidance.goal_m = self._rest_m()
@@ -343,29 +338,20 @@ class Vehicle:
             self.guidance.hold(self.guidance.goal_m)
         self.mode = mode
 
-    def _check_copter_mode(self, mode: Mode) -> None:
-        """Raise `Refused` if ArduCopter refuses a mode now; unarmed it accepts any (Copter::set_mode)."""
-        if not self.armed:
+    def _check_mode(self, mode: Mode) -> None:
+        """Raise `Refused` if the firmware refuses a mode now."""
+        conditions = ModeConditions(
+            armed=self.armed,
+            landed=self.land_detector.landed,
+            on_ground=self.body.on_ground,
+            mission_commands=[item.command for item in self.mission.items],
+            has_recent_set_point=self.guidance.has_recent_set_point(self.body.now_ns),
+        )
+        if (refusal := self.firmware.mode_refusal(mode, conditions)) is None:
             return
-        items, first = self.mission.items, self.firmware.first_item
-        if mode is Mode.MISSION and len(items) <= first:
-            raise self._failed_mode(mode)
-        if mode is Mode.MISSION and self.landed and items[first].command != dialect.MAV_CMD_NAV_TAKEOFF:
-            self.report(_CRITICAL, "Auto: Missing Takeoff Cmd")
-            raise self._failed_mode(mode)
-
-    def _failed_mode(self, mode: Mode) -> Refused:
-        return Refused(f"Mode change to {self.firmware.names[mode]} failed: init failed")
-
-    def _check_px4_mode(self, mode: Mode) -> None:
-        """Raise `Refused` if PX4 refuses a mode now."""
-        grounded = not self.armed or self.body.on_ground
-        if mode in {Mode.LAND, Mode.RTL} and grounded:
-            raise self._refusal(f"{mode.name} denied: not in the air")
-        if mode is Mode.OFFBOARD and not self.guidance.has_recent_set_point(self.body.now_ns):
-            raise self._refusal("OFFBOARD denied: no set-points")
-        if mode is Mode.MISSION and not self.mission.items:
-            raise self._refusal("MISSION denied: no mission")
+        if refusal.reason:
+            self.report(_CRITICAL, refusal.reason)
+        raise Refused(refusal.text)
 
     def _go(self, mode: Mode, goal_m: Vector) -> None:
         if not all(map(math.isfinite, goal_m)) or not self.fence.contains(goal_m):
@@ -379,13 +365,11 @@ class Vehicle:
     def _update_ground_state(self) -> None:
         """Detect take-off and landing; stop idle motors; react to missing set-points and to the fence."""
         now_ns, ardupilot = self.body.now_ns, self.firmware.is_ardupilot
-        if not self.body.on_ground:
-            self._flew, self.landed, self._grounded_ns = True, False, now_ns
-        elif now_ns - self._grounded_ns >= self.firmware.landed_s * 1e9:
-            self.landed = True
-        if self.armed and now_ns - self._grounded_ns > self._idle_s() * 1e9:
+        self.land_detector.advance(now_ns, on_ground=self.body.on_ground)
+        if self.armed and now_ns - self.land_detector.grounded_ns > self._idle_s() * 1e9:
             if not ardupilot:
-                self.report(_INFO, "Disarmed by landing" if self._flew else "Disarmed by auto preflight disarming")
+                reason = "landing" if self.land_detector.flew else "auto preflight disarming"
+                self.report(_INFO, f"Disarmed by {reason}")
             self.disarm()
         if ardupilot and (breach := self.fence.advance(self._state, self.body.position_m)):
             self._react(breach)
@@ -395,7 +379,7 @@ class Vehicle:
     def _idle_s(self) -> float:
         """Return the time on the ground after which its motors stop; ArduCopter stops them early in landing modes."""
         stops = self.mode is Mode.MISSION or not self.firmware.is_ardupilot
-        landed = (self._flew and stops) or self.mode in LANDING
+        landed = (self.land_detector.flew and stops) or self.mode in LANDING
         return self._parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]
 
     def _watch_set_points(self) -> None:
@@ -418,7 +402,7 @@ class Vehicle:
 
     def _stays_down(self) -> bool:
         """Return True if it cannot lift off now: its motors spool up, or its mode does not lift off."""
-        spools_up = self.body.now_ns - self._armed_ns < self.firmware.spool_s * 1e9
+        spools_up = self.body.now_ns - self.land_detector.armed_ns < self.firmware.spool_s * 1e9
         follows_set_points = self.mode is Mode.OFFBOARD and not self.firmware.lifts_off
         return self.body.on_ground and (spools_up or follows_set_points or self.mode in PILOTED)
 
@@ -446,8 +430,3 @@ class Vehicle:
         if self.mode is Mode.TAKEOFF and math.dist(self.body.position_m, self.guidance.goal_m) < NEAR_M:
             self.mode = Mode.OFFBOARD if self.firmware.is_ardupilot else Mode.LOITER
             self.guidance.hold(self.guidance.goal_m)
-
-
-def _shown(mode: Mode) -> Mode:
-    """Return the mode that is reported for a mode, which may be a phase of another one."""
-    return Mode.RTL if mode is Mode.HOMECOMING else mode
