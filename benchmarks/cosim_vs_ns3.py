@@ -30,12 +30,11 @@ from benchmarks.radio_vs_ns3 import NOISE_DBM, SENSITIVITY_DBM, TX_POWER_DBM, Ns
 from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
-from sim_backends.network.tcp.connection import TcpSample
-from sim_backends.network.tcp.options import TcpOptions
-from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.tcp.connection import Tcp, TcpSample
+from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.udp import Udp
 from sim_backends.radio.model import WifiInWorld
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import CHANNEL_6_HZ, Antenna
 from sim_backends.world.motion import State
 from sim_backends.world.world import World

@@ -24,7 +24,7 @@ from typing import Final
 from benchmarks.namespaces import Namespace
 from fieldkit.config.profiles import Radio
 from sim_backends.emulated.medium.medium_client import MediumClient
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 
 RADIO: Final = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
 PAYLOAD_BYTES: Final = 64

@@ -18,7 +18,7 @@ from benchmarks.medium import RADIO
 from benchmarks.namespaces import Namespace
 from fieldkit.core.model import Vector
 from sim_backends.emulated.medium.medium_client import MediumClient
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 
 SIZES: Final = (2, 10, 50)

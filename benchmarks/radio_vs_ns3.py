@@ -17,9 +17,8 @@ from typing import Final
 
 import numpy as np
 
-from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode
-from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.packet_error import packet_error
+from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode, packet_error
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import CHANNEL_6_HZ, Antenna, WorldChannel
 

@@ -33,7 +33,7 @@ from sim_backends.emulated.emulated_options import RosChoice
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
 
 SIZES: Final = (2, 10, 30, 50)

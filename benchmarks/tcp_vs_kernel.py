@@ -22,10 +22,10 @@ from scipy.stats import t as student
 from benchmarks.medium import iperf, listening_iperf, medium_path
 from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
-from sim_backends.network.tcp.options import Congestion, TcpOptions
-from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.tcp.connection import Tcp
+from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
 from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State
 
 LOSSES: Final = ("0.1%", "1%", "5%")

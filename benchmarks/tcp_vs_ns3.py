@@ -21,9 +21,8 @@ from scipy.stats import t as student
 from benchmarks.cosim_vs_ns3 import CONTROLS, Control
 from benchmarks.radio_vs_ns3 import Ns3, build
 from sim_backends.network.packets import Packet
-from sim_backends.network.tcp.connection import TcpSample
-from sim_backends.network.tcp.options import TcpOptions
-from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.tcp.connection import Tcp, TcpSample
+from sim_backends.network.tcp.tcp_options import TcpOptions
 from tests.helpers.scripted_wire import ScriptedWire, losing
 
 RATE_MBIT_S: Final = 10

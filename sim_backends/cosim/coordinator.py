@@ -17,8 +17,7 @@ from sim_backends.cosim.policies.sync_policy import LookingAhead, Pair, PolicyEr
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
 from sim_backends.cosim.wall_time import WallTime
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
-from sim_backends.world.dead_reckoning import DeadReckoned
-from sim_backends.world.motion import State
+from sim_backends.world.motion import DeadReckoned, State
 
 _MAX_EMPTY_WINDOWS: Final = 1000
 """Number of successive windows of length 0 after which the policy has failed."""

@@ -11,8 +11,7 @@ from sim_backends.cosim.federates import FederateError, seconds_text
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.radio.random_streams import PacketIdentity
-from sim_backends.world.dead_reckoning import DeadReckoned, moved_on
-from sim_backends.world.motion import STILL, State
+from sim_backends.world.motion import STILL, DeadReckoned, State, moved_on
 
 
 def transmitters(network: object) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Layout of plots: outlines of obstacles seen from above, directions of travel, and places of labels."""
+"""Contents and layout of plots: curves, outlines of obstacles, directions of travel, and places of labels."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -11,10 +11,66 @@ from sim_backends.world.shapes import Box
 from sim_backends.world.world import World
 
 Point = tuple[float, float]
+"""Metres east and north, or typographic points (1/72 inch) from the lower left corner of the figure."""
 
 _FLOOR_M: Final = 0.01
 _ARROW_SHARE: Final = 0.04
 """Length of an arrow, as a share of the diagonal of the rectangle that the path covers."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A labelled series of points.
+
+    Attributes:
+        name: Its name; the name of a sync policy determines its colour and marker.
+        x: Above 0, at least one.
+        y: At least 0, one for each x.
+        label: Text next to it; if empty, its name.
+    """
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[float]
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class LogPanel:
+    """Curves on two logarithmic axes; values of 0 are on a separate line below.
+
+    Attributes:
+        title: Title above the panel.
+        x_label: Quantity and unit of x.
+        y_label: Quantity and unit of y.
+        curves: The curves.
+        labels_at_right: True to stack the labels at the right; the axis then leaves space for the longest.
+        over_time: True if x is a time from 0 on: its axis is then linear, and there are no markers.
+    """
+
+    title: str
+    x_label: str
+    y_label: str
+    curves: Sequence[Curve]
+    labels_at_right: bool = False
+    over_time: bool = False
+
+
+@dataclass(frozen=True)
+class FlowTrace:
+    """The packets of a flow over time.
+
+    Attributes:
+        name: Its name.
+        sent_s: Times of sending.
+        delay_s: Time that each packet spent in the network; nan for packets that never arrived.
+        distance_m: Distance of sender and receiver at each time of sending.
+    """
+
+    name: str
+    sent_s: Sequence[float]
+    delay_s: Sequence[float]
+    distance_m: Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -51,8 +107,6 @@ def last_heading(path_m: Sequence[Point]) -> tuple[Point, Point] | None:
             return (from_e, from_n), (east_m, north_m)
     return None
 
-
-"""Position in typographic points (1/72 inch), from the lower left corner of the figure."""
 
 _DISTANCE_FACTOR = 1.3
 """Factor by which the distance of a label from its point grows until it does not cover anything."""

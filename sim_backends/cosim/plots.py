@@ -7,7 +7,6 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Final
 
@@ -22,7 +21,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 from fieldkit.core.text import sanitized
 from fieldkit.report.theme import CYCLE, LIGHT, METADATA, SETTINGS, Colour, Format, Marker
 from sim_backends.cosim.plot_layout import (
+    FlowTrace,
     LabelBox,
+    LogPanel,
     ObstacleOutline,
     Point,
     curve_boxes,
@@ -64,44 +65,6 @@ _STYLES: Final[Mapping[str, tuple[Colour, Marker]]] = {
 """Colour and marker of each sync policy, the same in all figures; other curves have those of `CYCLE`."""
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A labelled series of points.
-
-    Attributes:
-        name: Its name; the name of a sync policy determines its colour and marker.
-        x: Above 0, at least one.
-        y: At least 0, one for each x.
-        label: Text next to it; if empty, its name.
-    """
-
-    name: str
-    x: Sequence[float]
-    y: Sequence[float]
-    label: str = ""
-
-
-@dataclass(frozen=True)
-class LogPanel:
-    """Curves on two logarithmic axes; values of 0 are on a separate line below.
-
-    Attributes:
-        title: Title above the panel.
-        x_label: Quantity and unit of x.
-        y_label: Quantity and unit of y.
-        curves: The curves.
-        labels_at_right: True to stack the labels at the right; the axis then leaves space for the longest.
-        over_time: True if x is a time from 0 on: its axis is then linear, and there are no markers.
-    """
-
-    title: str
-    x_label: str
-    y_label: str
-    curves: Sequence[Curve]
-    labels_at_right: bool = False
-    over_time: bool = False
-
-
 def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
     """Return a figure of panels side by side, two per row, as wide as both columns of a paper.
 
@@ -127,23 +90,6 @@ def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
                 at_right=panel.labels_at_right or panel.over_time,
             )
         return _saved(figure, form)
-
-
-@dataclass(frozen=True)
-class FlowTrace:
-    """The packets of a flow over time.
-
-    Attributes:
-        name: Its name.
-        sent_s: Times of sending.
-        delay_s: Time that each packet spent in the network; nan for packets that never arrived.
-        distance_m: Distance of sender and receiver at each time of sending.
-    """
-
-    name: str
-    sent_s: Sequence[float]
-    delay_s: Sequence[float]
-    distance_m: Sequence[float]
 
 
 def run_figure(

@@ -5,8 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from sim_backends.network.packets import Arrival, Drop, Packet
-from sim_backends.world.dead_reckoning import DeadReckoned
-from sim_backends.world.motion import State
+from sim_backends.world.motion import DeadReckoned, State
 
 
 class Disc:

@@ -14,11 +14,10 @@ from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.network.udp import Udp
 from sim_backends.network.wire import IpPacket, Transport, Wire
-from sim_backends.radio.jamming import Emitter
-from sim_backends.radio.losses import RADIO_OFF
+from sim_backends.radio.channel import Emitter
+from sim_backends.radio.links import RADIO_OFF
 from sim_backends.radio.model import RadioModel
-from sim_backends.world.dead_reckoning import DeadReckoned
-from sim_backends.world.motion import State
+from sim_backends.world.motion import DeadReckoned, State
 
 TransportFactory = Callable[[Wire], Transport]
 

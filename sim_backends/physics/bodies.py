@@ -14,13 +14,11 @@ from typing import Any
 
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
-from sim_backends.physics.body import Body, Pose
+from sim_backends.physics.body import NEVER, Body, Pose, Snapshot, Track
 from sim_backends.physics.collisions import cylinder_footprint, move, overlaps
-from sim_backends.physics.grid import CellGrid
 from sim_backends.physics.ground import Ground
-from sim_backends.physics.neighbours import HORIZON_S, ContactCandidates, Neighbours
+from sim_backends.physics.neighbours import HORIZON_S, CellGrid, ContactCandidates, Neighbours
 from sim_backends.physics.paths import STEP_NS
-from sim_backends.physics.tracks import NEVER, Snapshot, Track
 from sim_backends.world.motion import State
 from sim_backends.world.world import World
 

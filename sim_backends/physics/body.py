@@ -1,15 +1,17 @@
-"""Protocols of a body moved by the physics, its commands, and its pose.
+"""Protocols of a body moved by the physics, its commands, its pose, and its track.
 
 A body has no mutable state: from a pose and a command it derives a course, which gives the pose at every later step
 and is evaluated on request. The result therefore does not depend on when it is requested, and a body at rest costs
-nothing.
+nothing. The states of all bodies at a step are also computed on request, from their tracks.
 """
 
+from collections.abc import Iterator, KeysView, Mapping
 from dataclasses import dataclass
-from typing import Final, Protocol, TypeVar
+from typing import Final, NamedTuple, Protocol, TypeVar
 
 from fieldkit.core.model import Vector
 from sim_backends.physics.collisions import ContactStop, Surface
+from sim_backends.world.motion import State
 
 GRAVITY_M_S2: Final = 9.80665
 """Standard acceleration of gravity (CGPM 1901)."""
@@ -132,3 +134,66 @@ class Body(Protocol[PoseT]):
     def limit_m_s2(self, pose: PoseT) -> float:
         """Return the maximum acceleration from a pose on, for any command."""
         ...
+
+
+NEVER: Final = 1 << 62
+"""A step after the end of any run."""
+
+
+class Track(NamedTuple):
+    """The motion of a body from a step on.
+
+    Attributes:
+        course: Its course.
+        first_step: The first step of the course.
+        antenna_m: Height of its antenna above its position.
+    """
+
+    course: Course[Pose]
+    first_step: int
+    antenna_m: float
+
+    @property
+    def end_step(self) -> int:
+        """The last step for which the course is valid."""
+        return NEVER if self.course.steps is None else self.first_step + self.course.steps
+
+    def pose(self, step: int) -> Pose:
+        """Return the pose at a step."""
+        return self.course.at(step - self.first_step)
+
+    def state(self, step: int) -> State:
+        """Return the state of the antenna at a step."""
+        pose = self.pose(step)
+        east_m, north_m, up_m = pose.place_m
+        return State((east_m, north_m, up_m + self.antenna_m), pose.velocity_m_s, pose.heading_rad)
+
+
+class Snapshot(Mapping[str, State]):
+    """The states of all bodies at one step, each computed on request.
+
+    Args:
+        tracks: Their tracks at that step; the mapping must not be modified.
+        step: The step.
+    """
+
+    def __init__(self, tracks: Mapping[str, Track], step: int) -> None:
+        self._tracks = tracks
+        self._step = step
+        self._cache: dict[str, State] = {}
+
+    def __getitem__(self, name: str) -> State:
+        state = self._cache.get(name)
+        if state is None:
+            state = self._cache[name] = self._tracks[name].state(self._step)
+        return state
+
+    def keys(self) -> KeysView[str]:
+        """Return the names of the bodies; as fast as a dict's, because it is called in every window."""
+        return self._tracks.keys()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tracks)
+
+    def __len__(self) -> int:
+        return len(self._tracks)

@@ -1,8 +1,10 @@
-"""Protocol of a radio channel: the power at which each station receives each other station, as Wi-Fi needs it."""
+"""Protocol of a radio channel, as Wi-Fi needs it: the power of each station at each other station; and jammers."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
+from fieldkit.core.model import Vector
 from sim_backends.radio.rate_control import RateControl
 
 
@@ -38,3 +40,18 @@ class RadioChannel(Protocol):
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
         """Return the rate control of a link; called once per link."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Emitter:
+    """A transmitter of noise in the whole channel.
+
+    Attributes:
+        name: Name that stays the same while it sends without a pause.
+        place_m: Current position, metres east, north, up.
+        power_dbm: Transmit power.
+    """
+
+    name: str
+    place_m: Vector
+    power_dbm: float

@@ -12,13 +12,27 @@ from typing import Generic
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import LinkSample, StationSample, Vector
-from sim_backends.radio import delay
-from sim_backends.radio.delay import Delay, Delivery, Payload
+from sim_backends.radio.channel import Emitter
 from sim_backends.radio.frames import TransmissionAttempt
-from sim_backends.radio.jamming import Emitter
-from sim_backends.radio.links import LinkCounters, LinkParameters, Pair
-from sim_backends.radio.losses import LOST, OUT_OF_RANGE, QUEUE_FULL, RADIO_OFF, LossLog
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.links import (
+    LOST,
+    OUT_OF_RANGE,
+    PACKET,
+    PROPAGATION_NS,
+    QUEUE_FULL,
+    QUEUING_NS,
+    RADIO_OFF,
+    TRANSMISSION_NS,
+    Delay,
+    Delivery,
+    LinkCounters,
+    LinkParameters,
+    LossLog,
+    Pair,
+    Payload,
+    delay_parts,
+)
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
 
@@ -76,7 +90,7 @@ class FixedLink:
                 return QUEUE_FULL
             if queuing_ns:
                 arrival_ns += queuing_ns
-                delay_sum += queuing_ns * delay.QUEUING_NS
+                delay_sum += queuing_ns * QUEUING_NS
         self.sent += 1
         if parameters.loss and self._loss_draw(packet) < parameters.loss:
             self._lost += 1
@@ -86,7 +100,7 @@ class FixedLink:
             extra_ns = self._last_arrival_ns - arrival_ns
         if extra_ns:
             arrival_ns += extra_ns
-            delay_sum += extra_ns * delay.PROPAGATION_NS
+            delay_sum += extra_ns * PROPAGATION_NS
         self._last_arrival_ns = arrival_ns
         return arrival_ns, delay_sum
 
@@ -110,9 +124,7 @@ class FixedLink:
         """Return the transmission time in ns and the delay without queueing for a packet size; cache them."""
         parameters = self._parameters
         transmission_ns = parameters.serialization_ns(size_bytes)
-        delay_sum = (
-            delay.PACKET + transmission_ns * delay.TRANSMISSION_NS + parameters.delay_ns * delay.PROPAGATION_NS
-        )
+        delay_sum = PACKET + transmission_ns * TRANSMISSION_NS + parameters.delay_ns * PROPAGATION_NS
         entry = self._by_size[size_bytes] = transmission_ns, delay_sum
         return entry
 
@@ -252,7 +264,7 @@ class FixedLinks(Generic[Payload]):
         for entry in in_flight:
             at_ns, _, packet, delay_sum, _ = entry
             link = packet[0]
-            if link.transmitter in newly_off and at_ns - delay.parts(delay_sum).propagation_ns > now_ns:
+            if link.transmitter in newly_off and at_ns - delay_parts(delay_sum).propagation_ns > now_ns:
                 link.count_lost()
                 self._lose(now_ns, packet, RADIO_OFF)
             else:
@@ -304,7 +316,7 @@ class FixedLinks(Generic[Payload]):
             return
         at_ns, delay_sum = result
         if before:
-            before -= delay.PACKET
+            before -= PACKET
         if at_ns <= now_ns:
             self._arrive(at_ns, packet, delay_sum + before)
             return

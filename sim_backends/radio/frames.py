@@ -6,10 +6,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic
 
-from sim_backends.radio import delay
-from sim_backends.radio.delay import Delay, Payload
-from sim_backends.radio.modes import WifiMode
-from sim_backends.radio.packet_error import log_success
+from sim_backends.radio.links import (
+    PACKET,
+    PROPAGATION_NS,
+    QUEUING_NS,
+    TRANSMISSION_NS,
+    Delay,
+    Payload,
+)
+from sim_backends.radio.modes import WifiMode, log_success
 from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0
@@ -130,8 +135,8 @@ class Frame(Generic[Payload]):
     def total_delay(self, now_ns: int, wave_ns: int) -> Delay:
         """Return the delay over all hops so far, for a frame decoded at `now_ns` after `wave_ns` of propagation."""
         waited_ns, sent_ns = self.first_attempt_ns - self.queued_ns, now_ns - self.first_attempt_ns
-        parts = delay.QUEUING_NS * waited_ns + delay.TRANSMISSION_NS * sent_ns + delay.PROPAGATION_NS * wave_ns
-        return parts + (self.before or delay.PACKET)
+        parts = QUEUING_NS * waited_ns + TRANSMISSION_NS * sent_ns + PROPAGATION_NS * wave_ns
+        return parts + (self.before or PACKET)
 
     def for_second_hop(self, now_ns: int, receiver: int | None, before: Delay) -> "Frame[Payload]":
         """Return the packet as a frame of its second hop, which the relay queues at `now_ns`."""

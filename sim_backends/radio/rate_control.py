@@ -1,9 +1,19 @@
-"""Rate control: the mode of a station's next frame, fixed or adapted to acknowledgements."""
+"""Rate control: the mode of a station's next frame, fixed or adapted to acknowledgements like Linux's minstrel."""
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import Final, Protocol
 
-from sim_backends.radio.modes import WifiMode
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.modes import (
+    CW_MIN,
+    DIFS_NS,
+    SHORT_RETRY_LIMIT,
+    SIFS_NS,
+    SLOT_NS,
+    WifiMode,
+    ack_ns,
+    packet_error,
+)
+from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
 
 class RateControl(Protocol):
@@ -40,3 +50,134 @@ class FixedRate:
 
     def report(self, mode: WifiMode, *, acknowledged: bool) -> None:
         """Implement `RateControl.report`."""
+
+
+_UPDATE_NS: Final = 100_000_000
+_OLD_WEIGHT: Final = 0.75
+_SAMPLE_SHARE: Final = 0.1
+_REFERENCE_BYTES: Final = 1200
+_SEGMENT_NS: Final = 6_000_000
+_LOW_SHARE, _HIGH_SHARE = 0.1, 0.95
+_SAMPLES: Final = 4
+_STALE_UPDATES: Final = 20
+
+
+class Minstrel:
+    """Sends in the mode with the highest throughput, falls back to others, and samples other modes occasionally.
+
+    Each mode has an exponentially weighted mean of the share of acknowledged attempts: weight 75 % for the old value,
+    updated every 100 ms. A frame is sent first in the mode with the highest throughput, then in the second best, then
+    in the most robust (the fastest with at least 95 % success), and finally in the slowest; each as often as fits
+    into 6 ms, at most twice if its success share is above 95 % or below 10 %, and in total at most up to the
+    standard's retry limit. A tenth of the frames are samples: a mode that is faster than the best, or was not used
+    for 20 updates, is tried before the best, at most four times per update if its share is above 95 % or below 10 %;
+    if there is no such mode, a slower mode replaces the second best, which costs nothing while the best succeeds. All
+    this is as in Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and in the documentation of mac80211's minstrel.
+
+    Three things differ. The initial shares are computed from the signal-to-noise ratio, like in drivers that start
+    from RSSI. The frames that sample, and the sampled modes, are drawn per frame and not counted, so that an
+    additional frame does not change the results of others. 802.11n's modes are selected by the same algorithm, for
+    which Linux has minstrel_ht.
+
+    Args:
+        modes: The available modes, two or more, slowest first.
+        snr_db: Mean signal-to-noise ratio at the receiver.
+        draws: Random draws for sampling.
+    """
+
+    def __init__(self, modes: Sequence[WifiMode], snr_db: float, draws: PacketDraws) -> None:
+        self._modes = tuple(modes)
+        self._draws = draws
+        self._time_ns = {mode: _exchange_ns(mode) for mode in modes}
+        self._max_attempts = {mode: _count_fitting_attempts(time_ns) for mode, time_ns in self._time_ns.items()}
+        self._share = {mode: 1 - packet_error(mode, snr_db, _REFERENCE_BYTES) for mode in modes}
+        self._attempts = dict.fromkeys(modes, 0)
+        self._acknowledged = dict.fromkeys(modes, 0)
+        self._unused_updates = dict.fromkeys(modes, 0)
+        self._samples_left = dict.fromkeys(modes, _SAMPLES)
+        self._updated_ns = 0
+        self._rank()
+        self._rate_chain = self._default_chain
+
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:
+        """Implement `RateControl.choose`."""
+        if now_ns - self._updated_ns >= _UPDATE_NS:
+            self._update(now_ns)
+        if attempt == 1:
+            draw = self._draws.draw(packet)
+            self._rate_chain = (
+                self._sampling_chain(draw / _SAMPLE_SHARE) if draw < _SAMPLE_SHARE else self._default_chain
+            )
+        return self._rate_chain[attempt - 1]
+
+    def report(self, mode: WifiMode, *, acknowledged: bool) -> None:
+        """Implement `RateControl.report`."""
+        self._attempts[mode] += 1
+        self._acknowledged[mode] += acknowledged
+
+    def _update(self, now_ns: int) -> None:
+        for mode, attempts in self._attempts.items():
+            self._unused_updates[mode] = 0 if attempts else self._unused_updates[mode] + 1
+            if attempts:
+                measured = self._acknowledged[mode] / attempts
+                self._share[mode] = _OLD_WEIGHT * self._share[mode] + (1 - _OLD_WEIGHT) * measured
+                self._attempts[mode] = self._acknowledged[mode] = 0
+            self._samples_left[mode] = _SAMPLES
+        self._updated_ns = now_ns
+        self._rank()
+
+    def _rank(self) -> None:
+        throughput = {mode: share / self._time_ns[mode] for mode, share in self._share.items()}
+        # Among modes with almost no success, the slowest is tried first.
+        ranked = sorted(
+            self._modes,
+            key=lambda mode: (throughput[mode] if self._share[mode] >= _LOW_SHARE else 0, self._time_ns[mode]),
+            reverse=True,
+        )
+        self._best, self._second = ranked[:2]
+        reliable = [mode for mode in self._modes if self._share[mode] >= _HIGH_SHARE]
+        self._robust = (
+            max(reliable, key=throughput.__getitem__) if reliable else max(self._modes, key=self._share.__getitem__)
+        )
+        self._default_chain = self._build_chain(self._best, self._second)
+
+    def _sampling_chain(self, draw: float) -> tuple[WifiMode, ...]:
+        """Return the modes of a sampling frame, selected by a draw on [0, 1)."""
+        candidates = [mode for mode in self._modes if self._is_sample_candidate(mode)]
+        if not candidates:
+            others = [mode for mode in self._modes if mode is not self._best]
+            return self._build_chain(self._best, others[int(draw * len(others))])
+        mode = candidates[int(draw * len(candidates))]
+        self._samples_left[mode] -= 1
+        return self._build_chain(mode, self._best)
+
+    def _is_sample_candidate(self, mode: WifiMode) -> bool:
+        if mode is self._best or not (self._samples_left[mode] > 0 or self._is_uncertain(mode)):
+            return False
+        return self._time_ns[mode] < self._time_ns[self._best] or self._unused_updates[mode] >= _STALE_UPDATES
+
+    def _is_uncertain(self, mode: WifiMode) -> bool:
+        """Return True if more attempts would improve the estimate of a mode's success share."""
+        return _LOW_SHARE <= self._share[mode] <= _HIGH_SHARE
+
+    def _build_chain(self, first: WifiMode, second: WifiMode) -> tuple[WifiMode, ...]:
+        """Return the mode of each attempt for a frame that starts with these two modes."""
+        chain: list[WifiMode] = []
+        for mode in (first, second, self._robust):
+            max_attempts = self._max_attempts[mode]
+            chain += [mode] * (max_attempts if self._is_uncertain(mode) else min(2, max_attempts // 2))
+        chain += [self._modes[0]] * SHORT_RETRY_LIMIT
+        return tuple(chain[:SHORT_RETRY_LIMIT])
+
+
+def _count_fitting_attempts(time_ns: int) -> int:
+    """Return the number of failed attempts, with mean backoffs in between, that take at most 6 ms."""
+    attempts, window, elapsed_ns = 1, CW_MIN, 2 * time_ns + CW_MIN * SLOT_NS // 2
+    while elapsed_ns <= _SEGMENT_NS:
+        attempts, window = attempts + 1, 2 * window + 1
+        elapsed_ns += time_ns + window * SLOT_NS // 2
+    return attempts
+
+
+def _exchange_ns(mode: WifiMode) -> int:
+    return DIFS_NS + mode.airtime_ns(_REFERENCE_BYTES) + SIFS_NS + ack_ns(mode)

@@ -6,10 +6,9 @@ from operator import ge
 from typing import Final, Generic
 
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.contention import BLIND_NS
-from sim_backends.radio.delay import Payload
-from sim_backends.radio.event_queue import EventQueue
+from sim_backends.radio.contention import BLIND_NS, EventQueue
 from sim_backends.radio.frames import PREAMBLE_SNR_DB, Emission, Transmission, success
+from sim_backends.radio.links import Payload
 from sim_backends.radio.modes import BASIC, DIFS_NS, ENERGY_DETECTION_DBM, SIFS_NS, ack_ns
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station

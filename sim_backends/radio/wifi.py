@@ -11,8 +11,7 @@ from typing import Final, Generic
 
 from fieldkit.core.model import LinkSample, StationSample
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.delay import Delay, Delivery, Payload
-from sim_backends.radio.event_queue import EventQueue
+from sim_backends.radio.contention import EventQueue
 from sim_backends.radio.frames import (
     HEADER_BYTES,
     Emission,
@@ -23,9 +22,19 @@ from sim_backends.radio.frames import (
     attempt_record,
     decibel,
 )
-from sim_backends.radio.links import LinkCounters, Pair
-from sim_backends.radio.losses import NOT_DECODED, OUT_OF_RANGE, QUEUE_FULL, RADIO_OFF, RETRIES_EXHAUSTED, LossLog
-from sim_backends.radio.meter import RadioMeter
+from sim_backends.radio.links import (
+    NOT_DECODED,
+    OUT_OF_RANGE,
+    QUEUE_FULL,
+    RADIO_OFF,
+    RETRIES_EXHAUSTED,
+    Delay,
+    Delivery,
+    LinkCounters,
+    LossLog,
+    Pair,
+    Payload,
+)
 from sim_backends.radio.modes import (
     ACK_BYTES,
     BASIC,
@@ -38,7 +47,7 @@ from sim_backends.radio.modes import (
 )
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.reception import Reception
-from sim_backends.radio.stations import Peer, Station
+from sim_backends.radio.stations import Peer, RadioMeter, Station
 
 # 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
 _ACK_TIMEOUT_NS: Final = SIFS_NS + SLOT_NS + 20_000

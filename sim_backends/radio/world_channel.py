@@ -14,14 +14,12 @@ from fieldkit.config.profiles import Radio
 from fieldkit.core.model import Vector
 from sim_backends.radio import propagation
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.fading import Echoes, Fades, Fading, Shadowing
 from sim_backends.radio.frames import decibel
-from sim_backends.radio.minstrel import Minstrel
-from sim_backends.radio.modes import MODES, Standard, WifiMode, fixed_mode, standard_of
-from sim_backends.radio.options import RadioOptions
-from sim_backends.radio.packet_error import packet_error
+from sim_backends.radio.modes import MODES, Standard, WifiMode, fixed_mode, packet_error, standard_of
+from sim_backends.radio.propagation import Echoes, Fades, Fading, Shadowing
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws
-from sim_backends.radio.rate_control import FixedRate, RateControl
+from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 from sim_backends.world.motion import STILL
 from sim_backends.world.shapes import Floats

@@ -15,7 +15,7 @@ from fieldkit.steps.kinds.ping import Payloads
 from fieldkit.trial.procedure import Procedure, load_procedure
 from sim_backends.cosim.scenario.schema import PhysicsOptions, PolicyChoice
 from sim_backends.emulated.emulated_options import EmulatedOptions
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from tests.helpers.paths import ROOT
 
 PROFILE = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")

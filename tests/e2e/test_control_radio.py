@@ -16,7 +16,7 @@ from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.medium.ports import MediumStats
 from sim_backends.emulated.testbed import EmulatedTestbed
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.known_radio import make_lab, measured
 from tests.helpers.runs import fieldkit, only_trial

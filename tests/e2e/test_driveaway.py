@@ -11,7 +11,7 @@ from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import track
 from sim_backends.radio.modes import N_MODES
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line

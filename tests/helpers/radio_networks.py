@@ -10,7 +10,7 @@ from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.network.radio import UDP_ONLY, RadioNetwork, TransportFactory
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import WifiInWorld
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.motion import State
 

@@ -13,7 +13,7 @@ from fieldkit.steps import variants
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import TURTLEBOT, los_plan
 from tests.helpers.plans import problems

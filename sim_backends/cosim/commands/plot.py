@@ -17,8 +17,8 @@ from sim_backends.cosim import plots
 from sim_backends.cosim.commands import orders, settings
 from sim_backends.cosim.commands.bias import LABELS
 from sim_backends.cosim.commands.replay import recording_at, scenario_of, title
-from sim_backends.cosim.plot_layout import ObstacleOutline, outlines
-from sim_backends.cosim.plots import Curve, FlowTrace, LogPanel, run_figure
+from sim_backends.cosim.plot_layout import Curve, FlowTrace, LogPanel, ObstacleOutline, outlines
+from sim_backends.cosim.plots import run_figure
 from sim_backends.cosim.recording.replay import Recording
 from sim_backends.cosim.studies.intervals import IntervalEstimate
 from sim_backends.cosim.studies.local_errors import LocalErrors

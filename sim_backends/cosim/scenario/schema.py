@@ -13,8 +13,8 @@ from sim_backends.cosim.policies.registry import POLICIES
 from sim_backends.cosim.programs.way_points import PERIOD_NS
 from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
-from sim_backends.network.tcp.options import Congestion
-from sim_backends.radio.options import RadioOptions
+from sim_backends.network.tcp.tcp_options import Congestion
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.obstacles import Place, Real
 
 

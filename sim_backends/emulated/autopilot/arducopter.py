@@ -3,7 +3,7 @@
 from typing import Final
 
 from sim_backends.emulated.autopilot.failsafes import ArduCopterFailsafes
-from sim_backends.emulated.autopilot.firmware import Firmware, StreamGroup
+from sim_backends.emulated.autopilot.firmware import Firmware, ModeConditions, ModeRefusal, StreamGroup
 from sim_backends.emulated.autopilot.mavlink_frames import COMMON_CAPABILITIES, EKF_STATUS_REPORT, dialect
 from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.onboard_estimates import FLIGHT_S, FULL_V, Battery
@@ -18,6 +18,7 @@ from sim_backends.emulated.autopilot.parameters import (
 )
 
 _d = dialect
+_FIRST_ITEM: Final = 1
 _CM: Final = 100.0
 _RTL_M: Final = 15.0
 
@@ -134,6 +135,18 @@ def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
     return ["Battery 1 below minimum arming voltage"] if low else []
 
 
+def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
+    """Return the refusal of a change of mode; unarmed it accepts any (Copter::set_mode)."""
+    if mode is not Mode.MISSION or not conditions.armed:
+        return None
+    text, commands = "Mode change to AUTO failed: init failed", conditions.mission_commands
+    if len(commands) <= _FIRST_ITEM:
+        return ModeRefusal(text)
+    if conditions.landed and commands[_FIRST_ITEM] != _d.MAV_CMD_NAV_TAKEOFF:
+        return ModeRefusal(text, "Auto: Missing Takeoff Cmd")
+    return None
+
+
 ARDUCOPTER: Final = Firmware(
     autopilot=_d.MAV_AUTOPILOT_ARDUPILOTMEGA,
     version=0x040600FF,
@@ -164,12 +177,14 @@ ARDUCOPTER: Final = Firmware(
         Mode.POSHOLD: "POSHOLD",
         Mode.BRAKE: "BRAKE",
     },
+    starting_flags=0xA7,
     boot_mode=Mode.STABILIZE,
     unarmable=frozenset({Mode.LAND, Mode.RTL, Mode.HOMECOMING, Mode.BRAKE, Mode.MISSION}),
     refused=_d.MAV_RESULT_FAILED,
     unknown_mode=_d.MAV_RESULT_FAILED,
     unknown_rate=_d.MAV_RESULT_DENIED,
     unknown_message=_d.MAV_RESULT_FAILED,
+    mode_refusal=_mode_refusal,
     prearm=("PreArm: ", "Arm: "),
     arming_errors=_arming_errors,
     parameters=_declared,
@@ -181,5 +196,5 @@ ARDUCOPTER: Final = Firmware(
     fix_type=_d.GPS_FIX_TYPE_RTK_FIXED,
     guided_holds=True,
     lifts_off=False,
-    first_item=1,
+    first_item=_FIRST_ITEM,
 )

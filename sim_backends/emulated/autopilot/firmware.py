@@ -1,7 +1,8 @@
 """Differences between firmware families: modes, parameters, messages, refusals."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from sim_backends.emulated.autopilot.failsafes import Failsafes
 from sim_backends.emulated.autopilot.modes import Mode
@@ -25,6 +26,37 @@ class StreamGroup:
 
 
 @dataclass(frozen=True)
+class ModeConditions:
+    """The state of a vehicle on which it depends whether a firmware changes the mode.
+
+    Attributes:
+        armed: True if its motors turn.
+        landed: True if it has detected that it is on the ground.
+        on_ground: True if it is on the ground.
+        mission_commands: MAV_CMD of each item of its mission.
+        has_recent_set_point: True if its last set-point is recent enough.
+    """
+
+    armed: bool
+    landed: bool
+    on_ground: bool
+    mission_commands: Sequence[int]
+    has_recent_set_point: bool
+
+
+class ModeRefusal(NamedTuple):
+    """A refused change of mode.
+
+    Attributes:
+        text: Text of the refusal.
+        reason: Text that is sent before it; empty if there is none.
+    """
+
+    text: str
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class Firmware:
     """A family of autopilots.
 
@@ -35,12 +67,14 @@ class Firmware:
         base: Constant MAV_MODE_FLAG bits of its heartbeat.
         modes: Custom mode of each mode.
         names: Name of each mode in AVAILABLE_MODES.
+        starting_flags: Flags of its position estimate before that has an origin.
         boot_mode: Mode after power-on.
         unarmable: Modes in which it cannot be armed.
         refused: MAV_RESULT of a command that it refuses now.
         unknown_mode: MAV_RESULT of a change to a mode that it does not have.
         unknown_rate: MAV_RESULT of MAV_CMD_SET_MESSAGE_INTERVAL for a message that it does not send.
         unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for such a message.
+        mode_refusal: Returns the refusal of a change of mode; None if it changes.
         prearm: Prefixes of the texts with the reasons against arming: on request, and on arming.
         arming_errors: Returns the reasons against arming.
         parameters: Its parameters, within the limits of a profile.
@@ -61,12 +95,14 @@ class Firmware:
     base: int
     modes: Mapping[Mode, int]
     names: Mapping[Mode, str]
+    starting_flags: int
     boot_mode: Mode
     unarmable: frozenset[Mode]
     refused: int
     unknown_mode: int
     unknown_rate: int
     unknown_message: int
+    mode_refusal: Callable[[Mode, ModeConditions], ModeRefusal | None]
     prearm: tuple[str, str]
     arming_errors: Callable[[Parameters, Battery], list[str]]
     parameters: Callable[[FlightLimits], tuple[Parameter, ...]]

@@ -138,6 +138,17 @@ class Airframe:
         return math.atan2(north, east) if math.hypot(east, north) > _MIN_COURSE_M_S else None
 
 
+def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorLimits:
+    """Return the limits of an airframe within the parameters of its autopilot."""
+    return replace(
+        limits,
+        speed_m_s=parameters["MPC_XY_VEL_MAX"],
+        climb_m_s=(parameters["MPC_Z_VEL_MAX_DN"], parameters["MPC_Z_VEL_MAX_UP"]),
+        acceleration_m_s2=parameters["MPC_ACC_HOR"],
+        climb_m_s2=(parameters["MPC_ACC_DOWN_MAX"], parameters["MPC_ACC_UP_MAX"]),
+    )
+
+
 def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vector:
     """Return the velocity towards a point relative to home from which it can brake to a stop there."""
     east, north, up = (goal - here for goal, here in zip(goal_m, body.position_m, strict=True))

@@ -28,3 +28,8 @@ class Mode(Enum):
 LANDING: Final = frozenset({Mode.LAND, Mode.HOMECOMING})
 RETURNING: Final = LANDING | {Mode.RTL}
 PILOTED: Final = frozenset({Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.BRAKE})
+
+
+def reported_mode(mode: Mode) -> Mode:
+    """Return the mode that is reported for a mode, which may be a phase of another one."""
+    return Mode.RTL if mode is Mode.HOMECOMING else mode

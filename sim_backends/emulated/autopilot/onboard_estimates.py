@@ -1,4 +1,4 @@
-"""Estimates on board of the emulated drone: its position, and the charge of its battery."""
+"""Estimates on board of the emulated drone: its position, whether it has landed, and the charge of its battery."""
 
 from typing import Final
 
@@ -116,3 +116,39 @@ class PositionEstimate:
             return None
         east, north, up = (place + origin for place, origin in zip(local_m, self.origin_m, strict=True))
         return east, north, up
+
+
+class LandDetector:
+    """Detects take-off and landing.
+
+    Args:
+        landed_s: Time on the ground after which it has detected a landing.
+
+    Attributes:
+        landed: True if it has detected that the drone is on the ground.
+        flew: True if the drone was in the air since it was armed last.
+        grounded_ns: Time of the last contact with the ground, or of arming.
+        armed_ns: Time of arming.
+    """
+
+    def __init__(self, landed_s: float) -> None:
+        self._landed_s = landed_s
+        self.landed = True
+        self.arm(0)
+
+    def place(self, now_ns: int) -> None:
+        """Start on the ground."""
+        self.landed = True
+        self.arm(now_ns)
+
+    def arm(self, now_ns: int) -> None:
+        """Record that the drone was armed."""
+        self.flew = False
+        self.grounded_ns = self.armed_ns = now_ns
+
+    def advance(self, now_ns: int, *, on_ground: bool) -> None:
+        """Record whether the drone is on the ground now."""
+        if not on_ground:
+            self.flew, self.landed, self.grounded_ns = True, False, now_ns
+        elif now_ns - self.grounded_ns >= self._landed_s * 1e9:
+            self.landed = True

@@ -3,7 +3,7 @@
 from typing import Final
 
 from sim_backends.emulated.autopilot.failsafes import Px4Failsafes
-from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.firmware import Firmware, ModeConditions, ModeRefusal
 from sim_backends.emulated.autopilot.mavlink_frames import COMMON_CAPABILITIES, dialect
 from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.onboard_estimates import FLIGHT_S, FULL_V, Battery
@@ -99,6 +99,18 @@ def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
     return ["Low battery"] if battery.left < (least if least >= 0 else _CRITICAL) else []
 
 
+def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
+    """Return the refusal of a change of mode."""
+    grounded = not conditions.armed or conditions.on_ground
+    if mode in {Mode.LAND, Mode.RTL} and grounded:
+        return ModeRefusal(f"{mode.name} denied: not in the air")
+    if mode is Mode.OFFBOARD and not conditions.has_recent_set_point:
+        return ModeRefusal("OFFBOARD denied: no set-points")
+    if mode is Mode.MISSION and not conditions.mission_commands:
+        return ModeRefusal("MISSION denied: no mission")
+    return None
+
+
 PX4: Final = Firmware(
     autopilot=_d.MAV_AUTOPILOT_PX4,
     version=0x011000FF,
@@ -128,12 +140,14 @@ PX4: Final = Firmware(
         Mode.ALT_HOLD: "Altitude",
         Mode.POSHOLD: "Position",
     },
+    starting_flags=0xA5,
     boot_mode=Mode.LOITER,
     unarmable=frozenset(),
     refused=_d.MAV_RESULT_TEMPORARILY_REJECTED,
     unknown_mode=_d.MAV_RESULT_DENIED,
     unknown_rate=_d.MAV_RESULT_FAILED,
     unknown_message=_d.MAV_RESULT_DENIED,
+    mode_refusal=_mode_refusal,
     prearm=("Preflight Fail: ", "Preflight Fail: "),
     arming_errors=_arming_errors,
     parameters=_declared,

@@ -128,7 +128,7 @@ class Telemetry:
         ardupilot = vehicle.firmware.is_ardupilot
         if vehicle.failsafes.active and (ardupilot or vehicle.armed):
             return int(dialect.MAV_STATE_CRITICAL)
-        active = vehicle.armed and not (ardupilot and vehicle.landed)
+        active = vehicle.armed and not (ardupilot and vehicle.land_detector.landed)
         return int(dialect.MAV_STATE_ACTIVE if active else dialect.MAV_STATE_STANDBY)
 
     def _sys_status(self) -> Message:
@@ -303,7 +303,7 @@ class Telemetry:
     def _extended_sys_state(self) -> Message:
         vehicle = self._vehicle
         state = dialect.MAV_LANDED_STATE_IN_AIR
-        if vehicle.landed:
+        if vehicle.land_detector.landed:
             state = dialect.MAV_LANDED_STATE_ON_GROUND
         elif vehicle.mode is Mode.TAKEOFF:
             state = dialect.MAV_LANDED_STATE_TAKEOFF

@@ -4,22 +4,18 @@ It has neither clock nor socket: `advance` receives the time.
 """
 
 import math
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot.failsafes import Fence, Reaction, VehicleState
-from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.flight import NEAR_M, STEP_NS, Airframe, Guidance, SetPoint, stop_m
+from sim_backends.emulated.autopilot.failsafes import Reaction
+from sim_backends.emulated.autopilot.firmware import ModeConditions
+from sim_backends.emulated.autopilot.flight import NEAR_M, STEP_NS, SetPoint, stop_m
 from sim_backends.emulated.autopilot.mavlink_frames import dialect
-from sim_backends.emulated.autopilot.mission_plan import Item, Mission
-from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode
-from sim_backends.emulated.autopilot.onboard_estimates import Battery, PositionEstimate
-from sim_backends.emulated.autopilot.parameters import Parameters
-from sim_backends.physics.collisions import Footprint
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.emulated.autopilot.mission_plan import Item
+from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode, reported_mode
+from sim_backends.emulated.autopilot.vehicle_parts import VehicleParts
 
 _INFO: Final = dialect.MAV_SEVERITY_INFO
 _CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
@@ -28,129 +24,14 @@ _PREARM_NS: Final = 30_000_000_000
 """ArduPilot repeats the reasons why it cannot be armed at this interval (AP_Arming)."""
 _OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
 """Mode when set-points are missing, by COM_OBL_RC_ACT; PX4 holds instead of a pilot's mode, which needs sticks."""
-_STARTING_FLAGS: Final = {True: 0xA7, False: 0xA5}
-"""Flags of an estimate without an origin; the key is True for ArduPilot."""
 
 
 class Refused(Exception):  # noqa: N818 (an answer of the autopilot, not an error)
     """The vehicle refuses a command; the text is for people, and empty if the firmware sends none."""
 
 
-class Remark(NamedTuple):
-    """A text for people: STATUSTEXT."""
-
-    severity: int
-    text: str
-
-
-class Vehicle:
-    """One drone.
-
-    Args:
-        firmware: Family of its autopilot.
-        parameters: Its parameters; the vehicle reads the current values.
-        limits: Limits of its airframe.
-        obstacles: Obstacles in the world, including the floor.
-        now_ns: Time of power-on.
-        boot_s: Time from power-on until its position estimate has an origin.
-
-    Attributes:
-        body: Position and motion, relative to home.
-        armed: True if its motors turn.
-        landed: True if it has detected that it is on the ground.
-        mode: Its flight mode.
-        mission: The mission of mode MISSION.
-        battery: Its battery.
-        estimate: Its position estimate.
-        fence: Its fence.
-        guidance: Its goal and set-points.
-        home_m: Home in the world, metres east, north, up: where it was armed last, or else where it booted.
-        failsafes: Its fail-safes.
-        remarks: Texts that are not sent yet; the reader clears the list.
-    """
-
-    def __init__(
-        self,
-        firmware: Firmware,
-        parameters: Parameters,
-        limits: QuadrotorLimits,
-        obstacles: Sequence[Footprint],
-        now_ns: int,
-        *,
-        boot_s: float = 0.0,
-    ) -> None:
-        self.firmware = firmware
-        self.battery = Battery(now_ns)
-        self._parameters = parameters
-        self._limits = limits
-        self._obstacles = obstacles
-        self.estimate = PositionEstimate(boot_s, _STARTING_FLAGS[firmware.is_ardupilot])
-        self.fence = Fence(parameters)
-        self.guidance = Guidance(firmware, parameters)
-        self.mission = Mission(firmware.first_item)
-        self.remarks: list[Remark] = []
-        self.home_m: Vector = (0.0, 0.0, 0.0)
-        self.place(self.home_m, math.pi / 2, now_ns)
-        self.boot(now_ns)
-
-    def boot(self, now_ns: int) -> None:
-        """Boot: set the mode after power-on, and reset fail-safes and origin."""
-        self.estimate.boot(now_ns)
-        self._prearm_ns = now_ns
-        self.mode = self.firmware.boot_mode
-        self.armed = False
-        self.failsafes = self.firmware.failsafes(self._parameters)
-
-    def place(self, place_m: Vector, facing_rad: float, now_ns: int) -> None:
-        """Put it on the ground at another place in the world, as if a person carried it. Its mode stays."""
-        self.body = Airframe(self._limits, place_m, facing_rad, self._obstacles, now_ns)
-        if self.estimate.origin_m is None:
-            self.home_m = place_m
-        self.body.home_m = self.home_m
-        self.armed = False
-        self.landed = True
-        self.guidance.hold(self.body.position_m)
-        self.guidance.set_point_ns = None
-        self.fence.reset()
-        self._flew = False
-        self._grounded_ns = self._armed_ns = now_ns
-
-    @property
-    def local_m(self) -> Vector | None:
-        """Position relative to the origin of its local frame, east, north, up; None before there is an origin."""
-        return self.estimate.to_local(self.body.place_m)
-
-    def from_local(self, place_m: Vector) -> Vector | None:
-        """Return the position of a point of its local frame relative to home; None before there is an origin."""
-        world_m = self.estimate.to_world(place_m)
-        if world_m is None:
-            return None
-        east, north, up = (place - home for place, home in zip(world_m, self.home_m, strict=True))
-        return east, north, up
-
-    @property
-    def limits(self) -> QuadrotorLimits:
-        """Limits of its airframe, within its parameters."""
-        get = self._parameters
-        return replace(
-            self._limits,
-            speed_m_s=get["MPC_XY_VEL_MAX"],
-            climb_m_s=(get["MPC_Z_VEL_MAX_DN"], get["MPC_Z_VEL_MAX_UP"]),
-            acceleration_m_s2=get["MPC_ACC_HOR"],
-            climb_m_s2=(get["MPC_ACC_DOWN_MAX"], get["MPC_ACC_UP_MAX"]),
-        )
-
-    @property
-    def arming_errors(self) -> list[str]:
-        """Reasons why it cannot be armed; empty if it can."""
-        reasons = self.firmware.arming_errors(self._parameters, self.battery) + self.failsafes.arming_errors
-        if self.estimate.origin_m is None:
-            reasons.append("Need Position Estimate" if self.firmware.is_ardupilot else "ekf2 missing data")
-        return reasons
-
-    def report(self, severity: int, text: str) -> None:
-        """Add a text for people."""
-        self.remarks.append(Remark(severity, text))
+class Vehicle(VehicleParts):
+    """One drone; its arguments and attributes are those of `VehicleParts`."""
 
     def check(self) -> None:
         """Report the reasons why it cannot be armed.
@@ -175,15 +56,15 @@ class Vehicle:
             raise self._refusal("Arming denied: it falls")
         reasons = self.arming_errors
         if self.mode in self.firmware.unarmable:
-            reasons.append(f"{self.firmware.names[_shown(self.mode)]} mode not armable")
+            reasons.append(f"{self.firmware.names[reported_mode(self.mode)]} mode not armable")
         for reason in reasons:
             self.report(_CRITICAL, self.firmware.prearm[1] + reason)
         if reasons:
             raise self._refusal("Arming denied: Resolve system health failures first")
         self.home_m = self.body.home_m = self.body.place_m
-        self.armed, self._flew = True, False
+        self.armed = True
         self.fence.reset()
-        self._grounded_ns = self._armed_ns = self.body.now_ns
+        self.land_detector.arm(self.body.now_ns)
         self.guidance.hold(self.body.position_m)
         self.report(_INFO, "Arming motors" if self.firmware.is_ardupilot else "Armed by external command")
 
@@ -214,7 +95,7 @@ class Vehicle:
         Raises:
             Refused: The motors are off, it is flying, or the height is not allowed.
         """
-        if self.mode is Mode.TAKEOFF and (self.landed or not self.firmware.is_ardupilot):
+        if self.mode is Mode.TAKEOFF and (self.land_detector.landed or not self.firmware.is_ardupilot):
             return
         height_m = self._parameters["MIS_TAKEOFF_ALT"] if height_m is None else height_m
         if not self.armed:
@@ -279,7 +160,7 @@ class Vehicle:
         while self.body.now_ns + STEP_NS <= now_ns:
             if not self.armed and self.body.on_ground:
                 self.body.now_ns += (now_ns - self.body.now_ns) // STEP_NS * STEP_NS
-                self.landed = True
+                self.land_detector.landed = True
                 break
             self._update_ground_state()
             self.body.driven = self.armed
@@ -303,10 +184,6 @@ class Vehicle:
         if self.firmware.is_ardupilot and not estimate.is_instant:
             self.report(_INFO, "EKF3 IMU0 origin set")
             self.report(_INFO, "EKF3 IMU0 is using GPS")
-
-    @property
-    def _state(self) -> VehicleState:
-        return VehicleState(self.body.now_ns, self.armed, self.landed, self.mode, self.battery)
 
     def _watch_failsafes(self) -> None:
         for reaction in self.failsafes.advance(self._state):
@@ -332,10 +209,7 @@ class Vehicle:
         if mode is Mode.TAKEOFF:
             self.take_off()
             return
-        if self.firmware.is_ardupilot:
-            self._check_copter_mode(mode)
-        else:
-            self._check_px4_mode(mode)
+        self._check_mode(mode)
         if mode is Mode.MISSION:
             self.mission.begin()
         self.guidance.goal_m = self._rest_m()
@@ -343,29 +217,20 @@ class Vehicle:
             self.guidance.hold(self.guidance.goal_m)
         self.mode = mode
 
-    def _check_copter_mode(self, mode: Mode) -> None:
-        """Raise `Refused` if ArduCopter refuses a mode now; unarmed it accepts any (Copter::set_mode)."""
-        if not self.armed:
+    def _check_mode(self, mode: Mode) -> None:
+        """Raise `Refused` if the firmware refuses a mode now."""
+        conditions = ModeConditions(
+            armed=self.armed,
+            landed=self.land_detector.landed,
+            on_ground=self.body.on_ground,
+            mission_commands=[item.command for item in self.mission.items],
+            has_recent_set_point=self.guidance.has_recent_set_point(self.body.now_ns),
+        )
+        if (refusal := self.firmware.mode_refusal(mode, conditions)) is None:
             return
-        items, first = self.mission.items, self.firmware.first_item
-        if mode is Mode.MISSION and len(items) <= first:
-            raise self._failed_mode(mode)
-        if mode is Mode.MISSION and self.landed and items[first].command != dialect.MAV_CMD_NAV_TAKEOFF:
-            self.report(_CRITICAL, "Auto: Missing Takeoff Cmd")
-            raise self._failed_mode(mode)
-
-    def _failed_mode(self, mode: Mode) -> Refused:
-        return Refused(f"Mode change to {self.firmware.names[mode]} failed: init failed")
-
-    def _check_px4_mode(self, mode: Mode) -> None:
-        """Raise `Refused` if PX4 refuses a mode now."""
-        grounded = not self.armed or self.body.on_ground
-        if mode in {Mode.LAND, Mode.RTL} and grounded:
-            raise self._refusal(f"{mode.name} denied: not in the air")
-        if mode is Mode.OFFBOARD and not self.guidance.has_recent_set_point(self.body.now_ns):
-            raise self._refusal("OFFBOARD denied: no set-points")
-        if mode is Mode.MISSION and not self.mission.items:
-            raise self._refusal("MISSION denied: no mission")
+        if refusal.reason:
+            self.report(_CRITICAL, refusal.reason)
+        raise Refused(refusal.text)
 
     def _go(self, mode: Mode, goal_m: Vector) -> None:
         if not all(map(math.isfinite, goal_m)) or not self.fence.contains(goal_m):
@@ -379,13 +244,11 @@ class Vehicle:
     def _update_ground_state(self) -> None:
         """Detect take-off and landing; stop idle motors; react to missing set-points and to the fence."""
         now_ns, ardupilot = self.body.now_ns, self.firmware.is_ardupilot
-        if not self.body.on_ground:
-            self._flew, self.landed, self._grounded_ns = True, False, now_ns
-        elif now_ns - self._grounded_ns >= self.firmware.landed_s * 1e9:
-            self.landed = True
-        if self.armed and now_ns - self._grounded_ns > self._idle_s() * 1e9:
+        self.land_detector.advance(now_ns, on_ground=self.body.on_ground)
+        if self.armed and now_ns - self.land_detector.grounded_ns > self._idle_s() * 1e9:
             if not ardupilot:
-                self.report(_INFO, "Disarmed by landing" if self._flew else "Disarmed by auto preflight disarming")
+                reason = "landing" if self.land_detector.flew else "auto preflight disarming"
+                self.report(_INFO, f"Disarmed by {reason}")
             self.disarm()
         if ardupilot and (breach := self.fence.advance(self._state, self.body.position_m)):
             self._react(breach)
@@ -395,7 +258,7 @@ class Vehicle:
     def _idle_s(self) -> float:
         """Return the time on the ground after which its motors stop; ArduCopter stops them early in landing modes."""
         stops = self.mode is Mode.MISSION or not self.firmware.is_ardupilot
-        landed = (self._flew and stops) or self.mode in LANDING
+        landed = (self.land_detector.flew and stops) or self.mode in LANDING
         return self._parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]
 
     def _watch_set_points(self) -> None:
@@ -412,13 +275,9 @@ class Vehicle:
             self.report(_CRITICAL, "Geofence: hold")
             self._switch_automatically(Mode.LOITER)
 
-    def _rest_m(self) -> Vector:
-        """Return where it comes to rest if it brakes now, or the nearest point inside the fence."""
-        return self.fence.nearest_inside(stop_m(self.body, self.limits))
-
     def _stays_down(self) -> bool:
         """Return True if it cannot lift off now: its motors spool up, or its mode does not lift off."""
-        spools_up = self.body.now_ns - self._armed_ns < self.firmware.spool_s * 1e9
+        spools_up = self.body.now_ns - self.land_detector.armed_ns < self.firmware.spool_s * 1e9
         follows_set_points = self.mode is Mode.OFFBOARD and not self.firmware.lifts_off
         return self.body.on_ground and (spools_up or follows_set_points or self.mode in PILOTED)
 
@@ -446,8 +305,3 @@ class Vehicle:
         if self.mode is Mode.TAKEOFF and math.dist(self.body.position_m, self.guidance.goal_m) < NEAR_M:
             self.mode = Mode.OFFBOARD if self.firmware.is_ardupilot else Mode.LOITER
             self.guidance.hold(self.guidance.goal_m)
-
-
-def _shown(mode: Mode) -> Mode:
-    """Return the mode that is reported for a mode, which may be a phase of another one."""
-    return Mode.RTL if mode is Mode.HOMECOMING else mode

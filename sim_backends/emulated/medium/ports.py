@@ -9,8 +9,7 @@ from typing import Final
 from fieldkit.core.model import DelayParts, LinkSample, StationSample
 from sim_backends.emulated.medium.framing import Routes
 from sim_backends.emulated.process.worker import Message
-from sim_backends.radio.delay import PACKET, Delay, parts
-from sim_backends.radio.links import LinkCounters, Pair
+from sim_backends.radio.links import PACKET, Delay, LinkCounters, Pair, delay_parts
 
 _MORE_FRAGMENTS: Final = 0x20
 _OFFSET: Final = 0x1F
@@ -43,7 +42,7 @@ class FlowDelays:
             port: Destination port.
         """
         key = bytes((protocol,)) + source.packed + destination.packed + port.to_bytes(2, "big")
-        return parts(self.counted.setdefault(key, 0))
+        return delay_parts(self.counted.setdefault(key, 0))
 
     def note_first_fragment(self, packet: bytes) -> None:
         """Remember the flow of a datagram when its first fragment is sent; other packets are ignored.
@@ -190,7 +189,7 @@ class Port:
 
     def delay_parts(self) -> dict[str, DelayParts]:
         """Return the delays of the written packets, per robot that sent them."""
-        return {source: parts(delay) for source, delay in self.delays.items()}
+        return {source: delay_parts(delay) for source, delay in self.delays.items()}
 
     @property
     def counters(self) -> PortCounters:

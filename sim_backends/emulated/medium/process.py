@@ -24,10 +24,10 @@ from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, pa
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
-from sim_backends.radio.delay import PACKET, processing_ns
 from sim_backends.radio.fixed_links import UniformLinks
+from sim_backends.radio.links import PACKET, processing_ns
 from sim_backends.radio.model import RadioModel, WifiInWorld
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.world import World
 

@@ -6,10 +6,9 @@ from functools import partial
 from typing import Final
 
 from sim_backends.network.packets import Packet
-from sim_backends.network.ros1.options import LENGTH_BYTES, Ros1Flow, Ros1Options
+from sim_backends.network.ros1.ros1_options import LENGTH_BYTES, Ros1Flow, Ros1Options
 from sim_backends.network.ros1.streams import Lost, TcpStreams
-from sim_backends.network.timer import WireTimer
-from sim_backends.network.wire import IpPacket, Wire
+from sim_backends.network.wire import IpPacket, Wire, WireTimer
 
 TRANSPORT: Final = "ros1"
 """Name of the transport, as in packets of programs."""

@@ -1,15 +1,14 @@
 """Linux's CUBIC (`net/ipv4/tcp_cubic.c`, Linux 4.x to 6.x), which robots run.
 
-It differs from RFC 9438 (`cubic`) in three ways that matter on lossy links. Its estimate of Reno's window grows by at
-most 8/15 of a segment per round trip. Windows are whole segments. The growth rate is updated only when the window has
-changed or 1/32 s has passed.
+It differs from RFC 9438 (`congestion.Cubic`) in three ways that matter on lossy links. Its estimate of Reno's window
+grows by at most 8/15 of a segment per round trip. Windows are whole segments. The growth rate is updated only when
+the window has changed or 1/32 s has passed.
 """
 
 from typing import ClassVar, Final
 
-from sim_backends.network.tcp.congestion import NewReno
-from sim_backends.network.tcp.cubic import cube_root
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.congestion import NewReno, cube_root
+from sim_backends.network.tcp.tcp_options import TcpOptions
 
 _NS_PER_S_CUBED: Final = 10**27
 # bic_scale 41: C is 410 / 1024 segments per s^3.

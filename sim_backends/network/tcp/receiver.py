@@ -2,11 +2,9 @@
 
 from collections.abc import Callable
 
-from sim_backends.network.tcp.options import TcpOptions
-from sim_backends.network.tcp.ranges import Ranges
-from sim_backends.network.tcp.segments import MAX_SACKS, Segment
-from sim_backends.network.timer import WireTimer
-from sim_backends.network.wire import Wire
+from sim_backends.network.tcp.segments import MAX_SACKS, Ranges, Segment
+from sim_backends.network.tcp.tcp_options import TcpOptions
+from sim_backends.network.wire import Wire, WireTimer
 
 
 class Receiver:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from sim_backends.network.tcp.ranges import Range, Ranges
+from sim_backends.network.tcp.segments import Range, Ranges
 
 DUPLICATE_THRESHOLD: Final = 3
 """Number of later segments that must arrive before a segment is lost (RFC 5681, 3.2; RFC 6675, 2: DupThresh)."""

@@ -1,13 +1,64 @@
-"""TCP segments as they are on the wire, without ports and checksums.
+"""The byte stream of a connection: the messages written to it, its segments, and ranges of its sequence numbers.
 
-Sequence numbers are relative, as in packet analysers: a SYN has number 0, the first data byte number 1. They do not
-wrap around.
+Segments are as they are on the wire, without ports and checksums. Sequence numbers are relative, as in packet
+analysers: a SYN has number 0, the first data byte number 1. They do not wrap around.
 """
 
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from sim_backends.network.tcp.ranges import Range
+Range = tuple[int, int]
+"""The first number, and the number after the last."""
+
+
+class Ranges:
+    """A set of numbers, stored as ranges that neither overlap nor touch."""
+
+    def __init__(self) -> None:
+        self._firsts: list[int] = []
+        self._ends: list[int] = []
+
+    def __iter__(self) -> Iterator[Range]:
+        return zip(self._firsts, self._ends, strict=True)
+
+    def __len__(self) -> int:
+        return len(self._firsts)
+
+    def add(self, first: int, end: int) -> list[Range]:
+        """Add the numbers from `first` up to, but without, `end`; return the parts that are new, in order."""
+        begin = bisect_left(self._ends, first)
+        after = bisect_right(self._firsts, end)
+        new = []
+        position = first
+        for known_first, known_end in zip(self._firsts[begin:after], self._ends[begin:after], strict=True):
+            if position < known_first:
+                new.append((position, known_first))
+            position = max(position, known_end)
+        if position < end:
+            new.append((position, end))
+        if begin < after:
+            first = min(first, self._firsts[begin])
+            end = max(end, self._ends[after - 1])
+        self._firsts[begin:after] = [first]
+        self._ends[begin:after] = [end]
+        return new
+
+    def containing(self, number: int) -> Range | None:
+        """Return the range that contains `number`, or None."""
+        index = bisect_right(self._firsts, number) - 1
+        if index < 0 or self._ends[index] <= number:
+            return None
+        return self._firsts[index], self._ends[index]
+
+    def remove_before(self, number: int) -> None:
+        """Remove all ranges that end at or before `number`."""
+        count = bisect_right(self._ends, number)
+        del self._firsts[:count]
+        del self._ends[:count]
+
 
 HEADER_BYTES: Final = 20 + 20 + 12
 """IP header, TCP header, and the timestamps option with its padding (RFC 7323, appendix A)."""
@@ -59,3 +110,60 @@ class Segment:
             return _SYN_BYTES
         sacks_bytes = 4 + 8 * len(self.sacks) if self.sacks else 0
         return HEADER_BYTES + sacks_bytes + self.length
+
+
+@dataclass(frozen=True, slots=True)
+class _Message:
+    packet_id: int
+    first: int
+    end: int
+    number: int
+
+
+class MessageStream:
+    """The positions of messages in the stream.
+
+    Args:
+        segment_bytes: Data bytes in a full segment.
+
+    Attributes:
+        end: The sequence number after the last written byte.
+    """
+
+    def __init__(self, segment_bytes: int) -> None:
+        self._segment_bytes = segment_bytes
+        self._numbers = 0
+        self._unsent: deque[_Message] = deque()
+        self._unread: deque[_Message] = deque()
+        self.end = 1
+
+    def write(self, packet_id: int, size_bytes: int) -> None:
+        """Append a message."""
+        message = _Message(packet_id, self.end, self.end + size_bytes, self._numbers)
+        self._numbers += -(-size_bytes // self._segment_bytes)
+        self.end = message.end
+        self._unsent.append(message)
+        self._unread.append(message)
+
+    def number(self, first: int) -> int:
+        """Return the number of the segment that starts with the byte `first`, which must not decrease between calls.
+
+        A segment ends when it is full or at the end of a message. Therefore at most one segment starts in each
+        segment-sized part of a message; the number of these parts before it is unique and independent of what was
+        sent before.
+        """
+        while self._unsent[0].end <= first:
+            self._unsent.popleft()
+        message = self._unsent[0]
+        return message.number + (first - message.first) // self._segment_bytes
+
+    def read(self, upto: int) -> list[int]:
+        """Return the packets that are complete before `upto` and were not returned before."""
+        packet_ids = []
+        while self._unread and self._unread[0].end <= upto:
+            packet_ids.append(self._unread.popleft().packet_id)
+        return packet_ids
+
+    def unread(self) -> list[int]:
+        """Return the packets that were not read."""
+        return [message.packet_id for message in self._unread]

@@ -3,18 +3,13 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from sim_backends.network.tcp.congestion import NewReno
-from sim_backends.network.tcp.cubic import Cubic
+from sim_backends.network.tcp.congestion import Cubic, NewReno
 from sim_backends.network.tcp.linux_cubic import LinuxCubic
-from sim_backends.network.tcp.messages import MessageStream
-from sim_backends.network.tcp.options import Congestion, TcpOptions
-from sim_backends.network.tcp.rack import RackScoreboard
-from sim_backends.network.tcp.reduction import ProportionalReduction
-from sim_backends.network.tcp.round_trips import RoundTrips
+from sim_backends.network.tcp.recovery import ProportionalReduction, RackScoreboard, RoundTrips
 from sim_backends.network.tcp.scoreboard import Scoreboard, SentSegment
-from sim_backends.network.tcp.segments import Segment
-from sim_backends.network.timer import WireTimer
-from sim_backends.network.wire import Wire
+from sim_backends.network.tcp.segments import MessageStream, Segment
+from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
+from sim_backends.network.wire import Wire, WireTimer
 
 _CONTROLS: Final[Mapping[Congestion, tuple[type[NewReno], type[Scoreboard]]]] = {
     "cubic": (LinuxCubic, RackScoreboard),

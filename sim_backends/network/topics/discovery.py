@@ -15,11 +15,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from sim_backends.network.timer import WireTimer
 from sim_backends.network.topics.flow import TRANSPORT, TopicSession
 from sim_backends.network.topics.qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
 from sim_backends.network.topics.rtps import IP_AND_UDP_BYTES, RTPS_HEADER_BYTES, Heartbeat, Sample
-from sim_backends.network.wire import IpPacket, Wire
+from sim_backends.network.wire import IpPacket, Wire, WireTimer
 
 SPDP_BYTES: Final = 436
 """Size of an announcement with the IP header: INFO_DST, INFO_TS, and DATA of 360 bytes."""

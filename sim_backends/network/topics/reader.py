@@ -9,11 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from sim_backends.network.timer import WireTimer
 from sim_backends.network.topics.qos import SECOND, RtpsTiming, TopicFlow
 from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage
 from sim_backends.network.topics.writer import Transmit
-from sim_backends.network.wire import Wire
+from sim_backends.network.wire import Wire, WireTimer
 
 _LONG_AGO_NS: Final = -(10**18)
 _MAX_BITS: Final = 256

@@ -9,11 +9,10 @@ intervals if the reader does not respond, and one after each retransmission.
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from sim_backends.network.timer import WireTimer
 from sim_backends.network.topics.history import WriterHistory
 from sim_backends.network.topics.qos import RtpsTiming, TopicFlow
 from sim_backends.network.topics.rtps import AckNack, Data, Gap, Heartbeat, NackFrag, Sample, Submessage, ip_bytes
-from sim_backends.network.wire import Wire
+from sim_backends.network.wire import Wire, WireTimer
 from sim_backends.radio.random_streams import PacketIdentity
 
 Transmit = Callable[[tuple[Submessage, ...], PacketIdentity], None]

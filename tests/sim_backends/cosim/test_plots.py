@@ -6,8 +6,8 @@ import re
 import pytest
 
 from fieldkit.report.theme import FORMATS, Format
-from sim_backends.cosim.plot_layout import ObstacleOutline, last_heading, outlines
-from sim_backends.cosim.plots import Curve, FlowTrace, LogPanel, log_figure, run_figure
+from sim_backends.cosim.plot_layout import Curve, FlowTrace, LogPanel, ObstacleOutline, last_heading, outlines
+from sim_backends.cosim.plots import log_figure, run_figure
 from sim_backends.world.world import load_world
 
 MAGIC = {"svg": b"<?xml", "pdf": b"%PDF", "png": b"\x89PNG"}

@@ -34,7 +34,7 @@ from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
 from tests.helpers.host import Untouched, descendants, wait_for_end

@@ -24,7 +24,7 @@ from sim_backends.emulated.emulated_options import EmulatedOptions, RobotOptions
 from sim_backends.emulated.provisioning import KeyPair
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.testbed import EmulatedTestbed
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 
 SITE: Final = """\

@@ -22,7 +22,7 @@ from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot import services
 from sim_backends.emulated.testbed import EmulatedTestbed
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.sshd import wait_until
 

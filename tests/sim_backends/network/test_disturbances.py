@@ -11,9 +11,8 @@ from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, Node
 from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.radio.frames import HEADER_BYTES
-from sim_backends.radio.losses import OUT_OF_RANGE, RADIO_OFF, RETRIES_EXHAUSTED
-from sim_backends.radio.modes import DIFS_NS, ENERGY_DETECTION_DBM, G_MODES, SLOT_NS
-from sim_backends.radio.packet_error import packet_error
+from sim_backends.radio.links import OUT_OF_RANGE, RADIO_OFF, RETRIES_EXHAUSTED
+from sim_backends.radio.modes import DIFS_NS, ENERGY_DETECTION_DBM, G_MODES, SLOT_NS, packet_error
 from sim_backends.radio.world_channel import CHANNEL_6_HZ
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 from tests.helpers.radio_networks import (

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.packets import Packet
-from sim_backends.network.ros1.calls import CallRetry
-from sim_backends.network.ros1.options import Ros1Flow, Ros1Options
-from sim_backends.network.ros1.transport import Ros1
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.ros1.ros1_options import Ros1Flow, Ros1Options
+from sim_backends.network.ros1.ros1_transport import Ros1
+from sim_backends.network.ros1.streams import CallRetry
+from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.wire import IpPacket
 from sim_backends.radio.random_streams import PacketDraws
 from tests.helpers.scripted_wire import Script, ScriptedWire

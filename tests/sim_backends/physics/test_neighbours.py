@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from sim_backends.physics.body import Body
 from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
-from sim_backends.physics.grid import CellGrid
 from sim_backends.physics.ground import Ground
-from sim_backends.physics.neighbours import Neighbours
+from sim_backends.physics.neighbours import CellGrid, Neighbours
 from sim_backends.physics.quadrotor import IRIS, Quadrotor
 from tests.helpers.worlds import world
 

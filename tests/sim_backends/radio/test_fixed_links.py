@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from sim_backends.radio.delay import Delay
 from sim_backends.radio.fixed_links import FixedLinks, _LinkPacket
-from sim_backends.radio.links import LinkCounters, LinkParameters
+from sim_backends.radio.links import Delay, LinkCounters, LinkParameters
 
 MS = 1_000_000
 

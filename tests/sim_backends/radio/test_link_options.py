@@ -6,7 +6,7 @@ from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.radio.fixed_links import mesh
 from sim_backends.radio.links import LinkParameters
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 
 
 def options(text: str) -> RadioOptions:

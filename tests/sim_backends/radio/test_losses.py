@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.losses import (
+from sim_backends.radio.links import (
     LOST,
     NOT_DECODED,
     OUT_OF_RANGE,
@@ -17,7 +17,7 @@ from sim_backends.radio.losses import (
 )
 from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import Antenna
 from tests.helpers.stations import FixedPowers

@@ -7,10 +7,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.model import DelayParts
-from sim_backends.radio import delay
-from sim_backends.radio.delay import Delivery
 from sim_backends.radio.fixed_links import FixedLinks
-from sim_backends.radio.links import LinkParameters
+from sim_backends.radio.links import (
+    PACKET,
+    PROCESSING_NS,
+    PROPAGATION_NS,
+    QUEUING_NS,
+    TRANSMISSION_NS,
+    Delivery,
+    LinkParameters,
+    delay_parts,
+    processing_ns,
+)
 from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import FixedPowers
@@ -45,7 +53,7 @@ def burst(link: LinkParameters, packets: int, relay: str | None = None) -> Delay
     links = engine(link, relay)
     for number in range(packets):
         links.send(0, "a", number, 1500, "b")
-    return delay.parts(sum(delay_sum for _, _, _, _, delay_sum in drain(links)))
+    return delay_parts(sum(delay_sum for _, _, _, _, delay_sum in drain(links)))
 
 
 @pytest.mark.parametrize("packets", [1, 2, 7, 1000])
@@ -84,7 +92,7 @@ def test_lost_packets_do_not_add_to_the_delay() -> None:
     for number in range(200):
         links.send(0, "a", number, 1500, "b")
     arrived = drain(links)
-    parts = delay.parts(sum(delay_sum for _, _, _, _, delay_sum in arrived))
+    parts = delay_parts(sum(delay_sum for _, _, _, _, delay_sum in arrived))
     assert 0 < parts.packets == len(arrived) < links.counters()["a", "r"].delivered
     assert parts.propagation_ns == len(arrived) * 2 * MS
 
@@ -94,7 +102,7 @@ def test_jitter_and_reordering_wait_count_as_propagation() -> None:
     for number in range(100):
         links.send(number, "a", number, 1500, "b")
     for at_ns, _, number, _, delay_sum in drain(links):
-        assert delay.parts(delay_sum) == DelayParts(
+        assert delay_parts(delay_sum) == DelayParts(
             packets=1, processing_ns=0, transmission_ns=0, propagation_ns=at_ns - number, queuing_ns=0
         )
 
@@ -112,7 +120,7 @@ def test_the_parts_add_up_to_the_time_from_sending_to_arrival(
         if source != destination:
             links.send(now_ns, source, number, size_bytes, None if destination == "*" else destination)
     for at_ns, _, number, source, delay_sum in drain(links):
-        parts = delay.parts(delay_sum)
+        parts = delay_parts(delay_sum)
         total_ns = parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
         assert (source, at_ns - total_ns, parts.packets) == (*sent_ns[number], 1)
 
@@ -124,12 +132,12 @@ def test_the_delay_includes_an_earlier_delay(relay: str | None, destination: str
     wifi.relay(relay)
     fixed = engine(LinkParameters(delay_ns=MS), relay)
     for model in (wifi, fixed):
-        model.send(0, "a", 0, 1000, destination, before=delay.PACKET + 7 * delay.PROCESSING_NS)
+        model.send(0, "a", 0, 1000, destination, before=PACKET + 7 * PROCESSING_NS)
         arrived = model.deliveries(10**9)
         assert arrived
         for at_ns, _, _, _, delay_sum in arrived:
-            parts = delay.parts(delay_sum)
-            assert (parts.packets, parts.processing_ns, delay.processing_ns(delay_sum)) == (1, 7, 7)
+            parts = delay_parts(delay_sum)
+            assert (parts.packets, parts.processing_ns, processing_ns(delay_sum)) == (1, 7, 7)
             assert parts.transmission_ns + parts.propagation_ns + parts.queuing_ns == at_ns
 
 
@@ -144,13 +152,13 @@ PARTS = st.builds(
 @given(st.lists(PARTS, max_size=100))
 def test_parts_of_delays_are_summed_separately(all_parts: list[DelayParts]) -> None:
     total = sum(
-        parts.packets * delay.PACKET
-        + parts.processing_ns * delay.PROCESSING_NS
-        + parts.transmission_ns * delay.TRANSMISSION_NS
-        + parts.propagation_ns * delay.PROPAGATION_NS
-        + parts.queuing_ns * delay.QUEUING_NS
+        parts.packets * PACKET
+        + parts.processing_ns * PROCESSING_NS
+        + parts.transmission_ns * TRANSMISSION_NS
+        + parts.propagation_ns * PROPAGATION_NS
+        + parts.queuing_ns * QUEUING_NS
         for parts in all_parts
     )
-    assert vars(delay.parts(total)) == {
+    assert vars(delay_parts(total)) == {
         name: sum(getattr(parts, name) for parts in all_parts) for name in DelayParts.__dataclass_fields__
     }

@@ -17,7 +17,7 @@ from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.testbed import EmulatedTestbed
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.faults import inject_until_exit
 from tests.helpers.sshd import wait_until

@@ -8,10 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from sim_backends.radio import delay
 from sim_backends.radio.contention import BLIND_NS
-from sim_backends.radio.delay import Delivery
 from sim_backends.radio.frames import HEADER_BYTES, TransmissionAttempt
+from sim_backends.radio.links import (
+    Delivery,
+    delay_parts,
+)
 from sim_backends.radio.modes import (
     CW_MIN,
     DIFS_NS,
@@ -22,8 +24,8 @@ from sim_backends.radio.modes import (
     SLOT_NS,
     WifiMode,
     ack_ns,
+    packet_error,
 )
-from sim_backends.radio.packet_error import packet_error
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import HEADERS_BYTES, NOISE_MW, STRONG_MW, FixedPowers, saturate
 
@@ -283,7 +285,7 @@ def test_the_parts_of_the_delay_add_up_to_the_elapsed_time(relay: str | None) ->
     arrived = wifi.deliveries(10**9)
     assert len(arrived) == 100
     for at_ns, _, sent_ns, source, delay_sum in arrived:
-        parts = delay.parts(delay_sum)
+        parts = delay_parts(delay_sum)
         assert source == "a"
         assert parts.packets == 1
         total_ns = parts.queuing_ns + parts.transmission_ns + parts.propagation_ns + parts.processing_ns

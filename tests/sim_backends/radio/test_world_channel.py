@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import Antenna, WorldChannel
 from sim_backends.world.world import World, load_world
 

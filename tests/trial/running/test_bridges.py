@@ -31,7 +31,7 @@ from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.nodes import running_robots
 from sim_backends.emulated.testbed import EmulatedTestbed
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import los_plan, ros_of
 from tests.helpers.paths import ROOT

@@ -24,14 +24,13 @@ from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork
-from sim_backends.network.tcp.connection import ConnectionName
+from sim_backends.network.tcp.connection import ConnectionName, Tcp
 from sim_backends.network.tcp.segments import Segment
-from sim_backends.network.tcp.transport import Tcp
 from sim_backends.network.udp import Udp
 from sim_backends.network.wire import IpPacket
 from sim_backends.physics.paths import Paths
 from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import WayPoints
 from tests.helpers.passing_robots import ABOUT, MS
 

@@ -19,7 +19,7 @@ from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.modes import G_MODES
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from tests.helpers.known_radio import make_lab
 from tests.helpers.runs import fieldkit, only_trial, rows
 

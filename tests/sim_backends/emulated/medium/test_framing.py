@@ -16,7 +16,7 @@ from fieldkit.config.profiles import Radio
 from sim_backends.emulated.medium.framing import ETHERNET, NO_ROBOT, mac_of
 from sim_backends.emulated.medium.framing import IP as BARE
 from sim_backends.emulated.medium.medium_client import MediumClient
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 
 OWN = IPv4Interface("10.42.0.1/24")
 OTHERS = {"b": IPv4Interface("10.42.0.2/24"), "c": IPv4Interface("10.42.0.3/24")}

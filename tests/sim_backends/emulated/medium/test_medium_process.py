@@ -22,7 +22,7 @@ from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.core.model import DelayParts, Vector
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.robot.network import open_tun
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from tests.helpers.host import alive
 from tests.helpers.paths import ROOT
@@ -368,7 +368,7 @@ def test_a_killed_medium_raises_an_error() -> None:
 OWN_A_MEDIUM = """
 import time
 from sim_backends.emulated.medium.medium_client import MediumClient
-from sim_backends.radio.options import RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 medium = MediumClient(RadioOptions(), seed=1)
 medium.stats()

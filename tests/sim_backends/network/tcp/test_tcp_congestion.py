@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.network.tcp.congestion import NewReno
-from sim_backends.network.tcp.cubic import Cubic, cube_root
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.tcp.congestion import Cubic, NewReno, cube_root
+from sim_backends.network.tcp.tcp_options import TcpOptions
 
 MS = 1_000_000
 SECOND = 1000 * MS

@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.network.packets import Packet
-from sim_backends.network.tcp.connection import TcpSample
-from sim_backends.network.tcp.options import Congestion, TcpOptions
+from sim_backends.network.tcp.connection import Tcp, TcpSample
 from sim_backends.network.tcp.segments import Segment
-from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
 from sim_backends.network.wire import IpPacket
 from tests.helpers.scripted_wire import Script, ScriptedWire, losing
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.packets import Packet
-from sim_backends.network.tcp.options import Congestion, TcpOptions
-from sim_backends.network.tcp.transport import Tcp
+from sim_backends.network.tcp.connection import Tcp
+from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
 from sim_backends.network.wire import IpPacket
 from tests.helpers.scripted_wire import Script, ScriptedWire, losing
 

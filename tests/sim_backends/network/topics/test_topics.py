@@ -22,7 +22,7 @@ from sim_backends.network.topics.rtps import (
     Submessage,
     ip_bytes,
 )
-from sim_backends.network.topics.transport import Topics
+from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.wire import IpPacket
 from sim_backends.radio.random_streams import PacketDraws
 from tests.helpers.scripted_wire import Script, ScriptedWire, losing

@@ -13,7 +13,7 @@ from sim_backends.network.packets import Packet
 from sim_backends.network.topics.discovery import SPDP_BYTES, Announcement, DiscoveryTiming, SharedHeartbeats
 from sim_backends.network.topics.flow import TopicSession
 from sim_backends.network.topics.qos import MS, SECOND, Qos, TopicFlow
-from sim_backends.network.topics.transport import Topics
+from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.wire import IpPacket
 from sim_backends.radio.random_streams import PacketDraws
 from tests.helpers.scripted_wire import Script, ScriptedWire

@@ -6,10 +6,10 @@ import pytest
 
 from sim_backends.network.disturbances import Disturbance, LinkCut
 from sim_backends.network.packets import Packet
-from sim_backends.network.ros1.options import Ros1Flow
-from sim_backends.network.ros1.transport import Ros1
+from sim_backends.network.ros1.ros1_options import Ros1Flow
+from sim_backends.network.ros1.ros1_transport import Ros1
 from sim_backends.network.topics.qos import Qos, TopicFlow
-from sim_backends.network.topics.transport import Topics
+from sim_backends.network.topics.rtps_transport import Topics
 from tests.helpers.radio_networks import MS, Outcome, network, outcome, standing, wifi
 
 NAMES = ("ugv", "uav", "other")

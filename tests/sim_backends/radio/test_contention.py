@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.event_queue import EventQueue
+from sim_backends.radio.contention import EventQueue
 
 
 class EventLog:

@@ -5,11 +5,10 @@ from functools import partial
 
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.network.packets import Packet
-from sim_backends.network.ros1 import options as sizes
-from sim_backends.network.ros1.calls import CallAnswer, RemoteCalls
+from sim_backends.network.ros1 import ros1_options as sizes
 from sim_backends.network.ros1.links import TRANSPORT, Block, Probe, TcprosLink, UdprosLink
-from sim_backends.network.ros1.options import Ros1Flow, Ros1Options
-from sim_backends.network.ros1.streams import TcpStreams
+from sim_backends.network.ros1.ros1_options import Ros1Flow, Ros1Options
+from sim_backends.network.ros1.streams import CallAnswer, RemoteCalls, TcpStreams
 from sim_backends.network.wire import IpPacket, Wire
 
 

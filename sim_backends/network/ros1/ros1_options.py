@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from sim_backends.network.ros1.calls import CallRetry
-from sim_backends.network.tcp.options import TcpOptions
+from sim_backends.network.ros1.streams import CallRetry
+from sim_backends.network.tcp.tcp_options import TcpOptions
 
 _MS: Final = 1_000_000
 _SECOND: Final = 1000 * _MS

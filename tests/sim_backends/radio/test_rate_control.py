@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
-from sim_backends.radio.minstrel import Minstrel
 from sim_backends.radio.modes import G_MODES, WifiMode
 from sim_backends.radio.random_streams import PacketDraws
+from sim_backends.radio.rate_control import Minstrel
 
 STEP_NS = 1_000_000
 PER_UPDATE = 100
