@@ -91,9 +91,9 @@ def test_the_help_lists_it_and_the_tab_key_completes_it(fieldkit: Fieldkit, tmp_
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("absent", "entry point absent = no_such_package:add of worst_command 1.0: it cannot be loaded: ModuleNotFoundError"),
-        ("failing", "entry point failing = failing:add of worst_command 1.0: its arguments cannot be declared: RuntimeError: not today"),
-        ("unfinished", "entry point unfinished = no_such_package:run of worst_command 1.0: it cannot be loaded: ModuleNotFoundError"),
+        ("absent", "entry point absent = no_such_package:add: it cannot be loaded: ModuleNotFoundError"),
+        ("failing", "entry point failing = failing:add: its arguments cannot be declared: RuntimeError: not today"),
+        ("unfinished", "entry point unfinished = no_such_package:run: it cannot be loaded: ModuleNotFoundError"),
         ("twice", "several packages add a command 'twice': "),
     ],
 )
