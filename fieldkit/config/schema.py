@@ -248,8 +248,13 @@ def by_kind(
         models = kinds()
         if unknown := next((str(key) for key in data if key not in models), None):
             parent = next((str(key) for key in data if key in models and unknown in _types(models[key])), None)
-            valid = f"valid keys: {', '.join(models)}; other kinds of {what} need a package that is not installed"
-            hint = f"it is a key of {parent}: write it inside" if parent else did_you_mean(unknown, models, valid)
+            others = f"other kinds of {what} need a package that is not installed"
+            valid = did_you_mean(unknown, models, f"valid keys: {', '.join(models)}")
+            hint = (
+                f"it is a key of {parent}: write it inside"
+                if parent
+                else f"{valid}{' ' if valid.endswith('?') else '; '}{others}"
+            )
             outer = [] if parent else [types for model in _ENCLOSING.get() if unknown in (types := _types(model))]
             raise _unknown(unknown, hint, outer[-1] if outer else ())
         if len(data) != 1:

@@ -200,7 +200,12 @@ def columns(
     Args:
         rank: `Column.rank`.
         declared: Name, unit and meaning of each column, then optionally its figure and its bounds.
+
+    Raises:
+        TypeError: `rank` is not a number.
     """
+    if not isinstance(rank, int):  # without it, the first column would be lost unnoticed
+        raise TypeError("the first argument of columns is the rank, for example 100")
     return tuple(_make_column(rank, *parts) for parts in declared)
 
 

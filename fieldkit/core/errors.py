@@ -2,8 +2,12 @@
 
 import difflib
 import shlex
+import traceback
 from collections.abc import Iterable
-from typing import ClassVar
+from pathlib import Path
+from typing import ClassVar, Final
+
+_PACKAGE: Final = Path(__file__).parents[1]
 
 
 class FieldkitError(Exception):
@@ -88,6 +92,22 @@ class EvidenceError(FieldkitError):
     """Evidence is missing, damaged or contradicts itself: a repeat failed, or `verify` found a difference."""
 
     exit_code = 4
+
+
+def raised(error: BaseException) -> str:
+    """Return an exception in one line with the place in the code: `KeyError: 'a' (hops_step.py, line 28)`.
+
+    The place is the last one in the outermost file that does not belong to fieldkit, because the error of a step or
+    policy of another package may be raised by a library that it calls; without such a file, it is the last one.
+    """
+    first_line = next(iter(str(error).splitlines()), "")
+    text = type(error).__name__ + (f": {first_line}" if first_line else "")
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames:
+        return text
+    others = [frame for frame in frames if not Path(frame.filename).is_relative_to(_PACKAGE)]
+    place = next((frame for frame in reversed(others) if frame.filename == others[0].filename), frames[-1])
+    return f"{text} ({Path(place.filename).name}, line {place.lineno})"
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:

@@ -1,4 +1,4 @@
-"""Installed packages: their versions, and the backends, steps and commands that they add through entry points."""
+"""Installed packages: their versions, and what they add through entry points: backends, steps, policies, commands."""
 
 import sys
 from functools import cache
@@ -17,6 +17,9 @@ MOTION: Final = "fieldkit.motion"
 POSITIONS: Final = "fieldkit.positions"
 """Entry point group of readers of positions: `SUFFIX = "package.module:function"`, without the dot; see
 `fieldkit.measure.positions.recorded`."""
+POLICIES: Final = "fieldkit.policies"
+"""Entry point group of sync policies of the co-simulation: `NAME = "package.module:Class"`, a `SyncPolicy`; see
+`sim_backends.cosim.policies.registry`."""
 COMMANDS: Final = "fieldkit.commands"
 """Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.parser`."""
 
@@ -67,5 +70,6 @@ def _entry_points(search_path: tuple[str, ...]) -> EntryPoints:  # noqa: ARG001 
 
 
 def location(point: EntryPoint) -> str:
-    """Return the description of an entry point for error messages."""
-    return f"entry point {point.name} = {point.value}"
+    """Return the description of an entry point for error messages, with the package that pip knows it by."""
+    package = f" of {point.dist.name} {point.dist.version}" if point.dist is not None else ""
+    return f"entry point {point.name} = {point.value}{package}"

@@ -3,10 +3,11 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from traceback import format_exception
 from typing import Final
 
 from fieldkit.core.columns import Measured, cell, step_prefixed
-from fieldkit.core.errors import EvidenceError
+from fieldkit.core.errors import EvidenceError, raised
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
@@ -24,10 +25,12 @@ class EvidenceVerdict:
         problems: Reasons why the evidence is incomplete or contradictory, so that the attempt is void; one sentence
             each.
         measured: The values that could be measured nevertheless.
+        step_errors: Tracebacks of the exceptions that steps raised on the evidence.
     """
 
     problems: tuple[str, ...]
     measured: Measured
+    step_errors: tuple[str, ...] = ()
 
 
 def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVerdict:
@@ -49,6 +52,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     )
     for role in link.ROLES:
         measured |= link.measure(role, evidence.links(role))
+    step_errors: list[str] = []
     placement_problem = placements.contradiction(scene, evidence)
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
@@ -66,12 +70,13 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see the docstring)
-            why = f"the evidence of {placed.called} cannot be measured: {type(error).__name__}: {error}"
+            why = f"the evidence of {placed.called} cannot be measured: {raised(error)}"
+            step_errors.append("".join(format_exception(error)))
             problems.append(why)
             result = Measured.all_missing(placed.step.output_columns(), why)
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
-    return EvidenceVerdict(tuple(problems), measured)
+    return EvidenceVerdict(tuple(problems), measured, tuple(step_errors))
 
 
 def _of_step(placed: PlacedStep, why: str) -> str:

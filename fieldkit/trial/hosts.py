@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from fieldkit.core.errors import raised
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import clock, endings, host
@@ -71,7 +72,12 @@ def _job_problems(
 ) -> Iterator[str]:
     """Yield the jobs of undisturbed steps that did not end as required."""
     for placed in procedure.walk():
-        for planned in () if placed.disturbed else placed.step.own_jobs(scene):
+        try:
+            planned_jobs = () if placed.disturbed else tuple(placed.step.own_jobs(scene))
+        except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
+            yield f"the commands of {placed.called} cannot be derived: {raised(error)}"
+            continue
+        for planned in planned_jobs:
             if planned.role is not role:
                 continue
             ending = (after.endings or {}).get(planned.job.name)

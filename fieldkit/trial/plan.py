@@ -12,6 +12,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Field, Int, Number, Strict
 from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
+from fieldkit.core.errors import ConfigurationError, FieldkitError, raised
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.steps.nest import Nest
@@ -106,7 +107,15 @@ class Plan(Strict):
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         """Yield every job of one attempt in the order of their starts."""
         for entry in self.procedure.steps:
-            yield from entry.step.jobs(scene)
+            try:
+                yield from entry.step.jobs(scene)
+            except FieldkitError:
+                raise
+            except Exception as error:
+                raise ConfigurationError(
+                    f"the commands of the step {entry.kind} cannot be derived: {raised(error)}",
+                    remedy="report it to the author of the step",
+                ) from error
 
     def puts(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""

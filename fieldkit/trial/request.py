@@ -80,7 +80,7 @@ def make_plan(
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     trial = f"{stamp}_{procedure.name}_{request.distance.label}_{topology}"
     others = (OTHERS,) if procedure.places else ()
-    return Plan(
+    plan = Plan(
         schema_version=SCHEMA_VERSION,
         trial=trial,
         versions={
@@ -111,6 +111,8 @@ def make_plan(
         step_packages=step_packages.of_kinds(placed.kind for placed in procedure.walk()),
         columns=freeze((*others, *of_steps(placed.step for placed in procedure.walk()))) or None,
     )
+    plan.puts()  # raises before robots are started if a step of another package cannot give its commands
+    return plan
 
 
 def _robot_data(cast: Cast) -> dict[str, object]:

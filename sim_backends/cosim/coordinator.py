@@ -7,6 +7,7 @@ import copy
 import time
 from collections.abc import Callable, Mapping, Sequence
 from itertools import islice, repeat
+from operator import index
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
@@ -198,6 +199,8 @@ class Coordinator:
     def _next_window(self, begin_ns: int, to_ns: int) -> int:
         try:
             end_ns = self.policy.next_window(self.situation)
+            if end_ns is not None:
+                end_ns = index(end_ns)  # the policy may be of another package; a float is a TypeError
         except PolicyError:
             raise
         except Exception as error:

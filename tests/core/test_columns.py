@@ -69,3 +69,8 @@ def test_a_rounded_value_at_a_bound_is_still_possible() -> None:
     assert [column.invalid_value_reason(cell(end)) for end in ends] == [None, None]
     assert column.invalid_value_reason("0.999999999") == "not from 1 to 2"
     assert column.invalid_value_reason("2.00000001") is not None
+
+
+def test_columns_without_a_rank_are_refused_because_the_first_one_would_be_lost() -> None:
+    with pytest.raises(TypeError, match="the first argument of columns is the rank"):
+        columns(("hops", "count", "Hops."))  # type: ignore[arg-type]

@@ -46,7 +46,7 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
     (installed / f"{target.partition(':')[0]}.py").write_text(source, encoding="utf-8")
     (tmp_path / "procedures").mkdir()
     (tmp_path / "procedures" / "busy.yaml").write_text(PROCEDURE, encoding="utf-8")
-    environment = os.environ | {"PYTHONPATH": str(installed)}
+    environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}"}
 
     def run(*words: str) -> subprocess.CompletedProcess[str]:
         command = (sys.executable, "-m", "fieldkit", *words)
@@ -70,7 +70,7 @@ def test_an_unknown_kind_is_rejected_with_the_available_ones(fieldkit: Fieldkit,
     refused = fieldkit("trial", "busy", "5m", "--dry-run")
     assert refused.returncode == 2
     assert "procedures/busy.yaml:9" in refused.stderr
-    assert "did you mean 'route'?" in refused.stderr
+    assert "did you mean 'route'? other kinds of step need a package that is not installed" in refused.stderr
 
 
 @pytest.mark.emulated
@@ -105,6 +105,39 @@ def test_a_step_that_raises_fails_its_attempt_with_one_line(fieldkit: Fieldkit, 
     assert len(logs) == 3
     assert all("route_step.py" in log.read_text(encoding="utf-8") for log in logs)
     assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
+
+
+@pytest.mark.emulated
+def test_an_exception_on_its_output_is_one_line_with_its_place_and_a_traceback(
+    fieldkit: Fieldkit, tmp_path: Path
+) -> None:
+    built_in_ros(tmp_path)
+    with (tmp_path / "installed" / "route_step.py").open("a", encoding="utf-8") as module:
+        module.write("\n    def parse(self, output: str) -> None:\n        raise RuntimeError('no route\\nat all')\n")
+    done = fieldkit("trial", "busy", "5m")
+    reason = (
+        "the evidence of the step route cannot be measured: RuntimeError: no route \\(route_step.py, line [0-9]+\\);"
+    )
+    assert len(re.findall(reason, done.stdout)) == 3, done.stdout
+    folder = only_trial(tmp_path)
+    logs = list(folder.glob("**/step-error.log"))
+    assert len(logs) == 3
+    assert all("in parse" in log.read_text(encoding="utf-8") for log in logs)
+    assert fieldkit("verify", str(folder)).returncode == 0
+    assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
+
+
+def test_a_step_without_a_command_is_an_error_before_the_trial(fieldkit: Fieldkit, tmp_path: Path) -> None:
+    with (tmp_path / "installed" / "route_step.py").open("a", encoding="utf-8") as module:
+        module.write("\n    def argv(self, scene: Scene) -> None:\n        raise KeyError('wlan0')\n")
+    for options in ((), ("--dry-run",)):
+        refused = fieldkit("trial", "busy", "5m", *options)
+        assert refused.returncode == 2
+        assert (
+            "the commands of the step route cannot be derived: KeyError: 'wlan0' (route_step.py, line"
+            in refused.stderr
+        )
+    assert not (tmp_path / "trials").exists()
 
 
 @pytest.mark.emulated

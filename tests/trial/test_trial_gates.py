@@ -1,5 +1,6 @@
 """Complete evidence passes every check; damaged in one place, it gives exactly one reason."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -150,11 +151,12 @@ def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monke
 
     monkeypatch.setattr(PingStep, "measure", measure)
     (said,) = problems(PLAN, Protocol.UDP, folder)
-    assert (
-        said == "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
-    )
+    what = "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
+    assert re.fullmatch(rf"{what} \(test_trial_gates.py, line [0-9]+\)", said)
     judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
     assert judged.measured.missing["rtt_loss"] == said
+    (traceback,) = judged.step_errors
+    assert "in measure" in traceback
     assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
 
 

@@ -24,6 +24,7 @@ from fieldkit.trial import gates, hosts, size, store
 from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.running import step_errors
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.robots import Robots
 
@@ -95,6 +96,7 @@ class Attempts:
             self._sink(PhaseStarted("collect evidence", str(repeat)))
             reasons += self._robots.fetch(remote, partial, clean=not reasons)
             verdict = self._judge(started, partial)
+            step_errors.store(verdict.step_errors, partial)
             reasons = reasons or list(verdict.problems)
             self._last_remote = remote
             if reasons:

@@ -2,7 +2,7 @@
 
 import errno
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
@@ -40,9 +40,15 @@ def reported(kind: str, folder: Path | None) -> Iterator[None]:
             raise
         remedy = "report it to the author of the step"
         if folder is not None:
-            text = "".join(traceback.format_exception(error))
-            (folder / laptop_files.STEP_ERROR).write_text(text, encoding="utf-8", errors="backslashreplace")
+            store(traceback.format_exception(error), folder)
             remedy += f", with {laptop_files.STEP_ERROR} of this repeat"
         first_line = next(iter(str(error).splitlines()), "")
         what = f"the step {kind} raised {type(error).__name__}" + (f": {first_line}" if first_line else "")
         raise StepError(what, remedy=remedy) from error
+
+
+def store(tracebacks: Sequence[str], folder: Path) -> None:
+    """Append tracebacks, if there are any, to `step-error.log` of an attempt."""
+    if tracebacks:
+        with (folder / laptop_files.STEP_ERROR).open("a", encoding="utf-8", errors="backslashreplace") as log:
+            log.writelines(tracebacks)

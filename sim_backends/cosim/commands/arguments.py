@@ -240,6 +240,6 @@ def _scenario_names() -> Iterable[str]:
 
 
 def _policy_names() -> Iterable[str]:
-    from sim_backends.cosim.policies.registry import POLICIES  # noqa: PLC0415 (as above
+    from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (as above
 
-    return POLICIES
+    return policies()

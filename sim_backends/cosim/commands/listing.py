@@ -7,7 +7,7 @@ from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
-from sim_backends.cosim.policies.registry import POLICIES
+from sim_backends.cosim.policies.registry import policies
 from sim_backends.cosim.scenario.loading import load_scenario, scenario_files
 from sim_backends.cosim.scenario.schema import CosimScenario
 
@@ -23,14 +23,14 @@ def list_all(arguments: argparse.Namespace) -> int:
             scenarios.append((name, load_scenario(path).summary))
         except FieldkitError as error:
             show_note(f"{error.located}: this scenario is omitted")
-    policies = [(name, _summary(kind)) for name, kind in POLICIES.items()]
+    listed = [(name, _summary(kind)) for name, kind in policies().items()]
     if arguments.format == "table":
         table([column.head for column in _SCENARIO], scenarios)
-        table([column.head for column in _POLICY], policies)
+        table([column.head for column in _POLICY], listed)
         return 0
     sheets = {
         "scenarios": Sheet(_SCENARIO, scenarios, [SheetPart("scenarios", ("scenario", "summary"))]),
-        "policies": Sheet(_POLICY, policies, [SheetPart("sync policies", ("policy", "summary"))]),
+        "policies": Sheet(_POLICY, listed, [SheetPart("sync policies", ("policy", "summary"))]),
     }
     show_all(sheets, arguments.format)
     return 0

@@ -14,8 +14,9 @@ from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.policies import registry
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.registry import POLICIES, make_policy
+from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -51,7 +52,9 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = settings.scenario(arguments)
     seeds = settings.seeds(arguments, scenario)
     windows_s = settings.windows_s(arguments, scenario) if arguments.windows else list(WINDOWS_S)
-    policies = [name for name in settings.policies(arguments) if not getattr(POLICIES[name], "exact", False)]
+    policies = [
+        name for name in settings.policies(arguments) if not getattr(registry.policies()[name], "exact", False)
+    ]
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
     build(scenario)  # raises before any run if the scenario is invalid
     with working() as sink:

@@ -14,7 +14,8 @@ from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import Progress, Sink
 from fieldkit.core.units import format_count, parse_duration_s
 from fieldkit.report.theme import Format, format_of
-from sim_backends.cosim.policies.registry import POLICIES, make_policy
+from sim_backends.cosim.policies import registry
+from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.phases import commensurate_events, incommensurate_window_s
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -71,14 +72,14 @@ def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ..
 
 
 def policies(arguments: argparse.Namespace) -> list[str]:
-    """Return the names of the sync policies without repetitions, in the order of `POLICIES`.
+    """Return the names of the sync policies without repetitions, in the order of `registry.policies`.
 
     Raises:
         ConfigurationError: One of these names is not a policy.
     """
     for name in arguments.policy:
         make_policy(name)
-    return [name for name in POLICIES if not arguments.policy or name in arguments.policy]
+    return [name for name in registry.policies() if not arguments.policy or name in arguments.policy]
 
 
 def windows_s(arguments: argparse.Namespace, chosen: CosimScenario) -> list[float]:
@@ -104,7 +105,7 @@ def with_window(chosen: CosimScenario, window_s: float) -> CosimScenario:
 
 def has_window(name: str) -> bool:
     """Return True if a sync policy has the parameter `window_s`."""
-    return "window_s" in inspect.signature(POLICIES[name]).parameters
+    return "window_s" in inspect.signature(registry.policies()[name]).parameters
 
 
 def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], None]:
@@ -196,7 +197,7 @@ def policy_text(name: str, chosen: CosimScenario) -> str:
     """Return a sync policy with the parameter that determines its windows: `sliding_window 10 ms`."""
     if has_window(name):
         return f"{name} {chosen.policy.window * 1e3:g} ms"
-    if "bound_m" not in inspect.signature(POLICIES[name]).parameters:
+    if "bound_m" not in inspect.signature(registry.policies()[name]).parameters:
         return name
     bound_db = chosen.policy.bound_db
     return f"{name} {chosen.policy.bound:g} m" if bound_db is None else f"{name} {bound_db:g} dB"

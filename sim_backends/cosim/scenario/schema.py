@@ -1,7 +1,7 @@
 """The schema of a scenario file. Checks that need more than the file are in `checks`."""
 
 from collections.abc import Iterator
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
@@ -9,7 +9,7 @@ from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length,
 from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
-from sim_backends.cosim.policies.registry import POLICIES
+from sim_backends.cosim.policies.registry import policies, unknown_policy
 from sim_backends.cosim.programs.way_points import PERIOD_NS
 from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
@@ -19,10 +19,13 @@ from sim_backends.world.obstacles import Place, Real
 
 
 def _check_policy_name(name: str) -> str:
-    if name not in POLICIES:
-        hint = did_you_mean(name, POLICIES, f"policies: {', '.join(POLICIES)}")
-        raise schema.validation_error(f"there is no sync policy {name!r}; {hint}")
+    if name not in policies():
+        raise schema.validation_error(f"there is no sync policy {name!r}; {unknown_policy(name)}")
     return name
+
+
+def _list_policies(json_schema: dict[str, Any]) -> None:
+    json_schema["enum"] = [*policies()]
 
 
 class PolicyChoice(Strict):
@@ -37,9 +40,7 @@ class PolicyChoice(Strict):
         exponent: Exponent of the log-distance law for `bound_db`.
     """
 
-    name: Annotated[str, AfterValidator(_check_policy_name), Field(json_schema_extra={"enum": [*POLICIES]})] = (
-        "event_driven"
-    )
+    name: Annotated[str, AfterValidator(_check_policy_name), Field(json_schema_extra=_list_policies)] = "event_driven"
     window: Annotated[Duration, Field(gt=0)] = 0.001
     longest: Annotated[Duration, Field(gt=0)] = 0.1
     bound: Annotated[Length, Field(gt=0)] = 0.01

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
-from sim_backends.cosim.policies.registry import POLICIES, make_policy
+from sim_backends.cosim.policies.registry import BUILTIN, make_policy
 from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Received
@@ -90,7 +90,7 @@ class Growing(Still):
 
 
 @pytest.mark.parametrize("extrapolates", [False, True])
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("policy", BUILTIN)
 def test_an_agent_that_appears_during_a_run_can_receive_with_every_policy(policy: str, *, extrapolates: bool) -> None:
     physics = Growing()
     physics.step_ns = MS

@@ -9,7 +9,7 @@ import pytest
 from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.comparison import errors
-from sim_backends.cosim.policies.registry import POLICIES
+from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.policies.window_policies import Scheduled
 from sim_backends.cosim.studies.local_errors import local_errors
 from sim_backends.world.motion import State
@@ -33,7 +33,7 @@ def physics(carts: Any) -> Any:  # noqa: ANN401 (as above)
 
 
 # The paper's rule as printed stops if a subscriber is faster, as the drone is immediately.
-@pytest.mark.parametrize("policy", sorted({*POLICIES} - {"velocity_aware_raw"}))
+@pytest.mark.parametrize("policy", sorted({*BUILTIN} - {"velocity_aware_raw"}))
 def test_the_class_of_the_page_runs_with_every_policy(policy: str, carts: Any) -> None:  # noqa: ANN401 (as above)
     simulation = build(SCENARIO, policy=policy, physics=physics(carts))
     run = simulation.run(400 * MS)

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, event, given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.policies.registry import POLICIES
+from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.policies.sync_policy import PolicyError
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
@@ -107,7 +107,7 @@ SCENARIOS = st.fixed_dictionaries(
     optional={
         "line": st.sampled_from(("los", "nlos")),
         "physics": some(step=written("ms", 0.5, 1)),
-        "policy": some(name=st.sampled_from([*POLICIES]), window=written("ms", 1, 3.7), bound=written("cm", 0.1, 5)),
+        "policy": some(name=st.sampled_from([*BUILTIN]), window=written("ms", 1, 3.7), bound=written("cm", 0.1, 5)),
         "topology": st.sampled_from(("master", "masterless")),
         "relay": AGENT,
         "radio": some(fading=st.booleans(), loss=st.just("10%"), queue_packets=st.integers(0, 3)),

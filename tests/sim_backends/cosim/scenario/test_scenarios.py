@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.policies.registry import POLICIES
+from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.scenario.loading import scenario_files
 from tests.helpers.paths import ROOT
 
@@ -22,7 +22,7 @@ print(json.dumps([run.digest for run in runs]))
 """
 
 
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("policy", BUILTIN)
 @pytest.mark.parametrize("name", scenario_files())
 def test_every_scenario_runs_with_every_policy(name: str, policy: str) -> None:
     run = build(load_scenario(name), policy=policy).run(SECOND_NS)
@@ -35,7 +35,7 @@ def test_every_scenario_runs_with_every_policy(name: str, policy: str) -> None:
 
 
 def test_another_process_gives_the_same_digests() -> None:
-    pairs = [(name, policy) for name in scenario_files() for policy in POLICIES]
+    pairs = [(name, policy) for name in scenario_files() for policy in BUILTIN]
     until_ns = SECOND_NS * 6 // 10
     digests = [build(load_scenario(name), policy=policy).run(until_ns).digest for name, policy in pairs]
     assert len(set(digests)) > len(pairs) / 2
