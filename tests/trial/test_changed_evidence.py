@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates
-from tests.helpers.changed_evidence import ATTEMPTS, Stored, changes, stored
+from tests.helpers.changed_evidence import ATTEMPTS, Stored, changes, stored, with_wrong_time
 
 Change = Callable[[bytes], bytes]
 TRIAL = ATTEMPTS[0][0]
@@ -46,6 +46,17 @@ def test_a_source_changed_at_random_never_moves_a_column_of_a_valid_repeat(
     kind, name, content = next(changes(attempt(protocol), other, random.Random(seed)))
     judged = attempt(protocol).changed(name, content, tmp_path_factory.mktemp("changed"))
     assert attempt(protocol).wrong(judged) == {}, (kind, name)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(Protocol), st.sampled_from(("sender", "receiver")), st.integers(0), st.integers(-8000, 8000))
+def test_one_wrong_time_in_a_capture_never_moves_the_clock_offset_beyond_its_error(
+    tmp_path_factory: pytest.TempPathFactory, protocol: Protocol, role: str, index: int, microseconds: int
+) -> None:
+    name = f"{role}.pcap"
+    changed = with_wrong_time((attempt(protocol).folder / name).read_bytes(), index, microseconds)
+    judged = attempt(protocol).changed(name, changed, tmp_path_factory.mktemp("changed"))
+    assert attempt(protocol).wrong(judged) == {}
 
 
 def demand(protocol: Protocol, name: str, change: Change | None, place: Path, reason: str) -> None:

@@ -222,7 +222,10 @@ CROSS_CHECKS: Final = (
         ("one_way_*", "delay_variation_*", "jitter_s", "clock_*"),
         "times in `sender.pcap` and `receiver.pcap`",
         ("packets in both directions: offset and skew of the clocks", "each robot's clock before and after"),
-        "withheld if the error of the offset is above a tenth of the delay, or the clocks were unsteady",
+        (
+            "withheld if the error of the offset, with one time stamp wrong, is above a tenth of the delay, or the "
+            "clocks were unsteady"
+        ),
         CheckOutcome.WITHHELD,
     ),
     CrossCheck(

@@ -7,8 +7,16 @@ line over time, and each line is possible that is below all upper bounds and abo
 "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999). The captures contain no more
 information: the division of a round trip into its two directions is unobservable (Paxson, "On calibrating
 measurements of packet transit times", SIGMETRICS 1998).
+
+A single wrong time stamp can exclude the true line. Therefore each line counts as possible that violates at most one
+packet's bound: the true line is one of them if one time stamp is wrong, by any amount. This is the intersection of
+Marzullo and Owicki ("Maintaining the time in a distributed system", PODC 1983; RFC 5905, section 11.2.1) with at
+most one faulty source, where each packet is a source. The lines are those of the polygons that result if one packet
+is left out; only packets on the convex hulls change the polygon. No smaller set has this property, because each of
+these lines is the true one if the time stamp of the packet that was left out is wrong.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -47,16 +55,16 @@ class Clocks:
     """Offset of the receiver's clock from the sender's over time: the best line, and the range of possible lines.
 
     Offsets are relative to `base_ns`, which keeps precision if clocks are decades apart. Times are seconds from
-    `middle_ns`.
+    `middle_ns`. If a direction has a single packet, no other one confirms its time, and the error is infinite.
 
     Attributes:
         middle_ns: Middle of the packets' times by the receiver's clock.
         base_ns: Integer part of the offset.
         offset_s: Best estimate of the remaining offset at `middle_ns`.
         skew: Best estimate of the skew: relative rate of the receiver's clock minus 1, in seconds per second.
-        skews: Corners of the possible range of skews, ascending. Shape (k,).
-        lowest_s: Lowest possible offset at `middle_ns` for each of these skews. Shape (k,).
-        highest_s: Highest possible offset. Shape (k,).
+        skews: Skews at the corners of the polygons of possible lines, ascending. Shape (k,).
+        lowest_s: Lowest offset at `middle_ns` for each of these skews in its polygon. Shape (k,).
+        highest_s: Highest offset in it. Shape (k,).
     """
 
     middle_ns: int
@@ -94,39 +102,81 @@ class Clocks:
 
 
 def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
-    """Return the offset between the clocks, or None if no line fits because a clock was set.
+    """Return the offset between the clocks, or None if no line fits all packets because a clock was set.
 
-    The chosen skew maximizes the shortest round-trip time: if both directions were undelayed early and late, any
-    other skew shortens one of them. Among equally good skews the smallest is chosen. If the packets leave more than
-    `QUARTZ_SKEW` undetermined, the smallest possible skew is chosen. The offset is the middle of the range that is
-    possible with this skew.
+    The chosen skew maximizes the shortest round-trip time without the fastest packet of each direction: if both
+    directions were undelayed early and late, any other skew shortens one of them. Among equally good skews the
+    smallest is chosen. If the packets leave more than `QUARTZ_SKEW` undetermined, the smallest possible skew is
+    chosen. The offset is the middle of the range that is possible with this skew.
 
     Args:
-        forward: Packets from sender to receiver, at least one.
-        reverse: Packets from receiver to sender, at least one.
+        forward: Packets from sender to receiver, at least one, each frame in one pair only.
+        reverse: Packets from receiver to sender, likewise.
     """
     times = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
     middle_ns = (int(times.min()) + int(times.max())) // 2
     base_ns = int(forward.receiver_ns[0] - forward.sender_ns[0])
     above, below = (_points(pairs, middle_ns, base_ns) for pairs in (forward, reverse))
-    ceiling, floor = _Hull.below(*above), _Hull.below(below[0], -below[1])
-
-    def bounds(skews: Floats) -> tuple[Floats, Floats]:
-        return -floor.intercepts(-skews) - STAMP_S, ceiling.intercepts(skews) + STAMP_S
-
-    slope_changes = np.concatenate(((-MAX_SKEW, MAX_SKEW), ceiling.slopes(), -floor.slopes()))
-    skews = np.unique(np.clip(slope_changes, -MAX_SKEW, MAX_SKEW))
-    lowest, highest = bounds(skews)
-    width = highest - lowest
-    if width.max() < 0:
+    ceilings, floors = _Hull.of_all_but_one(*above), _Hull.of_all_but_one(below[0], -below[1])
+    ceiling, floor = ceilings[0], floors[0]
+    if _polygon(ceiling, floor) is None:
         return None
-    first, last = _skew_range(skews, width, 0.0)
+    hulls = [(each, floor) for each in ceilings] + [(ceiling, each) for each in floors[1:]]
+    polygons = [polygon for pair in hulls if (polygon := _polygon(*pair)) is not None]
+    skews, lowest_s, highest_s = np.concatenate(polygons, axis=1)
+    order = np.argsort(skews, kind="stable")
+    skew = _best_skew(ceilings, floors, float(skews.min()), float(skews.max()))
+    ends = _range_without_fastest(ceilings, floors, np.array([skew]))
+    if not np.isfinite(ends).all():
+        ends = _range(ceiling, floor, np.array([skew]))
+    offset_s = float(ends[0][0] + ends[1][0]) / 2
+    return Clocks(middle_ns, base_ns, offset_s, skew, skews[order], lowest_s[order], highest_s[order])
+
+
+def _best_skew(ceilings: Sequence["_Hull"], floors: Sequence["_Hull"], first: float, last: float) -> float:
+    """Return the skew of the best line.
+
+    Args:
+        ceilings: Hulls of packets from sender to receiver, from `_Hull.of_all_but_one`.
+        floors: Hulls of packets from receiver to sender.
+        first: Lowest possible skew.
+        last: Highest possible skew.
+    """
+    slopes = np.concatenate([each.slopes() for each in ceilings] + [-each.slopes() for each in floors])
+    skews = np.clip(np.append(slopes, (0.0, -MAX_SKEW, MAX_SKEW)), first, last)
+    lowest_s, highest_s = _range_without_fastest(ceilings, floors, skews)
+    width_s = highest_s - lowest_s
+    best = skews[width_s >= width_s.max() - STAMP_S]
+    skew = float(best[np.abs(best).argmin()])
+    return float(np.clip(0.0, first, last)) if max(last - skew, skew - first) > QUARTZ_SKEW else skew
+
+
+def _range(ceiling: "_Hull", floor: "_Hull", skews: Floats) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest offset that the hulls permit with each skew."""
+    return -floor.intercepts(-skews) - STAMP_S, ceiling.intercepts(skews) + STAMP_S
+
+
+def _range_without_fastest(
+    ceilings: Sequence["_Hull"], floors: Sequence["_Hull"], skews: Floats
+) -> tuple[Floats, Floats]:
+    """Return the lowest and the highest offset with each skew if the fastest packet of each direction is left out."""
+    return (
+        np.min([_range(ceilings[0], floor, skews)[0] for floor in floors], axis=0),
+        np.max([_range(ceiling, floors[0], skews)[1] for ceiling in ceilings], axis=0),
+    )
+
+
+def _polygon(ceiling: "_Hull", floor: "_Hull") -> Floats | None:
+    """Return the lines between two hulls: skews, lowest and highest offsets of the corners; None without a line."""
+    slopes = np.concatenate(((-MAX_SKEW, MAX_SKEW), ceiling.slopes(), -floor.slopes()))
+    skews = np.unique(np.clip(slopes, -MAX_SKEW, MAX_SKEW))
+    lowest_s, highest_s = _range(ceiling, floor, skews)
+    width_s = highest_s - lowest_s
+    if width_s.max() < 0:
+        return None
+    first, last = _possible_skews(skews, width_s)
     corners = np.concatenate(((first,), skews[(skews > first) & (skews < last)], (last,)))
-    skew = float(np.clip(0.0, *_skew_range(skews, width, float(width.max()) - STAMP_S)))
-    if max(last - skew, skew - first) > QUARTZ_SKEW:
-        skew = float(np.clip(0.0, first, last))
-    (low,), (high,) = bounds(np.array([skew]))
-    return Clocks(middle_ns, base_ns, float(low + high) / 2, skew, corners, *bounds(corners))
+    return np.stack((corners, *_range(ceiling, floor, corners)))
 
 
 def _points(pairs: StampPairs, middle_ns: int, base_ns: int) -> tuple[Floats, Floats]:
@@ -134,41 +184,44 @@ def _points(pairs: StampPairs, middle_ns: int, base_ns: int) -> tuple[Floats, Fl
     return (pairs.receiver_ns - middle_ns) / 1e9, (pairs.receiver_ns - pairs.sender_ns - base_ns) / 1e9
 
 
-def _skew_range(skews: Floats, width: Floats, min_width: float) -> tuple[float, float]:
-    """Return the range of skews in which `width`, concave and linear between `skews`, is at least `min_width`."""
-    top = int(width.argmax())
+def _possible_skews(skews: Floats, width_s: Floats) -> tuple[float, float]:
+    """Return the range of skews in which `width_s`, concave and linear between `skews`, is not negative."""
+    top = int(width_s.argmax())
     rising, falling = slice(None, top + 1), slice(None, top - 1 if top else None, -1)
     return (
-        float(np.interp(min_width, width[rising], skews[rising])),
-        float(np.interp(min_width, width[falling], skews[falling])),
+        float(np.interp(0.0, width_s[rising], skews[rising])),
+        float(np.interp(0.0, width_s[falling], skews[falling])),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Hull:
-    """Lower convex hull of points, or of a sample of them."""
+    """Lower convex hull of points, or of a sample of them; without points, every line is below it."""
 
     x: Floats
     y: Floats
 
     @classmethod
-    def below(cls, x: Floats, y: Floats) -> Self:
-        """Return the hull of at most `_HULL_POINTS` points: the lowest of each group of neighbours.
+    def of_all_but_one(cls, x: Floats, y: Floats) -> list[Self]:
+        """Return the hull of at most `_HULL_POINTS` points, then the hull without each of its points.
 
-        Omitted points can only raise the hull, so no possible line is excluded.
+        The points are the lowest of each group of neighbours. Omitted points can only raise the hull, so no possible
+        line is excluded.
         """
         size = -(-len(x) // _HULL_POINTS)
         runs = np.append(y, np.full(-len(y) % size, np.inf)).reshape(-1, size)
         lowest = runs.argmin(axis=1) + np.arange(len(runs)) * size
-        order = lowest[np.lexsort((y[lowest], x[lowest]))]
-        hull: list[tuple[float, float]] = []
-        for point in zip(x[order].tolist(), y[order].tolist(), strict=True):
-            if hull and point[0] == hull[-1][0]:
-                continue
-            while len(hull) > 1 and _is_above_chord(hull[-2], hull[-1], point):
-                hull.pop()
-            hull.append(point)
-        return cls(*np.array(hull).T)
+        points = sorted(zip(x[lowest].tolist(), y[lowest].tolist(), strict=True))
+        outer = _lower_hull(points)
+        on_hull = set(outer)
+        # Without a point of this hull, only points of the hull of all others can be on the hull in addition.
+        others = [point for index, point in enumerate(points) if index not in on_hull]
+        nearest = [others[index] for index in _lower_hull(others)]
+        hulls = [[points[index] for index in outer]]
+        for left_out in outer:
+            rest = sorted([points[index] for index in outer if index != left_out] + nearest)
+            hulls.append([rest[index] for index in _lower_hull(rest)])
+        return [cls(*np.array(hull).reshape(-1, 2).T) for hull in hulls]
 
     def slopes(self) -> Floats:
         """Return the slope of each edge."""
@@ -177,8 +230,20 @@ class _Hull:
 
     def intercepts(self, slopes: Floats) -> Floats:
         """Return the intercepts at x = 0 of the lines with these slopes that touch the hull from below."""
-        intercepts: Floats = (self.y[:, None] - np.outer(self.x, slopes)).min(axis=0)
+        intercepts: Floats = (self.y[:, None] - np.outer(self.x, slopes)).min(axis=0, initial=np.inf)
         return intercepts
+
+
+def _lower_hull(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Return the indices of the points on the lower convex hull of points that are in ascending order."""
+    hull: list[int] = []
+    for index, point in enumerate(points):
+        if hull and point[0] == points[hull[-1]][0]:
+            continue
+        while len(hull) > 1 and _is_above_chord(points[hull[-2]], points[hull[-1]], point):
+            hull.pop()
+        hull.append(index)
+    return hull
 
 
 def _is_above_chord(first: tuple[float, float], second: tuple[float, float], third: tuple[float, float]) -> bool:

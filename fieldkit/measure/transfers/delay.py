@@ -1,5 +1,6 @@
 """One-way delay and jitter of a transfer's packets, from packets in both captures."""
 
+import math
 from typing import Final
 
 import numpy as np
@@ -80,6 +81,9 @@ LARGEST_ERROR: Final = 0.1
 
 UNSTEADY: Final = "no offset and drift fit: a clock was set during the attempt, or drifts by more than 500 ppm"
 """Reason why no times of a transfer are known, not even by one clock: either clock may be the wrong one."""
+
+SINGLE_PACKET: Final = "one direction has a single packet in both captures, and no other packet confirms its time"
+"""Reason why the error of the clock offset is unlimited."""
 
 _JITTER_GAIN: Final = 1 / 16
 _WEIGHTED_STEPS: Final = 1000
@@ -170,7 +174,7 @@ def packet_delays(
 ) -> tuple[Floats, float] | None:
     """Return the one-way delay of each packet, and the maximum error from the clocks, in seconds.
 
-    None if the clock offset cannot be estimated.
+    None if the clock offset cannot be estimated, or its error is unlimited.
 
     Args:
         pairs: The transfer's packets as for `measure`; all must have times.
@@ -182,7 +186,8 @@ def packet_delays(
     if not len(pairs) or not len(reverse):
         return None
     clocks = estimate(StampPairs.concatenated((pairs, _others(sender, receiver, transfer))), reverse)
-    return None if clocks is None else _delays_s(pairs, clocks)
+    delays = None if clocks is None else _delays_s(pairs, clocks)
+    return delays if delays and math.isfinite(delays[1]) else None
 
 
 def clocks_between(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> Clocks | None:
@@ -252,9 +257,13 @@ def _variation(delay_s: Floats) -> Measured:
 
 
 def _clock(clocks: Clocks) -> Measured:
+    error_s = clocks.error_s(np.array([clocks.middle_ns]))
+    if not math.isfinite(error_s):
+        names = ("clock_offset_s", "clock_offset_error_s", "clock_skew_ppm", "clock_skew_error_ppm")
+        return Measured({}, dict.fromkeys(names, SINGLE_PACKET))
     values = {
         "clock_offset_s": clocks.base_ns / 1e9 + clocks.offset_s,
-        "clock_offset_error_s": clocks.error_s(np.array([clocks.middle_ns])),
+        "clock_offset_error_s": error_s,
         "clock_skew_ppm": 1e6 * clocks.skew if clocks.skew_error <= QUARTZ_SKEW else None,
         "clock_skew_error_ppm": 1e6 * clocks.skew_error,
     }
@@ -268,6 +277,9 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
         "one_way_mean_s": float(delay_s.mean()),
         "one_way_p95_s": float(np.percentile(delay_s, 95)),
     }
+    if not math.isfinite(error_s):
+        names = (*figures, "one_way_error_s", "one_way_median_sent_s")
+        return Measured({"one_way_withheld": SINGLE_PACKET}, dict.fromkeys(names, SINGLE_PACKET))
     shown = {name: value if error_s <= LARGEST_ERROR * value else None for name, value in figures.items()}
     withheld_names = ", ".join(name.split("_")[2] for name, value in shown.items() if value is None)
     reason = f"the error is above a tenth of: {withheld_names}" if withheld_names else None
@@ -316,8 +328,14 @@ def _may_be_transfer(packets: Packets, transfer: Transfer) -> Mask:
 
 
 def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
-    """Return the times of the packets that are in both lists."""
+    """Return the times of the packets that are in both lists.
+
+    Each received frame occurs once, so that a wrong time of it makes one pair wrong. If offload joined several frames
+    to it, it is paired with the last of them, whose bound on the clock offset is the strictest.
+    """
     sent_index, received_index = _copies(match(sent, received))
+    received_index, last = np.unique(received_index[::-1], return_index=True)
+    sent_index = sent_index[::-1][last]
     return StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
 
 

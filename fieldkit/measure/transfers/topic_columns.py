@@ -6,6 +6,7 @@ update?", INFOCOM 2012. Mean just before each drop, the peak age: M. Costa, M. C
 information in status update systems with packet management", IEEE Trans. Information Theory 62, 2016.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -259,7 +260,7 @@ def _times(arrived: TopicSamples, clocks: Clocks | None, deadline_s: float | Non
     if len(arrived):
         variation_s = (transit_ns - transit_ns.min()) / 1e9
         values["topic_delay_variation_p95_s"] = float(np.percentile(variation_s, 95))
-    if len(arrived) and clocks is not None:
+    if len(arrived) and clocks is not None and math.isfinite(clocks.error_s(arrived.at_ns)):
         values |= _by_clocks(arrived, clocks, sent)
     reason = "too few samples arrived, there is no deadline, or the captures do not give the clock offset well enough"
     return Measured.from_optional(values, reason) | Measured.all_missing((*_TIMES, *_OF_SENT), reason)
