@@ -48,8 +48,8 @@ class MoveStep(Nest):
         within_limits: Whether a robot whose `limits.max_speed_m_s` or `limits.fence_m` are exceeded moves as far and
             as fast as they allow, and stops half a metre before the fence; `trial.yaml` records the actual motion.
             Otherwise the trial is refused.
-        driven: Whether there are columns of its [automatic drive](motion.md#evidence-of-a-drive). A robot that drives by
-            itself always has them.
+        driven: Whether there are columns of its [automatic drive](motion.md#evidence-of-a-drive). A robot that
+            fieldkit drives always has them.
         during: Steps that run meanwhile.
     """
 
