@@ -317,7 +317,7 @@ def test_files_named_in_contributor_pages_exist(page: Path) -> None:
 
 def test_the_walk_names_each_method_of_a_step() -> None:
     methods = {name for name, member in vars(Step).items() if isfunction(member)} - {"prefixed_name", "kind_name"}
-    rows = WALK.read_text(encoding="utf-8").split("| asked by | question |")[1]
+    rows = WALK.read_text(encoding="utf-8").split("| caller | method |")[1]
     assert {name for name in code_spans(rows) if name.isidentifier()} == {
         name for name in methods if not name.startswith("_")
     }

@@ -251,11 +251,6 @@ def tables(findings: MiddlewareFindings, conditions: str) -> Iterator[str]:
     yield ""
     pairs = [cell for cell in findings.cells if cell.robots == 2]
     yield from _table(pairs, "distance_m", lambda metres: f"{metres:g} m", _loss_and_delay)
-    yield ""
-    yield "Best effort, samples lost (and `1 - (1 - p)^n` of the n packets of a sample of which a share p was lost):"
-    yield ""
-    fragmented = [cell for cell in pairs if cell.expected_loss is not None and cell.size_bytes >= 10_000]
-    yield from _table(fragmented, "distance_m", lambda metres: f"{metres:g} m", _with_expected)
     for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
         yield ""
         yield f"Robots that publish to one at {metres:g} m, all streams together; delay of the first:"
@@ -289,11 +284,6 @@ def _loss_and_delay(cell: MiddlewareCell) -> str:
         "reliable",
     ) and cell.size_bytes >= middleware_page.IMAGE_BYTES
     return f"{lost:.1f} %, " + ("-" if late is None else f"{late:.0f} ms") + BIMODAL * is_bimodal
-
-
-def _with_expected(cell: MiddlewareCell) -> str:
-    lost, expected = _lost(cell), cell.expected_loss
-    return "" if lost is None or expected is None else f"{lost:.0f} % ({100 * expected:.0f})"
 
 
 def write_tables(page: Path, lines: Sequence[str]) -> None:

@@ -37,8 +37,6 @@ class MiddlewareCell:
         loss: Share of the samples of all valid repeats that did not arrive, or were not sent because the previous one
             blocked the publisher; None if the subscriber was not discovered.
         delay_p95_s: Median over repeats of the 95th percentile of the delay; None if the clocks are not comparable.
-        expected_loss: The loss if packets were lost independently with the measured share; None if samples are not
-            sent in UDP packets.
         loss_low: Lower end of the 95 % interval of the loss over repeats; None without one.
         loss_high: Upper end.
         samples: Number of samples.
@@ -52,7 +50,6 @@ class MiddlewareCell:
     robots: int
     loss: float | None
     delay_p95_s: float | None
-    expected_loss: float | None = None
     loss_low: float | None = None
     loss_high: float | None = None
     samples: int = 0
@@ -122,9 +119,8 @@ def _cells(campaign: str, rows: Sequence[Row]) -> Iterator[MiddlewareCell]:
             elif match := _STREAM.fullmatch(stream):
                 label = _NAMES[campaign] + (", tuned" if match["settings"] == "tuned" else "")
                 kind = "best effort" if match["kind"] in _BEST_EFFORT else "reliable"
-                expected = _expected(distance_rows, stream) if kind == "best effort" else None
                 loss, delay_s = _loss(distance_rows, [stream]), _delay_s(distance_rows, stream)
-                cell = MiddlewareCell(label, kind, int(match["bytes"]), metres, 2, loss, delay_s, expected)
+                cell = MiddlewareCell(label, kind, int(match["bytes"]), metres, 2, loss, delay_s)
                 yield _with_interval(cell, distance_rows, [stream])
 
 
@@ -156,13 +152,3 @@ def _with_interval(cell: MiddlewareCell, rows: Sequence[Row], streams: Sequence[
 def _delay_s(rows: Sequence[Row], stream: str) -> float | None:
     delays_s = [value for row in rows if (value := row[f"{stream}.topic_delay_p95_s"]) is not None]
     return median(delays_s) if delays_s else None
-
-
-def _expected(rows: Sequence[Row], stream: str) -> float | None:
-    """Return the loss of samples if their packets were lost independently: 1 - (1 - p)^n."""
-    sent = sum(row[f"{stream}.topic_sent"] or 0 for row in rows)
-    packets = sum(row[f"{stream}.topic_data_packets"] or 0 for row in rows)
-    lost = sum(
-        (row[f"{stream}.topic_packet_loss"] or 0.0) * (row[f"{stream}.topic_data_packets"] or 0) for row in rows
-    )
-    return 1 - (1 - lost / packets) ** (packets / sent) if sent and packets else None

@@ -65,7 +65,7 @@ def cells(page: Path) -> list[MiddlewareCell]:
 
 
 def _row(parts: Sequence[str], columns: Sequence[tuple[float, bool]], metres: float) -> Iterator[MiddlewareCell]:
-    """Yield the cells of one table row; a row with expected losses has none."""
+    """Yield the cells of one table row."""
     size_bytes = SIZES[parts[0]]
     for text, (number, is_distance) in zip(parts[3:], columns, strict=True):
         match = _CELL.fullmatch(text)

@@ -37,7 +37,8 @@ def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]
     meanings = attribute_meanings(model)
     for name, field in model.model_fields.items():
         key = field.alias or name
-        meaning = meanings.get(key) or meanings[name]
+        # By name first: the alias may be the name of an attribute of a base class, such as `Step.columns`.
+        meaning = meanings.get(name) or meanings[key]
         yield f"`{prefix}{key}`", default(model, name), relative(meaning)
         if field.discriminator:
             continue  # each kind has a separate table

@@ -18,6 +18,7 @@ from functools import partial
 from typing import Callable, Sequence
 
 from fieldkit.agent.arming import ArmingCheck
+from fieldkit.agent.boot_clock import boot_id
 from fieldkit.agent.dialect import ARM, Command, FlightDialect
 from fieldkit.agent.flight_log import FlightLog
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, MISPLACED, FlightPlan, point_on_path
@@ -38,7 +39,6 @@ _SET_POINTS_S = 1.0
 """Set-points are sent for this time before the mode that follows them is selected (PX4 user guide, offboard mode)."""
 _COORDINATES_S = 3.0
 """Timeout for latitude and longitude, which some drones do not know."""
-_BOOT_ID = "/proc/sys/kernel/random/boot_id"
 
 
 class OffboardPilot:
@@ -144,7 +144,7 @@ class OffboardPilot:
         latitude, longitude = drone.latitude_longitude or (None, None)
         if drone.yaw_rad is None:
             raise FlightError(REFUSED, "it does not report its heading (ATTITUDE)")
-        frame = frame_id(_boot_id(), drone.booted_s)
+        frame = frame_id(boot_id(), drone.booted_s)
         start = FlightOrigin(FRAME, frame, start_m[0], start_m[1], drone.yaw_rad, latitude, longitude)
         try:
             return resolve_origin(FlightOrigin.from_values(self._plan.origin) if self._plan.origin else None, start)
@@ -271,15 +271,6 @@ def fly(plan: FlightPlan, stop_event: threading.Event) -> int:
         log_line(f"error: {error}")
         return error.code
     return 0
-
-
-def _boot_id() -> str:
-    """Return the boot ID of this computer (random(4)), or an empty text if it is unknown."""
-    try:
-        with open(_BOOT_ID, encoding="ascii") as file:  # noqa: PTH123 (Python 3.8)
-            return file.read(100).strip()
-    except OSError:
-        return ""
 
 
 def _fault_text(check: ArmingCheck) -> str:

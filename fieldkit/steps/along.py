@@ -18,8 +18,8 @@ class AlongStep(Step):
 
     Attributes:
         duration_key: The key that sets its duration without `along`: `duration` or `count`.
-        along: Whether the step lasts as long as the motion of the `move` or `fly` around it, in place of its own
-            duration or count.
+        along: Whether the step lasts as long as the path of the `move` around it, in place of its own duration or
+            count. Inside `fly` it is not possible.
     """
 
     duration_key: ClassVar[str] = "duration"

@@ -81,7 +81,7 @@ class Procedure(catalog.Named):
             rejected.
         places: Positions of robots in additional roles, by role.
         on_abort: What a drone does when a repeat is aborted, by role: `land` where it is, or `return`; see
-            [MAVLink](mavlink.md#where-a-trial-is-cut-short).
+            [MAVLink](mavlink.md#when-a-trial-is-cut-short).
         expect: List of [expectations](values.md#expectations).
         steps: The steps of a repeat, in order; each entry has one key, the kind of step.
     """

@@ -106,7 +106,7 @@ class EmulatedOptions(Strict):
             `builtin`.
         ros2: How robots with ROS 2 discover each other.
         robots: Variants of tools, by robot; the default is what this machine has. See [add a
-            robot](add-a-robot.md#tools-of-another-kind).
+            robot](add-a-robot.md#variants-of-tools).
         world: The world around the robots: a file in the folder `worlds/` of the lab, or a shipped one (`lawn`,
             `baylands`, `open`). See [world file](world-file.md).
         radio: The radio between the robots: Wi-Fi in that world, unless one of `loss`, `delay`, `rate` and `jitter`

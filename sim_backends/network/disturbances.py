@@ -28,14 +28,14 @@ class LinkCut:
     """Two nodes are out of range of each other, in both directions.
 
     Attributes:
-        one: One of the nodes.
-        other: The other node.
+        first: One of the nodes.
+        second: The other node.
         begin_ns: Start time.
         end_ns: End time; None for the end of the run.
     """
 
-    one: str
-    other: str
+    first: str
+    second: str
     begin_ns: int
     end_ns: int | None = None
 

@@ -234,7 +234,7 @@ class RadioNetwork:
         """Apply the disturbances that are active now, after one has started or ended."""
         active_now = active(self._disturbances, self.now_ns)
         off = {disturbance.name for disturbance in active_now if isinstance(disturbance, NodeLoss)}
-        cut = {(link.one, link.other) for link in active_now if isinstance(link, LinkCut)}
+        cut = {(link.first, link.second) for link in active_now if isinstance(link, LinkCut)}
         newly_off, self._off = off - self._off, off
         self._radio.disturb(self.now_ns, off, cut)
         for host in sorted(newly_off):
@@ -271,7 +271,7 @@ class RadioNetwork:
             if isinstance(disturbance, NodeLoss):
                 names.append(disturbance.name)
             elif isinstance(disturbance, LinkCut):
-                names += [disturbance.one, disturbance.other]
+                names += [disturbance.first, disturbance.second]
         for name in names:
             if name not in self._names:
                 raise ConfigurationError(

@@ -31,7 +31,7 @@ class MemoryLink:
         self.messages: dict[int, MessageRate] = {}
 
     def fileno(self) -> int:
-        raise AssertionError("nobody waits for it")
+        raise AssertionError("no test waits for it")
 
     def receive(self) -> Iterator[bytes]:
         coming, self.coming = self.coming, []
@@ -41,7 +41,7 @@ class MemoryLink:
         self.sent.append(frame)
 
     def close(self) -> None:
-        raise AssertionError("nobody closes it")
+        raise AssertionError("no test closes it")
 
 
 def state_from(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState, MemoryLink]:

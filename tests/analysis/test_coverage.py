@@ -75,7 +75,7 @@ def test_shares_cover_for_any_burst_length(
     record_property("said", f"the same by Wilson: {rounded(naive)}")
     low, high = (96.0, 99.5) if (packets, rate) in RARE else BAND
     assert all(low <= percentage <= high for percentage in coverages)
-    assert BAND[0] <= naive[0] <= BAND[1], "Wilson, of losses each by itself"
+    assert BAND[0] <= naive[0] <= BAND[1], "Wilson, of losses independent losses"
     assert naive[-1] < 75, "Wilson, of long bursts"
     assert in_method(f"{packets}", f"{rate:.0%}".replace("%", " %")) == pytest.approx(
         [*coverages, naive[0], naive[-1]], abs=0.8
@@ -178,7 +178,7 @@ def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Call
     assert in_method(f"share lost, bursts of {burst}") == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
 
 
-def humps(share: float, apart: float) -> tuple[Draw, float]:
+def two_modes(share: float, apart: float) -> tuple[Draw, float]:
     """Mixture of two normal distributions, `share` in the lower one; the median is in it, or between equal ones."""
 
     def draw(random: np.random.Generator, shape: tuple[int, ...]) -> Floats:
@@ -190,16 +190,16 @@ def humps(share: float, apart: float) -> tuple[Draw, float]:
 SHAPES: Final[dict[str, tuple[Draw, float]]] = {
     "normal": (lambda random, shape: random.normal(0, 1, shape), 0.0),
     "lognormal, sigma 1": (lognormal(1.0), 1.0),
-    "two humps, 50:50": humps(0.5, 10),
-    "two humps, 60:40": humps(0.6, 10),
-    "two humps, 80:20": humps(0.8, 10),
+    "two modes, 50:50": two_modes(0.5, 10),
+    "two modes, 60:40": two_modes(0.6, 10),
+    "two modes, 80:20": two_modes(0.8, 10),
     "one of three values": (lambda random, shape: random.integers(0, 3, shape).astype(float), 1.0),
     "one of two values, 55:45": (lambda random, shape: (random.random(shape) < 0.45).astype(float), 0.0),
 }
 FEW_AND_MANY: Final = (2, 3, 4, 5, 6, 7, 10, 20, 30)
 
 
-@pytest.mark.parametrize("name", mark_nightly(SHAPES, in_ci=["two humps, 60:40"]))
+@pytest.mark.parametrize("name", mark_nightly(SHAPES, in_ci=["two modes, 60:40"]))
 def test_medians_have_the_assured_coverage_for_any_distribution(
     name: str, record_property: Callable[[str, object], None]
 ) -> None:

@@ -72,7 +72,7 @@ def test_no_line_during_a_question_and_after_the_end() -> None:
     progress.update(STARTED[-1])
     assert progress.is_needed
     progress.update(Request("move a", may_skip=False))
-    progress.update(PhaseStarted("told by another thread"))
+    progress.update(PhaseStarted("reported by another thread"))
     assert not progress.is_needed
     progress.update(Answered(skip=False, note=""))
     assert progress.is_needed

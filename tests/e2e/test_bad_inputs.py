@@ -132,54 +132,57 @@ def two_runs(command: str, **changes: Any) -> Setup:  # noqa: ANN401 (as replace
 TYPED: dict[str, Setup] = {
     "a distance without a unit": typed("trial los 30"),
     "an unknown unit": typed("trial los 30feet"),
-    "a distance of nothing": typed("trial los 0m"),
+    "a distance of zero": typed("trial los 0m"),
     "a duration without a unit": typed("trial los 30ft --record 2"),
-    "a recording of nothing": typed("trial los 30ft --record 0s"),
+    "a recording of zero seconds": typed("trial los 30ft --record 0s"),
     "an unknown procedure": typed("trial lso 30ft"),
     "an unknown backend": typed("trial los 30ft --backend emulatd"),
     "the field backend without a site file": typed("trial los 30ft --backend field"),
-    "a site file that is not there": typed("trial los 30ft --site nope.yaml"),
-    "a folder for trials that cannot be made": typed("trial los 30ft --out /proc/trials"),
+    "a missing site file": typed("trial los 30ft --site nope.yaml"),
+    "a folder for trials that cannot be created": typed("trial los 30ft --out /proc/trials"),
     "an unknown robot profile": typed("robots show turtlebot"),
     "an unknown column": typed("columns show iploss"),
-    "answers that are not there": typed("trial los 30ft --answers nope.txt"),
-    "a report where nothing can be written": lambda lab: (
+    "a missing file of answers": typed("trial los 30ft --answers nope.txt"),
+    "a report in a folder that is not writable": lambda lab: (
         f"report {tables.write(lab, [lawns.row()])} -o /proc/report.html"
     ),
-    "a report into a folder that is not there": typed("report . -o there/report.html"),
-    "a report over another file": lambda lab: (
+    "a report in a missing folder": typed("report . -o there/report.html"),
+    "a report in place of another file": lambda lab: (
         f"report . -o {tables.write(lab, [lawns.row()], 'all.csv').relative_to(lab)}"
     ),
-    "figures where nothing can be written": lambda lab: (
+    "figures in a folder that is not writable": lambda lab: (
         f"report {tables.write(lab, [lawns.row()])} --figures /proc/figures"
     ),
-    "a repeat that is not there": lambda lab: f"report {tables.write(lab, [lawns.row()])} --repeat udp-07",
-    "a folder that is no trial": typed("resume nowhere"),
+    "an unknown repeat": lambda lab: f"report {tables.write(lab, [lawns.row()])} --repeat udp-07",
+    "a folder that is not a trial": typed("resume nowhere"),
     "a folder without a manifest": typed("verify ."),
-    "a format that nobody writes": typed("export . --format parket -o out.parquet"),
-    "an export over a file": lambda lab: ((lab / "out.csv").write_bytes(b""), "export . --format csv -o out.csv")[1],
-    "an export into a folder that is not there": typed("export . --format csv -o there/out.csv"),
+    "an unknown format": typed("export . --format parket -o out.parquet"),
+    "an export to an existing file": lambda lab: (
+        (lab / "out.csv").write_bytes(b""),
+        "export . --format csv -o out.csv",
+    )[1],
+    "an export to a missing folder": typed("export . --format csv -o there/out.csv"),
     "several trials in one MCAP file": typed("export one other --format mcap -o out.mcap"),
     "two runs that are not comparable": two_runs("compare a b", procedure_sha256="ffff"),
-    "two runs with nothing in common": two_runs("compare a b", distance_m=16.764),
-    "a threshold for no quantity": two_runs("compare a b --threshold iploss=2%"),
-    "a threshold for a quantity that nobody measured": two_runs("compare a b --threshold rtt_loss=2%"),
+    "two runs without a common condition": two_runs("compare a b", distance_m=16.764),
+    "a threshold for an unknown quantity": two_runs("compare a b --threshold iploss=2%"),
+    "a threshold for a quantity that no run has": two_runs("compare a b --threshold rtt_loss=2%"),
     "a threshold without a value": two_runs("compare a b --threshold ip_loss"),
     "a threshold without a unit": two_runs("compare a b --threshold ip_loss=2"),
-    "a threshold of nothing": two_runs("compare a b --threshold ip_loss=0%"),
-    "a lab that is not up": typed("lab ps"),
-    "a lab of no robots": typed("lab up --robots 0"),
+    "a threshold of zero": two_runs("compare a b --threshold ip_loss=0%"),
+    "a lab that is not running": typed("lab ps"),
+    "a lab without robots": typed("lab up --robots 0"),
     "a lab of a backend that cannot start robots": site(FIELD, command="lab up --backend field"),
-    "a figure of no known kind": typed("lab plot -o lab.gif"),
+    "a figure with an unknown suffix": typed("lab plot -o lab.gif"),
 }
 
 WRITTEN: dict[str, Setup] = {
     "a key with a typo": site(LAB, "robots:", "robotz:"),
-    "a key that is missing": site(LAB, "{profile: duckiedrone}", "{}"),
+    "a missing key": site(LAB, "{profile: duckiedrone}", "{}"),
     "a key written twice": site(LAB, "roles:", "backend: emulated\nroles:"),
-    "a profile that nobody wrote": site(LAB, "duckiedrone}", "duckydrone}"),
-    "a world that nobody wrote": site(LAB + "emulated: {world: lwn}\n"),
-    "a role for a robot that is not there": site(LAB, "sender: turtlebot-1", "sender: turtlebot-9"),
+    "an unknown profile in a site file": site(LAB, "duckiedrone}", "duckydrone}"),
+    "an unknown world": site(LAB + "emulated: {world: lwn}\n"),
+    "a role of an unknown robot": site(LAB, "sender: turtlebot-1", "sender: turtlebot-9"),
     "one robot in two roles": site(LAB, "receiver: turtlebot-2", "receiver: turtlebot-1"),
     "one machine under two names": site(
         LAB,
@@ -210,8 +213,8 @@ WRITTEN: dict[str, Setup] = {
     ),
     "a robot without a host in the field": site(LAB, "backend: emulated", "backend: field"),
     "a password in the site file": site(LAB, "{profile: duckiedrone}", "{profile: duckiedrone, password: s3same}"),
-    "a file that is no UTF-8": lambda lab: ((lab / "fieldkit.yaml").write_bytes(b"backend: \xff"), DRY)[1],
-    "a step of no kind": own("procedures", "los", "  - ping:", "  - pong:"),
+    "a file that is not UTF-8": lambda lab: ((lab / "fieldkit.yaml").write_bytes(b"backend: \xff"), DRY)[1],
+    "an unknown kind of step": own("procedures", "los", "  - ping:", "  - pong:"),
     "a step for a role that does not exist": own("procedures", "los", "{robot: sender", "{robot: senderr"),
     "a payload that no packet can carry": own("procedures", "los", "udp: 8192", "udp: 65508"),
     "a second step of a kind": own(
@@ -220,7 +223,7 @@ WRITTEN: dict[str, Setup] = {
     "one robot that captures twice": own(
         "procedures", "los", "robots: [sender, receiver]", "robots: [sender, sender]"
     ),
-    "a variable that no for: has": own(
+    "an unknown variable": own(
         "procedures",
         "los",
         "        - ping: {",
@@ -233,12 +236,12 @@ WRITTEN: dict[str, Setup] = {
         "        - transfer: {name: more, from: sender, to: receiver}\n        # The",
     ),
     "a received file named as the bag": own("procedures", "los", "into: recv.bag", "into: scan.bag"),
-    "a rate that is no rate": own("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
-    "a profile under another name": own("robots", "duckiedrone", "name: duckiedrone", "name: drone"),
+    "a rate without a unit": own("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
+    "a profile whose name differs from its file": own("robots", "duckiedrone", "name: duckiedrone", "name: drone"),
     "a record command without its topics": own("robots", "turtlebot3_burger", '"{topics}"]', "]"),
     "a campaign without a seed": campaign("seed: 7\n", ""),
     "one distance twice": campaign("20ft", "3.048m"),
-    "a trial left out that there is not": campaign("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]"),
+    "an exception that matches no trial": campaign("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]"),
     "a walk that is too short": campaign("seed: 7", "seed: 7\nwalk: 12m"),
     "a campaign file that changed": campaign("seed: 7", "seed: 8", started=True),
 }
@@ -298,26 +301,26 @@ def add_journal_entry(trial: Path) -> None:
 
 
 READ: dict[str, Setup] = {
-    "a path that is not there": typed("aggregate nowhere"),
+    "a missing path": typed("aggregate nowhere"),
     "a folder without a trial": typed("aggregate ."),
     "a table of something else": lambda lab: ((lab / "a.csv").write_text("time,x\n1,2\n"), "aggregate a.csv")[1],
-    "a line that is torn": read(*tables.repeats(tables.ROW, 3), cut=20),
-    "a cell that is no number": read(replace(tables.ROW, distance_m="near")),
+    "a truncated line": read(*tables.repeats(tables.ROW, 3), cut=20),
+    "a cell that is not a number": read(replace(tables.ROW, distance_m="near")),
     "a table of a newer fieldkit": read(replace(tables.ROW, schema_version=99)),
     "two copies of a trial that differ": read(tables.ROW, other=replace(tables.ROW, transfer_s=2.0)),
     "trials in which no repeat has ended": with_empty_trial("aggregate trials"),
-    "trials whose tables are gone": with_empty_trial("aggregate trials", with_table=False),
+    "trials whose tables were deleted": with_empty_trial("aggregate trials", with_table=False),
     "a table without a line": lambda lab: (read()(lab), "aggregate trials/a/trial.csv")[1],
     "a table alone to rebuild from": read(tables.ROW, options="--rebuild"),
-    "a column that tells no conditions": read(tables.ROW, options="--by distanse"),
-    "a quantity that is none": read(tables.ROW, options="--quantity ip_los"),
+    "an unknown column in --by": read(tables.ROW, options="--by distanse"),
+    "an unknown quantity": read(tables.ROW, options="--quantity ip_los"),
     "a width without a unit": read(tables.ROW, options="--width 2"),
-    "a width for none of the quantities": read(tables.ROW, options="--width 1ms --quantity ip_loss"),
-    "a paper's table of what nobody measured": read(tables.ROW, options="--format latex --quantity jitter_s"),
+    "a width with the unit of another quantity": read(tables.ROW, options="--width 1ms --quantity ip_loss"),
+    "a LaTeX table of a quantity without values": read(tables.ROW, options="--format latex --quantity jitter_s"),
     "a link in the folder of a trial": with_changed_trial("rebuild a", replace_table_by_link),
-    "evidence that is not what was measured": with_changed_trial("rebuild a", add_evidence),
-    "a journal of what cannot have happened": with_changed_trial("rebuild a", add_journal_entry),
-    "a manifest that is none": with_changed_trial(
+    "evidence that was changed after the measurement": with_changed_trial("rebuild a", add_evidence),
+    "a journal with an impossible entry": with_changed_trial("rebuild a", add_journal_entry),
+    "a file that is not a manifest": with_changed_trial(
         "verify a", lambda trial: (trial / store.MANIFEST_FILE).write_text("x\n", encoding="utf-8")
     ),
 }

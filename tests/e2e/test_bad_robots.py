@@ -125,23 +125,23 @@ def unused_address(lab: Testbed) -> str:
 
 
 ON_ROBOTS: dict[str, Setup] = {
-    "a host name that nobody knows": site(r"host: 127.0.0.1", "host: turtlebot.invalid"),
+    "an unknown host name": site(r"host: 127.0.0.1", "host: turtlebot.invalid"),
     "a robot that does not listen": closed_port,
     "a wrong user": site("user: root", "user: pi"),
-    "a login key that the robot does not know": unknown_login,
-    "a login key that is not there": site(r"key: \S+login", "key: /no/such/key"),
+    "a login key that is not authorized on the robot": unknown_login,
+    "a missing login key": site(r"key: \S+login", "key: /no/such/key"),
     "a host key that changed": changed_key,
-    "a host key that is none": site(r"host_key: [^}]*", "host_key: AAAA"),
+    "an invalid host key": site(r"host_key: [^}]*", "host_key: AAAA"),
     "an address that the robot does not have": site("address: 10.42.0.1", "address: 10.42.0.77"),
     "an interface that the robot does not have": profile("interface: wlan0", "interface: wlan7"),
-    "a tool that the robot lacks": profile("netcat: nc.traditional", "netcat: nc.imaginary"),
-    "a setup file that is not there": profile("/opt/ros/noetic/setup.bash", "/opt/ros/melodic/setup.bash"),
+    "a missing tool": profile("netcat: nc.traditional", "netcat: nc.imaginary"),
+    "a missing setup file": profile("/opt/ros/noetic/setup.bash", "/opt/ros/melodic/setup.bash"),
     "no right to capture": profile("capture_right: direct", "capture_right: sudo"),
-    "a port that is taken": port_taken,
+    "a port that is in use": port_taken,
     "a job left by another trial": leftover,
     "a robot whose disk is full": full_robot,
-    "a topic that is silent": procedure("[/scan]", "[/nothing]"),
-    "nobody to place the robots": unused_address,
+    "a topic without messages": procedure("[/scan]", "[/nothing]"),
+    "no person to place the robots": unused_address,
 }
 
 

@@ -297,7 +297,7 @@ def test_added_positions_replace_the_testbeds_track(trial: Path) -> None:
     lines = "".join(f"{at_s:.6f},48.1,{11 + number},\n" for number, at_s in enumerate(times_s))
     (trial.parent / "walk.csv").write_text(f"t_s,lat,lon,note\n{lines}")
     assert main(["positions", str(trial), f"receiver={trial.parent / 'walk.csv'}", "sender=1m,2m"]) == 0
-    read_messages = messages(exported(trial, "told.mcap"))
+    read_messages = messages(exported(trial, "messages.mcap"))
     for message in read_messages:
         jsonschema.validate(message.said, message.schema)
     transforms = [message.said["transforms"][0] for message in of(read_messages, "/tf")]

@@ -392,7 +392,7 @@ def _all_targets() -> Iterator[Target]:
         "tlog", (flight(3), flight(2, lost=lambda at: at % 3 == 1)), partial(_read_file, _measure_tlog, "x.tlog")
     )
     summary = b'{"frames": 203, "left_out": 0, "ended_us": 1795000010000000, "refused": {"32": 2}}\n'
-    yield Target("tlog-told", (summary,), partial(_read_evidence, tlog.read_summary))
+    yield Target("tlog-summary", (summary,), partial(_read_evidence, tlog.read_summary))
     yield Target("topic-log", _topic_logs(), partial(_read_evidence, _measure_topic_log))
     yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_stored("iperf3/3.12/*.json")), _read_printed)
     yield Target("iw", (*_stored("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe_seeds()), _judge_sections, 2)

@@ -64,12 +64,12 @@ class Subject:
             self.restore()
 
 
-def soon() -> Deadline:
+def deadline_soon() -> Deadline:
     return Deadline.after(SOON_S)
 
 
-def said(shell: Shell, *argv: str) -> str:
-    return shell.run(argv, deadline=soon()).stdout.decode()
+def output_of(shell: Shell, *argv: str) -> str:
+    return shell.run(argv, deadline=deadline_soon()).stdout.decode()
 
 
 @contextmanager
@@ -81,7 +81,7 @@ def endless_command(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ..
     try:
         yield ("sh", "-c", f"{first}; echo $$ >endless; exec sleep 600")
     finally:
-        said(shell, "sh", "-c", "kill $(cat endless) 2>/dev/null; rm -f endless")
+        output_of(shell, "sh", "-c", "kill $(cat endless) 2>/dev/null; rm -f endless")
 
 
 @contextmanager
@@ -91,15 +91,15 @@ def waiting_thread(shell: Shell) -> Iterator[Callable[[float], BaseException | N
     Yields a function that returns the thread's error, within a number of seconds.
     """
     with endless_command(shell, first="cat") as argv, ThreadPoolExecutor(1) as pool:
-        session = shell.begin(argv, deadline=soon())
+        session = shell.begin(argv, deadline=deadline_soon())
         ended = pool.submit(session.end, deadline=Deadline.after(2 * SOON_S))
-        said(shell, "sh", "-c", "until [ -s endless ]; do sleep 0.05; done")
+        output_of(shell, "sh", "-c", "until [ -s endless ]; do sleep 0.05; done")
         yield ended.exception
 
 
 def is_responsive(shell: Shell) -> bool:
     try:
-        return said(shell, "echo", "back") == "back\n"
+        return output_of(shell, "echo", "back") == "back\n"
     except LinkError:
         return False
 
@@ -110,7 +110,7 @@ class ShellConformance:
     @pytest.mark.parametrize("code", [0, 1, 3, 124, 255])
     def test_both_streams_and_the_exit_code_arrive(self, subject: Subject, code: int) -> None:
         argv = ("sh", "-c", f"echo out; echo err >&2; exit {code}")
-        completed = subject.shell.run(argv, deadline=soon(), check=False)
+        completed = subject.shell.run(argv, deadline=deadline_soon(), check=False)
         assert (completed.argv, completed.exit_code, completed.stdout, completed.stderr) == (
             argv,
             code,
@@ -120,54 +120,56 @@ class ShellConformance:
 
     def test_a_failed_command_raises_a_robot_error_with_its_output(self, subject: Subject) -> None:
         with pytest.raises(RobotError, match=r"exit code 3.*no bag today"):
-            subject.shell.run(("sh", "-c", "echo no bag today >&2; exit 3"), deadline=soon())
+            subject.shell.run(("sh", "-c", "echo no bag today >&2; exit 3"), deadline=deadline_soon())
 
     def test_a_missing_command_has_exit_code_127(self, subject: Subject) -> None:
-        completed = subject.shell.run(("no-such-program",), deadline=soon(), check=False)
+        completed = subject.shell.run(("no-such-program",), deadline=deadline_soon(), check=False)
         assert completed.exit_code == 127
         assert b"no-such-program" in completed.stderr
 
     def test_arguments_arrive_unchanged(self, subject: Subject) -> None:
         arguments = ["", " ", "a b", "'", '"', "$HOME", "`id`", "\\", "*", "~", "a\nb", "-n", ";", "größe", "机器人"]
-        assert said(subject.shell, "printf", "%s\\0", *arguments).split("\0")[:-1] == arguments
+        assert output_of(subject.shell, "printf", "%s\\0", *arguments).split("\0")[:-1] == arguments
 
     def test_both_streams_may_be_large(self, subject: Subject) -> None:
         script = f"head -c {LARGE_BYTES} /dev/zero >&2 & head -c {LARGE_BYTES} /dev/zero; wait; echo end >&2"
-        completed = subject.shell.run(("sh", "-c", script), deadline=soon())
+        completed = subject.shell.run(("sh", "-c", script), deadline=deadline_soon())
         assert completed.stdout == bytes(LARGE_BYTES)
         assert completed.stderr.endswith(b"\0end\n")
 
     def test_standard_input_may_be_large(self, subject: Subject) -> None:
         data = bytes(range(256)) * (LARGE_BYTES // 256)
-        completed = subject.shell.run(("sha256sum",), stdin=data, deadline=soon())
+        completed = subject.shell.run(("sha256sum",), stdin=data, deadline=deadline_soon())
         assert completed.stdout.split()[0].decode() == hashlib.sha256(data).hexdigest()
 
     def test_the_input_of_a_session_is_closed_when_its_end_is_awaited(self, subject: Subject) -> None:
-        session = subject.shell.begin(("cat",), deadline=soon())
-        assert said(subject.shell, "echo", "meanwhile") == "meanwhile\n"
-        assert session.end(deadline=soon()).exit_code == 0
+        session = subject.shell.begin(("cat",), deadline=deadline_soon())
+        assert output_of(subject.shell, "echo", "meanwhile") == "meanwhile\n"
+        assert session.end(deadline=deadline_soon()).exit_code == 0
 
     def test_silence_does_not_affect_a_working_link(self, subject: Subject) -> None:
         with subject.shell.silence(SOON_S):
-            assert said(subject.shell, "echo", "here") == "here\n"
-        assert said(subject.shell, "echo", "again") == "again\n"
+            assert output_of(subject.shell, "echo", "here") == "here\n"
+        assert output_of(subject.shell, "echo", "again") == "again\n"
 
     def test_commands_run_concurrently(self, subject: Subject) -> None:
         with ThreadPoolExecutor(8) as pool:
             texts = [f"{number}\n" for number in range(8)]
-            assert list(pool.map(lambda text: said(subject.shell, "printf", text), texts)) == texts
+            assert list(pool.map(lambda text: output_of(subject.shell, "printf", text), texts)) == texts
 
     def test_a_file_is_fetched_completely(self, subject: Subject, tmp_path: Path) -> None:
         script = f'head -c {LARGE_BYTES} /dev/urandom >"$HOME/large" && sha256sum "$HOME/large"'
-        digest = said(subject.shell, "sh", "-c", script).split()[0]
+        digest = output_of(subject.shell, "sh", "-c", script).split()[0]
         argv = ("sh", "-c", 'cat "$HOME/large" && rm "$HOME/large"')
-        subject.shell.fetch(argv, tmp_path / "large", deadline=soon(), limit_bytes=LARGE_BYTES)
+        subject.shell.fetch(argv, tmp_path / "large", deadline=deadline_soon(), limit_bytes=LARGE_BYTES)
         assert hashlib.sha256((tmp_path / "large").read_bytes()).hexdigest() == digest
 
     def test_output_beyond_the_limit_raises_a_robot_error(self, subject: Subject, tmp_path: Path) -> None:
         with pytest.raises(RobotError, match="more than 1000 bytes"):
-            subject.shell.fetch(("cat", "/dev/zero"), tmp_path / "endless", deadline=soon(), limit_bytes=1000)
-        assert said(subject.shell, "echo", "on") == "on\n"
+            subject.shell.fetch(
+                ("cat", "/dev/zero"), tmp_path / "endless", deadline=deadline_soon(), limit_bytes=1000
+            )
+        assert output_of(subject.shell, "echo", "on") == "on\n"
 
     def test_an_endless_command_raises_a_link_error_at_the_deadline(self, subject: Subject) -> None:
         with endless_command(subject.shell) as argv:
@@ -175,22 +177,22 @@ class ShellConformance:
             with pytest.raises(LinkError):
                 subject.shell.run(argv, deadline=Deadline.after(1.0))
             assert 1.0 <= time.monotonic() - began_s < 1.0 + NOTICED_S
-        assert said(subject.shell, "echo", "on") == "on\n"
+        assert output_of(subject.shell, "echo", "on") == "on\n"
 
     def test_a_killed_command_raises_a_robot_error(self, subject: Subject) -> None:
         with pytest.raises(RobotError):
-            subject.shell.run(("sh", "-c", "kill -KILL $$"), deadline=soon())
-        assert said(subject.shell, "echo", "on") == "on\n"
+            subject.shell.run(("sh", "-c", "kill -KILL $$"), deadline=deadline_soon())
+        assert output_of(subject.shell, "echo", "on") == "on\n"
 
     def test_close_ends_the_wait_of_another_thread(self, subject: Subject) -> None:
         with waiting_thread(subject.shell) as error:
             subject.shell.close()
             assert isinstance(error(NOTICED_S), LinkError)
-        assert said(subject.shell, "echo", "made again") == "made again\n"
+        assert output_of(subject.shell, "echo", "made again") == "made again\n"
 
     def test_a_detached_job_outlives_the_connection_and_is_collected(self, subject: Subject, tmp_path: Path) -> None:
         shell, folder = subject.shell, jobs.work_folder("conformance", "job-1")
-        jobs.install(shell, soon())
+        jobs.install(shell, deadline_soon())
         evidence.begin(shell, folder, "sender", "lo")
         script = f"head -c {LARGE_FILE_BYTES} /dev/urandom >large.bag; sleep 1; echo done"
         job = Job(folder, "slow", ("sh", "-c", script), limit_s=60.0, log="slow.log")
@@ -203,12 +205,12 @@ class ShellConformance:
         assert (tmp_path / "large.bag").stat().st_size == LARGE_FILE_BYTES
 
     def test_a_session_survives_a_short_link_outage(self, subject: Subject) -> None:
-        session = subject.shell.begin(("sh", "-c", "sleep 1; echo done"), deadline=soon())
+        session = subject.shell.begin(("sh", "-c", "sleep 1; echo done"), deadline=deadline_soon())
         subject.cut()
         timer = threading.Timer(GAP_S, subject.restore)
         timer.start()
         try:
-            assert session.end(deadline=soon()).stdout == b"done\n"
+            assert session.end(deadline=deadline_soon()).stdout == b"done\n"
         finally:
             timer.join()
 
@@ -216,7 +218,7 @@ class ShellConformance:
         with waiting_thread(subject.shell) as error, subject.dead_link():
             assert isinstance(error(NOTICED_S + subject.give_up_s), LinkError)
         # The Shell gives up early to save time; on a busy machine, a new connection may take longer.
-        wait_until(lambda: is_responsive(subject.shell), soon())
+        wait_until(lambda: is_responsive(subject.shell), deadline_soon())
 
 
 class RebootConformance:
@@ -226,9 +228,9 @@ class RebootConformance:
     """
 
     def test_a_robot_is_reachable_after_a_reboot(self, subject: Subject, reboot: Callable[[], object]) -> None:
-        boot = said(subject.shell, "cat", "/proc/sys/kernel/random/boot_id")
+        boot = output_of(subject.shell, "cat", "/proc/sys/kernel/random/boot_id")
         reboot()
-        assert said(subject.shell, "cat", "/proc/sys/kernel/random/boot_id") != boot
+        assert output_of(subject.shell, "cat", "/proc/sys/kernel/random/boot_id") != boot
 
 
 class BackendConformance:
@@ -242,16 +244,18 @@ class BackendConformance:
     def test_each_address_is_on_the_radio_interface_and_routes_use_it(self, testbed: Testbed, cast: Cast) -> None:
         for role, robot in cast.items():
             interface = robot.profile.radio.interface
-            assert f" {robot.address}/" in said(testbed.shells[role], "ip", "-4", "addr", "show", "dev", interface)
+            assert f" {robot.address}/" in output_of(
+                testbed.shells[role], "ip", "-4", "addr", "show", "dev", interface
+            )
             for other in cast.values():
                 if other is not robot:
-                    route = said(testbed.shells[role], "ip", "route", "get", other.address)
+                    route = output_of(testbed.shells[role], "ip", "route", "get", other.address)
                     assert f"dev {interface}" in route
 
     def test_placed_robots_reach_each_other(self, testbed: Testbed, cast: Cast, topology: Topology) -> None:
         for distance in ("10m", "5m"):
             testbed.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
-            said(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
+            output_of(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
 
     def test_the_oracle_of_a_testbed_is_constant(self, testbed: Testbed) -> None:
         assert testbed.oracle is testbed.oracle
@@ -260,7 +264,7 @@ class BackendConformance:
         if testbed.oracle is None:
             return  # a testbed with a real radio has no oracle
         before = testbed.oracle.lateness()
-        said(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
+        output_of(testbed.shells[Role.SENDER], "ping", "-c", "5", "-i", "0.2", cast[Role.RECEIVER].address)
         after = testbed.oracle.lateness()
         assert sum(after.packets.values()) - sum(before.packets.values()) >= 10
         assert before.bound_ns == after.bound_ns > 0
@@ -272,7 +276,7 @@ class BackendConformance:
         before = oracle.delays(*flow)
         assert oracle.delays(*other_flow).packets == 0, "the first query of a flow"
         script = "for n in 1 2 3 4 5; do echo x >/dev/udp/$0/9; sleep 0.1; done"
-        said(testbed.shells[Role.SENDER], "bash", "-c", script, cast[Role.RECEIVER].address)
+        output_of(testbed.shells[Role.SENDER], "bash", "-c", script, cast[Role.RECEIVER].address)
         wait_until(lambda: oracle.delays(*flow).packets >= before.packets + 5, Deadline.after(30))
         after = oracle.delays(*flow)
         assert oracle.delays(*other_flow).packets == 0, "packets to another port belong to another flow"
@@ -296,9 +300,9 @@ class BackendConformance:
             return
         testbed.oracle.record_air(tmp_path)
         try:
-            said(testbed.shells[Role.SENDER], "ping", "-c", "1", cast[Role.RECEIVER].address)
+            output_of(testbed.shells[Role.SENDER], "ping", "-c", "1", cast[Role.RECEIVER].address)
         finally:
             testbed.oracle.record_air(None)
         sizes = {path: path.stat().st_size for path in tmp_path.iterdir()}
-        said(testbed.shells[Role.SENDER], "ping", "-c", "1", cast[Role.RECEIVER].address)
+        output_of(testbed.shells[Role.SENDER], "ping", "-c", "1", cast[Role.RECEIVER].address)
         assert {path: path.stat().st_size for path in tmp_path.iterdir()} == sizes

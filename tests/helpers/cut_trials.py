@@ -126,7 +126,7 @@ def cuts_at_every_sync(disk: Disk, place: Path, *, without: str = "") -> tuple[l
         witness = Witness(out)
 
         def cut(location: str) -> bool:
-            witness.look()
+            witness.record_versions()
             image = disk.image(mounted, place / f"cut-{len(cuts)}.img")
             cuts.append(Cut(image, dict(witness.reported), witness.is_over, f"cut {len(cuts)}, before {location}"))
             locations.append(location)
@@ -189,30 +189,30 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
     with disk.mounted(place / "disk") as mounted, ThreadPoolExecutor() as pool:
         (out := mounted / OUT).mkdir(exist_ok=True)
         witness = Witness(out)
-        witness.look()
+        witness.record_versions()
         witness.reported = dict.fromkeys(witness.versions, 0)  # these versions are on disk and must stay there
         states: list[tuple[dict[str, int], bool]] = []
         cut_requested = threading.Event()
 
         def image() -> Cut:
             cut_requested.wait()
-            ((told, is_over),) = states
-            return Cut(disk.image(mounted, file), told, is_over, f"cut after {after_calls} calls and returns")
+            ((reported, is_over),) = states
+            return Cut(disk.image(mounted, file), reported, is_over, f"cut after {after_calls} calls and returns")
 
         def cut() -> None:
             # The trial may hold any lock here, including one of the thread pool, so no thread is started.
             states.append((dict(witness.reported), witness.is_over))
             cut_requested.set()
 
-        def look(_location: str) -> bool:
-            witness.look()
+        def record(_location: str) -> bool:
+            witness.record_versions()
             return True
 
         cut_result = pool.submit(image)
         try:
-            with at_every_sync(look), at_call(after_calls, cut):
+            with at_every_sync(record), at_call(after_calls, cut):
                 run(out, witness)
-            witness.look()
+            witness.record_versions()
         finally:
             if not states:
                 cut()

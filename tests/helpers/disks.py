@@ -25,7 +25,7 @@ class FileSystem:
         make: Command that makes it, without the file.
         options: Mount options. The file system must not commit automatically during a test, so that only requested
             data reaches the disk: xfs writes its log every 30 s; by default ext4 commits every 5 s, btrfs every 30 s.
-        mend: Command that must repair it after a cut, without the file; empty if mounting repairs it.
+        repair: Command that must repair it after a cut, without the file; empty if mounting repairs it.
     """
 
     name: str

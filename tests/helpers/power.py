@@ -1,4 +1,4 @@
-"""What fieldkit had reported to the user before a power cut, compared with the disk after the cut."""
+"""The files that fieldkit had reported to the user before a power cut, compared with the disk after the cut."""
 
 import hashlib
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ class Witness:
     """Records all versions of files with their final name, and the version of each at the last report to the user.
 
     Args:
-        folder: Folder of the trials; must exist before the first `look`.
+        folder: Folder of the trials; must exist before the first `record_versions`.
     """
 
     folder: Path
@@ -32,7 +32,7 @@ class Witness:
     reported: dict[str, int] = field(default_factory=dict)
     is_over: bool = False
 
-    def look(self) -> None:
+    def record_versions(self) -> None:
         """Record the present versions of all files."""
         for name, content in visible(self.folder).items():
             versions = self.versions.setdefault(name, [])
@@ -42,7 +42,7 @@ class Witness:
     def on_event(self, event: Event) -> None:
         """Record the present versions if an event reports completed work to the user."""
         if isinstance(event, Note | RepeatEnded | TrialEnded):
-            self.look()
+            self.record_versions()
             self.reported |= {name: len(versions) - 1 for name, versions in self.versions.items()}
             self.is_over = isinstance(event, TrialEnded)
 
@@ -53,7 +53,7 @@ class Cut:
 
     Attributes:
         disk: The disk after the cut.
-        told: For each file, the version at the last report to the user.
+        reported: For each file, the version at the last report to the user.
         is_over: True if the end of the trial had been reported.
         at: Description of the time of the cut.
     """

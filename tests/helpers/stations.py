@@ -23,10 +23,10 @@ class FixedPowers(RadioChannel):
         self.noise_mw = [NOISE_MW] * len(names)
         self.sensitivity_mw = [SENSITIVITY_MW] * len(names)
         self._mode = mode
-        self.rows = [[0.0 if one == other else STRONG_MW for other in names] for one in names]
+        self.rows = [[0.0 if receiver == transmitter else STRONG_MW for receiver in names] for transmitter in names]
         for pair in deaf:
-            one, other = (self.names.index(name) for name in pair)
-            self.rows[one][other] = self.rows[other][one] = 0.0
+            first, second = (self.names.index(name) for name in pair)
+            self.rows[first][second] = self.rows[second][first] = 0.0
 
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
         return self.rows[transmitter]

@@ -208,13 +208,13 @@ def test_unfetched_folders_are_not_deleted(robot: Flaky) -> None:
 class HostileShell(LocalShell):
     """A robot that sends any list of large files, and any hashes."""
 
-    def __init__(self, home: Path, large: str, told: bytes = b"") -> None:
+    def __init__(self, home: Path, large: str, hashes: bytes = b"") -> None:
         super().__init__(home)
         (home / "x").write_bytes(b"x")
         digest = hashlib.sha256(b"x").hexdigest()
         (home / ".sums-1").write_text(f"{digest}  x\n", encoding="ascii")
         (home / ".large-1").write_text(large, encoding="utf-8")
-        self.told = told
+        self.hashes = hashes
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         if argv[2] == "pack":
@@ -227,7 +227,7 @@ class HostileShell(LocalShell):
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
         if argv[0] == "tar":
             return super().run(argv, deadline=deadline)
-        return Completed(tuple(argv), 0, self.told, b"")
+        return Completed(tuple(argv), 0, self.hashes, b"")
 
 
 @pytest.mark.parametrize(
@@ -248,8 +248,8 @@ def test_list_of_a_robot_cannot_leave_the_folder_or_fill_the_disk(tmp_path: Path
     home, into = tmp_path / "home", tmp_path / "outer" / "into"
     home.mkdir()
     into.mkdir(parents=True)
-    told = f"{hashlib.sha256(bytes(100)).hexdigest()}  {'x' if 'x' in large else 'y'}\n"
+    hashes = f"{hashlib.sha256(bytes(100)).hexdigest()}  {'x' if 'x' in large else 'y'}\n"
     with pytest.raises((EvidenceError, RobotError), match=said):
-        fetching.fetch(HostileShell(home, large, told.encode()), FOLDER, "sender", "lo", into)
+        fetching.fetch(HostileShell(home, large, hashes.encode()), FOLDER, "sender", "lo", into)
     assert [path.name for path in (tmp_path / "outer").iterdir()] == ["into"]
     assert names(into) <= {"x", ".sender.x.part"}

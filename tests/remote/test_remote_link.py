@@ -113,11 +113,11 @@ class FakeServer:
 
 
 def ssh_server(
-    stream: socket.socket, key: paramiko.PKey, at: str = "never", told: Callable[[], None] = lambda: None
+    stream: socket.socket, key: paramiko.PKey, at: str = "never", on_request: Callable[[], None] = lambda: None
 ) -> paramiko.Transport:
     transport = paramiko.Transport(stream)
     transport.add_server_key(key)
-    transport.start_server(event=threading.Event(), server=HaltingServer(at, told))
+    transport.start_server(event=threading.Event(), server=HaltingServer(at, on_request))
     return transport
 
 

@@ -22,7 +22,7 @@ def at(distance: str, topology: Topology = LOS.topology) -> Plan:
     return LOS.model_copy(update={"distance_m": parsed.metres, "distance": distance, "topology": topology})
 
 
-def test_at_first_a_good_link_is_assumed_and_a_dead_one_stated() -> None:
+def test_the_first_estimate_assumes_a_good_link_and_has_the_time_with_a_dead_link() -> None:
     lasts = of_repeats(LOS, TCP, 20, [])
     assert lasts.likely_s == pytest.approx(20 * LOS.procedure.expected_s(TCP))
     assert lasts.most_s == pytest.approx(lasts.likely_s + 20 * 120.0), "a transfer waits for its limit of 120 s"

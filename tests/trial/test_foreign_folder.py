@@ -22,7 +22,7 @@ from fieldkit.trial.running.stop import Stop
 from tests.helpers import recorded
 from tests.helpers.casts import los_plan
 
-OURS = "ours, and of nobody else's concern\n"
+OURS = "ours, and of no interest to others\n"
 
 
 @pytest.fixture

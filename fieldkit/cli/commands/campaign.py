@@ -1,4 +1,4 @@
-"""`fieldkit campaign FILE`: a day of trials."""
+"""`fieldkit campaign FILE`: run a file of trials."""
 
 import argparse
 from pathlib import Path

@@ -84,7 +84,7 @@ class FlyStep(Nest):
     take-off its autopilot, PX4 or ArduCopter, must report [that it can be
     armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight, but not a
     flight inside them. Adds columns of the flight (`fly_height_median_m` and others,
-    [MAVLink](mavlink.md#what-a-flight-leaves)). Leaves `fly.jsonl`, `fly.log` and `fly.orders`.
+    [MAVLink](mavlink.md#evidence-of-a-flight)). Leaves `fly.jsonl`, `fly.log` and `fly.orders`.
 
     Attributes:
         robot: Role that flies.

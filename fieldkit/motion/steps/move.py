@@ -35,7 +35,7 @@ class MoveStep(Nest):
 
     So all repeats start from the same place. At the end of its path the robot stops and waits. Robots of a lab move
     on the ground of their world, and return instantly; in the field the operator is asked to start the motion and
-    to bring the robot back. Ground robots that [drive by themselves](motion.md) do both, with `--allow-motion`, and
+    to bring the robot back. Ground robots that [fieldkit drives](motion.md) do both, with `--allow-motion`, and
     leave `drive.jsonl`. `--dry-run` describes the path. A move may be inside another one of another robot, with a
     `name` for one of them, since each may leave such a file; a `fault` may be inside a move, but not a move inside
     a fault.
@@ -48,8 +48,8 @@ class MoveStep(Nest):
         within_limits: Whether a robot whose `limits.max_speed_m_s` or `limits.fence_m` are exceeded moves as far and
             as fast as they allow, and stops half a metre before the fence; `trial.yaml` records the actual motion.
             Otherwise the trial is refused.
-        driven: Whether there are columns of how it [drove by itself](motion.md#what-is-kept). A robot that drives by
-            itself always has them.
+        driven: Whether there are columns of its [automatic drive](motion.md#evidence-of-a-drive). A robot that
+            fieldkit drives always has them.
         during: Steps that run meanwhile.
     """
 

@@ -78,12 +78,12 @@ class RecordStep(Step):
         duration: Duration of the recording.
         name: Name of the bag without its extension; names of its job and log begin with it, unless it is `scan`.
         reception: Whether columns report how soon its topics were received, and how regularly: [what a recorder
-            heard](method-delay.md#what-a-recorder-received).
+            received](method-delay.md#what-a-recorder-received).
     """
 
     cross_checks = (
         CrossCheck(
-            "what a bag holds, and when it was heard",
+            "content of a bag, and times of reception",
             ("*",),
             "the bag",
             ("the procedure: topics and duration", "how long the recorder ran"),

@@ -157,7 +157,7 @@ class RunStep(Step):
         limit: A program that runs longer is stopped, and the repeat is void.
         output: File for its standard output.
         prints: Approximate size of the output, for the estimate of disk space.
-        figures: Columns of the repeat, read from the output.
+        figures: Columns of `trial.csv`, each read from the output.
         expect: Conditions without which the repeat is void.
     """
 

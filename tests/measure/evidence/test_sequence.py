@@ -19,7 +19,7 @@ def sent(count: int, first: int = 0) -> list[tuple[int, int]]:
 @given(st.lists(st.booleans(), min_size=10, max_size=900), st.integers(0, 255))
 def test_losses_between_the_first_and_the_last_message_are_counted(lost: list[bool], first: int) -> None:
     arrivals = [message for message, is_lost in zip(sent(len(lost), first), lost, strict=True) if not is_lost]
-    # A second without a message, where the number alone does not tell it, has tests of its own.
+    # A second without a message, which the number alone does not show, has tests of its own.
     if not arrivals or max((after[0] - before[0] for before, after in pairwise(arrivals)), default=0) > 1e6:
         return
     counts = count_messages(arrivals, 0)

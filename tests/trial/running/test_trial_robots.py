@@ -109,7 +109,7 @@ class Rebooted(LocalShell):
         raise RobotError("no job in .jobs/capture", where="turtlebot-1")
 
 
-def test_a_void_attempt_says_that_its_robot_rebooted(tmp_path: Path) -> None:
+def test_a_void_attempt_reports_that_its_robot_rebooted(tmp_path: Path) -> None:
     robots = Robots(los_plan(), IdleTestbed({role: Rebooted(tmp_path) for role in (Role.SENDER, Role.RECEIVER)}))
     robots.begin("x", old=None)
     said = robots.fetch("x", tmp_path, clean=False)
