@@ -47,7 +47,7 @@ class BagContents:
         duration_s: Time from the first message to the last, in seconds.
         compression: Compression of a ROS 2 bag: `none` or `zstd`.
         problems: Its damages, one sentence each.
-        savable: Number of messages that can be recovered; None for a bag without problems.
+        recoverable_messages: Number of messages that can be recovered; None for a bag without problems.
     """
 
     format: BagFormat

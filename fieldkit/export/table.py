@@ -79,7 +79,7 @@ def of_packets(transfers: Mapping[str, Crossings]) -> Table:
         transfers: Packets by name of the step, empty if it has none.
     """
     columns = (
-        Column("step", "text", "Name of the step that sent it; empty where it has none."),
+        Column("step", "text", "Name of the step that sent the packet; empty if the step has no name."),
         *fates.CROSSING_COLUMNS,
     )
     schema = _schema(columns)

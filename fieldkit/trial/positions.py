@@ -30,7 +30,7 @@ class AttemptPositions:
 
     Attributes:
         attempt: Its folder's name.
-        told_by: Sources of the positions; None if there are none, except perhaps the testbed's.
+        source: Sources of the positions, as text; None if there are none besides the testbed.
         distances_m: Smallest and largest distance by measurement: `transfer`, `rtt`, `up.rtt`.
         missing: Reasons for missing distances, by measurement.
     """

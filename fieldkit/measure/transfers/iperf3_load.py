@@ -144,7 +144,7 @@ JITTER: Final = columns(
     (
         "iperf3_captured_variation_p95_s",
         "s",
-        "95th percentile of that.",
+        "95th percentile of the datagrams' delay relative to the fastest (RFC 5481). Empty for TCP.",
         Figure("iperf3 delay variation, 95 % (RFC 5481, captured)", Kind.MEDIAN, rank=63),
     ),
 )

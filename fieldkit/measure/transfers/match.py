@@ -40,9 +40,9 @@ class Match:
         sent_index: For each received packet the index of the sent packet of which it is a copy; `NONE` if there is no
             such packet in the sender's capture. Shape (m,).
         duplicates: Mask of received packets that are further copies of a packet that had arrived. Shape (m,).
-        doubtful: Mask of ambiguous sent packets: others are equal and were sent at nearly the same time, so that it
-            is unknown which of them arrived in which order. They are matched in the order of sending, so that of n
-            sent and m received, min(n, m) arrived. Shape (n,).
+        ambiguous: Mask of sent packets that cannot be distinguished: others are equal and were sent at nearly the
+            same time, so it is unknown which of them arrived in which order. They are matched in the order of
+            sending: if n were sent and m received, min(n, m) arrived. Shape (n,).
         possible_copy: Mask of received packets that count as arrived but may be copies of another packet, because
             packets with their key arrived closer together than they were sent. Shape (m,).
     """
@@ -165,7 +165,7 @@ def match_keys(
     ambiguous = np.zeros(len(key), dtype=np.bool_)
     ambiguous[sent_order] = (~is_clear & (received_count > 0))[group]
     possible_copy = np.zeros(len(received_key), dtype=np.bool_)
-    # If a single one arrived it cannot be a copy of another, whichever it is.
+    # If only one packet of a group arrived, it cannot be a copy of another.
     possible_copy[received_order] = (~is_clear & ~no_copy & (received_count > 1))[received_group]
     possible_copy &= ~duplicates
     return Match(received_index, sent_index, duplicates, ambiguous, possible_copy)

@@ -26,12 +26,12 @@ _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (
 
 @dataclass(frozen=True)
 class Holder:
-    """Holder of robots, and the purpose; of each text the letters, digits and `._@-` are used, at most 80.
+    """Holder of a lock on robots, and its purpose. Only letters, digits and `._@-` of a text are used, at most 80.
 
     Attributes:
         token: Identifies the trial; a holder with the same token can lock its robots again.
-        who: `user@laptop`, see `runtime.me`.
-        what: The purpose, for example the trial.
+        user: `user@laptop`, see `runtime.me`.
+        purpose: The purpose, for example the trial.
     """
 
     token: str
