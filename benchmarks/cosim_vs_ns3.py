@@ -43,7 +43,7 @@ from sim_backends.world.world import World
 SECONDS: Final = 10.0
 TRACE_S: Final = 20.0
 QUEUE_PACKETS: Final = 100
-BATCH, MOST_RUNS, NARROW = 2, 48, 0.08
+BATCH, MAX_RUNS, NARROW = 2, 48, 0.08
 """Runs per batch, most runs, and the relative half-width of the interval of the ratio at which runs end."""
 RATE_MBIT_S: Final = 2.0
 PAYLOAD_BYTES: Final = 1000
@@ -205,7 +205,7 @@ def measured(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
         runs += pool.map(partial(once, ns3, cell), range(len(runs) + 1, len(runs) + 1 + BATCH))
         newreno, cubic, udp_loss = np.moveaxis(np.array(runs), 2, 0)
         ratio, low, high = ratio_of(newreno[:, -1], newreno[:, -2])
-        if len(runs) >= MOST_RUNS or math.isnan(ratio) or high / low < (1 + NARROW) ** 2:
+        if len(runs) >= MAX_RUNS or math.isnan(ratio) or high / low < (1 + NARROW) ** 2:
             return Row(cell, newreno, cubic, udp_loss)
 
 

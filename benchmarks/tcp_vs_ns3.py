@@ -31,7 +31,7 @@ DELAY_MS: Final = 10
 QUEUE_PACKETS: Final = 100
 SECONDS: Final = 10.0
 SEEDS: Final = 40
-MOST_PACKETS: Final = 20_000
+MAX_PACKETS: Final = 20_000
 AT_S: Final = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 SEGMENT_BYTES: Final = TcpOptions().segment_bytes
 
@@ -78,7 +78,7 @@ segment per 255, the largest value that can be set.
 
 def by_chance(seed: int, data: float, acks: float) -> Losses:
     """Return random losses of these shares, without losses in the handshake, which does not affect the window."""
-    draws = np.random.default_rng(seed).random((2, MOST_PACKETS))
+    draws = np.random.default_rng(seed).random((2, MAX_PACKETS))
     draws[:, :2] = 1
     lost = [np.flatnonzero(row < share).tolist() for row, share in zip(draws, (data, acks), strict=True)]
     return Losses(*lost)
@@ -118,7 +118,7 @@ def ours(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
         script=losing({"a": frozenset(losses.data), "b": frozenset(losses.acks)}),
     )
     transport = wire.transports["tcp"] = Tcp(wire, TcpOptions(congestion=control), log=samples.append)
-    for number in range(MOST_PACKETS):
+    for number in range(MAX_PACKETS):
         transport.send(Packet(number, "a", "b", SEGMENT_BYTES, ("stream", number), 0, 0, "tcp"))
     wire.run(round(seconds * 1e9))
     events: list[tuple[int, str, float]] = []

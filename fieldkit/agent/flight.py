@@ -88,7 +88,7 @@ class OffboardPilot:
         self._loop.state = LANDING
         self._log.phase = "coming down"
         try:
-            with landing_marker(self._plan.unhurried):
+            with landing_marker(self._plan.landing_marker):
                 bring_down(self._loop.session, self._plan.abort, lambda: drone.guided, self._loop.update)
         except Exception:
             log_line(alarm(drone))
@@ -115,7 +115,7 @@ class OffboardPilot:
                 self._return(origin)
         self._start_phase("coming down")
         loop.state = LANDING if loop.has_armed else loop.state
-        with landing_marker(plan.unhurried):
+        with landing_marker(plan.landing_marker):
             bring_down(loop.session, "land", lambda: self._drone.guided, loop.update)
         self._log.end("landed")
         log_line("landed")

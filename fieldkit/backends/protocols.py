@@ -115,11 +115,11 @@ class Oracle(Protocol):
         """
         ...
 
-    def links(self, *, go_on: bool) -> Mapping[Role, Sequence[LinkSample]]:
+    def links(self, *, continue_sampling: bool) -> Mapping[Role, Sequence[LinkSample]]:
         """Return the samples of the robots' links since the last call, five per second, and one of now.
 
         Args:
-            go_on: Whether sampling continues after this call; it starts with the first such call.
+            continue_sampling: Whether sampling continues after this call; it starts with the first such call.
 
         Returns:
             Samples by robot in the order of time. Times are of the laptop's clock; stations are names of robots.

@@ -117,18 +117,18 @@ def interruptible() -> Iterator[Stop]:
                 _say(_ABANDONED)
             return
         if stop.motions.order_stop(_say):
-            stopping = stop.due = True
+            stopping = stop.after_saving = True
             if not stop.saving:
                 raise KeyboardInterrupt
             return
-        if number == signal.SIGINT and stop.patient and not stop.asked:
-            stop.asked = True
+        if number == signal.SIGINT and stop.can_finish and not stop.after_repeat:
+            stop.after_repeat = True
             left = f", about {format_duration(stop.left_s)} more" if stop.left_s else ""
             _say(_FINISHING.format(left=left))
             return
         stopping = True
         _say(_STOPPING)
-        stop.due = True
+        stop.after_saving = True
         if not stop.saving:
             raise KeyboardInterrupt
 

@@ -246,7 +246,7 @@ def _activities_of_moves(evidence: AttemptEvidence) -> Iterator[Activity]:
             yield Activity(f"move {role}", changes[0][0], changes[-1][1], "orange")
 
 
-MOST_SAMPLES: Final = 1500
+MAX_SAMPLES: Final = 1500
 """Most samples of each kind in a panel; of more samples, every k-th is drawn."""
 _TIME: Final = "time [s]"
 _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
@@ -324,7 +324,7 @@ def _topic(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_n
     )
     series = []
     for label, style, at_s, heights in kinds:
-        every_kth = slice(None, None, max(1, -(-len(at_s) // MOST_SAMPLES)))
+        every_kth = slice(None, None, max(1, -(-len(at_s) // MAX_SAMPLES)))
         series.append(Series(label, style, at_s[every_kth], heights[every_kth]))
     yield Panel(
         title=f"delay of {step.name or 'the topic'} beyond its fastest sample",

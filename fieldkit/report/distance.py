@@ -25,7 +25,7 @@ _ASIDE: Final = 0.009
 """Offset of single repeats from the interval of their estimate, as a share of the axis."""
 _FEWEST_JOINED: Final = 4
 """Fewest distances whose points are joined. A line through fewer suggests a curve that was not measured."""
-_MOST_WIDE: Final = 2
+_MAX_WIDE: Final = 2
 """Most panels of a chart of several steps that are drawn large."""
 _MARGIN: Final = 0.06
 """Margin at each end of the axis, as a share of the axis."""
@@ -145,7 +145,7 @@ class _CurveDrawing:
                 self._panel(title, places, y_label, of_protocols[wording.text(places[0].cell, "protocol")])
                 for title, places in groups.items()
             ],
-            is_dense=several and len(groups) > _MOST_WIDE,
+            is_dense=several and len(groups) > _MAX_WIDE,
         )
 
     def _places(self, quantity: Quantity, group: Sequence[Cell], factor: float) -> list[_CurvePlace]:

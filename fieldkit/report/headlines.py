@@ -65,9 +65,9 @@ def _lab_columns(plan: Plan) -> Iterator[str]:
 _OF_PROTOCOLS: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
 _OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
 """Quantities of trials that stream topics, in which pings and transfers only serve clocks and load."""
-_MOST_FIRST: Final = 6
+_MAX_FIRST: Final = 6
 """Most headlines of expected quantities and of a lab's quantities."""
-_MOST_PLACES: Final = 3
+_MAX_PLACES: Final = 3
 _COUNT_TEXTS: Final = {
     "silent": "nothing arrived in {}",
     "failed": "{} failed",
@@ -121,7 +121,7 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
     """
     writer = _HeadlineWriter(evidence, Ranking(evidence), wording.differing(cells))
     yield writer.repeats(cells, unmeasured)
-    first = writer.ranking.first(measured(cells))[:_MOST_FIRST]
+    first = writer.ranking.first(measured(cells))[:_MAX_FIRST]
     for quantity in first:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
         own_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
@@ -256,8 +256,8 @@ def _end(values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Ce
 
 def _first_places(places: Sequence[str]) -> str:
     """Return the first places, and the number of further ones."""
-    more = len(places) - _MOST_PLACES
-    return "; ".join((*places[:_MOST_PLACES], *([f"{more} more"] if more > 0 else [])))
+    more = len(places) - _MAX_PLACES
+    return "; ".join((*places[:_MAX_PLACES], *([f"{more} more"] if more > 0 else [])))
 
 
 def _subject(same: Sequence[Quantity], protocol: str, has_topics: bool) -> str:

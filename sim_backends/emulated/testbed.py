@@ -68,9 +68,9 @@ class EmulatedOracle:
         """Implement `Oracle.lateness`."""
         return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self._medium.stats().late)
 
-    def links(self, *, go_on: bool) -> dict[Role, list[LinkSample]]:
+    def links(self, *, continue_sampling: bool) -> dict[Role, list[LinkSample]]:
         """Implement `Oracle.links`."""
-        links = self._medium.links(go_on=go_on)
+        links = self._medium.links(continue_sampling=continue_sampling)
         return {role: links.get(name, []) for role, name in self._names.items()}
 
     def record_air(self, folder: Path | None) -> None:

@@ -212,7 +212,7 @@ class CaptureStep(Nest):
             if not scene.tools(capture.role).immediate_mode:
                 jobs.begin_wait(testbed.shells[capture.role], capture.job, RING_S).end(RING_S + jobs.REPLY_S)
             shell, file = testbed.shells[capture.role], self._file(capture.role)
-            return jobs.stop(shell, capture.job, settle=file, parting=COUNTED)
+            return jobs.stop(shell, capture.job, settle=file, end_text=COUNTED)
 
         return run_parallel(stop, captures)
 

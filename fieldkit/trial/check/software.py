@@ -91,7 +91,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     return _judge_tools(profile, sections.get(_TOOLS, NOTHING), report)
 
 
-def ask_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
+def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
     """Report the agent's findings on requirements of steps; the agent is installed if its Python interpreter exists.
 
     Raises:

@@ -154,7 +154,7 @@ class Attempts:
             yield
         except BaseException as error:
             if not isinstance(error, Exception) or isinstance(error, TestbedLostError):
-                self._robots.hang_up()  # unblocks threads that wait for an answer
+                self._robots.close_connections()  # unblocks threads that wait for an answer
             with suppress(FieldkitError):  # a robot that cannot be reached ends its jobs at their time limits
                 self._robots.end_jobs(started.remote(self._plan.trial))
             if isinstance(error, OSError):

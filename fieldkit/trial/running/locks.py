@@ -80,7 +80,9 @@ def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) ->
     touched: list[Shell] = []
     in_order = sorted(shells.values(), key=lambda shell: shell.robot)
     run_parallel(
-        lambda shell: jobs.install(shell, Deadline.after(REPLY_S)), in_order, hang_up=lambda: _hang_up(in_order)
+        lambda shell: jobs.install(shell, Deadline.after(REPLY_S)),
+        in_order,
+        on_interrupt=lambda: _close_all(in_order),
     )
     try:
         for shell in in_order:
@@ -90,7 +92,7 @@ def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) ->
         yield
     except BaseException as error:
         if not isinstance(error, Exception):
-            _hang_up(touched)
+            _close_all(touched)
         raise
     finally:
         if touched:
@@ -135,7 +137,7 @@ def demand(shell: Shell, token: str) -> None:
     call(shell, "renew", word(token), "0", deadline=Deadline.after(REPLY_S))
 
 
-def _hang_up(shells: Iterable[Shell]) -> None:
+def _close_all(shells: Iterable[Shell]) -> None:
     for shell in shells:
         shell.close()
 

@@ -179,14 +179,14 @@ class Worker:
         if self._channel.fileno() == -1 or self._process.poll() is not None:
             raise self._gone(_ENDED)
 
-    def hang_up(self) -> None:
+    def request_exit(self) -> None:
         """Request that the process exits, without waiting for it; requests under way fail immediately."""
         if self._channel.fileno() != -1:
             self._channel.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Stop the process and wait until it has exited; a second call does nothing."""
-        self.hang_up()
+        self.request_exit()
         with self._lock:
             self._channel.close()
         try:
