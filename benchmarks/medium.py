@@ -167,7 +167,7 @@ def errors(name: str, errors_ms: Sequence[float]) -> Figures:
     return {f"{name}_median_ms": statistics.median(sizes), f"{name}_p99_ms": quantile(sizes, 0.99)}
 
 
-def one_round(seconds: float, probes: int) -> dict[str, Figures]:
+def measure_round(seconds: float, probes: int) -> dict[str, Figures]:
     """Return the figures of one round per path."""
     with ExitStack() as stack:
         ends = stack.enter_context(veth_path())
@@ -194,7 +194,7 @@ def main() -> None:
         (send_probes if options.probe == "send" else receive_probes)(options.probes)
         return
     load_before = os.getloadavg()[0]
-    rounds = [one_round(options.seconds, options.probes) for _ in range(options.rounds)]
+    rounds = [measure_round(options.seconds, options.probes) for _ in range(options.rounds)]
     if options.json:
         print(json.dumps({"load_before": load_before, "rounds": rounds}, indent=2))
         return

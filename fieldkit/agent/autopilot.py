@@ -224,7 +224,7 @@ class AutopilotState:
             self.speed_m_s = math.hypot(*values[3:])
 
     def _on_global_position(self, payload: bytes) -> None:
-        """Process GLOBAL_POSITION_INT; ArduPilot sends zeros if it does not know its position."""
+        """Process GLOBAL_POSITION_INT; ArduPilot sends zeros if its position is unknown."""
         latitude, longitude = struct.unpack_from("<ii", payload, 4)
         if (latitude or longitude) and abs(latitude) <= 90e7 and abs(longitude) <= 180e7:
             self._latitude_longitude, self._latitude_longitude_s = (latitude / 1e7, longitude / 1e7), time.monotonic()

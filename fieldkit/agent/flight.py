@@ -37,7 +37,7 @@ _RISEN_FRACTION = 0.9
 _SET_POINTS_S = 1.0
 """Set-points are sent for this time before the mode that follows them is selected (PX4 user guide, offboard mode)."""
 _COORDINATES_S = 3.0
-"""Timeout for latitude and longitude, which some drones do not know."""
+"""Timeout for latitude and longitude, which some drones do not report."""
 _BOOT_ID = "/proc/sys/kernel/random/boot_id"
 
 

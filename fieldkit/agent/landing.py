@@ -57,8 +57,8 @@ def bring_down(
     Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. The
     first command waits for a new heartbeat, because the mode may have changed since the last one. A drone that lands
     or returns automatically is only monitored. An autopilot without heartbeats may still receive commands, and the
-    connection may be restored: for `NO_HEARTBEAT_S` its last reported mode is assumed, and commands are sent. An alarm
-    is logged as soon as heartbeats are missing.
+    connection may be restored: for `NO_HEARTBEAT_S` its last reported mode is assumed, and commands are sent. A
+    missing heartbeat causes an alarm in the log.
 
     Args:
         session: The session with its autopilot.

@@ -68,7 +68,7 @@ def _is_opaque_mapping(kind: Any) -> bool:  # noqa: ANN401 (any type)
 
 
 SHAPES: Final[dict[str, str]] = {}
-"""Description of the texts that match a pattern, by pattern; see `schema.shaped`."""
+"""Description of the texts that match a pattern, by pattern; see `schema.pattern_field`."""
 
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
 _MAX_SHOWN: Final = 60

@@ -31,7 +31,7 @@ class Mover(Protocol):
 
         Args:
             report: Receives a line for each change of state of the robot.
-            abandoned: Set when the operator does not want to wait any longer.
+            abandoned: Set if the operator cancels the wait.
         """
         ...
 

@@ -17,7 +17,7 @@ IDENTITY: Final = columns.columns(
     ("procedure", "text", "Name of the procedure."),
     ("scenario", "text", "los (line of sight) or nlos (no line of sight)."),
     ("topology", "text", "master (packets pass a relay) or masterless."),
-    ("backend", "text", "Source of the robots: field, emulated, or that of another package."),
+    ("backend", "text", "Backend that provided the robots."),
     ("distance_m", "m", "Planned distance."),
     ("distance", "text", "Distance as the operator wrote it."),
     ("protocol", "text", "Transport protocol: tcp or udp."),
@@ -44,7 +44,7 @@ OTHERS: Final = Column("others", "text", "Robots in further roles of the procedu
 """The column is present only if a procedure has such roles."""
 
 ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS)
-"""Columns that are measured whatever the steps are."""
+"""Columns that are measured with any steps."""
 
 _KINDS_WITH_COLUMNS: Final = ("capture", "transfer", "ping")
 """Kinds of step whose columns are in every trial, in addition to `outage.COLUMNS` of faults.

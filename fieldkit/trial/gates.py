@@ -36,7 +36,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     The evidence of steps inside a fault may be incomplete, because the fault disturbs it. Each column that a step
     declares must have a value or a reason why it is missing; if it has neither, a value was lost and the attempt is
     void. The attempt is also void if a step raises an exception on its evidence: a trial must continue, and must be
-    resumable and rebuildable, whatever a file contains.
+    resumable and rebuildable for any content of its files.
 
     Raises:
         MemoryError: This machine has too little memory; this is not a problem of the evidence.

@@ -27,7 +27,7 @@ class Fate:
         late_ns: How far the receiver had passed `counted_ns` already.
         reason: Why it never arrived; empty if it arrived or is under way.
         position_error_m: Largest error of the relative position that the network assumed for two of the agents that
-            matter for the packet; None if these are source and destination only (`geometry.position_error_m`).
+            matter for the packet; None if these are source and destination only (`packet_ledger.position_error_m`).
     """
 
     packet: Packet

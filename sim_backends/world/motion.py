@@ -106,7 +106,7 @@ def _leg(start: Vector, end: Vector, start_ns: int, end_ns: int) -> tuple[int, i
 
 
 class OnGround:
-    """A motion whose robots stay on the ground, whatever heights it has.
+    """A motion whose robots stay on the ground; the heights of the motion are ignored.
 
     Args:
         motion: The motion.

@@ -295,7 +295,7 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
     shown_numbers, shown_copies = np.unique(subscriber.heads.sequence, return_counts=True)
     known = np.isin(numbers, shown_numbers)
     max_copies = np.ones(len(numbers), dtype=np.int64)
-    if not subscriber.is_tcp:  # TCP delivers every byte once, however often it arrived
+    if not subscriber.is_tcp:  # TCP delivers every byte once, even if it arrived several times
         max_copies[known] = shown_copies[np.searchsorted(shown_numbers, numbers[known])]
     if surplus := int(((copies > max_copies) & (known | subscriber.is_tcp)).sum()):
         yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"

@@ -235,7 +235,7 @@ def measure_stalls(flow: str, load: LoadStreams, sender: Packets | None, receive
     """Return the columns of the stalls of a load; a capture that is missing or damaged is None.
 
     Args:
-        flow: Prefix of the columns' names, as for `stalls.declared`.
+        flow: Prefix of the columns' names, as for `stalls.declare_columns`.
         load: The load.
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.

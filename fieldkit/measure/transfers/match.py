@@ -281,7 +281,7 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
     time to one of them, it is assigned to that one, and the group is clear. In all other groups, each received item
     is assigned to the nearest in time, subject to two conditions: the order is kept, and each item of the smaller
     side, sent or received, is assigned. A group has no copies if each received item is clearly nearest to another
-    sent item, however close they were sent.
+    sent item, even if these were sent close together.
 
     Args:
         group: Group of each sent item, ascending.

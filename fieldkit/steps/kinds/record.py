@@ -83,7 +83,7 @@ class RecordStep(Step):
 
     cross_checks = (
         CrossCheck(
-            "what a bag holds, and when it was heard",
+            "content of a bag, and the times of reception",
             ("*",),
             "the bag",
             ("the procedure: topics and duration", "how long the recorder ran"),

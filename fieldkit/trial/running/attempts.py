@@ -66,7 +66,7 @@ class Attempts:
         self._reached: Status | None = None
 
     def make(self, repeat: RepeatId) -> str:
-        """Make another attempt at a repeat and store it, whatever its result.
+        """Make another attempt at a repeat, and store it with any result.
 
         Returns:
             The remedy of a failed step; empty if none failed.
@@ -148,7 +148,7 @@ class Attempts:
     def _storing_interrupted(self, started: Attempt, partial: Path) -> Iterator[None]:
         """If the body is interrupted, end its jobs and store the attempt as one that does not count.
 
-        Its measurements stay on the robots, and the attempt says so: after a request to stop, nothing is fetched.
+        Its measurements stay on the robots, and its reason states this: after a request to stop, nothing is fetched.
         """
         try:
             yield

@@ -76,7 +76,7 @@ class Robots:
         Programs of the lab are copied now, before the first step, so that the copies do not load the radio later.
 
         Raises:
-            FieldkitError: As for `evidence.begin` and `programs.place`; or a program of the lab has changed.
+            FieldkitError: As for `evidence.begin` and `programs.copy`; or a program of the lab has changed.
         """
         plan = self._plan
         puts = [(put, put.program.content()) for put in plan.puts()]
@@ -212,7 +212,7 @@ class Robots:
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
     def restore_unfetched(self, ended: Attempt, kept: Path) -> None:
-        """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder says so."""
+        """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder is marked so."""
         if ended.status is not Status.VALID and not self.transient:
             for role in self._roles:
                 if (kept / unfetched_file(role)).is_file():

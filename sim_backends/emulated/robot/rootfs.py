@@ -143,7 +143,7 @@ def write_setup(spec: RobotSpec) -> None:
 
 @contextmanager
 def _writable(folder: Path, replaced: set[str]) -> Iterator[Path]:
-    """Yield where files for `folder` must be written: the folder itself, or a mirror of a folder of the host."""
+    """Yield a writable folder for the files of `folder`: the folder itself, or a mirror of a folder of the host."""
     if os.access(folder, os.W_OK):
         yield folder
         return
