@@ -269,12 +269,12 @@ def _subject(same: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
 
 def _chosen(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
     """Return the quantities called `names`, else the first ones, each with the same quantity of other steps."""
-    chosen = [same for name in names if (same := _of_name(quantities, name))]
+    chosen = [same for name in names if (same := _quantities_named(quantities, name))]
     others = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)
-    return chosen or [_of_name(quantities, name) for name in list(others)[: len(names)]]
+    return chosen or [_quantities_named(quantities, name) for name in list(others)[: len(names)]]
 
 
-def _of_name(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
+def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
     """Return the quantity called `name`, or those of named steps if no other step measures it."""
     same = with_plain_name(quantities, name)
     return same[:1] if same and not same[0].step else same

@@ -56,7 +56,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
             result = placed.step.measure(view)
             impossible = dict(_impossible(placed, result))
             if not placed.disturbed:
-                problems += (_of_step(placed, why) for why in placed.step.check(view))
+                problems += (_step_problem(placed, why) for why in placed.step.check(view))
                 problems += _unexplained(placed, result)
                 problems += impossible.values()
             result = result.without(impossible)
@@ -74,7 +74,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     return EvidenceVerdict(tuple(problems), measured)
 
 
-def _of_step(placed: PlacedStep, why: str) -> str:
+def _step_problem(placed: PlacedStep, why: str) -> str:
     """Return a problem of a step's evidence, preceded by the step's name if it has one."""
     return f"{placed.step.prefix}: {why}" if placed.step.prefix else why
 

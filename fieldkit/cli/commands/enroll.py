@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
             "answered",
         )
     _show(address, offered, pinned)
-    if not arguments.yes and not confirmed("pin it", unasked="compare the fingerprints, then add --yes"):
+    if not arguments.yes and not confirmed("pin it", remedy="compare the fingerprints, then add --yes"):
         print_text("not pinned")
         return FieldkitError.exit_code
     pin_host_key(path, name, offered.text)

@@ -194,8 +194,8 @@ class Robots:
         except LinkError as error:
             return error.located, True
         except (RobotError, EvidenceError) as error:
-            return self._rebooted(role) or error.located, not isinstance(error, (NoFolderError, LateError))
-        rebooted = None if clean else self._rebooted(role)
+            return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateError))
+        rebooted = None if clean else self._reboot_message(role)
         return (rebooted, False) if rebooted else None
 
     def mark_unfetched(self, remote: str, into: Path, reason: str) -> None:
@@ -224,7 +224,7 @@ class Robots:
             return {}
         return {self._plan.cast[role].name: folders for role, folders in self._unfetched.items() if folders}
 
-    def _rebooted(self, role: Role) -> str | None:
+    def _reboot_message(self, role: Role) -> str | None:
         """Return a message if a robot rebooted unexpectedly during the attempt; None if it did not, or is unknown."""
         booted = self._boots.get(role) if role not in hosts.restarted(self._plan.procedure) else None
         with suppress(FieldkitError):

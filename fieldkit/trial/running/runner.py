@@ -190,7 +190,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
                         past.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))
                     remaining = [other for other in repeats if not ledger.is_over(other)]
                     # Inside the context, so that a repeat that a stop request let finish is reported too.
-                    sink(_ended(plan, ledger, len(repeats), _remaining_time(plan, remaining, past), remedy))
+                    sink(_repeat_event(plan, ledger, len(repeats), _remaining_time(plan, remaining, past), remedy))
     except BaseException as error:
         if report_resume:
             sink(TrialStopped(str(folder), ledger.done, len(repeats)))
@@ -211,10 +211,10 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
 
 def _show_judgements(judgements: Iterable[Judgement], sink: Sink) -> None:
     for judgement in judgements:
-        sink(_judged(judgement))
+        sink(_judgement_event(judgement))
 
 
-def _judged(judgement: Judgement) -> ExpectationJudged:
+def _judgement_event(judgement: Judgement) -> ExpectationJudged:
     _, protocol, measured, interval, _ = wording.judgement_texts(judgement)
     estimate = judgement.estimate
     return ExpectationJudged(
@@ -243,7 +243,7 @@ def _remaining_time(plan: Plan, remaining: Sequence[RepeatId], past: Sequence[Fi
     return estimates.total(estimates.of_repeats(plan, protocol, counts[protocol], past) for protocol in counts)
 
 
-def _ended(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: str) -> RepeatEnded:
+def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: str) -> RepeatEnded:
     attempt, row = ledger.last
     return RepeatEnded(
         repeat=str(attempt.repeat),
