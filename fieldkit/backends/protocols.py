@@ -108,7 +108,7 @@ class Oracle(Protocol):
         ...
 
     def lateness(self) -> Lateness:
-        """Return by how much packets were later than the model demands, over all packets since the testbed started.
+        """Return the lateness of packets relative to the model, over all packets since the testbed started.
 
         Raises:
             LinkError: The medium did not answer.

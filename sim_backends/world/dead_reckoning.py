@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from sim_backends.world.motion import State
 
 
-def moved_on(state: State, seconds: float) -> State:
+def extrapolate(state: State, seconds: float) -> State:
     """Return the state after this time, at constant velocity."""
     (e, n, u), (v_e, v_n, v_u) = state.position_m, state.velocity_m_s
     return state._replace(position_m=(e + seconds * v_e, n + seconds * v_n, u + seconds * v_u))
@@ -19,7 +19,7 @@ class _Extrapolated(Mapping[str, State]):
         self._seconds = seconds
 
     def __getitem__(self, name: str) -> State:
-        return moved_on(self._states[name], self._seconds)
+        return extrapolate(self._states[name], self._seconds)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._states)

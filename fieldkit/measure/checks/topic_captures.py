@@ -403,7 +403,7 @@ def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_m
 
 
 def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:
-    """Return how many samples are missing in a log by the TCP bytes that arrived, if the capture has no heads."""
+    """Return the number of samples missing in a log by the TCP bytes that arrived, if the capture has no heads."""
     if not subscriber.is_tcp:
         return 0
     max_bytes = plan.size_bytes + plan.envelope_bytes + _OVERHEAD_BYTES

@@ -50,7 +50,7 @@ class MoveStep(Nest):
             Otherwise the trial is refused.
         driven: Whether there are columns of how it [drove by itself](motion.md#what-is-kept). A robot that drives by
             itself always has them.
-        during: Steps that run meanwhile.
+        during: Steps that run at the same time.
     """
 
     leads = True

@@ -119,7 +119,7 @@ class TrackStep(Nest):
     Attributes:
         robots: Source of each robot's position, by role.
         heights: Whether heights above the ellipsoid are used; those of satellite receivers are often wrong by 10 m.
-        during: Steps that run meanwhile.
+        during: Steps that run at the same time.
     """
 
     cross_checks = position_checks.OF_POSITIONS

@@ -27,7 +27,7 @@ from sim_backends.cosim.federates import Action
 from sim_backends.cosim.programs.way_points import PERIOD_NS, NeverSends, PeriodicTimer, drive_towards
 from sim_backends.network.packets import Received
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.world.dead_reckoning import moved_on
+from sim_backends.world.dead_reckoning import extrapolate
 from sim_backends.world.motion import State
 
 TIMEOUT_NS: Final = 1_000_000_000
@@ -66,7 +66,7 @@ class LatestStates:
         """Return the extrapolated states of the agents whose latest state is still valid."""
         latest = (self._latest[name] for name in self._names if name in self._latest)
         return [
-            moved_on(datagram.payload, (now_ns - datagram.sent_ns) / 1e9)
+            extrapolate(datagram.payload, (now_ns - datagram.sent_ns) / 1e9)
             for datagram in latest
             if now_ns - datagram.arrived_ns <= self._timeout_ns
         ]

@@ -413,7 +413,7 @@ class Vehicle:
             self._switch_automatically(Mode.LOITER)
 
     def _rest_m(self) -> Vector:
-        """Return where it comes to rest if it brakes now, or the nearest point inside the fence."""
+        """Return the position at which it stops if it brakes now, or the nearest point inside the fence."""
         return self.fence.nearest_inside(stop_m(self.body, self.limits))
 
     def _stays_down(self) -> bool:

@@ -62,9 +62,9 @@ def pair(
 @pytest.mark.parametrize(
     ("federate", "message"),
     [
-        ("physics", "physics has not answered for 0.25 s: asked to advance from 0.006 s to 0.009 s"),
-        ("network", "network has not answered for 0.25 s: asked to advance from 0.006 s to 0.009 s"),
-        ("program", "the program of a has not answered for 0.25 s: asked to act at 0.012 s"),
+        ("physics", "physics has not answered for 0.25 s: request to advance from 0.006 s to 0.009 s"),
+        ("network", "network has not answered for 0.25 s: request to advance from 0.006 s to 0.009 s"),
+        ("program", "the program of a has not answered for 0.25 s: request to act at 0.012 s"),
     ],
 )
 def test_a_timeout_names_the_federate_and_the_request(federate: str, message: str) -> None:
@@ -214,7 +214,7 @@ def test_a_physics_that_loses_an_agent_is_refused() -> None:
             return states if to_ns < 5 * MS else {"a": states["a"]}
 
     losing = Losing([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
-    with pytest.raises(FederateError, match=r"physics, asked to advance to 0\.006 s, has no state of b"):
+    with pytest.raises(FederateError, match=r"physics, requested to advance to 0\.006 s, has no state of b"):
         pair(physics=losing).advance(1000 * MS)
 
 
