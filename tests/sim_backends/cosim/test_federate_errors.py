@@ -90,7 +90,7 @@ def test_an_error_of_a_policy_that_looks_ahead_has_the_time_that_the_window_has_
                 next(iter(()))
             return situation.now_ns + MS
 
-    with pytest.raises(FederateError, match=r"policy error_bounded failed when .* StopIteration") as raised:
+    with pytest.raises(FederateError, match=r"policy error_bounded failed at the request .* StopIteration") as raised:
         pair(policy=Faulty()).advance(1000 * MS)
     assert "extend the window beyond 0.007 s" in str(raised.value)
 
@@ -160,14 +160,26 @@ class Broken(Disc):
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"physics": Failing(10 * MS)}, r"physics failed when .* from 0\.009 s to 0\.012 s: KeyError: 'wheel'"),
-        ({"network": FailingDisc(1.0, MS)}, r"network failed when .* from 0 s to 0\.003 s: ValueError: no air"),
+        (
+            {"physics": Failing(10 * MS)},
+            r"physics failed at the request .* from 0\.009 s to 0\.012 s: KeyError: 'wheel'",
+        ),
+        (
+            {"network": FailingDisc(1.0, MS)},
+            r"network failed at the request .* from 0 s to 0\.003 s: ValueError: no air",
+        ),
         (
             {"network": Broken(1.0, MS), "policy": EventDriven()},
-            r"network failed when .* its next event after 0 s: ValueError: no heap",
+            r"network failed at the request .* its next event after 0 s: ValueError: no heap",
         ),
-        ({"program": Failing(MS)}, r"the program of a failed when .* act at 0\.005 s: RuntimeError: no plan"),
-        ({"program": Failing(0)}, r"the program of a failed when .* next wake time after 0 s: OSError: no clock"),
+        (
+            {"program": Failing(MS)},
+            r"the program of a failed at the request .* act at 0\.005 s: RuntimeError: no plan",
+        ),
+        (
+            {"program": Failing(0)},
+            r"the program of a failed at the request .* next wake time after 0 s: OSError: no clock",
+        ),
     ],
 )
 def test_a_failure_names_the_federate_and_its_last_time(parts: dict[str, Any], message: str) -> None:
