@@ -222,7 +222,10 @@ def main() -> None:
     if arguments.json:
         print(
             json.dumps(
-                {"load": load, "runs": {name: [vars(each) for each in runs] for name, runs in runs_by_name.items()}}
+                {
+                    "load": load,
+                    "runs": {name: [vars(result) for result in runs] for name, runs in runs_by_name.items()},
+                }
             )
         )
         return

@@ -154,7 +154,7 @@ def main() -> None:
     columns = list(rounds[0][LAYERS[0].name])
     print(f"{'':22}" + "".join(f"{column:>15}" for column in columns))
     for name, first in rounds[0].items():
-        values = {column: statistics.median(each[name][column] for each in rounds) for column in first}
+        values = {column: statistics.median(results[name][column] for results in rounds) for column in first}
         print(
             f"{name:22}"
             + "".join(f"{values[column]:>15.3g}" if column in values else f"{'':>15}" for column in columns)

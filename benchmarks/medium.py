@@ -201,7 +201,9 @@ def main() -> None:
     print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
     print(f"{'':22}{'veth':>28}{'medium':>28}{'medium/veth':>13}{'bare timer':>28}")
     for name in rounds[0]["medium"]:
-        cells = {path: [figures[name] for each in rounds if name in (figures := each[path])] for path in rounds[0]}
+        cells = {
+            path: [figures[name] for results in rounds if name in (figures := results[path])] for path in rounds[0]
+        }
         ratio = statistics.median(cells["medium"]) / statistics.median(cells["veth"])
         texts = {path: spread(values) for path, values in cells.items()}
         print(f"{name:22}{texts['veth']:>28}{texts['medium']:>28}{ratio:>13.2f}{texts['timer']:>28}")

@@ -121,9 +121,9 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
                 label=f"{topology}, {'in sight' if scenario == 'los' else 'behind the wall'}",
                 style=style,
                 x=[feet(cell) + (rank - 1.5) * DODGE_FT for cell in series_cells],
-                y=[factor * each.value for each in estimates],
-                low=[_end(each, each.low, factor) for each in estimates],
-                high=[_end(each, each.high, factor) for each in estimates],
+                y=[factor * item.value for item in estimates],
+                low=[_end(item, item.low, factor) for item in estimates],
+                high=[_end(item, item.high, factor) for item in estimates],
             )
         )
     top = max(1.0 if unit == "%" else 0.0, 1.6 * factor * largest)

@@ -30,7 +30,7 @@ class Ranking:
 
     def __init__(self, evidence: Evidence) -> None:
         plans = list({id(plan): plan for plan in evidence.plans.values()}.values())
-        expectations = [each for plan in plans for each in plan.procedure.expectations]
+        expectations = [expectation for plan in plans for expectation in plan.procedure.expectations]
         self._expected: dict[str, Expectation] = {}
         for expectation in expectations:
             self._expected.setdefault(expectation.quantity, expectation)
@@ -165,7 +165,7 @@ class _HeadlineWriter:
             affected = [
                 (cell, getattr(counts, name), counts.planned) for cell, counts in counted if getattr(counts, name)
             ]
-            affected.sort(key=lambda each: -each[1] / each[2])
+            affected.sort(key=lambda item: -item[1] / item[2])
             places = [
                 f"{wording.condition(cell, differing=self.differing)} ({count} of {total_count})"
                 for cell, count, total_count in affected

@@ -177,12 +177,12 @@ def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> 
 
 def ends(points: Sequence[Point], unit: str) -> tuple[float, float]:
     """Return the ends of an axis for these points. It starts at 0 unless a value is negative, as in dBm."""
-    if min(each.bottom for each in points) < 0:
-        values = [value for each in points for value in (each.value, *each.repeats)]
+    if min(point.bottom for point in points) < 0:
+        values = [value for point in points for value in (point.value, *point.repeats)]
         low, high = min(values), max(values)
         margin = _MARGIN * (high - low) or 1.0
         return low - margin, high + margin
-    largest, highest = max(each.value for each in points), max(each.top for each in points)
+    largest, highest = max(point.value for point in points), max(point.top for point in points)
     top = min(highest, _MAX_LENGTH * largest) if largest > 0 else highest
     return 0.0, max(1.08 * top, _MIN_TOP_PERCENT if unit == "%" else 0.0) or 1.0
 

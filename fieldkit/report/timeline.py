@@ -52,7 +52,7 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
     pings = [
         panel for name, role, output in times.pings for panel in _round_trips(name, role, output, times, zero_ns)
     ]
-    stops_s = [(each.stop_ns - zero_ns) / 1e9 for each in times.activities]
+    stops_s = [(activity.stop_ns - zero_ns) / 1e9 for activity in times.activities]
     stops_s += [float(np.max(series.x)) for panel in pings for series in panel.series if len(series.x)]
     strips = [
         _bars(times, zero_ns),
@@ -109,19 +109,22 @@ def _within(series: Series, right_s: float) -> Series:
 
 def _bars(times: Moments, zero_ns: int) -> Panel:
     """Return a panel with a lane per activity name, the first at the top."""
-    names = list(dict.fromkeys(each.name for each in times.activities))
+    names = list(dict.fromkeys(activity.name for activity in times.activities))
     last = len(names) - 1
-    spans = [(each, (each.start_ns - zero_ns) / 1e9, (each.stop_ns - zero_ns) / 1e9) for each in times.activities]
+    spans = [
+        (activity, (activity.start_ns - zero_ns) / 1e9, (activity.stop_ns - zero_ns) / 1e9)
+        for activity in times.activities
+    ]
     least_s = _MIN_BAR * max(stop for *_, stop in spans)
     return Panel(
         title="activities",
         x_label=_TIME,
         y_label="",
         series=[],
-        words="; ".join(f"{each.name} from {start:.3f} to {stop:.3f} s" for each, start, stop in spans),
+        words="; ".join(f"{activity.name} from {start:.3f} to {stop:.3f} s" for activity, start, stop in spans),
         spans=[
-            Span(last - names.index(each.name), start, max(stop, start + least_s), each.colour)
-            for each, start, stop in spans
+            Span(last - names.index(activity.name), start, max(stop, start + least_s), activity.colour)
+            for activity, start, stop in spans
         ],
         lanes=list(reversed(names)),
     )

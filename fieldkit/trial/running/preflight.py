@@ -97,7 +97,7 @@ def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[R
     """
     checked = check(plan, shells, folder.parent, whole=False)
     findings = checked.findings
-    fields = ((each.robot, each.check, each.status, each.detail, each.remedy) for each in findings)
+    fields = ((finding.robot, finding.check, finding.status, finding.detail, finding.remedy) for finding in findings)
     lines = map("\t".join, fields)
     files.write(folder / store.PREFLIGHT_FILE, "".join(f"{line}\n" for line in lines).encode())
     for finding in findings:

@@ -54,5 +54,5 @@ def make_policy(name: str, **parameters: float) -> SyncPolicy:
         )
     kind = POLICIES[name]
     accepted = inspect.signature(kind).parameters
-    given = {"window_s": _WINDOW_S} | parameters
-    return kind(**{key: value for key, value in given.items() if key in accepted})
+    values = {"window_s": _WINDOW_S} | parameters
+    return kind(**{key: value for key, value in values.items() if key in accepted})
