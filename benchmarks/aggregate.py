@@ -88,12 +88,15 @@ def _lines(draw: np.random.Generator, number: int) -> Iterator[str]:
             counted = zip(quantity.columns, (f"{1 - arrived / SENT:.9g}", str(arrived), str(SENT)), strict=True)
             fixed |= dict(counted)
         drawn = zip(columns, shares[repeat], counts[repeat], strict=True)
-        yield ",".join(fixed.get(column.name) or _drawn(column, *two) for column, *two in drawn) + "\n"
+        yield (
+            ",".join(fixed.get(column.name) or _random_value(column, share, count) for column, share, count in drawn)
+            + "\n"
+        )
 
 
-def _drawn(column: Column, share: float, whole: int) -> str:
+def _random_value(column: Column, share: float, count: int) -> str:
     if column.type is int:
-        return str(whole)
+        return str(count)
     if column.unit == "bool":
         return "true" if share < 0.9 else "false"
     return "" if column.unit in {"text", "hash"} else f"{share:.9g}"
@@ -133,12 +136,12 @@ def run(argv: Sequence[str], out: Path) -> Run:
     return Run(time.perf_counter() - started, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1e3)
 
 
-def by_fieldkit(folder: Path, out: Path) -> Run:
+def run_fieldkit(folder: Path, out: Path) -> Run:
     """Run the command on all trials in a folder."""
     return run([sys.executable, "-m", "fieldkit", "aggregate", str(folder), "--format", "json"], out)
 
 
-def by_pandas(folder: Path, out: Path) -> Run:
+def run_pandas(folder: Path, out: Path) -> Run:
     """Run the peer on all trials in a folder."""
     return run([sys.executable, "-m", "benchmarks.pandas_peer", str(folder)], out)
 
@@ -173,21 +176,21 @@ def rounds(base: Path, counts: Sequence[int], number: int, rows: int) -> dict[st
     runs: dict[str, list[Run]] = {}
     for _ in range(number):
         for count in counts:
-            result = by_fieldkit(base / str(count), base / f"{count}.json")
+            result = run_fieldkit(base / str(count), base / f"{count}.json")
             runs.setdefault(f"fieldkit, {count:,} tables", []).append(result)
         fewest = min(counts)
-        result = by_pandas(base / str(fewest), base / "pandas.json")
+        result = run_pandas(base / str(fewest), base / "pandas.json")
         runs.setdefault(f"pandas and scipy, {fewest:,} tables", []).append(result)
         check(base / f"{fewest}.json", base / "pandas.json")
         if rows:
-            result = by_fieldkit(base / TABLE, base / "table.json")
+            result = run_fieldkit(base / TABLE, base / "table.json")
             runs.setdefault(f"fieldkit, one table of {rows:,} rows", []).append(result)
     return runs
 
 
 def show(runs_by_name: Mapping[str, Sequence[Run]]) -> None:
     """Print a table."""
-    print("| | s, median (lowest to highest) | of the processor (s) | repeats/s | peak memory (MB) |")
+    print("| | s, median (lowest to highest) | processor time (s) | repeats/s | peak memory (MB) |")
     print("| --- | --- | --- | --- | --- |")
     for name, runs in runs_by_name.items():
         walls = [each_run.wall_s for each_run in runs]
@@ -219,7 +222,10 @@ def main() -> None:
     if arguments.json:
         print(
             json.dumps(
-                {"load": load, "runs": {name: [vars(each) for each in runs] for name, runs in runs_by_name.items()}}
+                {
+                    "load": load,
+                    "runs": {name: [vars(result) for result in runs] for name, runs in runs_by_name.items()},
+                }
             )
         )
         return

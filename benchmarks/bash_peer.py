@@ -24,7 +24,7 @@ from sim_backends.emulated.testbed import EmulatedTestbed
 SCRIPT: Final = Path(__file__).with_name("trial_overhead.sh")
 DONE: Final = "done"
 
-_DIES_WITH_US: Final = ("setpriv", "--pdeathsig", "KILL", "--")
+_KILLED_WITH_PARENT: Final = ("setpriv", "--pdeathsig", "KILL", "--")
 _CONNECT_S: Final = 10.0
 # ProxyCommand: without its master connection a client must not connect to the SSH server of this machine.
 _SSH_CONFIG: Final = """\
@@ -53,7 +53,7 @@ class BashPeer:
     def __init__(self, config: Path, words: Sequence[str]) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (`close` closes it)
         self._process = subprocess.Popen(
-            [*_DIES_WITH_US, "bash", str(SCRIPT), str(config), *words],
+            [*_KILLED_WITH_PARENT, "bash", str(SCRIPT), str(config), *words],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
@@ -127,7 +127,7 @@ def _master(robot: EmulatedRobot, config: Path, role: Role, slow: SlowLinks | No
         command_words: tuple[str, ...] = ("nsenter", f"--net=/proc/{robot.pid}/ns/net", "--", *ssh)
     else:
         command_words = (*ssh, "-p", str(slow.port(partial(robot.stream_to, "127.0.0.1", SSH_PORT))))
-    argv = [*_DIES_WITH_US, *command_words, role]
+    argv = [*_KILLED_WITH_PARENT, *command_words, role]
     process = subprocess.Popen(argv, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
         _wait_for_socket(config.parent / role, process)

@@ -83,7 +83,7 @@ class Fleet:
         return RadioNetwork(WifiInWorld(1, RadioOptions(), dict.fromkeys(self.names, ANTENNA), None), self.names)
 
 
-def coordinated(fleet: Fleet, seconds: float) -> tuple[Arrivals, Figures]:
+def run_coordinator(fleet: Fleet, seconds: float) -> tuple[Arrivals, Figures]:
     """Return the arrivals under the coordinator, and its figures."""
     agents = Agents(fleet.physics(), fleet.programs())
     pairs = list(fleet.next_of.items())
@@ -171,7 +171,7 @@ class PlainLoop:
         return packets
 
 
-def plain(fleet: Fleet, seconds: float) -> tuple[Arrivals, float]:
+def run_plain_loop(fleet: Fleet, seconds: float) -> tuple[Arrivals, float]:
     """Return the arrivals in the plain loop, and its processor time."""
     loop = PlainLoop(fleet)
     gc.collect()
@@ -180,7 +180,7 @@ def plain(fleet: Fleet, seconds: float) -> tuple[Arrivals, float]:
     return loop.arrived, time.process_time() - started_s
 
 
-def one_fleet(count: int, seconds: float) -> Figures:
+def measure_fleet(count: int, seconds: float) -> Figures:
     """Return the figures for a number of robots.
 
     Raises:
@@ -188,16 +188,16 @@ def one_fleet(count: int, seconds: float) -> Figures:
     """
     fleet = Fleet(count)
     # The plain loop runs before and after, so that a drift of the machine's speed favours neither.
-    expected, before_s = plain(fleet, seconds)
-    arrivals, measured = coordinated(fleet, seconds)
-    _, after_s = plain(fleet, seconds)
+    expected, before_s = run_plain_loop(fleet, seconds)
+    arrivals, measured = run_coordinator(fleet, seconds)
+    _, after_s = run_plain_loop(fleet, seconds)
     if sorted(arrivals) != sorted(expected):
         raise RuntimeError(f"coordinator and plain loop deliver different packets among {count} robots")
     share_added = 2 * measured["spent_s"] / (before_s + after_s) - 1
     return measured | {"coordinator_adds_percent": 100 * share_added}
 
 
-def one_scenario(name: str) -> Figures:
+def measure_scenario(name: str) -> Figures:
     """Return the figures of a shipped scenario."""
     simulation = build(load_scenario(name))
     started_s = time.process_time()
@@ -222,10 +222,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     load_before = os.getloadavg()[0]
     results = {
-        f"{count} robots": medians(options.rounds, partial(one_fleet, count, options.seconds))
+        f"{count} robots": medians(options.rounds, partial(measure_fleet, count, options.seconds))
         for count in options.robots
     }
-    results |= {name: medians(options.rounds, partial(one_scenario, name)) for name in options.scenarios}
+    results |= {name: medians(options.rounds, partial(measure_scenario, name)) for name in options.scenarios}
     if options.json:
         print(json.dumps({"load_before": load_before, "figures": results}, indent=2))
         return

@@ -42,7 +42,7 @@ from sim_backends.world.world import World
 SECONDS: Final = 10.0
 TRACE_S: Final = 20.0
 QUEUE_PACKETS: Final = 100
-BATCH, MOST_RUNS, NARROW = 2, 48, 0.08
+BATCH, MAX_RUNS, NARROW = 2, 48, 0.08
 """Runs per batch, most runs, and the relative half-width of the interval of the ratio at which runs end."""
 RATE_MBIT_S: Final = 2.0
 PAYLOAD_BYTES: Final = 1000
@@ -188,7 +188,7 @@ class Ns3Link:
         return float(lines[-1].split()[0]), trace
 
 
-def once(ns3: Ns3, cell: Cell, run: int) -> list[list[float]]:
+def run_once(ns3: Ns3, cell: Cell, run: int) -> list[list[float]]:
     """Return per peer the goodputs of NewReno and CUBIC and the loss of UDP, each on a new link."""
 
     def link(peer: Peer) -> Link | Ns3Link:
@@ -197,14 +197,14 @@ def once(ns3: Ns3, cell: Cell, run: int) -> list[list[float]]:
     return [[*(link(peer).tcp(control, SECONDS)[0] for control in CONTROLS), link(peer).udp()[1]] for peer in PEERS]
 
 
-def measured(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
+def measure_link(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
     """Return the results of a link, from as many runs as needed."""
     runs: list[list[list[float]]] = []
     while True:
-        runs += pool.map(partial(once, ns3, cell), range(len(runs) + 1, len(runs) + 1 + BATCH))
+        runs += pool.map(partial(run_once, ns3, cell), range(len(runs) + 1, len(runs) + 1 + BATCH))
         newreno, cubic, udp_loss = np.moveaxis(np.array(runs), 2, 0)
         ratio, low, high = ratio_of(newreno[:, -1], newreno[:, -2])
-        if len(runs) >= MOST_RUNS or math.isnan(ratio) or high / low < (1 + NARROW) ** 2:
+        if len(runs) >= MAX_RUNS or math.isnan(ratio) or high / low < (1 + NARROW) ** 2:
             return Row(cell, newreno, cubic, udp_loss)
 
 
@@ -230,7 +230,7 @@ def rows(ns3: Ns3, wanted: Sequence[str]) -> Iterable[Row]:
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         for cell in cells:
             if any(text in str(cell) for text in wanted):
-                yield measured(ns3, cell, pool)
+                yield measure_link(ns3, cell, pool)
 
 
 def traces(ns3: Ns3) -> dict[Control, tuple[Trace, Trace]]:

@@ -25,7 +25,7 @@ from fieldkit.measure.evidence.ping import parse
 
 RADIOS: Final = {
     "fixed links, 1 Mbit/s": "{rate: 1Mbit/s, delay: 0ms}",
-    "the same, 7,335 km of light": "{rate: 1Mbit/s, delay: 24.467ms}",
+    "the same, propagation over 7,335 km": "{rate: 1Mbit/s, delay: 24.467ms}",
     "Wi-Fi, free space": "{propagation: free-space, fading: false}",
     "Wi-Fi, exponent 2.5": "{exponent: 2.5, fading: false}",
     "Wi-Fi, exponent 3": "{fading: false}",
@@ -72,7 +72,7 @@ def lab(radio: str) -> Iterator[Path]:
             fieldkit(here, "down")
 
 
-def pinged(here: Path) -> Figures:
+def measure_pings(here: Path) -> Figures:
     """Return the results of 100 pings; None for times without a reply, and for the SNR of fixed links."""
     words = ("ping", "-c", str(PINGS), "-i", "0.1", "-W", "1", "-s", "56", f"robot-{ROBOTS}")
     ping_output = parse(fieldkit(here, "shell", "robot-1", *words))
@@ -90,12 +90,12 @@ def pinged(here: Path) -> Figures:
     return {**times, "loss": 100 * (1 - len(rtt_ms) / PINGS), "snr_db": snr_db}
 
 
-def measured(radio: str) -> dict[str, Figures]:
-    """Return one round: the figures before and after the move."""
+def measure_round(radio: str) -> dict[str, Figures]:
+    """Return the figures of one round, before and after the move."""
     with lab(radio) as here:
-        before = pinged(here)
+        before = measure_pings(here)
         fieldkit(here, "move", f"robot-{ROBOTS}", "--by", "100m", "100m", "100m")
-        return dict(zip(POSITIONS, (before, pinged(here)), strict=True))
+        return dict(zip(POSITIONS, (before, measure_pings(here)), strict=True))
 
 
 def spread(values: list[float | None]) -> str:
@@ -115,8 +115,8 @@ def show(rounds: dict[str, list[dict[str, Figures]]]) -> None:
         for name, figures in REFERENCES.items():
             cells = (f"{figures[column][index]:g}" if column in figures else "" for column in names)
             print(f"{name + ', ' + position:38}" + "".join(f"{cell:>24}" for cell in cells))
-        for name, each in rounds.items():
-            cells = (spread([result[position][column] for result in each]) for column in names)
+        for name, results in rounds.items():
+            cells = (spread([result[position][column] for result in results]) for column in names)
             print(f"{name + ', ' + position:38}" + "".join(f"{cell:>24}" for cell in cells))
 
 
@@ -134,7 +134,7 @@ def main() -> None:
     rounds: dict[str, list[dict[str, Figures]]] = {name: [] for name in RADIOS}
     for _ in range(options.rounds):
         for name, radio in RADIOS.items():
-            rounds[name].append(measured(radio))
+            rounds[name].append(measure_round(radio))
     about += f", after: {os.getloadavg()[0]:.2f}"
     if options.json:
         print(json.dumps({"about": about, "radios": RADIOS, "rounds": rounds}, indent=2))

@@ -39,7 +39,7 @@ class Row:
 
     case: str
     passed: bool
-    seen: str
+    observation: str
     lasted_s: float
 
 
@@ -75,18 +75,18 @@ class Bench:
         while True:
             done = self._run("arming", request)
             lines = [json.loads(line) for line in done.stdout.splitlines()]
-            faults = [line["what"] for line in lines if line.get("grave")]
-            if done.returncode == 0 and lines and not faults:
+            problems = [line["what"] for line in lines if line.get("grave")]
+            if done.returncode == 0 and lines and not problems:
                 return f"{lines[-1]['autopilot']}, battery {lines[-1]['charge']}"
             if time.monotonic() > end_s:
-                raise CaseFailed("; ".join(faults) or done.stderr.strip())
+                raise CaseFailed("; ".join(problems) or done.stderr.strip())
             time.sleep(1.0)
 
     def record(self) -> str:
         """Record the telemetry, and count its frames."""
         log = self._folder / "flight.tlog"
         request = json.dumps({"connection": self._connection, "intervals_us": _RATES_US})
-        with self._started("mavlink", request, str(log)) as process:
+        with self._running("mavlink", request, str(log)) as process:
             time.sleep(_RECORD_S)
             process.terminate()
             _, errors = process.communicate(timeout=30)
@@ -98,38 +98,38 @@ class Bench:
     def out_and_back(self) -> str:
         """Fly out and back, and land; compare the log with the plan."""
         with self._flight(end="return") as process:
-            self._order("climb")
-            self._phase(process, "up")
-            self._order("go")
-            self._phase(process, "there")
-            self._order("home")
+            self._write_order("climb")
+            self._wait_for_phase(process, "up")
+            self._write_order("go")
+            self._wait_for_phase(process, "there")
+            self._write_order("home")
             code = process.wait(_FLIGHT_S)
-        high_m, far_m = self._flown()
+        high_m, far_m = self._extent_m()
         if code or abs(high_m - HEIGHT_M) > 0.7 or abs(far_m - AHEAD_M) > 0.7:
-            raise CaseFailed(f"code {code}, {high_m:.1f} m high, {far_m:.1f} m far, {self._last_words()}")
+            raise CaseFailed(f"code {code}, {high_m:.1f} m high, {far_m:.1f} m far, {self._last_log_line()}")
         return f"{high_m:.1f} m high, {far_m:.1f} m far, landed"
 
     def lease_expires(self) -> str:
-        """Stop renewing the orders in the air; check that the drone lands."""
+        """Stop renewing the orders while the drone is in the air; check that the drone lands."""
         with self._flight() as process:
-            self._order("climb", lease_s=60.0)
-            self._phase(process, "up")
-            self._order("stay", lease_s=1.0)
+            self._write_order("climb", lease_s=60.0)
+            self._wait_for_phase(process, "up")
+            self._write_order("stay", lease_s=1.0)
             began_s = time.monotonic()
             code = process.wait(_FLIGHT_S)
-        if not code or "landed" not in self._words():
-            raise CaseFailed(f"code {code}, {self._last_words()}")
+        if not code or "landed" not in self._log_text():
+            raise CaseFailed(f"code {code}, {self._last_log_line()}")
         return f"landed {time.monotonic() - began_s:.0f} s after the last order"
 
-    def terminated(self) -> str:
-        """Terminate the program in the air by SIGTERM; check that the drone lands."""
+    def terminate(self) -> str:
+        """Terminate the program by SIGTERM while the drone is in the air; check that the drone lands."""
         with self._flight() as process:
-            self._order("climb")
-            self._phase(process, "up")
+            self._write_order("climb")
+            self._wait_for_phase(process, "up")
             process.terminate()
             code = process.wait(_FLIGHT_S)
-        if not code or "landed" not in self._words():
-            raise CaseFailed(f"code {code}, {self._last_words()}")
+        if not code or "landed" not in self._log_text():
+            raise CaseFailed(f"code {code}, {self._last_log_line()}")
         return "landed"
 
     @contextmanager
@@ -148,12 +148,12 @@ class Bench:
         }
         if "fence_m" in {field.name for field in fields(FlightPlan)}:
             plan["fence_m"] = 50.0
-        with self._started("fly", json.dumps(plan)) as process:
+        with self._running("fly", json.dumps(plan)) as process:
             yield process
 
     @contextmanager
-    def _started(self, *words: str) -> "Iterator[subprocess.Popen[str]]":
-        with (self._folder / "words").open("w", encoding="utf-8") as stderr:
+    def _running(self, *words: str) -> "Iterator[subprocess.Popen[str]]":
+        with (self._folder / "log").open("w", encoding="utf-8") as stderr:
             argv = (sys.executable, str(self._program), *words)
             process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=stderr, text=True)
             try:
@@ -166,27 +166,27 @@ class Bench:
         argv = (sys.executable, str(self._program), *words)
         return subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
 
-    def _order(self, what: str, lease_s: float = 120.0) -> None:
+    def _write_order(self, what: str, lease_s: float = 120.0) -> None:
         self._orders += 1
         new_file = self._folder / "orders.new"
         new_file.write_text(f"{self._orders} {what} {lease_s:g}\n", encoding="ascii")
         new_file.replace(self._folder / "orders")
 
-    def _words(self) -> str:
-        return (self._folder / "words").read_text(encoding="utf-8")
+    def _log_text(self) -> str:
+        return (self._folder / "log").read_text(encoding="utf-8")
 
-    def _last_words(self) -> str:
-        return (self._words().splitlines() or ["it printed nothing"])[-1]
+    def _last_log_line(self) -> str:
+        return (self._log_text().splitlines() or ["it printed nothing"])[-1]
 
-    def _phase(self, process: "subprocess.Popen[str]", phase: str) -> None:
+    def _wait_for_phase(self, process: "subprocess.Popen[str]", phase: str) -> None:
         """Wait until the program reports a phase of the flight."""
         end_s = time.monotonic() + _FLIGHT_S
-        while phase not in (line.partition(" ")[2] for line in self._words().splitlines()):
+        while phase not in (line.partition(" ")[2] for line in self._log_text().splitlines()):
             if process.poll() is not None or time.monotonic() > end_s:
-                raise CaseFailed(f"not {phase}: {self._last_words()}")
+                raise CaseFailed(f"not {phase}: {self._last_log_line()}")
             time.sleep(0.1)
 
-    def _flown(self) -> tuple[float, float]:
+    def _extent_m(self) -> tuple[float, float]:
         """Return the largest height and distance in the log of positions."""
         lines = (self._folder / "fly.jsonl").read_text(encoding="ascii").splitlines()
         positions = [position for line in lines if (position := _place(json.loads(line))) is not None]
@@ -221,16 +221,16 @@ def rows(connection: str) -> Iterator[Row]:
             "can be armed": bench.check,
             "telemetry is recorded": bench.record,
             "out and back": bench.out_and_back,
-            "orders lapse in the air": bench.lease_expires,
-            "program ended in the air": bench.terminated,
+            "lease expires in the air": bench.lease_expires,
+            "program is terminated in the air": bench.terminate,
         }
         for name, case in cases.items():
             began_s = time.monotonic()
             try:
-                seen, passed = case(), True
+                observation, passed = case(), True
             except (CaseFailed, subprocess.TimeoutExpired) as failure:
-                seen, passed = str(failure), False
-            yield Row(name, passed, seen, time.monotonic() - began_s)
+                observation, passed = str(failure), False
+            yield Row(name, passed, observation, time.monotonic() - began_s)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -238,12 +238,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--connection", required=True, help="as mavlink.connection of a profile")
     connection = parser.parse_args(arguments).connection
-    sys.stdout.write("| case | result | seen | s |\n| --- | --- | --- | --- |\n")
+    sys.stdout.write("| case | result | observation | s |\n| --- | --- | --- | --- |\n")
     failed = False
     for row in rows(connection):
         failed = failed or not row.passed
         result = "passed" if row.passed else "FAILED"
-        sys.stdout.write(f"| {row.case} | {result} | {row.seen} | {row.lasted_s:.0f} |\n")
+        sys.stdout.write(f"| {row.case} | {result} | {row.observation} | {row.lasted_s:.0f} |\n")
         sys.stdout.flush()
     return int(failed)
 

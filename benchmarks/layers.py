@@ -85,7 +85,7 @@ def _places(stations: int) -> dict[str, tuple[float, float, float]]:
     return {_name(number): (1.0 + 0.5 * number, 1.0, 0.3) for number in range(stations)}
 
 
-def engine(layer: Layer, stations: int, packets: int) -> Figures:
+def measure_engine(layer: Layer, stations: int, packets: int) -> Figures:
     """Return the processor time per packet to the first station from all others."""
     model = layer.model(stations)
     receiver, *senders = _places(stations)
@@ -132,10 +132,10 @@ def _parts_ms(parts: DelayParts) -> float:
     return (parts.transmission_ns + parts.propagation_ns + parts.queuing_ns) / 1e6
 
 
-def one_round(packets: int) -> dict[str, Figures]:
+def measure_round(packets: int) -> dict[str, Figures]:
     """Return the figures of one round per layer, and per number of stations with all layers."""
-    figures = {layer.name: {**engine(layer, 2, packets), **round_trips(layer)} for layer in LAYERS}
-    return figures | {f"all, {count} stations": engine(LAYERS[-1], count, packets) for count in STATIONS}
+    figures = {layer.name: {**measure_engine(layer, 2, packets), **round_trips(layer)} for layer in LAYERS}
+    return figures | {f"all, {count} stations": measure_engine(LAYERS[-1], count, packets) for count in STATIONS}
 
 
 def main() -> None:
@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     load_before = os.getloadavg()[0]
-    rounds = [one_round(options.packets) for _ in range(options.rounds)]
+    rounds = [measure_round(options.packets) for _ in range(options.rounds)]
     if options.json:
         print(json.dumps({"load_before": load_before, "rounds": rounds}, indent=2))
         return
@@ -154,7 +154,7 @@ def main() -> None:
     columns = list(rounds[0][LAYERS[0].name])
     print(f"{'':22}" + "".join(f"{column:>15}" for column in columns))
     for name, first in rounds[0].items():
-        values = {column: statistics.median(each[name][column] for each in rounds) for column in first}
+        values = {column: statistics.median(results[name][column] for results in rounds) for column in first}
         print(
             f"{name:22}"
             + "".join(f"{values[column]:>15.3g}" if column in values else f"{'':>15}" for column in columns)

@@ -1,6 +1,6 @@
 """Overhead of the ledger in trials of many repeats: `python -m benchmarks.ledger`; needs no root.
 
-The trials have one ping per repeat, with generated evidence instead of robots. Measured is the wall time, disk
+The trials have one ping per repeat, with generated evidence instead of robots. The result is the wall time, disk
 included, for storing an attempt (files, journal, row, table, manifest), as the mean over all attempts and over the
 last hundred; for opening the trial again as `fieldkit resume` does, which reads all evidence; for reading the number
 of finished repeats; and for storing the next ten attempts. `--keep FOLDER` keeps the trials in that folder, and

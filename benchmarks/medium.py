@@ -167,7 +167,7 @@ def errors(name: str, errors_ms: Sequence[float]) -> Figures:
     return {f"{name}_median_ms": statistics.median(sizes), f"{name}_p99_ms": quantile(sizes, 0.99)}
 
 
-def one_round(seconds: float, probes: int) -> dict[str, Figures]:
+def measure_round(seconds: float, probes: int) -> dict[str, Figures]:
     """Return the figures of one round per path."""
     with ExitStack() as stack:
         ends = stack.enter_context(veth_path())
@@ -194,14 +194,16 @@ def main() -> None:
         (send_probes if options.probe == "send" else receive_probes)(options.probes)
         return
     load_before = os.getloadavg()[0]
-    rounds = [one_round(options.seconds, options.probes) for _ in range(options.rounds)]
+    rounds = [measure_round(options.seconds, options.probes) for _ in range(options.rounds)]
     if options.json:
         print(json.dumps({"load_before": load_before, "rounds": rounds}, indent=2))
         return
     print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
     print(f"{'':22}{'veth':>28}{'medium':>28}{'medium/veth':>13}{'bare timer':>28}")
     for name in rounds[0]["medium"]:
-        cells = {path: [figures[name] for each in rounds if name in (figures := each[path])] for path in rounds[0]}
+        cells = {
+            path: [figures[name] for results in rounds if name in (figures := results[path])] for path in rounds[0]
+        }
         ratio = statistics.median(cells["medium"]) / statistics.median(cells["veth"])
         texts = {path: spread(values) for path, values in cells.items()}
         print(f"{name:22}{texts['veth']:>28}{texts['medium']:>28}{ratio:>13.2f}{texts['timer']:>28}")

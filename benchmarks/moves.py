@@ -1,8 +1,8 @@
 """Cost of a move in the medium, by the number of robots: `python -m benchmarks.moves [--json]`, as root.
 
-Per world and number of robots, one robot is moved repeatedly by 0.1 m. Measured are the medium's processor time per
-move, and the time until its answer, during which it carries no packets. The reference moves all robots in each step,
-so that all links are computed.
+For each world and number of robots, it moves one robot repeatedly by 0.1 m, and measures the medium's processor time
+per move, and the time until its answer, during which it carries no packets. The reference moves all robots in each
+step, so that all links are computed.
 """
 
 import argparse
@@ -29,7 +29,7 @@ _TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
 Figures = dict[str, float]
 
 
-def moved(world: str, size: int, radio: RadioOptions, *, move_all: bool) -> Figures:
+def measure_moves(world: str, size: int, radio: RadioOptions, *, move_all: bool) -> Figures:
     """Return the cost of a step with `size` robots, 5 m apart, of which one or all move."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(radio, load_world(world), seed=1))
@@ -76,7 +76,7 @@ def main() -> None:
             for size in options.sizes:
                 for moving in ("one", "all"):
                     key = f"{world}, {name}, {size} robots, {moving} moving"
-                    table[key] = moved(world, size, radio, move_all=moving == "all")
+                    table[key] = measure_moves(world, size, radio, move_all=moving == "all")
                     if not options.json:
                         print(f"{key:44}" + "".join(f"{what} {value:8.3f}  " for what, value in table[key].items()))
     if options.json:

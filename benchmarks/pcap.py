@@ -95,7 +95,7 @@ def write_captures(folder: Path) -> tuple[Path, Path]:
     return paths
 
 
-def by_fieldkit(sender: Path, receiver: Path) -> int:
+def losses_by_fieldkit(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets."""
     sent, received = pcap.read(sender).packets, pcap.read(receiver).packets
     transfer_measures.paper_frames_from(sent, TRANSFER.sender_address, TRANSFER.port)
@@ -109,7 +109,7 @@ def lost(sent: Iterable[Key], received: Iterable[Key]) -> int:
     return (Counter(sent) - Counter(received)).total()
 
 
-def by_dpkt(sender: Path, receiver: Path) -> int:
+def losses_by_dpkt(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets."""
     return lost(*(list(_keys_by_dpkt(path)) for path in (sender, receiver)))
 
@@ -121,7 +121,7 @@ def _keys_by_dpkt(path: Path) -> Iterator[Key]:
             yield ip.id, ip.offset
 
 
-def by_tshark(sender: Path, receiver: Path) -> int:
+def losses_by_tshark(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets."""
     return lost(*(list(_keys_by_tshark(path)) for path in (sender, receiver)))
 
@@ -145,7 +145,7 @@ def _keys_by_tshark(path: Path) -> Iterator[Key]:
         yield int(columns[3], 16), int(columns[4])
 
 
-def by_scapy(sender: Path, receiver: Path) -> int:
+def losses_by_scapy(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets among the first ones."""
     sent = list(_keys_by_scapy(sender))
     return lost(sent, _keys_by_scapy(receiver))
@@ -236,16 +236,16 @@ def rates(folder: Path, rounds: int) -> dict[str, list[float]]:
         first_packets(all_captures[1], int(SCAPY_PACKETS * (1 - LOSS))),
     )
     peers: dict[str, tuple[Peer, tuple[Path, Path]]] = {
-        "fieldkit": (by_fieldkit, all_captures),
-        "dpkt": (by_dpkt, all_captures),
+        "fieldkit": (losses_by_fieldkit, all_captures),
+        "dpkt": (losses_by_dpkt, all_captures),
     }
     if shutil.which("tshark"):
-        peers["tshark"] = (by_tshark, all_captures)
-    peers["scapy"] = (by_scapy, first_captures)
+        peers["tshark"] = (losses_by_tshark, all_captures)
+    peers["scapy"] = (losses_by_scapy, first_captures)
     packets = {
         captures: sum(pcap.read(path).frames for path in captures) for captures in (all_captures, first_captures)
     }
-    expected = {captures: by_fieldkit(*captures) for captures in (all_captures, first_captures)}
+    expected = {captures: losses_by_fieldkit(*captures) for captures in (all_captures, first_captures)}
     rates_by_peer: dict[str, list[float]] = {name: [] for name in peers}
     for _ in range(rounds):
         for name, (peer, captures) in peers.items():

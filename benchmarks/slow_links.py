@@ -32,7 +32,8 @@ class _Direction:
     Attributes:
         source: Socket from which bytes are read.
         sink: Socket to which they are written.
-        flight: Delayed chunks: due time, trip number, and the bytes, empty for the end.
+        flight: Delayed chunks: due time, trip number, and the bytes, which are empty at the end of the stream.
+        ended: Whether the source has reached its end.
     """
 
     source: socket.socket

@@ -24,16 +24,16 @@ from tests.helpers.motion_truth import MotionSampler, stopped_s
 from tests.helpers.rovers import RoverLab, rover_lab
 from tests.helpers.runs import finish, start
 
-_WAY_M: Final = 25.0
-_BRAKES: Final = 0.9
+_PATH_M: Final = 25.0
+_BRAKING_SHARE: Final = 0.9
 """Below this share of its speed a robot counts as braking: it has received a velocity of zero."""
 _LONG_S: Final = 60.0
 FIGURES: Final = {
     "ssh": "`ssh box-1 true` (OpenSSH)",
     "idle": "`fieldkit stop box-1`, which no program moves",
     "brakes": "`fieldkit stop rover-1`, until the base brakes",
-    "stands": "until the robot is stationary",
-    "said": "until `stopped (standing)` is printed",
+    "stationary": "until the robot is stationary",
+    "printed": "until `stopped (standing)` is printed",
     "ended": "until the command has exited",
 }
 
@@ -51,7 +51,7 @@ def measure(lab: RoverLab, out: str) -> dict[str, float]:
             with subprocess.Popen(_stop_words("rover-1"), stdout=subprocess.PIPE, text=True) as stop:
                 assert stop.stdout is not None
                 line = stop.stdout.readline()
-                times["said"] = time.monotonic() - started_s
+                times["printed"] = time.monotonic() - started_s
                 code = stop.wait(_LONG_S)
                 times["ended"] = time.monotonic() - started_s
             if code != 0 or line != "rover-1: stopped (standing)\n":
@@ -65,9 +65,9 @@ def measure(lab: RoverLab, out: str) -> dict[str, float]:
     brakes_s = next(
         sample.at_s - started_s
         for sample in samples
-        if sample.at_s > started_s and sample.speed_m_s < _BRAKES * before_m_s
+        if sample.at_s > started_s and sample.speed_m_s < _BRAKING_SHARE * before_m_s
     )
-    return times | {"brakes": brakes_s, "stands": stationary_s if stationary_s is not None else float("nan")}
+    return times | {"brakes": brakes_s, "stationary": stationary_s if stationary_s is not None else float("nan")}
 
 
 def ssh_words(lab: RoverLab) -> tuple[str, ...]:
@@ -102,7 +102,7 @@ def main() -> int:
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory(prefix="fieldkit-stop-") as folder, rover_lab(Path(folder)) as lab:
         os.chdir(lab.folder)  # where the site file is
-        lab.write_procedure(Role.SENDER, _WAY_M)
+        lab.write_procedure(Role.SENDER, _PATH_M)
         rounds = [measure(lab, f"round-{number}") for number in range(options.rounds)]
         os.chdir("/")
     if options.json:

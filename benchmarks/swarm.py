@@ -1,12 +1,12 @@
 """Cost of the medium by the number of robots, with EMANE's figures: `python -m benchmarks.swarm [--json]`, as root.
 
-Measured per number of robots, over ideal fixed links, over Wi-Fi and over a bare veth pair: round trips between two
-robots, the lateness of their packets in the medium, 64-byte UDP payloads at full rate and, for 2 and 10 robots, TCP.
+For each number of robots, over ideal fixed links, over Wi-Fi and over a bare veth pair, it measures round trips
+between two robots, the lateness of their packets in the medium, the rate of 64-byte UDP payloads and TCP.
 The other robots are silent and should not add cost; the processor time per frame is measured at 2,000 packets/s. Then
-all neighbours form pairs, in each of which one sends to the other: over fixed links at full rate, over Wi-Fi 2,000
-packets/s in all, about a third of the channel's capacity. These robots are bare namespaces. Then whole robots, with
-SSH server and sensors: start-up time, its processor time, and the memory per robot without shared pages (own) and
-with a proportional part of them (PSS).
+all neighbours form pairs, in each of which one robot sends to the other: over fixed links at full rate, over Wi-Fi at
+2,000 packets/s in total, about a third of the channel's capacity. These robots are bare namespaces. Last, it measures
+robots with SSH server and sensors: start-up time, its processor time, and the memory per robot without shared pages
+(own) and with a proportional part of them (PSS).
 """
 
 import argparse
@@ -40,9 +40,9 @@ SIZES: Final = (2, 10, 30, 50)
 TCP_SIZES: Final = (2, 10)
 RADIOS: Final = {"fixed": radio("0ms"), "wifi": RadioOptions(fading=False)}
 PINGS: Final = 300
-# Packets/s of all senders together; 0 is full rate.
-ONE_TALKS: Final = 2_000
-ALL_TALK: Final = {"fixed": 0, "wifi": 2_000}
+ONE_SENDER_PACKETS_S: Final = 2_000
+ALL_SENDERS_PACKETS_S: Final = {"fixed": 0, "wifi": 2_000}
+"""Packets per second of all senders together; 0 is full rate."""
 REFERENCE: Final = {
     "rtt_median_ms": ("0.85", "2.0", "3.9", "6.0"),
     "rtt_p99_ms": ("4.3", "5.0", "5.6", "8.5"),
@@ -53,7 +53,7 @@ REFERENCE: Final = {
 }
 """EMANE 1.5.3 on 2 quiet cores, nodes without SSH server or sensors; TCP by RF Pipe and Comm Effect."""
 
-TALK_SCRIPT: Final = f"""
+SENDER_SCRIPT: Final = f"""
 import socket, sys, time
 address, seconds, packets_s = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -85,7 +85,7 @@ def swarm(
         yield medium, spaces
 
 
-def carried(size: int, options: RadioOptions, seconds: float) -> Figures:
+def measure_medium(size: int, options: RadioOptions, seconds: float) -> Figures:
     """Return the figures of the medium for two of `size` robots."""
     with swarm(size, options) as (medium, (near, far, *_)):
         near.run("ping", "-c", "3", "10.9.0.2")
@@ -98,7 +98,7 @@ def carried(size: int, options: RadioOptions, seconds: float) -> Figures:
         return figures
 
 
-def wired(seconds: float) -> Figures:
+def measure_veth(seconds: float) -> Figures:
     """Return the figures of a veth pair."""
     with veth_path() as (near, far):
         near.run("ping", "-c", "3", "10.9.0.2")
@@ -133,15 +133,17 @@ def tcp(near: Namespace, far: Namespace, seconds: float) -> Figures:
         return {"tcp_mbit_s": iperf(near, seconds)["sum_received"]["bits_per_second"] / 1e6}
 
 
-def talking(size: int, options: RadioOptions, seconds: float, packets_s: int, pairs: int) -> Figures:
+def measure_pairs(size: int, options: RadioOptions, seconds: float, packets_s: int, pairs: int) -> Figures:
     """Return the received packets between pairs of `size` robots, and the cost per packet in the medium."""
     with swarm(size, options) as (medium, spaces):
         senders, receivers = spaces[: 2 * pairs : 2], spaces[1 : 2 * pairs : 2]
-        each = str(packets_s / len(senders))
+        packets_s_each = str(packets_s / len(senders))
         before, arrived = Counter(medium.stats().late), sum(map(packets_in, receivers))
         started_s, cpu_before_s = time.monotonic(), cpu_s(medium.pid)
         senders_running = [
-            sender.start(sys.executable, "-c", TALK_SCRIPT, f"10.9.0.{2 * number + 2}", str(seconds), each)
+            sender.start(
+                sys.executable, "-c", SENDER_SCRIPT, f"10.9.0.{2 * number + 2}", str(seconds), packets_s_each
+            )
             for number, sender in enumerate(senders)
         ]
         for process in senders_running:
@@ -152,7 +154,7 @@ def talking(size: int, options: RadioOptions, seconds: float, packets_s: int, pa
         return figures | lateness(medium, before)
 
 
-def started(size: int) -> Figures:
+def measure_startup(size: int) -> Figures:
     """Return the start-up cost of `size` whole robots, including the lab, and the mean memory of a robot."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     login, host_key = KeyPair.make(), KeyPair.make()
@@ -168,7 +170,7 @@ def started(size: int) -> Figures:
         processors_s = time.process_time() - started_cpu_s + sum(cpu_s(robot.pid) for robot in robots)
         memory = [Memory.of(robot.pid) for robot in robots]
         for robot in robots:
-            robot.hang_up()
+            robot.request_exit()
     return {
         "start_s": lasted_s,
         "cpu_s": processors_s,
@@ -208,17 +210,17 @@ def main() -> None:
     options = parser.parse_args()
     print(f"load before: {os.getloadavg()[0]:.2f}")
     table = {
-        name: {size: carried(size, radio_options, options.seconds) for size in options.sizes}
+        name: {size: measure_medium(size, radio_options, options.seconds) for size in options.sizes}
         for name, radio_options in RADIOS.items()
     }
     for name, radio_options in RADIOS.items():
-        for senders, rate in (("one", ONE_TALKS), ("all", ALL_TALK[name])):
+        for senders, rate in (("one", ONE_SENDER_PACKETS_S), ("all", ALL_SENDERS_PACKETS_S[name])):
             table[f"{name}, {senders}"] = {
-                size: talking(size, radio_options, options.seconds, rate, 1 if senders == "one" else size // 2)
+                size: measure_pairs(size, radio_options, options.seconds, rate, 1 if senders == "one" else size // 2)
                 for size in options.sizes
             }
-    veth = wired(options.seconds)
-    table["robots"] = {size: started(size) for size in options.sizes}
+    veth = measure_veth(options.seconds)
+    table["robots"] = {size: measure_startup(size) for size in options.sizes}
     if options.json:
         print(json.dumps({"veth": veth, **table}, indent=2))
     else:

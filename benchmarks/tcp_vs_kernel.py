@@ -50,7 +50,7 @@ class Link:
         return RadioOptions.model_validate({"loss": self.loss, "delay": self.delay, "rate": RATE})
 
 
-def ours(link: Link, congestion: Congestion, seconds: float, seed: int) -> float:
+def cosim_bit_s(link: Link, congestion: Congestion, seconds: float, seed: int) -> float:
     """Return the goodput of the co-simulation's TCP in bit/s."""
     network = RadioNetwork(
         UniformLinks(seed, link.options),
@@ -64,7 +64,7 @@ def ours(link: Link, congestion: Congestion, seconds: float, seed: int) -> float
     return len(arrivals) * MESSAGE_BYTES * 8 / seconds
 
 
-def kernels(link: Link, control: str, seconds: float, seed: int) -> float:
+def kernel_bit_s(link: Link, control: str, seconds: float, seed: int) -> float:
     """Return the goodput of the kernel's TCP in bit/s."""
     with medium_path(link.options, seed=seed) as (near, far), listening_iperf(far):
         return iperf(near, seconds, "--congestion", control)["sum_received"]["bits_per_second"]
@@ -84,7 +84,7 @@ def row(link: Link, kernel_runs: Sequence[float], controls: Sequence[Congestion]
     peers = np.array(kernel_runs)
     yield f"{link.loss:>5} {link.delay:>5}  kernel {peers.mean() / 1e6:6.3f} Mbit/s ({len(peers)} runs)"
     for control in controls:
-        mine = np.array([ours(link, control, seconds, seed) for seed in range(2 * len(peers))])
+        mine = np.array([cosim_bit_s(link, control, seconds, seed) for seed in range(2 * len(peers))])
         value, half = ratio(mine, peers)
         yield f"{control} {mine.mean() / 1e6:6.3f} {value:.2f} [{value - half:.2f}, {value + half:.2f}]"
 
@@ -105,7 +105,7 @@ def main() -> None:
     print(f"Linux {platform.release()}, {options.kernel}; {RATE}; runs of {options.seconds:g} s; load {load:.1f}")
     with ThreadPoolExecutor(options.together) as pool:
         for link in (Link(loss, delay) for loss in options.loss for delay in options.delay):
-            run = partial(kernels, link, options.kernel, options.seconds)
+            run = partial(kernel_bit_s, link, options.kernel, options.seconds)
             kernel_runs = list(pool.map(run, range(options.runs)))
             print(" | ".join(row(link, kernel_runs, get_args(Congestion), options.seconds)), flush=True)
 

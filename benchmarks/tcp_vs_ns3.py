@@ -30,7 +30,7 @@ DELAY_MS: Final = 10
 QUEUE_PACKETS: Final = 100
 SECONDS: Final = 10.0
 SEEDS: Final = 40
-MOST_PACKETS: Final = 20_000
+MAX_PACKETS: Final = 20_000
 AT_S: Final = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 SEGMENT_BYTES: Final = TcpOptions().segment_bytes
 
@@ -75,9 +75,9 @@ segment per 255, the largest value that can be set.
 """
 
 
-def by_chance(seed: int, data: float, acks: float) -> Losses:
+def random_losses(seed: int, data: float, acks: float) -> Losses:
     """Return random losses of these shares, without losses in the handshake, which does not affect the window."""
-    draws = np.random.default_rng(seed).random((2, MOST_PACKETS))
+    draws = np.random.default_rng(seed).random((2, MAX_PACKETS))
     draws[:, :2] = 1
     lost = [np.flatnonzero(row < share).tolist() for row, share in zip(draws, (data, acks), strict=True)]
     return Losses(*lost)
@@ -107,7 +107,7 @@ class Run:
         return next(before, math.nan)
 
 
-def ours(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
+def run_cosim(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
     """Return a run of the co-simulation's sender."""
     samples: list[TcpSample] = []
     wire = ScriptedWire(
@@ -117,7 +117,7 @@ def ours(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
         script=losing({"a": frozenset(losses.data), "b": frozenset(losses.acks)}),
     )
     transport = wire.transports["tcp"] = Tcp(wire, TcpOptions(congestion=control), log=samples.append)
-    for number in range(MOST_PACKETS):
+    for number in range(MAX_PACKETS):
         transport.send(Packet(number, "a", "b", SEGMENT_BYTES, ("stream", number), 0, 0, "tcp"))
     wire.run(round(seconds * 1e9))
     events: list[tuple[int, str, float]] = []
@@ -134,7 +134,7 @@ def ours(control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
     return Run(events, len(wire.delivered) * SEGMENT_BYTES * 8 / seconds / 1e6)
 
 
-def theirs(ns3: Ns3, peer: str, control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
+def run_ns3(ns3: Ns3, peer: str, control: Control, losses: Losses, seconds: float = SECONDS) -> Run:
     """Return a run of the sender of one of the `PEERS`."""
     lost = {"lost-data": losses.data, "lost-acks": losses.acks}
     options: dict[str, object] = {name: ",".join(map(str, numbers)) for name, numbers in lost.items() if numbers}
@@ -183,7 +183,9 @@ def pattern_lines(ns3: Ns3) -> Iterator[str]:
     yield f"{'segments after (s)':32}" + " ".join(f"{at_s:6}" for at_s in AT_S)
     for control in CONTROLS:
         for name, losses in PATTERNS.items():
-            runs = {peer: theirs(ns3, peer, control, losses) for peer in PEERS} | {"ours": ours(control, losses)}
+            runs = {peer: run_ns3(ns3, peer, control, losses) for peer in PEERS} | {
+                "ours": run_cosim(control, losses)
+            }
             for peer, run in runs.items():
                 windows = " ".join(f"{run.window_at(at_s):6.1f}" for at_s in AT_S)
                 yield f"{control:9}{name:14}{peer:9}{windows}  {run.mbit_s:.2f} Mbit/s"
@@ -195,10 +197,10 @@ def chance_lines(ns3: Ns3) -> Iterator[str]:
         for name, (data, acks, seconds) in CHANCES.items():
             goodputs: dict[str, list[float]] = {peer: [] for peer in (*PEERS, "ours")}
             for seed in range(SEEDS):
-                losses = by_chance(seed, data, acks)
+                losses = random_losses(seed, data, acks)
                 for peer in PEERS:
-                    goodputs[peer].append(theirs(ns3, peer, control, losses, seconds).mbit_s)
-                goodputs["ours"].append(ours(control, losses, seconds).mbit_s)
+                    goodputs[peer].append(run_ns3(ns3, peer, control, losses, seconds).mbit_s)
+                goodputs["ours"].append(run_cosim(control, losses, seconds).mbit_s)
             mbit_s = {peer: np.array(values) for peer, values in goodputs.items()}
             means = " ".join(f"{peer} {values.mean():.3f}" for peer, values in mbit_s.items())
             ratios = (paired_ratio(mbit_s["ours"], mbit_s[peer]) for peer in PEERS)
@@ -209,7 +211,7 @@ def chance_lines(ns3: Ns3) -> Iterator[str]:
 
 def event_lines(ns3: Ns3, name: str, control: Control) -> Iterator[str]:
     """Yield the events of the unchanged ns-3 and of the co-simulation's sender around their first difference."""
-    runs = {"ns-3": theirs(ns3, "ns-3", control, PATTERNS[name]), "ours": ours(control, PATTERNS[name])}
+    runs = {"ns-3": run_ns3(ns3, "ns-3", control, PATTERNS[name]), "ours": run_cosim(control, PATTERNS[name])}
     at_ns = first_difference_ns(*runs.values())
     if at_ns is None:
         yield "both send the same segments"

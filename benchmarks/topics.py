@@ -128,7 +128,7 @@ def stream_together(plain: Sequence[Running], agent_pair: AgentPair, rates_hz: S
     return [[arrival for arrival in times if first_ns <= arrival[0] <= last_ns] for times in streams]
 
 
-def one_round(over: str, number: int, agent_pair: AgentPair, environment: dict[str, str]) -> dict[str, Any]:
+def measure_round(over: str, number: int, agent_pair: AgentPair, environment: dict[str, str]) -> dict[str, Any]:
     """Return the results of a middleware in a round: median delay and rate of a burst, by pair."""
     pairs = (*PLAIN[over], "agent")
     rates_hz = [RATES_HZ[(place + number) % len(pairs)] for place in range(len(pairs))]
@@ -166,7 +166,9 @@ def measure(rounds: int) -> list[dict[str, Any]]:
         stack.callback(master.terminate)
         agents = {over: AgentPair(over, port, folder) for over in PLAIN}
         return [
-            one_round(over, number, pair, environment) for number in range(rounds) for over, pair in agents.items()
+            measure_round(over, number, pair, environment)
+            for number in range(rounds)
+            for over, pair in agents.items()
         ]
 
 

@@ -1,8 +1,8 @@
 """The paper's field trial on emulated robots: `python -m benchmarks.studies.field_shape [--figures FOLDER]`, as root.
 
 Four campaigns (benchmarks/studies/lawn/: two topologies, with line of sight and behind the wall) run in parallel,
-because a repeat mostly waits; 640 repeats take 21 to 25 minutes. You can stop it at any time: the same command
-continues. At the end it prints the table of docs/studies/field-shape.md and draws its two figures.
+because a repeat mostly waits; 640 repeats take 21 to 25 minutes. It can be stopped at any time: the same command
+continues the campaigns. At the end it prints the table of docs/studies/field-shape.md and draws its two figures.
 """
 
 import argparse
@@ -63,7 +63,7 @@ SHOWN: Final = (
 )
 
 
-def lab(folder: Path, repeats_each: int | None) -> None:
+def copy_lab(folder: Path, repeats_each: int | None) -> None:
     """Copy the lab's files into a folder, unless it exists: a started campaign keeps its files."""
     if folder.exists():
         return
@@ -121,9 +121,9 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
                 label=f"{topology}, {'in sight' if scenario == 'los' else 'behind the wall'}",
                 style=style,
                 x=[feet(cell) + (rank - 1.5) * DODGE_FT for cell in series_cells],
-                y=[factor * each.value for each in estimates],
-                low=[_end(each, each.low, factor) for each in estimates],
-                high=[_end(each, each.high, factor) for each in estimates],
+                y=[factor * item.value for item in estimates],
+                low=[_end(item, item.low, factor) for item in estimates],
+                high=[_end(item, item.high, factor) for item in estimates],
             )
         )
     top = max(1.0 if unit == "%" else 0.0, 1.6 * factor * largest)
@@ -190,7 +190,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, help="fewer repeats, for a test")
     parser.add_argument("--no-run", action="store_true", help="read the existing results")
     options = parser.parse_args()
-    lab(options.out, options.repeats)
+    copy_lab(options.out, options.repeats)
     if not options.no_run:
         run(options.out)
     attempts = read(options.out)

@@ -1,8 +1,9 @@
 """Compare middlewares on a lossy radio: `python -m benchmarks.studies.middleware [--figures FOLDER] [--page PAGE]`.
 
-As root. Six campaigns of benchmarks/studies/middleware/ run in parallel, because a repeat mostly waits; `--only`
-selects some of them, `--full` those that last hours. Stop it at any time: the same command continues where it
-stopped. Then it prints the tables of docs/studies/middleware.md, or writes them into PAGE, and draws its figures.
+It needs root. Six campaigns of benchmarks/studies/middleware/ run in parallel, because a repeat mostly waits;
+`--only` selects some of them, `--full` those that last hours. It can be stopped at any time: the same command
+continues the campaigns. At the end it prints the tables of docs/studies/middleware.md, or writes them into PAGE, and
+draws its figures.
 
 Two repeats, as in the campaigns, show only large differences. On a quiet machine `--repeats 12` measures each place
 twelve times, in about two and a half hours. Then the intervals treat the repeat as the independent unit.
@@ -54,7 +55,7 @@ ROBOTS_DODGE: Final = 0.06
 """Offset between series at the same number of robots."""
 
 
-def lab(folder: Path, repeats: int | None = None) -> None:
+def copy_lab(folder: Path, repeats: int | None = None) -> None:
     """Copy the lab's files into a folder if they are missing: a started campaign keeps its files.
 
     Args:
@@ -127,7 +128,7 @@ def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -
                 ]
                 shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
                 series.append(_series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], drawn))
-            panel = drawn.panel(f"{SIZES[size]}, {quality}{_counted(pairs, size)}", "distance (m)", series)
+            panel = drawn.panel(f"{SIZES[size]}, {quality}{_sample_count_text(pairs, size)}", "distance (m)", series)
             panels.append(replace(panel, left=min(distances_m) - MARGIN_M, right=max(distances_m) + MARGIN_M))
     return Chart(name=name, title=name, caption="", panels=panels)
 
@@ -172,7 +173,7 @@ def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "
     )
 
 
-def _counted(cells: Sequence[MiddlewareCell], size: int) -> str:
+def _sample_count_text(cells: Sequence[MiddlewareCell], size: int) -> str:
     """Return the number of samples and repeats of each point of a size: `, n = 80 (2 repeats)`."""
     counts = sorted({(cell.samples, cell.repeats) for cell in cells if cell.size_bytes == size})
     if not counts or not counts[-1][0]:
@@ -189,11 +190,11 @@ def _comparable(findings: MiddlewareFindings, distance_m: float) -> list[Middlew
     return [cell for cell in at_distance if (cell.middleware, cell.size_bytes) in settings]
 
 
-def _lost(cell: MiddlewareCell) -> float | None:
+def _loss_percent(cell: MiddlewareCell) -> float | None:
     return None if cell.loss is None else 100 * cell.loss
 
 
-def _lost_interval(cell: MiddlewareCell) -> tuple[float | None, float | None]:
+def _loss_interval_percent(cell: MiddlewareCell) -> tuple[float | None, float | None]:
     low, high = (None if end is None else 100 * end for end in (cell.loss_low, cell.loss_high))
     return low, high
 
@@ -202,7 +203,7 @@ def _no_interval(_cell: MiddlewareCell) -> tuple[None, None]:
     return None, None
 
 
-def _late(cell: MiddlewareCell) -> float | None:
+def _delay_p95_ms(cell: MiddlewareCell) -> float | None:
     return None if cell.delay_p95_s is None else 1e3 * cell.delay_p95_s
 
 
@@ -231,8 +232,8 @@ class DrawnFigure:
         return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
 
 
-LOST: Final = DrawnFigure("samples lost (%)", _lost, _lost_interval, 0.0, 100.0)
-LATE: Final = DrawnFigure("delay, 95 % (ms)", _late, _no_interval, 1.0, 10_000.0, log=True)
+LOST: Final = DrawnFigure("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
+LATE: Final = DrawnFigure("delay, 95 % (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
 
 
 BIMODAL: Final = " *"
@@ -276,14 +277,14 @@ def _table(
 
 
 def _loss_and_delay(cell: MiddlewareCell) -> str:
-    lost, late = _lost(cell), _late(cell)
-    if lost is None:
+    loss_percent, delay_ms = _loss_percent(cell), _delay_p95_ms(cell)
+    if loss_percent is None:
         return "not found"
     is_bimodal = (cell.middleware, cell.kind) == (
         "Zenoh",
         "reliable",
     ) and cell.size_bytes >= middleware_page.IMAGE_BYTES
-    return f"{lost:.1f} %, " + ("-" if late is None else f"{late:.0f} ms") + BIMODAL * is_bimodal
+    return f"{loss_percent:.1f} %, " + ("-" if delay_ms is None else f"{delay_ms:.0f} ms") + BIMODAL * is_bimodal
 
 
 def write_tables(page: Path, lines: Sequence[str]) -> None:
@@ -318,12 +319,12 @@ def main() -> None:
     prefix = "full-" if options.full else ""
     names = [f"{prefix}{campaign_name(name, options.repeats)}" for name in CAMPAIGNS]
     if not options.no_run:
-        lab(options.out, options.repeats)
+        copy_lab(options.out, options.repeats)
         run(options.out, [f"{prefix}{campaign_name(name, options.repeats)}" for name in options.only])
     findings = read(options.out, names)
     conditions = (
-        f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.ended}; packets handed over late by "
-        f"up to {1e3 * findings.late_s:.1f} ms; load average {os.getloadavg()[2]:.1f} when this was written."
+        f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.ended}; packets were up to "
+        f"{1e3 * findings.late_s:.1f} ms late; load average {os.getloadavg()[2]:.1f} when this was written."
     )
     lines = list(tables(findings, conditions))
     if options.page:

@@ -3,7 +3,7 @@
 Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports, in which a
 string counts only by its digits. A function is matched with one of the same shape anywhere in the other tests, so it
 may move; the rest is matched by name. Inside of an assertion equal names must stay equal, so that `assert a == b` is
-not `assert a == a`. Limit: outside of assertions, a name in place of another one is not detected.
+not `assert a == a`. Outside of assertions, a replaced name is not detected.
 """
 
 import ast
@@ -73,7 +73,7 @@ class Changes:
     def summary(self) -> str:
         """Return one line with counts."""
         return (
-            f"{'tests:':40} {self.same:5} the same but for names, {self.added:4} added,"
+            f"{'tests:':40} {self.same:5} the same except for names, {self.added:4} added,"
             f" {len(self.removed):4} removed,"
             f" {len(self.assertions):4} assertions and {len(self.bodies):4} bodies changed"
         )
@@ -111,10 +111,10 @@ def _match_by_shape(olds: Sequence[Unit], news: Sequence[Unit]) -> tuple[list[Un
         partners[new.shape, new.is_test].append(new)
     matched: list[Unit] = []
     unmatched = olds
-    for alike in (lambda a, b: str(a) == str(b), lambda a, b: a.name == b.name, lambda *_: True):
+    for is_alike in (lambda a, b: str(a) == str(b), lambda a, b: a.name == b.name, lambda *_: True):
         still_unmatched = []
         for old in unmatched:
-            partner = next((new for new in partners[old.shape, old.is_test] if alike(old, new)), None)
+            partner = next((new for new in partners[old.shape, old.is_test] if is_alike(old, new)), None)
             if partner is None:
                 still_unmatched.append(old)
             else:

@@ -68,9 +68,9 @@ class SystemStatus:
     """Content of SYS_STATUS.
 
     Attributes:
-        ill: Bits of the sensors that are present, enabled and not healthy (MAV_SYS_STATUS_SENSOR).
+        unhealthy: Bits of the sensors that are present, enabled and not healthy (MAV_SYS_STATUS_SENSOR).
         charge: Remaining charge of the battery, from 0 to 1; None if unknown.
-        heard_s: Time of arrival by the monotonic clock.
+        received_s: Time of arrival by the monotonic clock.
     """
 
     unhealthy: int
@@ -91,16 +91,13 @@ class AutopilotState:
         mode: Its custom mode, from its heartbeat.
         dialect: The dialect of its family; None for an unknown family, or before its first heartbeat.
         family: Its MAV_AUTOPILOT and MAV_TYPE.
-        place_m: Position north, east, down in LOCAL_POSITION_NED; None without a fresh report.
         speed_m_s: Its speed.
-        yaw_rad: Its heading, clockwise from north; None without a fresh report.
-        degrees: Latitude and longitude in degrees; None without a fresh report, or if they are unknown.
         status: Its health and battery; None before its first report.
         estimate: Flags of its position estimate (ESTIMATOR_STATUS_FLAGS); None before its first report.
         has_home: Whether it has reported its home position.
         parameters: The values of the requested parameters that it has reported.
         texts: Its text messages (STATUSTEXT).
-        answers: The final MAV_RESULT of each command, from its last acknowledgement.
+        command_results: The final MAV_RESULT of each command, from its last acknowledgement.
     """
 
     def __init__(self, link: FlightLink, component: int = PILOT) -> None:
@@ -176,7 +173,7 @@ class AutopilotState:
 
     @property
     def last_position_m(self) -> tuple[float, float, float] | None:
-        """Its last reported position, however old; None before the first."""
+        """Its last reported position of any age; None before the first."""
         return self._position_m if math.isfinite(self._position_s) else None
 
     @property
@@ -227,7 +224,7 @@ class AutopilotState:
             self.speed_m_s = math.hypot(*values[3:])
 
     def _on_global_position(self, payload: bytes) -> None:
-        """Process GLOBAL_POSITION_INT; ArduPilot sends zeros if it does not know its position."""
+        """Process GLOBAL_POSITION_INT; ArduPilot sends zeros if its position is unknown."""
         latitude, longitude = struct.unpack_from("<ii", payload, 4)
         if (latitude or longitude) and abs(latitude) <= 90e7 and abs(longitude) <= 180e7:
             self._latitude_longitude, self._latitude_longitude_s = (latitude / 1e7, longitude / 1e7), time.monotonic()

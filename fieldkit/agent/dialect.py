@@ -40,10 +40,10 @@ class FlightDialect(Protocol):
 
     Attributes:
         name: Name of the family.
-        guided: Name of the mode in which it follows set-points.
-        estimate: Id of the message with the flags of its position estimate.
-        bounds_from: Names of the parameters with its limits; `|` separates alternative names of one parameter.
-        says_now: Whether its arming checks apply to its present mode.
+        guided_mode: Name of the mode in which it follows set-points.
+        estimate_message: Id of the message with the flags of its position estimate.
+        limit_parameters: Names of the parameters with its limits; `|` separates alternative names of one parameter.
+        checks_present_mode: Whether its arming checks apply to its present mode.
     """
 
     name: str

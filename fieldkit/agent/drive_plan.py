@@ -11,7 +11,7 @@ OUT = "out"
 BACK = "back"
 END = "end"
 ORDERS = (WAIT, OUT, BACK, END)
-"""Orders of the laptop: wait, drive the path, drive back to the origin, and stop finally."""
+"""Orders of the laptop: wait, drive the path, drive back to the origin, and end the drive."""
 
 START_M = 0.3
 START_RAD = 0.3

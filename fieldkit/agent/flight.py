@@ -38,7 +38,7 @@ _RISEN_FRACTION = 0.9
 _SET_POINTS_S = 1.0
 """Set-points are sent for this time before the mode that follows them is selected (PX4 user guide, offboard mode)."""
 _COORDINATES_S = 3.0
-"""Timeout for latitude and longitude, which some drones do not know."""
+"""Timeout for latitude and longitude, which some drones do not report."""
 
 
 class OffboardPilot:
@@ -88,7 +88,7 @@ class OffboardPilot:
         self._loop.state = LANDING
         self._log.phase = "coming down"
         try:
-            with landing_marker(self._plan.unhurried):
+            with landing_marker(self._plan.landing_marker):
                 bring_down(self._loop.session, self._plan.abort, lambda: drone.guided, self._loop.update)
         except Exception:
             log_line(alarm(drone))
@@ -115,7 +115,7 @@ class OffboardPilot:
                 self._return(origin)
         self._start_phase("coming down")
         loop.state = LANDING if loop.has_armed else loop.state
-        with landing_marker(plan.unhurried):
+        with landing_marker(plan.landing_marker):
             bring_down(loop.session, "land", lambda: self._drone.guided, loop.update)
         self._log.end("landed")
         log_line("landed")

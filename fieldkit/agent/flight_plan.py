@@ -57,7 +57,7 @@ class FlightPlan:
         origin: Values of the `FlightOrigin` of the trial; None at the first start, which becomes the origin.
         log: The log file of positions; empty for none.
         liveness: The file that pilot and guard share (`LivenessFile`); empty if only one of them runs.
-        unhurried: A file that exists while the program lands a drone, so that the program is not killed.
+        landing_marker: A file that exists while the program lands a drone, so that the program is not killed.
     """
 
     connection: str
@@ -77,7 +77,7 @@ class FlightPlan:
     origin: Mapping[str, Any] | None = None
     log: str = ""
     liveness: str = ""
-    unhurried: str = ""
+    landing_marker: str = ""
 
     @property
     def needs(self) -> FlightNeeds:

@@ -29,8 +29,8 @@ _MODE_WAIT_S = 0.3
 """Maximum wait for a heartbeat before the first command: the last one may be older than a takeover by a person."""
 _LANDING_TIMEOUT_S = 600.0
 """Time for which a drone whose motors turn is commanded to come down."""
-UNHEARD_S = 60.0
-"""Time for which it is commanded without heartbeats of its autopilot: a lost connection may be restored."""
+NO_HEARTBEAT_S = 60.0
+"""Time for which commands are sent although no heartbeat arrives: a lost connection may be restored."""
 
 
 class FlightError(Exception):
@@ -57,8 +57,8 @@ def bring_down(
     Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. The
     first command waits for a new heartbeat, because the mode may have changed since the last one. A drone that lands
     or returns automatically is only monitored. An autopilot without heartbeats may still receive commands, and the
-    connection may be restored: for `UNHEARD_S` its last reported mode is assumed, and commands are sent. An alarm is
-    logged as soon as heartbeats are missing.
+    connection may be restored: for `NO_HEARTBEAT_S` its last reported mode is assumed, and commands are sent. A
+    missing heartbeat causes an alarm in the log.
 
     Args:
         session: The session with its autopilot.
@@ -67,8 +67,8 @@ def bring_down(
         each_iteration: Called in each iteration.
 
     Raises:
-        FlightError: Another party flies the drone (`TAKEN_OVER`), no heartbeat was received for `UNHEARD_S`, or its
-            motors still turn after `_LANDING_TIMEOUT_S`.
+        FlightError: Another party flies the drone (`TAKEN_OVER`), no heartbeat was received for `NO_HEARTBEAT_S`, or
+            its motors still turn after `_LANDING_TIMEOUT_S`.
     """
     drone, retry_s, start_s, warned = session.drone, 0.0, time.monotonic(), False
     command = (drone.dialect or Px4()).bring_down_command(how)  # other families accept the commands of PX4
@@ -79,8 +79,8 @@ def bring_down(
         now_s = time.monotonic()
         if now_s > start_s + _LANDING_TIMEOUT_S:
             raise FlightError(REFUSED, f"the autopilot reports that its motors turn; it was commanded to {how}")
-        if min(drone.heartbeat_age_s, now_s - start_s) > UNHEARD_S:
-            raise FlightError(REFUSED, f"no heartbeat of the autopilot for {UNHEARD_S:g} s")
+        if min(drone.heartbeat_age_s, now_s - start_s) > NO_HEARTBEAT_S:
+            raise FlightError(REFUSED, f"no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s")
         if not drone.alive and not warned:
             log_line(alarm(drone))
         warned = not drone.alive
@@ -119,10 +119,10 @@ def alarm(drone: AutopilotState) -> str:
             f"LAST KNOWN {drone.position_age_s:.0f} S AGO {north_m:.1f} M NORTH, {east_m:.1f} M EAST, "
             f"{-down_m:.1f} M UP IN ITS LOCAL FRAME"
         )
-    heard = "NO HEARTBEAT"
+    heartbeat = "NO HEARTBEAT"
     if math.isfinite(drone.heartbeat_age_s):
-        heard = f"MODE {drone.mode_name}, LAST HEARTBEAT {drone.heartbeat_age_s:.0f} S AGO"
-    return f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {where}, {heard}. {MANUAL_ACTION}"
+        heartbeat = f"MODE {drone.mode_name}, LAST HEARTBEAT {drone.heartbeat_age_s:.0f} S AGO"
+    return f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {where}, {heartbeat}. {MANUAL_ACTION}"
 
 
 MANUAL_ACTION = "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION."
@@ -133,7 +133,7 @@ def landing_marker(path: str) -> Iterator[None]:
     """Create a marker file and remove it after the body; errors are ignored.
 
     Args:
-        path: The file, see `FlightPlan.unhurried`; empty for none.
+        path: The file, see `FlightPlan.landing_marker`; empty for none.
     """
     if path:
         with suppress(OSError):

@@ -31,7 +31,7 @@ from fieldkit.agent.mavlink_frames import (
 )
 from fieldkit.agent.mavlink_links import open_link
 
-MOST_BYTES = 256 << 20
+MAX_BYTES = 256 << 20
 """Maximum size of a log, for example if another program floods the recorder."""
 
 _STAMP = struct.Struct(">Q")
@@ -116,7 +116,7 @@ class FlightRecorder:
             self._process(head(frame), intact=is_intact(frame))
 
     def _write(self, frame: bytes) -> None:
-        if self._bytes + len(frame) + _STAMP.size > MOST_BYTES:
+        if self._bytes + len(frame) + _STAMP.size > MAX_BYTES:
             self._left_out += 1
             return
         record = _STAMP.pack(time.time_ns() // 1000) + frame

@@ -20,7 +20,7 @@ HEAD = struct.Struct("<8sqq")
 """Magic number, sequence number, time in nanoseconds since 1970 UTC."""
 MAGIC = b"fieldkit"
 
-LEAST_BYTES = HEAD.size
+MIN_BYTES = HEAD.size
 
 # An empty sequence of dimensions, the offset, and the length of the data; in CDR after the encapsulation header.
 _ROS1 = struct.Struct("<III")
@@ -41,7 +41,7 @@ class Stream:
 
     Attributes:
         over: Name of the middleware.
-        size_bytes: Length of the data of a sample, at least `LEAST_BYTES`.
+        size_bytes: Length of the data of a sample, at least `MIN_BYTES`.
         rate_hz: Samples per second.
         duration_s: Duration.
         patience_s: Time for which the publisher waits for a subscription.

@@ -111,8 +111,8 @@ class Cell:
         tallies: Word counts by name of the column, in order; only those that any valid repeat has.
         payload_bytes: ICMP payload sizes of the valid repeats, ascending, by the name of each quantity that depends
             on them; see `Quantity.payload`.
-        lacking: Quantities that were measured in the valid repeats, but have no value in any of them, for example the
-            RTT of pings without an answer; see `Quantity.implied_by`.
+        quantities_without_value: Quantities that were measured in the valid repeats, but have no value in any of
+            them, for example the RTT of pings without an answer; see `Quantity.implied_by`.
     """
 
     key: Mapping[str, str | float | None]

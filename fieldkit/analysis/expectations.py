@@ -122,13 +122,13 @@ def _scope(match: re.Match[str], quantity: Quantity, *, is_below: bool) -> tuple
         share = parse_amount(match["share"], "share", "share of repeats")
         if not 0 < share <= MAX_SHARE:
             raise ConfigurationError(
-                f"{match['share']} is not a share that repeats can show",
+                f"{match['share']} of repeats cannot be required",
                 remedy="write a share above 0 % and below 100 %; or every, for every repeat of the trial",
             )
         return Scope.SHARE, share
     if match["repeats"] in {"max", "min"} and (match["repeats"] == "max") is not is_below:
         raise ConfigurationError(
-            f"{match[0][:60]!r}: this would hold if a single repeat meets it",
+            f"{match[0][:60]!r}: a single repeat would be sufficient",
             remedy="write max with <, min with >, or every",
         )
     return (Scope.EVERY if match["repeats"] else Scope.FIGURE), None

@@ -36,7 +36,7 @@ def share_high(met: int, n: int) -> float:
 
 
 def repeats_for(share: float) -> int:
-    """Return the number of repeats, all of which must meet a requirement, that show it for this share of all repeats.
+    """Return the number of repeats that show, if all meet a requirement, that this share of all repeats meets it.
 
     From `share_low`: the smallest n with share^n <= 5 %.
     """

@@ -77,7 +77,7 @@ def codes(column: Texts) -> NDArray[np.int64]:
 
 
 def are_possible(values: Numbers, column: Column) -> bool:
-    """Return True if all values of a column are possible or missing; the same condition as `Column.problem`."""
+    """Return True if all values of a column are possible or missing; same rule as `Column.invalid_value_reason`."""
     present = values[~np.isnan(values)]
     low, high = column.possible if column.type is not bool else (0, 1)
     fits = (present >= low) & (present <= high)

@@ -1,6 +1,6 @@
 """Statistics over repeats with 95 % intervals: shares, means and medians, and differences of two samples.
 
-Each repeat is one independent sampling unit, whatever the dependence within it. All formulas are in closed form and
+Each repeat is one independent sampling unit, with any dependence within it. All formulas are in closed form and
 vectorized over cells. There is no resampling, so no result depends on a seed. Coverage: docs/method-intervals.md.
 """
 
@@ -244,7 +244,7 @@ def holm(p_values: ArrayLike) -> tuple[float, ...]:
     """Return p-values corrected for their number, in the same order (Holm 1979, Scand. J. Stat. 6:65).
 
     If values below 0.05 are reported as differences, at most 5 % of the comparisons of equal runs have any false
-    report, whatever the dependence between the single differences.
+    report, for any dependence between the single differences.
     """
     p = np.asarray(p_values, dtype=np.float64)
     order = np.argsort(p, kind="stable")

@@ -324,8 +324,8 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
     significant = sum(is_significant(difference) for difference in differences)
     yield (
         f"{format_count(comparisons, 'comparison')}: {format_count(excludes_zero, 'difference')} seen, {significant} "
-        f"after correction for their number; were there none, about {(1 - CONFIDENCE) * comparisons:.1f} "
-        "would be seen"
+        f"after correction for their number; without real differences about {(1 - CONFIDENCE) * comparisons:.1f} "
+        "would be seen by chance"
     )
     for pair in comparison.pairs:
         if pair.missing_in:

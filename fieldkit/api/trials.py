@@ -134,8 +134,8 @@ class Trials:
         Raises:
             ConfigurationError: There is no such column, or it cannot be aggregated.
         """
-        chosen, words = self._sources.chosen(_names(quantities or ()), asked="quantities")
-        keys = self._sources.condition(",".join(_names(by)), asked="by")
+        chosen, words = self._sources.chosen(_names(quantities or ()), option="quantities")
+        keys = self._sources.condition(",".join(_names(by)), option="by")
         self._warn_of_mixtures(keys)
         declared = {column.name: column for column in (*self._attempts.columns, _SOURCE)}
         cells = aggregate(self._attempts, keys, quantities=chosen, words=words)
@@ -150,7 +150,7 @@ class Trials:
         Raises:
             ConfigurationError: There is no such column, no such cell, or several.
         """
-        keys = self._sources.condition(",".join((*DEFAULT_BY, *condition)), asked="cell")
+        keys = self._sources.condition(",".join((*DEFAULT_BY, *condition)), option="cell")
         self._warn_of_mixtures(keys)
         cells = aggregate(self._attempts, keys)
         matches = [cell for cell in cells if all(cell.key[name] == value for name, value in condition.items())]
@@ -161,9 +161,9 @@ class Trials:
         differences = "; ".join(
             f"{name}: {', '.join(map(repr, distinct))}" for name, distinct in values.items() if len(distinct) > 1
         )
-        asked = ", ".join(f"{name}={value!r}" for name, value in condition.items()) or "any condition"
+        conditions = ", ".join(f"{name}={value!r}" for name, value in condition.items()) or "any condition"
         raise ConfigurationError(
-            f"{len(matches) or 'no'} cells have {asked}; exactly one must",
+            f"{len(matches) or 'no'} cells have {conditions}; exactly one must",
             where=self._sources.where,
             remedy=f"they differ in {differences}" if differences else "there is one cell: leave out the condition",
         )

@@ -1,4 +1,4 @@
-"""Conflicts of ROS topics between a robot that drives itself and other robots that hear the same topics."""
+"""Conflicts of ROS topics between a robot that drives itself and other robots that receive the same topics."""
 
 from collections.abc import Iterable
 

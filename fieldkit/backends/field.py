@@ -93,7 +93,7 @@ class FieldBackend:
 
     @contextmanager
     def persistent_shells(self, *, sink: Sink) -> Iterator[Mapping[str, Shell | FieldkitError]]:
-        """Yield the connection or the error of each robot; see `Backend.standing`.
+        """Yield the connection or the error of each robot; see `Backend.persistent_shells`.
 
         Each robot is connected at its first command.
         """

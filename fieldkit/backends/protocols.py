@@ -108,18 +108,18 @@ class Oracle(Protocol):
         ...
 
     def lateness(self) -> Lateness:
-        """Return by how much packets were later than the model demands, over all packets since the testbed started.
+        """Return the lateness of packets relative to the model, over all packets since the testbed started.
 
         Raises:
             LinkError: The medium did not answer.
         """
         ...
 
-    def links(self, *, go_on: bool) -> Mapping[Role, Sequence[LinkSample]]:
+    def links(self, *, continue_sampling: bool) -> Mapping[Role, Sequence[LinkSample]]:
         """Return the samples of the robots' links since the last call, five per second, and one of now.
 
         Args:
-            go_on: Whether sampling continues after this call; it starts with the first such call.
+            continue_sampling: Whether sampling continues after this call; it starts with the first such call.
 
         Returns:
             Samples by robot in the order of time. Times are of the laptop's clock; stations are names of robots.

@@ -47,7 +47,7 @@ class BagContents:
         duration_s: Time from the first message to the last, in seconds.
         compression: Compression of a ROS 2 bag: `none` or `zstd`.
         problems: Its damages, one sentence each.
-        savable: Number of messages that can be recovered; None for a bag without problems.
+        recoverable_messages: Number of messages that can be recovered; None for a bag without problems.
     """
 
     format: BagFormat
@@ -90,7 +90,7 @@ def inspect(path: Path, *, read_all: bool = False) -> BagContents:
         EvidenceError: It is empty, or reading it exceeds the limits of memory or time for its size.
     """
     bag = find(path)
-    answer = _ask_worker(bag, {"do": "inspect", "all": read_all})
+    answer = _query_worker(bag, {"do": "inspect", "all": read_all})
     return BagContents(
         bag.format,
         bag.size_bytes,
@@ -118,7 +118,7 @@ def repair(path: Path, to: Path) -> WriteResult:
         )
 
     def write(temporary_path: Path) -> WriteResult:
-        answer = _ask_worker(bag, {"do": "repair", "to": str(temporary_path)})
+        answer = _query_worker(bag, {"do": "repair", "to": str(temporary_path)})
         if not answer["messages"]:
             what = f"no message can be saved: {answer['why']}"
             raise EvidenceError(what, where=str(path), remedy=LAST_RESORT.get(bag.format, ""))
@@ -159,7 +159,7 @@ def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distri
     return _write_atomically(
         to,
         lambda temporary_path: WriteResult(
-            None, tuple(_ask_worker(bag, request | {"to": str(temporary_path)})["notes"])
+            None, tuple(_query_worker(bag, request | {"to": str(temporary_path)})["notes"])
         ),
     )
 
@@ -182,7 +182,7 @@ def _write_atomically(to: Path, write: Callable[[Path], WriteResult]) -> WriteRe
     return result
 
 
-def _ask_worker(bag: BagFiles, request: Json) -> Json:
+def _query_worker(bag: BagFiles, request: Json) -> Json:
     size_bytes = _MAX_GROWTH * sum(allocated_bytes(file) for file in bag.files)
     try:
         return _WORKER.query({"path": str(bag.path.absolute()), **request}, size_bytes)

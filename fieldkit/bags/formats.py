@@ -80,8 +80,8 @@ def find(path: Path) -> BagFiles:
     """
     try:
         if path.is_dir():
-            return _in_folder(path)
-        return _of_file(path, _format(path))
+            return _bag_in_folder(path)
+        return _bag_from_file(path, _format(path))
     except OSError as error:
         where = Path(error.filename or path)
         raise ConfigurationError(
@@ -91,7 +91,7 @@ def find(path: Path) -> BagFiles:
         ) from error
 
 
-def _of_file(path: Path, bag_format: BagFormat) -> BagFiles:
+def _bag_from_file(path: Path, bag_format: BagFormat) -> BagFiles:
     if bag_format is BagFormat.ROS1:
         if path.suffix not in _ROS1_SUFFIXES:
             raise ConfigurationError(
@@ -100,15 +100,15 @@ def _of_file(path: Path, bag_format: BagFormat) -> BagFiles:
         return BagFiles(path, bag_format, (path,), closed=True)
     if not (path.parent / METADATA).is_file():
         return BagFiles(path, bag_format, (path,), _is_closed_mcap(path, bag_format))
-    folder_bag = _in_folder(path.parent)
+    folder_bag = _bag_in_folder(path.parent)
     return folder_bag if folder_bag.files == (path,) else BagFiles(path, bag_format, (path,), closed=True)
 
 
-def _in_folder(folder: Path) -> BagFiles:
+def _bag_in_folder(folder: Path) -> BagFiles:
     files = sorted(file for file in folder.iterdir() if file.is_file())
     bag_files = [(file, bag_format) for file in files if (bag_format := _format_or_none(file)) is not None]
     if len(bag_files) == 1 and not (folder / METADATA).is_file():
-        return _of_file(*bag_files[0])
+        return _bag_from_file(*bag_files[0])
     formats = {bag_format for _, bag_format in bag_files}
     if not formats:
         raise ConfigurationError("no bag is in this folder", where=str(folder), remedy=_WHAT_TO_NAME)

@@ -42,7 +42,7 @@ class CampaignEntry:
         took_s: Duration of placing the robots, in seconds.
         valid: Number of valid repeats.
         failed: Number of failed repeats.
-        unmet: Number of expectations that its figures do not show to hold.
+        unmet: Number of expectations that its figures do not prove.
     """
 
     utc_ns: int

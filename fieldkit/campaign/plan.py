@@ -137,7 +137,7 @@ def trials_of(
                 where=document.where(("except", index)),
                 remedy="use values of procedures, topologies and distances",
             )
-    kept = tuple(trial for trial in combinations if not _covered(trial, campaign.left_out))
+    kept = tuple(trial for trial in combinations if not _is_left_out(trial, campaign.left_out))
     if not kept:
         raise ConfigurationError(
             "except leaves out every trial", where=document.where(("except",)), remedy="leave out fewer"
@@ -145,7 +145,7 @@ def trials_of(
     return kept
 
 
-def _covered(trial: PlannedTrial, left_out: Iterable[LeftOut]) -> bool:
+def _is_left_out(trial: PlannedTrial, left_out: Iterable[LeftOut]) -> bool:
     return any(rule.covers(trial) for rule in left_out)
 
 
@@ -253,7 +253,7 @@ def unmeasured(paths: Iterable[Path], sources: Collection[str], note: Note) -> I
     for folder in dict.fromkeys(candidate for path in paths for candidate in (path, *_below(path))):
         if (folder / CAMPAIGN_FILE).is_file():
             try:
-                yield from _unmeasured(folder, sources)
+                yield from _unmeasured_trials(folder, sources)
             except FieldkitError as error:
                 note(f"the missing trials are not known: {error.located}")
 
@@ -262,7 +262,7 @@ def _below(path: Path) -> list[Path]:
     return sorted(child for child in path.iterdir() if child.is_dir()) if path.is_dir() else []
 
 
-def _unmeasured(folder: Path, sources: Collection[str]) -> Iterator[str]:
+def _unmeasured_trials(folder: Path, sources: Collection[str]) -> Iterator[str]:
     plans = [
         store.read_plan(Path(source))
         for source in sources

@@ -39,7 +39,7 @@ class CampaignOutcome:
     Attributes:
         left: Trials that have not ended.
         failed: Number of failed repeats in the others.
-        unmet: Number of expectations that their figures do not show to hold.
+        unmet: Number of expectations that their figures do not prove.
         folders: Folders of the trials that have ended.
     """
 
@@ -102,7 +102,7 @@ class CampaignRun:
             self._sink(Note(line))
 
     def run(self, operator: Operator, stop: Stop) -> CampaignOutcome:
-        """Run the remaining trials; skipped trials are offered once more after the others.
+        """Run the remaining trials; skipped trials are offered again after the others.
 
         Args:
             operator: Sets up and places the robots.

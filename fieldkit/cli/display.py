@@ -271,8 +271,8 @@ def _serialize(sink: Sink) -> Sink:
 
 def shown(event: Event, width: int | None = None) -> Text | None:
     """Return the text of an event for people, or None if only the live line shows it. Raises as `words_of`."""
-    said = words_of(event, width)
-    return _harmless(Text.assemble(*((completed(text), style) for text, style in said))) if said else None
+    parts = words_of(event, width)
+    return _harmless(Text.assemble(*((completed(text), style) for text, style in parts))) if parts else None
 
 
 def words_of(event: Event, width: int | None = None) -> Words:

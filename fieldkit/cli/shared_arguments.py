@@ -15,7 +15,7 @@ PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, o
 CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
 """Equal to `analysis.quantities.DEFAULT_BY`; a test compares them."""
 
-_MOST_DIGITS: Final = 15
+_MAX_DIGITS: Final = 15
 
 _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 
@@ -154,7 +154,7 @@ def natural(text: str) -> int:
     """Return a whole number from 0 with at most 15 digits; argparse reports other texts."""
     if not text.isascii() or not text.isdigit():
         raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number from 0")
-    if len(text) > _MOST_DIGITS:
+    if len(text) > _MAX_DIGITS:
         raise argparse.ArgumentTypeError(f"a number of {len(text)} digits is too large")
     return int(text)
 

@@ -64,18 +64,18 @@ def _require_terminal(what: str, remedy: str) -> None:
         raise ConfigurationError(f"{what}, and there is no terminal to ask at", remedy=remedy)
 
 
-def confirmed(question: str, *, unasked: str) -> bool:
+def confirmed(question: str, *, remedy: str) -> bool:
     """Return True if the person at the terminal answers yes.
 
     Args:
         question: In the imperative, without a question mark: `pin it`.
-        unasked: The remedy if there is no terminal.
+        remedy: The remedy if there is no terminal.
 
     Raises:
         ConfigurationError: There is no terminal to ask at.
     """
     if not sys.stdin.isatty():
-        raise ConfigurationError(f"a person must confirm: {question}", remedy=unasked)
+        raise ConfigurationError(f"a person must confirm: {question}", remedy=remedy)
     print(f"{question}? yes or no", file=sys.stderr)
     while (answer := _read_line().strip().lower()) not in {"yes", "no"}:
         print("yes or no", file=sys.stderr)
@@ -117,18 +117,18 @@ def interruptible() -> Iterator[Stop]:
                 _say(_ABANDONED)
             return
         if stop.motions.order_stop(_say):
-            stopping = stop.due = True
+            stopping = stop.after_saving = True
             if not stop.saving:
                 raise KeyboardInterrupt
             return
-        if number == signal.SIGINT and stop.patient and not stop.asked:
-            stop.asked = True
+        if number == signal.SIGINT and stop.can_finish and not stop.after_repeat:
+            stop.after_repeat = True
             left = f", about {format_duration(stop.left_s)} more" if stop.left_s else ""
             _say(_FINISHING.format(left=left))
             return
         stopping = True
         _say(_STOPPING)
-        stop.due = True
+        stop.after_saving = True
         if not stop.saving:
             raise KeyboardInterrupt
 

@@ -28,8 +28,8 @@ _MAX_BYTES: Final = 1 << 20
 _MAX_DEPTH: Final = 50
 _MAX_INT: Final = 2**63 - 1
 _MAX_DIGITS: Final = 100
-"""Most characters of a number. The time of Python's conversion grows with the square of the length."""
-_NO_TEXT: Final = re.compile("[\0\ud800-\udfff]")
+"""Maximum number of characters of a number. The time of Python's conversion grows with the square of the length."""
+_INVALID_CHARACTERS: Final = re.compile("[\0\ud800-\udfff]")
 """Characters that an escape sequence can produce, but that file names, arguments and UTF-8 files cannot contain."""
 
 Location = tuple[str | int, ...]
@@ -67,9 +67,9 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
-        if isinstance(node, yaml.ScalarNode) and _NO_TEXT.search(node.value):
+        if isinstance(node, yaml.ScalarNode) and _INVALID_CHARACTERS.search(node.value):
             raise _problem(
-                "this text has a character that no file can hold (\\0, or half of a surrogate pair)", event
+                "this text has a character that no file can contain (\\0, or half of a surrogate pair)", event
             )
         if isinstance(node, yaml.ScalarNode) and isinstance(parent, yaml.SequenceNode):
             self._require_one_item(node)
@@ -81,7 +81,7 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
             lines = self._text.splitlines()[node.start_mark.line : node.end_mark.line + 1]
             for number, line in enumerate(lines[1:], start=node.start_mark.line + 2):
                 if line.lstrip().startswith("- "):
-                    raise _Joined(number)
+                    raise _JoinedItemError(number)
 
     def whole(self, node: yaml.ScalarNode) -> int:
         """Return a whole number. Leading zeros have no effect."""
@@ -96,8 +96,8 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         return number
 
 
-class _Joined(yaml.YAMLError):
-    """An item of a list is indented more than the one before it, which is a text.
+class _JoinedItemError(yaml.YAMLError):
+    """An item of a list is indented more than the item before it, so YAML reads it as a part of that item's text.
 
     Attributes:
         line: Its line, from 1.
@@ -171,9 +171,9 @@ class Document:
 
     def where(self, location: Location) -> str:
         """Return `file:line` of the innermost part of `location` that exists in the file."""
-        return f"{self.source}:{self.lines.get(self.known(location), 1)}"
+        return f"{self.source}:{self.lines.get(self.existing_part(location), 1)}"
 
-    def known(self, location: Location) -> Location:
+    def existing_part(self, location: Location) -> Location:
         """Return a location without the parts that do not exist in the file: a missing key, or the name of a kind."""
         existing: Location = ()
         for part in location:
@@ -259,16 +259,16 @@ _REMEDIES: Final = {
     "cannot start any token": "put this text in quotes",
     "part of the text before it": "indent this item with as many spaces as the other items of its list",
     "expected <block end>": "indent this line with as many spaces as the other lines of its list or mapping",
-    "mapping values are not allowed": "put text that has a colon in quotes; indent the keys of one mapping alike",
+    "mapping values are not allowed": "put text that has a colon in quotes; indent all keys of a mapping equally",
 }
 """Remedies by the message of PyYAML."""
 
 
 def _configuration_error(error: Exception, text: str, source: str, line: int) -> ConfigurationError:
     if isinstance(error, yaml.reader.ReaderError):
-        message = f"a text file cannot hold the character {error.character:#04x}"
+        message = f"a text file cannot contain the character {error.character:#04x}"
         line = text.count("\n", 0, error.position) + 1
-    elif isinstance(error, _Joined):
+    elif isinstance(error, _JoinedItemError):
         message, line = str(error), error.line
     elif isinstance(error, yaml.MarkedYAMLError):
         message = str(error.problem or error.context)

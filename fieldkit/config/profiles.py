@@ -160,7 +160,7 @@ class RobotBridge(Strict):
         return (self.program, "bridge", *options, *back, *self.topics)
 
 
-MOST_DOMAIN: Final = 232
+MAX_DOMAIN: Final = 232
 """Highest domain. Above it there are no ports for RTPS (docs.ros.org, "The ROS_DOMAIN_ID")."""
 
 
@@ -194,8 +194,8 @@ class Ros(Strict):
     @schema.model_validator(mode="after")
     def _is_in_a_domain(self) -> "Ros":
         text = self.environment.get("ROS_DOMAIN_ID") or "0"
-        if not (text.isascii() and text.isdecimal() and int(text) <= MOST_DOMAIN):
-            message = f"{text!r} is not a domain of ROS 2; use a whole number from 0 to {MOST_DOMAIN}"
+        if not (text.isascii() and text.isdecimal() and int(text) <= MAX_DOMAIN):
+            message = f"{text!r} is not a domain of ROS 2; use a whole number from 0 to {MAX_DOMAIN}"
             raise schema.validation_error(message, "environment", "ROS_DOMAIN_ID")
         return self
 
@@ -258,7 +258,7 @@ class Radio(Strict):
     sensitivity_dbm: Number | Int
 
 
-LEAST_CHARGE: Final = 0.2
+MIN_CHARGE: Final = 0.2
 """No drone starts a flight below this charge. Battery makers recommend to keep 20 %."""
 
 _CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
@@ -292,7 +292,7 @@ class Mavlink(Strict):
     autopilot: Annotated[str, Field(pattern="^(px4|ardupilot)$", exclude_if=lambda name: name == "px4")] = "px4"
     system: Annotated[Int, Field(gt=0, le=250, exclude_if=lambda number: number == 1)] = 1
     boot_s: Annotated[Number | Int, Field(ge=0, le=120, exclude_if=lambda time_s: time_s == BOOT_S)] = BOOT_S
-    least_charge: Annotated[Fraction, Field(exclude_if=lambda share: share == LEAST_CHARGE)] = LEAST_CHARGE
+    least_charge: Annotated[Fraction, Field(exclude_if=lambda share: share == MIN_CHARGE)] = MIN_CHARGE
 
     @property
     def onboard_connection(self) -> str:

@@ -16,7 +16,7 @@ from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.units import format_bytes
 
-MOST_BYTES: Final = 8 << 20
+MAX_BYTES: Final = 8 << 20
 """Largest size of a program.
 
 It is sent over the control connection before each attempt, perhaps over a slow radio.
@@ -35,7 +35,7 @@ class LabProgram(Strict):
 
     file: Annotated[str, Field(pattern=r"^[^\x00]+$")]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-    size_bytes: Annotated[Int, Field(ge=0, le=MOST_BYTES)]
+    size_bytes: Annotated[Int, Field(ge=0, le=MAX_BYTES)]
     executable: Bool
 
     @property
@@ -51,7 +51,7 @@ class LabProgram(Strict):
         """
         remedy = f"restore it (SHA-256 {self.sha256}), or start a new trial"
         try:
-            content = files.read(_resolve(Path(self.file)), MOST_BYTES)
+            content = files.read(_resolve(Path(self.file)), MAX_BYTES)
         except OSError as error:
             raise ConfigurationError(
                 f"the program that the trial copies to robots cannot be read: {error.strerror}",
@@ -105,10 +105,10 @@ def _record(name: str, path: Path, folder: Path) -> dict[str, object]:
             raise schema.validation_error(f"{name!r} is a link to a file outside of {inside}; copy the file there")
         if target.is_dir():
             raise schema.validation_error(f"{name!r} is a folder; name one file")
-        if status.st_size > MOST_BYTES:
-            sizes = f"{format_bytes(status.st_size)}, more than {format_bytes(MOST_BYTES)}"
+        if status.st_size > MAX_BYTES:
+            sizes = f"{format_bytes(status.st_size)}, more than {format_bytes(MAX_BYTES)}"
             raise schema.validation_error(f"{name!r} has {sizes}; install it on the robot")
-        content = files.read(target, MOST_BYTES)
+        content = files.read(target, MAX_BYTES)
     except OSError as error:
         raise schema.validation_error(f"{name!r} cannot be read: {error.strerror}") from None
     return {

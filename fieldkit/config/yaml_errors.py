@@ -68,10 +68,10 @@ def _is_opaque_mapping(kind: Any) -> bool:  # noqa: ANN401 (any type)
 
 
 SHAPES: Final[dict[str, str]] = {}
-"""Description of the texts that match a pattern, by pattern; see `schema.shaped`."""
+"""Description of the texts that match a pattern, by pattern; see `schema.pattern_field`."""
 
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
-_MOST_SHOWN: Final = 60
+_MAX_SHOWN: Final = 60
 _NOTHING: Final = ", and there are none; indent the keys that belong to this line more than this line"
 _MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 
@@ -100,10 +100,10 @@ def explain(problems: Sequence[Any], document: Document) -> ConfigurationError:
         message = _misindented(first, document)
     else:
         message = _message(first)
-    path = ".".join(str(part) for part in (*document.place, *document.known(place)))
+    path = ".".join(str(part) for part in (*document.place, *document.existing_part(place)))
     remedy = f"add {missing}: to it" if missing else "correct this line"
     # A value with several valid forms has one problem per form at the same location.
-    others = len({(document.known(_location(problem)), _missing_key(problem)) for problem in problems}) - 1
+    others = len({(document.existing_part(_location(problem)), _missing_key(problem)) for problem in problems}) - 1
     more = f" ({others} more after this one)" if others else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
@@ -117,7 +117,7 @@ def _misindented(problem: Any, document: Document) -> str:  # noqa: ANN401 (as i
     place, context = problem["loc"], problem["ctx"]
     key, outer = context["key"], context["outer"]
     depth = max((depth for depth, part in enumerate(place) if part in outer), default=0)
-    names = [part for part in document.known(place[:depth]) if isinstance(part, str)]
+    names = [part for part in document.existing_part(place[:depth]) if isinstance(part, str)]
     owner = f"of {names[-1]}" if names else "of the whole file"
     return f"unknown key {key} here; it is a key {owner}: indent it like {place[depth]}:"
 
@@ -180,7 +180,7 @@ def _kinds(names: Sequence[str]) -> str:
 
 def _pattern_message(text: str, pattern: str) -> str:
     """Return the message about a text that does not match a pattern."""
-    quoted = repr(text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}...")
+    quoted = repr(text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}...")
     if words := _WORDS.fullmatch(pattern):
         choices = words[1].split("|")
         return f"{quoted} is not one of: {', '.join(choices)}"

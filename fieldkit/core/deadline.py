@@ -49,7 +49,7 @@ class Deadline:
     def extended_by_suspension(self, began_s: float, wait_s: float) -> "Deadline":
         """Return the deadline, extended by the time for which this process was suspended during a wait.
 
-        The suspension says nothing about the awaited program, whose answer may have arrived already.
+        A suspension is no evidence about the awaited program, whose answer may have arrived already.
 
         Args:
             began_s: Start of the wait, in seconds of `time.monotonic`.

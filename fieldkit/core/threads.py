@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 T = TypeVar("T")
 
-_HANG_UP_WAIT_S: Final = 10.0
+_INTERRUPT_WAIT_S: Final = 10.0
 _POLL_INTERVAL_S: Final = 0.5
 
 
@@ -49,7 +49,7 @@ def run_parallel(
     call: Callable[[Item], T],
     items: Collection[Item],
     *,
-    hang_up: Callable[[], None] | None = None,
+    on_interrupt: Callable[[], None] | None = None,
     end_others: Callable[[], None] | None = None,
 ) -> list[T]:
     """Call `call` with each of `items` in a separate thread; return the results, or raise the first error.
@@ -57,8 +57,8 @@ def run_parallel(
     Args:
         call: The function.
         items: Its arguments, one per thread.
-        hang_up: Ends the waits of the calls after Ctrl-C, for example by closing connections. The threads then have
-            10 s to return, so that they no longer write to files. Without it, Ctrl-C does not wait for the threads.
+        on_interrupt: Ends the waits of the calls after Ctrl-C, for example by closing connections. The threads then
+            have 10 s to return, so that they no longer write to files. Without it, Ctrl-C does not wait for them.
         end_others: Ends the waits of all calls after one has failed. It is called repeatedly until all threads have
             returned, and their errors are ignored. Without it, all calls run to their end.
     """
@@ -79,10 +79,10 @@ def run_parallel(
                 if failed is not None:
                     end_others()
     except BaseException:
-        if hang_up is not None:
+        if on_interrupt is not None:
             running = [future for future in futures if not future.cancel()]
-            hang_up()
-            wait(running, _HANG_UP_WAIT_S)
+            on_interrupt()
+            wait(running, _INTERRUPT_WAIT_S)
         raise
     return [future.result() for future in ([failed] if failed else futures)]
 

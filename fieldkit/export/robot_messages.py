@@ -210,7 +210,7 @@ def messages(record: AttemptRecord) -> Iterator[Message]:
         if file in record.captures:
             topic, meaning = (
                 _named("packets", _step(file)),
-                "What its capture holds: IP packets, frames of offload.",
+                "IP packets in its capture; with segmentation offload, larger frames.",
             )
             channel = _channel(record, role, topic, schemas.PACKET, meaning)
             streams.append(packet_messages(channel, record.attempt.folder, marked[file]))
@@ -243,14 +243,16 @@ def _rtts(record: AttemptRecord, role: Role) -> Iterator[Message]:
 
 def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterator[Message]:
     repeat, pings = record.attempt.folder, record.pings[file]
-    channel = _channel(record, role, _named("rtt", step), schemas.RTT, "Each reply to ping, when it was printed.")
+    channel = _channel(
+        record, role, _named("rtt", step), schemas.RTT, "Replies to ping at the time when each was printed."
+    )
     for reply in pings.replies:
         if reply.at_utc_ns is not None:
             yield Message(channel, reply.at_utc_ns, schemas.rtt(reply.at_utc_ns, repeat, reply))
     log = _channel(record, role, "log", schemas.LOG, "ICMP errors in place of a reply to ping.")
     for problem in pings.problems:
         if problem.at_utc_ns is not None:
-            text = f"icmp_seq={problem.seq}: {problem.source} says {problem.text}"
+            text = f"icmp_seq={problem.seq}: {problem.source} reports {problem.text}"
             yield Message(
                 log,
                 problem.at_utc_ns,
@@ -259,14 +261,14 @@ def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterato
 
 
 def _links(record: AttemptRecord, role: Role) -> Iterator[Message]:
-    channel = _channel(record, role, "link", schemas.LINK, "What its radio told of its links, five times a second.")
+    channel = _channel(record, role, "link", schemas.LINK, "State of its radio's links, five times a second.")
     for sample in record.links[role]:
         yield Message(channel, sample.utc_ns, schemas.link(record.attempt.folder, sample))
 
 
 def _phases(record: AttemptRecord, role: Role) -> Iterator[Message]:
-    """Yield when a robot started and stopped recording, sending or receiving, and ping; named steps are separate."""
-    meaning = "What it began to do, by the first and last stamp of its evidence."
+    """Yield the start and end of a robot's recording, transfer and ping; steps with a name have separate channels."""
+    meaning = "Start and end of its phases, by the first and last time stamp of its evidence."
     for step, phase, begin_ns, end_ns in _spans(record, role):
         channel = _channel(record, role, _named("phase", step), schemas.PHASE, meaning)
         for t_ns, name in ((begin_ns, phase), (end_ns, "idle")):

@@ -74,7 +74,7 @@ def _present(values: Mapping[str, Any]) -> Json:
 
 
 def repeat(t_ns: int, folder: str, row: Row, table: tuple[Column, ...]) -> Json:
-    """Return a message of `repeat_schema`: the numbers of the attempt in `folder`, missing ones left out."""
+    """Return a message of `repeat_schema`: the numbers of the attempt in `folder`, without missing ones."""
     measured = {name: row[name] for name in _measured(table) if name in row}
     head = {"timestamp": time(t_ns), "repeat": folder, "status": row["status"], "reason": row.get("reason", "")}
     return head | measured
@@ -122,7 +122,7 @@ _TIME: Final = _object(
     "time",
     {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999}},
 )
-_REPEAT: Final = _typed("string", "Repeat and attempt, as its folder is called: udp-07, or udp-07.void1.")
+_REPEAT: Final = _typed("string", "Folder of the attempt, with repeat and attempt: udp-07, or udp-07.void1.")
 
 LOG: Final = _object(
     "foxglove.Log",
@@ -131,7 +131,7 @@ LOG: Final = _object(
         "level": {"oneOf": [{"title": level.name, "const": int(level)} for level in Level]},
         "message": _typed("string", "What happened."),
         "name": _typed("string", "The repeat."),
-        "file": _typed("string", "File of the trial that says so."),
+        "file": _typed("string", "File of the trial that the message refers to."),
         "line": _typed("integer", "Its line, 0 for the whole file.", minimum=0),
     },
 )
@@ -163,7 +163,7 @@ PHASE: Final = _object(
     {
         "timestamp": _TIME,
         "repeat": _REPEAT,
-        "phase": _typed("string", "What begins: record, transfer, ping; idle when one ends."),
+        "phase": _typed("string", "Phase that starts: record, transfer or ping; idle if a phase ends."),
     },
 )
 RTT: Final = _object(
@@ -172,7 +172,7 @@ RTT: Final = _object(
         "timestamp": _TIME,
         "repeat": _REPEAT,
         "seq": _typed("integer", "Sequence number of the echo request."),
-        "rtt_s": _typed("number", "Round-trip time in seconds; absent when ping gave none."),
+        "rtt_s": _typed("number", "Round-trip time in seconds; absent if ping printed none."),
         "duplicate": _typed("boolean", "Whether the request had been answered before."),
         "damaged": _typed("boolean", "Whether the checksum was wrong."),
     },
@@ -186,32 +186,32 @@ PACKET: Final = _object(
         "protocol": _typed("integer", "IP protocol number: 1 ICMP, 6 TCP, 17 UDP."),
         "source": _typed("string", "Source address."),
         "destination": _typed("string", "Destination address."),
-        "source_port": _typed("integer", "Source port; absent where the packet carries none."),
-        "destination_port": _typed("integer", "Destination port, likewise."),
+        "source_port": _typed("integer", "Source port; absent if the packet has none."),
+        "destination_port": _typed("integer", "Destination port; absent if the packet has none."),
         "wire_bytes": _typed("integer", "Length of the frame on the link."),
         "payload_bytes": _typed("integer", "Bytes after the IP header."),
         "fragment_offset": _typed("integer", "Offset of the payload in its datagram, in bytes."),
-        "lost": _typed("boolean", "Whether no copy is in the receiver's capture; absent where that is not known."),
-        "copy": _typed("boolean", "Whether the same packet had been received before; absent likewise."),
+        "lost": _typed("boolean", "Whether the receiver's capture has no copy; absent if unknown."),
+        "copy": _typed("boolean", "Whether the same packet had been received before; absent if unknown."),
     },
     optional=("source_port", "destination_port", "lost", "copy"),
 )
 
 _STATION: Final = {
-    "station": _typed("string", "Address of the other radio, or its name; empty where that is not told."),
-    "signal_dbm": _typed("number", "How strong it arrives, in dBm."),
-    "tx_rate_bit_s": _typed("number", "Rate of the last frame to it, in bit/s."),
-    "rx_rate_bit_s": _typed("number", "Rate of the last frame from it."),
-    "tx_packets": _typed("integer", "Packets sent to it; this and the others count from any number."),
-    "rx_packets": _typed("integer", "Packets that came from it."),
-    "tx_retries": _typed("integer", "Frames sent again to it."),
-    "tx_failures": _typed("integer", "Packets to it that were given up."),
-    "beacon_losses": _typed("integer", "Times that its beacons stayed away."),
+    "station": _typed("string", "Address of the other radio, or its name; empty if unknown."),
+    "signal_dbm": _typed("number", "Signal received from this station, in dBm."),
+    "tx_rate_bit_s": _typed("number", "PHY rate of the last frame to this station, in bit/s."),
+    "rx_rate_bit_s": _typed("number", "PHY rate of the last frame from this station, in bit/s."),
+    "tx_packets": _typed("integer", "Packets sent to this station; counters may start at any number."),
+    "rx_packets": _typed("integer", "Packets received from this station."),
+    "tx_retries": _typed("integer", "Frames retransmitted to this station."),
+    "tx_failures": _typed("integer", "Packets to this station that were dropped after the last retry."),
+    "beacon_losses": _typed("integer", "Number of times that beacons of this station were lost."),
 }
 _CHANNEL: Final = {
-    "noise_dbm": _typed("number", "Noise in the channel, in dBm; what a radio does not tell is absent."),
-    "active_s": _typed("number", "Time for which the radio listened to its channel, from any number."),
-    "busy_s": _typed("number", "Of that, the time in which the channel was busy."),
+    "noise_dbm": _typed("number", "Noise in the channel, in dBm; absent if the radio does not report it."),
+    "active_s": _typed("number", "Time for which the radio was on its channel, counted from any start."),
+    "busy_s": _typed("number", "Part of active_s in which the channel was busy."),
 }
 LINK: Final = _object(
     "fieldkit.Link",

@@ -69,7 +69,7 @@ def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
         (*(cell.key[column.name] for column in by), *astuple(row)) for cell in cells for row in estimate_rows(cell)
     ]
     columns = (*by, *declared(EstimateRow))
-    return _of_rows(columns, [[None if value == "" else value for value in row] for row in rows])
+    return _table_of_rows(columns, [[None if value == "" else value for value in row] for row in rows])
 
 
 def of_packets(transfers: Mapping[str, Crossings]) -> Table:
@@ -79,7 +79,7 @@ def of_packets(transfers: Mapping[str, Crossings]) -> Table:
         transfers: Packets by name of the step, empty if it has none.
     """
     columns = (
-        Column("step", "text", "Name of the step that sent it; empty where it has none."),
+        Column("step", "text", "Name of the step that sent the packet; empty if the step has no name."),
         *fates.CROSSING_COLUMNS,
     )
     schema = _schema(columns)
@@ -96,7 +96,7 @@ def of_packets(transfers: Mapping[str, Crossings]) -> Table:
     return pa.concat_tables([schema.empty_table(), *parts]).unify_dictionaries().combine_chunks()
 
 
-def _of_rows(columns: Sequence[Column], rows: Sequence[Sequence[Any]]) -> Table:
+def _table_of_rows(columns: Sequence[Column], rows: Sequence[Sequence[Any]]) -> Table:
     schema = _schema(columns)
     values = zip(*rows, strict=True) if rows else [()] * len(columns)
     return Table.from_arrays(

@@ -32,9 +32,9 @@ _OPEN_ATTEMPTS: Final = 2
 _LAPTOP: Final = "laptop"
 _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 
-_LOG: Final = Channel("/trial/log", schemas.LOG, _LAPTOP, "What the journal says of each attempt.")
+_LOG: Final = Channel("/trial/log", schemas.LOG, _LAPTOP, "Status of each attempt from the journal.")
 _PLACES: Final = Channel(
-    "/tf", schemas.TRANSFORMS, _LAPTOP, "Where robots were, or by plan are to stand: metres east, north, up."
+    "/tf", schemas.TRANSFORMS, _LAPTOP, "Positions of the robots, recorded or planned: metres east, north, up."
 )
 
 
@@ -142,13 +142,13 @@ def _sampled(plan: Plan, role: Role, samples: Samples, started_ns: int, ended_ns
 def _place(plan: Plan, role: Role, t_ns: int, place: Vector, frame: str = "field") -> Message:
     name = plan.cast[role].name
     if frame == WGS84:
-        channel = Channel(f"/{role}/location", schemas.LOCATION, _LAPTOP, "Where on the earth it was.")
+        channel = Channel(f"/{role}/location", schemas.LOCATION, _LAPTOP, "Geographic position of the robot.")
         return Message(channel, t_ns, schemas.location(t_ns, name, place))
     return Message(_PLACES, t_ns, schemas.transform(t_ns, name, place, frame))
 
 
 def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int) -> Message:
-    meaning = "The numbers of each attempt, when it has ended."
+    meaning = "The measurements of each attempt, at its end."
     channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(plan.table), _LAPTOP, meaning)
     row = rebuild.row(plan, attempt, evidence)
     return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row, plan.table))

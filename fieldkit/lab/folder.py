@@ -46,7 +46,7 @@ class LabFolder:
 
     @property
     def claim(self) -> str:
-        """Name of the lock that only one process can hold, see `runtime.held`."""
+        """Name of the lock that only one process can hold, see `runtime.hold_lock`."""
         return f"lab-{self.path.name}"
 
 

@@ -1,4 +1,4 @@
-"""Requests to the process of a lab: the messages, one JSON document each way, and the client that sends them."""
+"""Requests to the process of a lab: their messages, one JSON document per request and answer, and their client."""
 
 import json
 import os
@@ -30,7 +30,7 @@ class RobotState:
         roles: Its roles in trials.
         address: Its address on the radio.
         place_m: Position of its antenna, metres east, north, up.
-        programs: Names of the programs that run on it; empty if the robot has terminated.
+        programs: Names of the programs that run on it; empty if its process has exited.
     """
 
     name: str
@@ -47,7 +47,7 @@ class LabState:
 
     Attributes:
         pid: Process id.
-        up_s: Time since it has been up.
+        up_s: Time since its start was complete.
         robots: Its robots.
     """
 
@@ -112,12 +112,12 @@ def unpack_state(answer: bytes) -> LabState:
 
 
 def unpack_place_m(answer: bytes) -> Vector:
-    """Return the position in an answer; raises as `state`."""
+    """Return the position in an answer; raises as `unpack_state`."""
     return _PLACE.parse(_read(answer)).place_m
 
 
 def unpack_overview(answer: bytes) -> Overview:
-    """Return the plan view of the lab in an answer; raises as `state`."""
+    """Return the plan view of the lab in an answer; raises as `unpack_state`."""
     return _OVERVIEW.parse(_read(answer))
 
 

@@ -36,7 +36,7 @@ class Offset:
 
     Attributes:
         offset_s: Best estimate in seconds; positive if the robot's clock is ahead.
-        error_s: Maximum error of the estimate, whatever the delays of request and answer were.
+        error_s: Maximum error of the estimate for any delays of request and answer.
     """
 
     offset_s: float
@@ -46,7 +46,7 @@ class Offset:
 def offset(exchanges: Sequence[Exchange]) -> Offset:
     """Return the offset from the exchange with the narrowest interval: its midpoint, and half its width as the error.
 
-    The robot read its clock at some moment between request and answer, so its offset lies between
+    The robot read its clock at some time between request and answer, so its offset is between
     `robot - answered` and `robot + resolution - asked`.
 
     Raises:

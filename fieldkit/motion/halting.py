@@ -86,7 +86,7 @@ def halt_all(
     """Stop all programs that move robots, on all robots in parallel; return the result of each.
 
     Args:
-        robots: The robots, from `Backend.standing`.
+        robots: The robots, from `Backend.persistent_shells`.
         who: Name of the operator, see `halt`.
         within_s: Timeout for each robot.
         report: Called with each result as soon as it exists, in any thread.

@@ -31,11 +31,11 @@ from fieldkit.remote.shell import Shell
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit stop`."""
     parser.description = (
-        "Stop robots that fieldkit drives or flies, immediately, in parallel and without questions, whatever started "
-        "them and whether it still runs: robots that drive stop, drones come down. Nothing is sent to a robot that "
-        "no program of fieldkit moves. A trial that holds one of the robots ends, with exit code 3. Prints a line "
-        "per robot. Exit code 3 if a robot was not reached or has not confirmed; the other robots are stopped "
-        "nevertheless."
+        "Stop all robots that fieldkit drives or flies, immediately, in parallel and without questions, even if the "
+        "program that started them is another one or has ended: ground robots stop, drones land, or return and "
+        "land. Nothing is sent to a robot that no program of fieldkit moves. A trial that holds one of the robots "
+        "ends, with exit code 3. Prints a line per robot. Exit code 3 if a robot was not reached or has not "
+        "confirmed; the other robots are stopped nevertheless."
     )
     shared.add_site(parser)
     which = parser.add_mutually_exclusive_group(required=True)

@@ -37,7 +37,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         group.addoption(f"--fieldkit-{name}", metavar=metavar, choices=choices, help=text)
         parser.addini(f"fieldkit_{name}", text)
     group.addoption(
-        "--fieldkit-yes", action="store_true", help="ask no person: real robots are already at their places"
+        "--fieldkit-yes", action="store_true", help="show no questions: real robots are already at their places"
     )
 
 

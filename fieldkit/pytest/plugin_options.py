@@ -61,7 +61,7 @@ def output(config: pytest.Config) -> Path:
 
 
 def keep(config: pytest.Config) -> Keep:
-    """Return which evidence is kept."""
+    """Return the option that selects the evidence to keep."""
     return Keep(_text(config, "keep") or Keep.FAILED)
 
 

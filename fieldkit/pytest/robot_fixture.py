@@ -70,8 +70,8 @@ TIMEOUT_S: Final = 30.0
 FILE_BYTES: Final = 1 << 30
 """Default limit for the size of a fetched file."""
 
-_END_S: Final = 10.0
-_SHOWN: Final = 2000
+_EXIT_TIMEOUT_S: Final = 10.0
+_MAX_SHOWN_CHARACTERS: Final = 2000
 # Replaces the file atomically: it is complete or unchanged.
 _PUT: Final = (
     'mkdir -p "$(dirname "$1")" && cat >"$1.$$" && [ "$(wc -c <"$1.$$")" -eq "$2" ] && chmod "$3" "$1.$$" '
@@ -79,7 +79,7 @@ _PUT: Final = (
 )
 
 
-class RobotsUp(Protocol):
+class OpenRobots(Protocol):
     """Open robots, as a lab provides them; errors as for `OpenedLab.open`."""
 
     @property
@@ -105,7 +105,7 @@ class RobotHandle:
         lab: Its lab.
     """
 
-    def __init__(self, role: Role, lab: RobotsUp) -> None:
+    def __init__(self, role: Role, lab: OpenRobots) -> None:
         self.role = role
         self._lab = lab
 
@@ -181,7 +181,9 @@ class RobotHandle:
         try:
             yield program
         finally:
-            program.output = self._result(argv, lambda: session.end(deadline=Deadline.after(_END_S), check=False))
+            program.output = self._result(
+                argv, lambda: session.end(deadline=Deadline.after(_EXIT_TIMEOUT_S), check=False)
+            )
 
     def put(self, local: str | Path, remote: str) -> None:
         """Copy a file with its mode to the robot; missing folders are created.
@@ -235,7 +237,7 @@ class RobotHandle:
         """
         testbed = self._lab.testbed
         if testbed.oracle is not None:
-            return testbed.oracle.links(go_on=False)[self.role][-1]
+            return testbed.oracle.links(continue_sampling=False)[self.role][-1]
         command = ("iw", "dev", self._robot.profile.radio.interface, "station", "dump")
         done = self._shell.run(command, deadline=Deadline.after(TIMEOUT_S), check=False)
         return LinkSample(time.time_ns(), link_samples.parse_stations(done.stdout.decode(errors="replace")))
@@ -284,7 +286,7 @@ class RobotHandle:
         out, err = (text.decode(errors="replace") for text in (done.stdout, done.stderr))
         self._lab.log(f"{words}\n{out}{err}exit code {done.exit_code}")
         if check and done.exit_code != 0:
-            excerpt = sanitized((err or out).strip())[-_SHOWN:] or "it printed nothing"
+            excerpt = sanitized((err or out).strip())[-_MAX_SHOWN_CHARACTERS:] or "it printed nothing"
             raise ProgramError(f"{self.name}: `{quote(argv)}` exited with code {done.exit_code}: {excerpt}")
         return ProgramOutput(tuple(argv), done.exit_code, out, err)
 
@@ -296,7 +298,7 @@ class RobotHandles:
         lab: The lab.
     """
 
-    def __init__(self, lab: RobotsUp) -> None:
+    def __init__(self, lab: OpenRobots) -> None:
         self._lab = lab
 
     def __repr__(self) -> str:

@@ -90,7 +90,7 @@ class TrialRunner:
         store.prepare(out)
         outcome = runner.run_trial(plan, testbed, out, self._lab.keeper.add_event)
         assert outcome is not None, "a trial in a test cannot be skipped"
-        return _checked(outcome)
+        return _load_checked(outcome)
 
 
 def _positive(repeats: int | None) -> int | None:
@@ -99,7 +99,7 @@ def _positive(repeats: int | None) -> int | None:
     return repeats
 
 
-def _checked(outcome: Outcome) -> Trials:
+def _load_checked(outcome: Outcome) -> Trials:
     __tracebackhide__ = True
     if outcome.failed:
         raise EvidenceError(

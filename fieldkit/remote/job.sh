@@ -158,22 +158,22 @@ remove() { # delete folder $1; a second try, because a concurrent abort may crea
 }
 
 stop() {
-    meta=$1/.jobs/$2 log=$1/${6-} parting=${7-}
+    meta=$1/.jobs/$2 log=$1/${6-} end_text=${7-}
     [ -e "$meta/leaves" ] && return
     [ "${5--}" = - ] || settle "$1/$5"
     if alive "$meta" && [ ! -s "$meta/exit" ]; then
         ask
         signal "$3" || fail "cannot signal the group $pid"
-        [ -n "$parting" ] && parts "$4" && return
+        [ -n "$end_text" ] && reports_end "$4" && return
         await "$meta" "$4" || { signal KILL; await "$meta" 2; }
     fi
     result "$meta"
 }
 
-parts() { # true if $log contains $parting within $1 seconds, which shows that the job in $meta has finished its work
+reports_end() { # true if $log contains $end_text within $1 seconds, which shows that the job in $meta has finished its work
     clock
     until_s=$((now + $1))
-    until holds "$log" "$parting"; do
+    until holds "$log" "$end_text"; do
         clock
         [ "$now" -le "$until_s" ] && alive "$meta" || return 1
         nap 0.002
@@ -193,7 +193,7 @@ gone() { # wait for the jobs of this folder for which `stop` did not wait; set l
     done
 }
 
-end() { # stop and list all jobs in the folders $@: SIGINT to all, SIGKILL after 2 s; see `jobs.unhurried_file`
+end() { # stop and list all jobs in the folders $@: SIGINT to all, SIGKILL after 2 s; see `jobs.landing_marker_file`
     for dir do
         [ -d "$dir/.jobs" ] && { printf '%s\n' "${by-}" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do

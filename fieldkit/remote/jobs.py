@@ -247,7 +247,7 @@ def stop(
     signal: str = "INT",
     grace_s: float = 2.0,
     settle: str | None = None,
-    parting: str | None = None,
+    end_text: str | None = None,
 ) -> int:
     """Stop a job, identified by its recorded process: `signal` to its group, then SIGKILL after `grace_s`.
 
@@ -257,11 +257,11 @@ def stop(
         signal: Name without `SIG`.
         grace_s: Time until SIGKILL, in whole seconds.
         settle: File in the job's folder that must stop growing before the signal.
-        parting: Text in the log that shows that the job has finished its work. `stop` then does not wait for its end;
-            `fetching.fetch` does so, and fails if its exit code is not 0.
+        end_text: Text in the log which shows that the job has finished its work. `stop` then does not wait for its
+            end; `fetching.fetch` does so, and fails if its exit code is not 0.
 
     Returns:
-        The job's exit code, or `KILLED`; 0 if `parting` is in its log.
+        The job's exit code, or `KILLED`; 0 if `end_text` is in its log.
 
     Raises:
         LinkError: The robot did not answer.
@@ -275,7 +275,7 @@ def stop(
         signal,
         f"{grace_s:.0f}",
         settle or "-",
-        *([job.log, parting] if parting else []),
+        *([job.log, end_text] if end_text else []),
     )
     done = shell.run(argv, deadline=Deadline.after(grace_s + REPLY_S), check=False)
     return _exit_code(shell, job, done)

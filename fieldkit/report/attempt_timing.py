@@ -91,7 +91,9 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> M
         if (packet_fates := fates.read(evidence, transfer)) is not None
     ]
     bags = {transfer.sent_file: evidence.read_or_none(bag.read, transfer.sent_file) for transfer in transfers}
-    outputs = [(each.name, each.role, evidence.read_or_none(ping.read, each.file)) for each in plan.pingings()]
+    outputs = [
+        (pinging.name, pinging.role, evidence.read_or_none(ping.read, pinging.file)) for pinging in plan.pingings()
+    ]
     offset_ns, clocks = _clock_offset(
         transfers, packets, ends, {transfer.name: _offset_s(repeats, row, transfer) for transfer in transfers}
     )
@@ -120,7 +122,7 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> M
         *_activities_of_faults(moments, evidence),
         *_activities_of_moves(evidence),
     ]
-    return replace(moments, activities=sorted(activities, key=lambda each: each.start_ns))
+    return replace(moments, activities=sorted(activities, key=lambda activity: activity.start_ns))
 
 
 def _offset_s(repeats: Repeats, row: int, transfer: Transfer) -> float:
@@ -192,7 +194,7 @@ def _step_label(what: str, name: str) -> str:
 
 def _activities_of_jobs(moments: Moments) -> Iterator[Activity]:
     """Yield the jobs that no other evidence shows. Jobs of the same name on several robots are combined."""
-    shown = {each.name.partition(" ")[0] for each in _activities_of_evidence(moments)}
+    shown = {activity.name.partition(" ")[0] for activity in _activities_of_evidence(moments)}
     names = dict.fromkeys(name for _, name in moments.jobs)
     for name in names:
         what = plain_name(name)
@@ -246,8 +248,8 @@ def _activities_of_moves(evidence: AttemptEvidence) -> Iterator[Activity]:
             yield Activity(f"move {role}", changes[0][0], changes[-1][1], "orange")
 
 
-MOST_SAMPLES: Final = 1500
-"""Most samples of each kind in a panel; of more samples, every k-th is drawn."""
+MAX_SAMPLES: Final = 1500
+"""Maximum number of samples of each kind in a panel; of more samples, every k-th is drawn."""
 _TIME: Final = "time [s]"
 _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 _RECEIVED: Final = Style("green", "^", "none")
@@ -324,7 +326,7 @@ def _topic(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_n
     )
     series = []
     for label, style, at_s, heights in kinds:
-        every_kth = slice(None, None, max(1, -(-len(at_s) // MOST_SAMPLES)))
+        every_kth = slice(None, None, max(1, -(-len(at_s) // MAX_SAMPLES)))
         series.append(Series(label, style, at_s[every_kth], heights[every_kth]))
     yield Panel(
         title=f"delay of {step.name or 'the topic'} beyond its fastest sample",

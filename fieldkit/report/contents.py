@@ -38,9 +38,9 @@ _ALWAYS_VISIBLE: Final = frozenset(
 _FIRST: Final = "expected and own figures"
 """Quantities with an expectation, and quantities that a lab declares."""
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
-_MOST_FURTHER: Final = 12
+_MAX_FURTHER: Final = 12
 """Most charts of quantities that are not defined by fieldkit."""
-_MOST_IN_TABLE: Final = 8
+_MAX_IN_TABLE: Final = 8
 """Most visible columns of quantities that are not defined by fieldkit."""
 
 
@@ -214,7 +214,7 @@ def _further_charts(
             and distance.has_curve(cells, quantity, evidence)
         ):
             others.setdefault(plain_name(quantity.name), quantity.name)
-    chosen = dict.fromkeys((*map(plain_name, wanted), *list(others)[:_MOST_FURTHER]))
+    chosen = dict.fromkeys((*map(plain_name, wanted), *list(others)[:_MAX_FURTHER]))
     undrawn = [name for plain, name in others.items() if plain not in chosen]
     return ChartSection(
         "further",
@@ -310,7 +310,7 @@ def _tables_of_protocol(
         others = [quantity for quantity in remaining if quantity.step == step and not quantity.is_own]
         # Without quantities to be always visible, the first ones are.
         visible = [quantity for quantity in builtin if plain_name(quantity.name) in _ALWAYS_VISIBLE] or builtin[
-            :_MOST_IN_TABLE
+            :_MAX_IN_TABLE
         ]
         more = [quantity for quantity in builtin if quantity not in visible]
         if builtin or (not step and not remaining and not first):
@@ -319,7 +319,7 @@ def _tables_of_protocol(
             )
         if others:
             title_text = ", ".join(filter(None, (title, step, "further figures")))
-            yield CellTable(title_text, others[:_MOST_IN_TABLE], others[_MOST_IN_TABLE:], lines, {})
+            yield CellTable(title_text, others[:_MAX_IN_TABLE], others[_MAX_IN_TABLE:], lines, {})
     if words:
         yield CellTable(f"{title}, words", (), (), lines, {}, words)
 

@@ -25,7 +25,7 @@ _ASIDE: Final = 0.009
 """Offset of single repeats from the interval of their estimate, as a share of the axis."""
 _FEWEST_JOINED: Final = 4
 """Fewest distances whose points are joined. A line through fewer suggests a curve that was not measured."""
-_MOST_WIDE: Final = 2
+_MAX_WIDE: Final = 2
 """Most panels of a chart of several steps that are drawn large."""
 _MARGIN: Final = 0.06
 """Margin at each end of the axis, as a share of the axis."""
@@ -132,8 +132,8 @@ class _CurveDrawing:
         y_label = f"{label} [{unit}]" if unit else label
         points = [place.content for places in groups.values() for place in places if isinstance(place.content, Point)]
         of_protocols = {
-            protocol: ends([each for each in points if each.protocol == protocol], scale.unit)
-            for protocol in {each.protocol for each in points}
+            protocol: ends([point for point in points if point.protocol == protocol], scale.unit)
+            for protocol in {point.protocol for point in points}
         }
         missing = [place for places in groups.values() for place in places if isinstance(place.content, Absence)]
         name = plain_name(quantity.name).removesuffix("_s").removesuffix("_bit").replace("_", "-")
@@ -145,7 +145,7 @@ class _CurveDrawing:
                 self._panel(title, places, y_label, of_protocols[wording.text(places[0].cell, "protocol")])
                 for title, places in groups.items()
             ],
-            is_dense=several and len(groups) > _MOST_WIDE,
+            is_dense=several and len(groups) > _MAX_WIDE,
         )
 
     def _places(self, quantity: Quantity, group: Sequence[Cell], factor: float) -> list[_CurvePlace]:
@@ -293,9 +293,9 @@ def _words(title: str, y_label: str, series: Iterable[tuple[Identity, list[_Curv
     sentences = [
         f"{identity.label or 'all'}: "
         + ", ".join(
-            f"{f'{each.content.value:.2f}' if isinstance(each.content, Point) else each.content.text} "
-            f"at {wording.distance(each.cell)}"
-            for each in places
+            f"{f'{place.content.value:.2f}' if isinstance(place.content, Point) else place.content.text} "
+            f"at {wording.distance(place.cell)}"
+            for place in places
         )
         for identity, places in series
     ]

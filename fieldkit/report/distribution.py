@@ -15,13 +15,13 @@ from fieldkit.report.charts import Chart, Panel, Series
 from fieldkit.report.series import Identities, needs_log, panels
 from fieldkit.report.trial_folders import Evidence
 
-MOST_DISTANCES: Final = 3
+MAX_DISTANCES: Final = 3
 """Most distances with a panel: the nearest, the middle and the farthest."""
 _ROOM: Final = 1.03
 _LOG_ROOM: Final = 1.1
 """Factor between the ends of an axis and the extreme times."""
 _LOG: Final = ", on a logarithmic axis"
-MOST_STEPS: Final = 120
+MAX_STEPS: Final = 120
 """Most steps of a line. A longer line is drawn through this number of its quantiles."""
 
 
@@ -120,9 +120,9 @@ def _chart(
 
 
 def _places(cells: Sequence[Cell]) -> list[str]:
-    """Return labels of the distances that get a panel, at most `MOST_DISTANCES`."""
+    """Return labels of the distances that get a panel, at most `MAX_DISTANCES`."""
     places = [label for _, label in sorted({(wording.metres(cell), wording.distance(cell)) for cell in cells})]
-    if len(places) <= MOST_DISTANCES:
+    if len(places) <= MAX_DISTANCES:
         return places
     return [places[0], places[(len(places) - 1) // 2], places[-1]]
 
@@ -135,8 +135,8 @@ def _series(identities: Identities, sample: _Sample, factor: float) -> Series:
 
 def _steps(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the corners of the distribution function: times, and the shares up to each time, from 0 to 1."""
-    if len(times) > MOST_STEPS:
-        shares = np.linspace(0, 1, MOST_STEPS + 1)
+    if len(times) > MAX_STEPS:
+        shares = np.linspace(0, 1, MAX_STEPS + 1)
         return np.quantile(times, shares, method="inverted_cdf"), shares
     return np.insert(times, 0, times[0]), np.arange(len(times) + 1) / len(times)
 
@@ -154,10 +154,10 @@ def _caption(samples: Sequence[_Sample], unit_name: str, *, is_log: bool) -> str
     many = str(counts[0]) if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
     text = f"Share of {unit_name} that took at most this time{_LOG if is_log else ''}; {many} {unit_name} per line"
     places = {wording.distance(sample.cell) for sample in samples}
-    if len(places) > MOST_DISTANCES:
+    if len(places) > MAX_DISTANCES:
         text += f"; of {len(places)} distances the nearest, a middle one and the farthest"
-    if counts[-1] > MOST_STEPS:
-        text += f"; lines of more than {MOST_STEPS} go through as many quantiles"
+    if counts[-1] > MAX_STEPS:
+        text += f"; lines of more than {MAX_STEPS} go through as many quantiles"
     return (
         f"{text}. Requests without a reply are in no line: see ping loss." if unit_name == "replies" else f"{text}."
     )

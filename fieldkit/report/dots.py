@@ -145,7 +145,7 @@ def _axis(unit: str, scale: Scale, lanes: Sequence[_Lane]) -> str:
 
 def _with_limits(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
     """Return a panel with the ends of its axis of values, which is logarithmic if values need it."""
-    values = list(chain.from_iterable((each.value, *each.repeats) for each in points))
+    values = list(chain.from_iterable((point.value, *point.repeats) for point in points))
     if needs_log(values):
         return replace(panel, x_log=True, left=min(values) / _LOG_ROOM, right=max(values) * _LOG_ROOM)
     left, right = ends(points, unit)
@@ -153,19 +153,19 @@ def _with_limits(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
 
 
 def _series(identity: Identity, placed: Sequence[tuple[float, Point]], aside: float) -> Series:
-    points = [each for _, each in placed]
+    points = [point for _, point in placed]
     return Series(
         label=identity.label,
         style=replace(identity.style, line="none"),
-        x=[each.value for each in points],
+        x=[point.value for point in points],
         y=[height for height, _ in placed],
-        low=[each.low for each in points],
-        high=[each.high for each in points],
+        low=[point.low for point in points],
+        high=[point.high for point in points],
         join="none",
-        behind=[(value, height - aside) for height, each in placed for value in each.singles(False)],
-        behind_bounds=[(value, height - aside) for height, each in placed for value in each.singles(True)],
-        bounds=[each.is_bound for each in points],
-        notes=[each.note for each in points] if any(each.note for each in points) else (),
+        behind=[(value, height - aside) for height, point in placed for value in point.singles(False)],
+        behind_bounds=[(value, height - aside) for height, point in placed for value in point.singles(True)],
+        bounds=[point.is_bound for point in points],
+        notes=[point.note for point in points] if any(point.note for point in points) else (),
     )
 
 

@@ -42,9 +42,9 @@ _BACKED: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
 _EDGE: Final = 0.15
 """Share of the world next to its edges in which labels are aligned inwards."""
 
-_MOST_LABELLED: Final = 15
+_MAX_LABELLED: Final = 15
 """Most links that are labelled with their SNR: those of six robots."""
-_LEAST_LABELLED: Final = 0.1
+_MIN_LABELLED: Final = 0.1
 """Least length of a labelled link, as a share of the drawing's width."""
 
 
@@ -152,14 +152,14 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
         array=[link.snr_db for link in lab.links],
         cmap="viridis",
         linestyles=["solid" if link.linked else "dotted" for link in lab.links],
-        linewidths=1.2 if len(lines) <= _MOST_LABELLED else 0.4,
+        linewidths=1.2 if len(lines) <= _MAX_LABELLED else 0.4,
         zorder=2,
     )
     drawn.set_clim(*_SNR_DB)
     axes.add_collection(drawn)
     figure.colorbar(drawn, ax=axes, label="SNR (dB)", shrink=0.7)
     for (place_m, other_m), link in zip(lines, lab.links, strict=True):
-        if len(lines) <= _MOST_LABELLED and math.dist(place_m, other_m) > _LEAST_LABELLED * max(lab.area_m):
+        if len(lines) <= _MAX_LABELLED and math.dist(place_m, other_m) > _MIN_LABELLED * max(lab.area_m):
             middle_m = (place_m[0] + other_m[0]) / 2, (place_m[1] + other_m[1]) / 2
             axes.annotate(
                 sanitized(", ".join((f"{link.snr_db:.0f} dB", *link.through))),

@@ -30,7 +30,7 @@ class Ranking:
 
     def __init__(self, evidence: Evidence) -> None:
         plans = list({id(plan): plan for plan in evidence.plans.values()}.values())
-        expectations = [each for plan in plans for each in plan.procedure.expectations]
+        expectations = [expectation for plan in plans for expectation in plan.procedure.expectations]
         self._expected: dict[str, Expectation] = {}
         for expectation in expectations:
             self._expected.setdefault(expectation.quantity, expectation)
@@ -65,9 +65,9 @@ def _lab_columns(plan: Plan) -> Iterator[str]:
 _OF_PROTOCOLS: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
 _OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
 """Quantities of trials that stream topics, in which pings and transfers only serve clocks and load."""
-_MOST_FIRST: Final = 6
+_MAX_FIRST: Final = 6
 """Most headlines of expected quantities and of a lab's quantities."""
-_MOST_PLACES: Final = 3
+_MAX_PLACES: Final = 3
 _COUNT_TEXTS: Final = {
     "silent": "nothing arrived in {}",
     "failed": "{} failed",
@@ -121,7 +121,7 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
     """
     writer = _HeadlineWriter(evidence, Ranking(evidence), wording.differing(cells))
     yield writer.repeats(cells, unmeasured)
-    first = writer.ranking.first(measured(cells))[:_MOST_FIRST]
+    first = writer.ranking.first(measured(cells))[:_MAX_FIRST]
     for quantity in first:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
         own_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
@@ -165,7 +165,7 @@ class _HeadlineWriter:
             affected = [
                 (cell, getattr(counts, name), counts.planned) for cell, counts in counted if getattr(counts, name)
             ]
-            affected.sort(key=lambda each: -each[1] / each[2])
+            affected.sort(key=lambda item: -item[1] / item[2])
             places = [
                 f"{wording.condition(cell, differing=self.differing)} ({count} of {total_count})"
                 for cell, count, total_count in affected
@@ -256,8 +256,8 @@ def _end(values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Ce
 
 def _first_places(places: Sequence[str]) -> str:
     """Return the first places, and the number of further ones."""
-    more = len(places) - _MOST_PLACES
-    return "; ".join((*places[:_MOST_PLACES], *([f"{more} more"] if more > 0 else [])))
+    more = len(places) - _MAX_PLACES
+    return "; ".join((*places[:_MAX_PLACES], *([f"{more} more"] if more > 0 else [])))
 
 
 def _subject(same: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
@@ -269,12 +269,12 @@ def _subject(same: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
 
 def _chosen(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
     """Return the quantities called `names`, else the first ones, each with the same quantity of other steps."""
-    chosen = [same for name in names if (same := _of_name(quantities, name))]
+    chosen = [same for name in names if (same := _quantities_named(quantities, name))]
     others = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)
-    return chosen or [_of_name(quantities, name) for name in list(others)[: len(names)]]
+    return chosen or [_quantities_named(quantities, name) for name in list(others)[: len(names)]]
 
 
-def _of_name(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
+def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
     """Return the quantity called `name`, or those of named steps if no other step measures it."""
     same = with_plain_name(quantities, name)
     return same[:1] if same and not same[0].step else same

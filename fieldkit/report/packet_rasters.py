@@ -14,11 +14,11 @@ from fieldkit.report import wording
 from fieldkit.report.series import panels
 from fieldkit.report.trial_folders import Evidence
 
-MOST_REPEATS: Final = 400
+MAX_REPEATS: Final = 400
 """Most repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""
-MOST_LINES: Final = 20
+MAX_LINES: Final = 20
 """Most lines of a cell."""
-MOST_COLUMNS: Final = 300
+MAX_COLUMNS: Final = 300
 """Most columns of a line. A line with more packets combines several in a column, marked if any of them is."""
 
 _WHAT: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments sent again"}
@@ -63,14 +63,14 @@ class RasterGroup:
 def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
     """Yield the rasters of all cells whose captures are available."""
     differing = wording.differing(cells) - {"topology"}
-    share = min(MOST_LINES, max(1, MOST_REPEATS // max(1, len(cells))))
+    share = min(MAX_LINES, max(1, MAX_REPEATS // max(1, len(cells))))
     for title, cells_of in panels(cells).items():
         drawn = {
             wording.place(cell, differing=differing): _marked_packets(cell, evidence, share) for cell in cells_of
         }
         for transfer in dict.fromkeys(name for lines in drawn.values() for name in lines):
             marked = {place: lines.get(transfer, []) for place, lines in drawn.items()}
-            width = -(-max(len(line) for lines in marked.values() for line in lines) // MOST_COLUMNS)
+            width = -(-max(len(line) for lines in marked.values() for line in lines) // MAX_COLUMNS)
             what = _WHAT[transfer[1]]
             yield RasterGroup(
                 title=", ".join(filter(None, (transfer[0], title))),

@@ -85,10 +85,10 @@ def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
     return scenario != procedure, index, scenario, procedure
 
 
-MOST_BEHIND: Final = 100
+MAX_BEHIND: Final = 100
 """Most single repeats behind one estimate; of more repeats, every k-th is drawn."""
-_LEAST_TOP_PERCENT: Final = 1.0
-_MOST_LENGTH: Final = 2.0
+_MIN_TOP_PERCENT: Final = 1.0
+_MAX_LENGTH: Final = 2.0
 """Most length of the axis, as a multiple of the largest value. Wider intervals are cut there."""
 _MARGIN: Final = 0.25
 """Margins of an axis that does not start at 0, as a share of the range of values."""
@@ -160,7 +160,7 @@ def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> 
     estimate = cell.estimates[quantity.name]
     low, high = (None if end is None else factor * end for end in (estimate.low, estimate.high))
     values, is_bound = evidence.observed(cell, quantity)
-    every_kth = slice(None, None, max(-(-len(values) // MOST_BEHIND), 1))
+    every_kth = slice(None, None, max(-(-len(values) // MAX_BEHIND), 1))
     if quantity.kind is Kind.FLAG:
         values = values[:0]
     return Point(
@@ -177,14 +177,14 @@ def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> 
 
 def ends(points: Sequence[Point], unit: str) -> tuple[float, float]:
     """Return the ends of an axis for these points. It starts at 0 unless a value is negative, as in dBm."""
-    if min(each.bottom for each in points) < 0:
-        values = [value for each in points for value in (each.value, *each.repeats)]
+    if min(point.bottom for point in points) < 0:
+        values = [value for point in points for value in (point.value, *point.repeats)]
         low, high = min(values), max(values)
         margin = _MARGIN * (high - low) or 1.0
         return low - margin, high + margin
-    largest, highest = max(each.value for each in points), max(each.top for each in points)
-    top = min(highest, _MOST_LENGTH * largest) if largest > 0 else highest
-    return 0.0, max(1.08 * top, _LEAST_TOP_PERCENT if unit == "%" else 0.0) or 1.0
+    largest, highest = max(point.value for point in points), max(point.top for point in points)
+    top = min(highest, _MAX_LENGTH * largest) if largest > 0 else highest
+    return 0.0, max(1.08 * top, _MIN_TOP_PERCENT if unit == "%" else 0.0) or 1.0
 
 
 def needs_log(values: Iterable[float]) -> bool:

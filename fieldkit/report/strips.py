@@ -15,7 +15,7 @@ from fieldkit.report.series import Identities, panels
 from fieldkit.report.theme import Colour
 from fieldkit.report.trial_folders import Evidence
 
-MOST_MARKS: Final = 2000
+MAX_MARKS: Final = 2000
 """Most marks on a page, shared by its strips. Of more attempts, valid ones are omitted evenly, others never."""
 FEWEST_MARKS: Final = 20
 """Fewest marks of valid attempts in a strip."""
@@ -75,7 +75,7 @@ class StripGroup:
 def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[StripGroup]:
     """Yield the strips of all cells, those of a protocol and a topology together."""
     differing = wording.differing(cells) - {"topology"}
-    most_marks = max(FEWEST_MARKS, MOST_MARKS // max(1, len(cells)))
+    most_marks = max(FEWEST_MARKS, MAX_MARKS // max(1, len(cells)))
     for title, group in panels(cells).items():
         heights = _heights(group, [cell for cell in cells if cell.key["protocol"] == group[0].key["protocol"]])
         strips = []

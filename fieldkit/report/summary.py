@@ -65,7 +65,7 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
     columns = [texts for name, texts in valid.texts.items() if plain_name(name) == "one_way_withheld"]
     withheld = [reasons for reasons in zip(*columns, strict=True) if any(reasons)]
     if withheld:
-        reasons = _counted([reason for each in withheld for reason in each if reason])
+        reasons = _counted([reason for row_reasons in withheld for reason in row_reasons if reason])
         yield Caution(
             f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}.", reasons
         )

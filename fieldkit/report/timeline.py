@@ -19,8 +19,8 @@ from fieldkit.report.charts import Chart, Panel, Series, Span
 from fieldkit.report.theme import Style
 from fieldkit.report.trial_folders import Evidence
 
-MOST_PACKETS: Final = 1500
-"""Most packets of each kind in a panel; of more packets, every k-th is drawn."""
+MAX_PACKETS: Final = 1500
+"""Maximum number of packets of each kind in a panel; of more packets, every k-th is drawn."""
 
 _MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "sent again"}
 _SENT: Final = Style("blue", "o", "none")
@@ -30,10 +30,10 @@ _ROUND_TRIP: Final = Style("pink", "D", "none")
 _DISTANCE: Final = Style("orange", line="solid")
 _LINKS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 """Styles of the sending robot and of the other."""
-_LEAST_BAR: Final = 0.004
-"""Least length of a bar, as a share of the axis; a shorter one would be invisible."""
+_MIN_BAR: Final = 0.004
+"""Minimum length of a bar, as a share of the axis; a shorter one would be invisible."""
 _TIME: Final = "time [s]"
-_ROOM: Final = 0.01
+_MARGIN: Final = 0.01
 """Margin at the right end of the axis, as a share of the axis."""
 
 
@@ -52,7 +52,7 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
     pings = [
         panel for name, role, output in times.pings for panel in _round_trips(name, role, output, times, zero_ns)
     ]
-    stops_s = [(each.stop_ns - zero_ns) / 1e9 for each in times.activities]
+    stops_s = [(activity.stop_ns - zero_ns) / 1e9 for activity in times.activities]
     stops_s += [float(np.max(series.x)) for panel in pings for series in panel.series if len(series.x)]
     strips = [
         _bars(times, zero_ns),
@@ -83,7 +83,7 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
 
 def _stacked(strips: Sequence[Panel], end_s: float) -> list[Panel]:
     """Return panels with a shared time axis, labelled in the lowest panel; points outside of it are removed."""
-    last, right_s = len(strips) - 1, (1 + _ROOM) * end_s or 1.0
+    last, right_s = len(strips) - 1, (1 + _MARGIN) * end_s or 1.0
     return [
         replace(
             panel,
@@ -109,19 +109,22 @@ def _within(series: Series, right_s: float) -> Series:
 
 def _bars(times: Moments, zero_ns: int) -> Panel:
     """Return a panel with a lane per activity name, the first at the top."""
-    names = list(dict.fromkeys(each.name for each in times.activities))
+    names = list(dict.fromkeys(activity.name for activity in times.activities))
     last = len(names) - 1
-    spans = [(each, (each.start_ns - zero_ns) / 1e9, (each.stop_ns - zero_ns) / 1e9) for each in times.activities]
-    least_s = _LEAST_BAR * max(stop for *_, stop in spans)
+    spans = [
+        (activity, (activity.start_ns - zero_ns) / 1e9, (activity.stop_ns - zero_ns) / 1e9)
+        for activity in times.activities
+    ]
+    least_s = _MIN_BAR * max(stop for *_, stop in spans)
     return Panel(
         title="activities",
         x_label=_TIME,
         y_label="",
         series=[],
-        words="; ".join(f"{each.name} from {start:.3f} to {stop:.3f} s" for each, start, stop in spans),
+        words="; ".join(f"{activity.name} from {start:.3f} to {stop:.3f} s" for activity, start, stop in spans),
         spans=[
-            Span(last - names.index(each.name), start, max(stop, start + least_s), each.colour)
-            for each, start, stop in spans
+            Span(last - names.index(activity.name), start, max(stop, start + least_s), activity.colour)
+            for activity, start, stop in spans
         ],
         lanes=list(reversed(names)),
     )
@@ -138,7 +141,7 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
     )
     series = []
     for label, style, at_ns, at_bytes in kinds:
-        every_kth = slice(None, None, max(1, -(-len(at_ns) // MOST_PACKETS)))
+        every_kth = slice(None, None, max(1, -(-len(at_ns) // MAX_PACKETS)))
         series.append(Series(label, style, (at_ns[every_kth] - first_sent_ns) / 1e6, at_bytes[every_kth] / 1e3))
     return Panel(
         title=f"packets of {transfer.name or 'the transfer'}",

@@ -116,7 +116,7 @@ class Evidence:
     def pings(self, row: int, step: str = "") -> ping.Ping | None:
         """Return the output of ping in a row's attempt, optionally of a named step, or None if unavailable."""
         evidence, plan = self.attempt(row), self.plan(row)
-        pinging = next((each for each in plan.pingings() if each.name == step), None) if plan else None
+        pinging = next((candidate for candidate in plan.pingings() if candidate.name == step), None) if plan else None
         return evidence.read_or_none(ping.read, pinging.file) if evidence and pinging else None
 
 

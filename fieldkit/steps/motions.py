@@ -31,7 +31,7 @@ class Mover(Protocol):
 
         Args:
             report: Receives a line for each change of state of the robot.
-            abandoned: Set when the operator does not want to wait any longer.
+            abandoned: Set if the operator cancels the wait.
         """
         ...
 
@@ -40,9 +40,9 @@ class Motions:
     """The moving robots, and the order to stop. After the order no robot starts to move.
 
     Attributes:
-        ahead: A line for each robot on what it does when it is stopped, while steps run in which robots move
+        stop_notes: A line for each robot on what it does when it is stopped, while steps run in which robots move
             automatically; empty otherwise.
-        called: Whether the order was given; it cannot be withdrawn.
+        is_ordered: Whether the order was given; it cannot be withdrawn.
     """
 
     def __init__(self) -> None:

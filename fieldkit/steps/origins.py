@@ -72,8 +72,8 @@ class Origins(Protocol):
     def moving(self, role: Role) -> AbstractContextManager[RobotMotion]:
         """Record that a robot moves while the body runs. The record is on disk before the body begins.
 
-        Unless the body calls `RobotMotion.ended`, no robot moves again before a person has confirmed. The call is
-        missing after a fault, and after this process was killed within the body.
+        Unless the body calls `RobotMotion.mark_ended`, no robot moves again before a person has confirmed. The call
+        is missing after a fault, and after this process was killed within the body.
 
         Raises:
             MotionHeldError: A fault stopped a robot earlier, and no person has confirmed since.

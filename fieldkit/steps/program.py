@@ -22,7 +22,7 @@ class ProgramStep(Step):
     """A step that runs one program on one robot and parses its output.
 
     A kind needs the fields that are its YAML keys, `columns`, and two methods: `argv` and `parse`. The output is
-    stored in a file of at most `program_output.MOST_BYTES` bytes.
+    stored in a file of at most `program_output.MAX_OUTPUT_BYTES` bytes.
 
     Attributes:
         exit_codes: Exit codes of success; any other one makes the repeat void.

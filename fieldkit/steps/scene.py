@@ -49,7 +49,7 @@ class RecordedFile:
         role: Role of the robot.
         name: Its path, relative to the attempt's folder.
         size_bytes: Approximate size.
-        called: Alternative name in procedures, independent of the robot's recorder.
+        alias: Alternative name in procedures, independent of the robot's recorder.
     """
 
     role: Role
@@ -68,7 +68,7 @@ class Scene:
         folder: The attempt's folder on every robot.
         recorded: The files that the procedure records on each robot, in the order of recording.
         variants: The detected tools of the robots; empty before the detection.
-        here: The attempt's folder on the laptop, for data that no robot has; None if no attempt is made.
+        laptop_folder: The attempt's folder on the laptop, for data that no robot has; None if no attempt is made.
         placement: The placement of the robots; None if they were not placed.
         repeat: Number of the repeat of its protocol, from 1; None if the scene is valid for all repeats.
         flows: The traffic of all steps of the procedure on the radio.
@@ -140,7 +140,7 @@ class Planned:
         program: The program of the command line, for which preflight searches.
         setup: Shell files to source before this search.
         tool: The tool of the program; None if it has no variants.
-        ends: Permitted causes of its end; after another cause its evidence is incomplete.
+        permitted_causes: Permitted causes of its end; after another cause its evidence is incomplete.
         least_s: Minimum duration in seconds of a job that ended normally.
         remedy: What to do if the program is missing; empty for the default remedy on profile and package.
         put: Program of the lab that the job needs on the robot; None if it needs no such program.
@@ -202,8 +202,9 @@ class Need:
         name: Name of the check.
         argv: Command that changes nothing on the robot.
         judge: Converts the result to a verdict, a detail, and a remedy, which is empty if the need is met.
-        of: Program without which the check is skipped; empty if the check depends on no program.
-        explains: Program that is not found if this need is not met, so that it is not reported; empty without one.
+        required_program: Program without which the check is skipped; empty if the check depends on no program.
+        missing_program: Program that is missing if this need is not met, so its absence is not reported as well;
+            empty if there is none.
         agent: Whether the command runs the agent, which is then installed first.
     """
 

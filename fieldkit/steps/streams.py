@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from fieldkit.ros.qos import QosProfile
 
 MESSAGE: Final = "std_msgs/msg/UInt8MultiArray"
-LEAST_BYTES: Final = 24
-MOST_BYTES: Final = 16e6
+MIN_BYTES: Final = 24
+MAX_BYTES: Final = 16e6
 LONGEST_S: Final = 3600.0
 
 
@@ -122,7 +122,7 @@ class StreamOptions(Strict):
     over: MiddlewareName = MiddlewareName.DDS
     topic: TopicName = "/fieldkit/stream"
     rate: Annotated[Hertz, Field(gt=0, le=100_000)] = 10.0
-    bytes: Annotated[Bytes, Field(ge=LEAST_BYTES, le=MOST_BYTES)] = 1000.0
+    bytes: Annotated[Bytes, Field(ge=MIN_BYTES, le=MAX_BYTES)] = 1000.0
     qos: StreamQos = StreamQos.defaults()
     discovery: Discovery | None = None
     server: Role = Role.RELAY

@@ -12,31 +12,31 @@ from fieldkit.steps.base import Step, step_types
 
 IDENTITY: Final = columns.columns(
     0,
-    ("schema_version", "count", "Version of these columns, of the fieldkit that measured the row."),
+    ("schema_version", "count", "Version of the columns in the fieldkit that measured the row."),
     ("trial", "text", "Name of the trial's folder."),
-    ("procedure", "text", "Procedure."),
-    ("scenario", "text", "los or nlos."),
-    ("topology", "text", "master or masterless."),
-    ("backend", "text", "Where the robots came from."),
-    ("distance_m", "m", "Distance."),
+    ("procedure", "text", "Name of the procedure."),
+    ("scenario", "text", "los (line of sight) or nlos (no line of sight)."),
+    ("topology", "text", "master (packets pass a relay) or masterless."),
+    ("backend", "text", "Backend that provided the robots."),
+    ("distance_m", "m", "Planned distance."),
     ("distance", "text", "Distance as the operator wrote it."),
-    ("protocol", "text", "tcp or udp."),
+    ("protocol", "text", "Transport protocol: tcp or udp."),
     ("repeat", "count", "Number of the repeat, from 1, per protocol."),
     (
         "attempt",
         "count",
-        "Number of the attempt, from 1; above 1 after a void one. The last one allowed is failed, not void.",
+        "Number of the attempt, from 1; above 1 after a void attempt. The last allowed attempt is valid or failed.",
     ),
-    ("status", "text", "valid, void (evidence not whole) or failed."),
-    ("reason", "text", "Why it is not valid; empty when it is."),
+    ("status", "text", "valid, void (evidence is incomplete) or failed."),
+    ("reason", "text", "Reason why the attempt is not valid; empty if it is valid."),
     ("started_utc_ns", "ns", "Start by the laptop's clock, nanoseconds since 1970 UTC."),
     ("seed", "count", "The trial's seed."),
     ("sender", "text", "Robot in the role sender."),
     ("receiver", "text", "Robot in the role receiver."),
-    ("relay", "text", "Robot whose access point relays; empty when masterless."),
+    ("relay", "text", "Robot whose access point relays; empty if masterless."),
     ("profiles_sha256", "hash", "First 16 digits of the hash over the robots' profiles and roles."),
     ("procedure_sha256", "hash", "First 16 digits of the hash of the procedure: its file and --record."),
-    ("code_sha256", "hash", "First 16 digits of the hash over fieldkit's own source."),
+    ("code_sha256", "hash", "First 16 digits of the hash over fieldkit's source."),
 )
 """Columns that identify an attempt; the columns that its evidence fills follow."""
 
@@ -44,7 +44,7 @@ OTHERS: Final = Column("others", "text", "Robots in further roles of the procedu
 """The column is present only if a procedure has such roles."""
 
 ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS)
-"""Columns that are measured whatever the steps are."""
+"""Columns that are measured with any steps."""
 
 _KINDS_WITH_COLUMNS: Final = ("capture", "transfer", "ping")
 """Kinds of step whose columns are in every trial, in addition to `outage.COLUMNS` of faults.

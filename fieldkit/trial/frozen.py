@@ -12,7 +12,7 @@ from fieldkit.config.schema import AfterValidator, Field, Int, Number, Strict
 from fieldkit.core import files
 from fieldkit.core.columns import Column, Figure, Kind
 
-MOST_COLUMNS: Final = 2000
+MAX_COLUMNS: Final = 2000
 """Limit per trial, not counting the columns of every trial."""
 _MOST: Final = sys.float_info.max  # YAML is read without infinity, and no column has such a value
 
@@ -58,7 +58,7 @@ def _demand_unique_names(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColum
     return columns
 
 
-Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MOST_COLUMNS), AfterValidator(_demand_unique_names)]
+Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MAX_COLUMNS), AfterValidator(_demand_unique_names)]
 
 
 class _PlanColumns(Strict):

@@ -39,7 +39,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     The evidence of steps inside a fault may be incomplete, because the fault disturbs it. Each column that a step
     declares must have a value or a reason why it is missing; if it has neither, a value was lost and the attempt is
     void. The attempt is also void if a step raises an exception on its evidence: a trial must continue, and must be
-    resumable and rebuildable, whatever a file contains.
+    resumable and rebuildable for any content of its files.
 
     Raises:
         MemoryError: This machine has too little memory; this is not a problem of the evidence.
@@ -60,7 +60,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
             result = placed.step.measure(view)
             impossible = dict(_impossible(placed, result))
             if not placed.disturbed:
-                problems += (_of_step(placed, why) for why in placed.step.check(view))
+                problems += (_step_problem(placed, why) for why in placed.step.check(view))
                 problems += _unexplained(placed, result)
                 problems += impossible.values()
             result = result.without(impossible)
@@ -79,7 +79,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors))
 
 
-def _of_step(placed: PlacedStep, why: str) -> str:
+def _step_problem(placed: PlacedStep, why: str) -> str:
     """Return a problem of a step's evidence, preceded by the step's name if it has one."""
     return f"{placed.step.prefix}: {why}" if placed.step.prefix else why
 

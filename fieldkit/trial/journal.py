@@ -89,7 +89,7 @@ class Attempt:
 
 
 def claimed(folder: Path) -> AbstractContextManager[None]:
-    """Return a context that locks a trial against other processes of fieldkit; raises as `jsonl.claimed`."""
+    """Return a context that locks a trial against other processes of fieldkit; raises as `jsonl.locked`."""
     return jsonl.locked(folder / JOURNAL_FILE, "trial")
 
 

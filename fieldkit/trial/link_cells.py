@@ -14,7 +14,7 @@ from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.core.columns import Kind, step_prefixed
 
-LEAST_REPEATS: Final = 5
+MIN_REPEATS: Final = 5
 """Losses over TCP may be bimodal (docs/studies/middleware-link.md): fewer repeats may all be of one mode."""
 _DECIMALS: Final = 12
 """Decimals of the bound: 29 of 1,000 must count as equal to a bound of 2.9 %, which is smaller in binary."""
@@ -43,7 +43,7 @@ class LinkCriterion:
     max_loss: float
     max_delay_s: float | None = None
     size_bytes: float | None = None
-    repeats: int = LEAST_REPEATS
+    repeats: int = MIN_REPEATS
     share: float | None = None
 
     def __str__(self) -> str:

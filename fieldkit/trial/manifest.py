@@ -132,7 +132,7 @@ def verify(folder: Path) -> list[str]:
     unexpected = {str(path.relative_to(folder)): kind for path, kind in store.unexpected_files(folder)}
     present = {_name(folder, path): path for path in _plain_files(folder)}
     present.pop(MANIFEST_FILE, None)
-    return _sentences(_compared(listed.keys() - unexpected.keys(), listed, present) | unexpected)
+    return _sentences(_file_differences(listed.keys() - unexpected.keys(), listed, present) | unexpected)
 
 
 def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[str, str]:
@@ -154,7 +154,7 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
 
     def compare(attempt: str) -> dict[str, str]:
         present = {_name(folder, path): path for path in _plain_files(store.attempt_folder(folder, attempt))}
-        return _compared(summed[attempt].keys(), summed[attempt], present)
+        return _file_differences(summed[attempt].keys(), summed[attempt], present)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return top_level | {
@@ -198,7 +198,7 @@ def summarize(problems: Mapping[str, str]) -> str:
     return "; ".join(sentences[:_MAX_LISTED]) + (f"; and {more} more: fieldkit verify lists them" if more > 0 else "")
 
 
-def _compared(names: Iterable[str], listed: Sums, present: Mapping[str, Path]) -> dict[str, str]:
+def _file_differences(names: Iterable[str], listed: Sums, present: Mapping[str, Path]) -> dict[str, str]:
     wanted = set(names)
     problems = dict.fromkeys(wanted - present.keys(), "missing")
     problems |= dict.fromkeys(present.keys() - listed.keys(), "not in the manifest")

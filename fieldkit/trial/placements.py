@@ -32,13 +32,14 @@ SATELLITE_M: Final = 15.0
 TRACKER_M: Final = 2.0
 """Tolerance for all other positions: two robots, each within 1 m of its planned place."""
 SHARE: Final = 0.1
-"""Share of the planned distance that is added to both, for distances measured in paces and drift of odometry."""
+"""Share of the planned distance that is added to both tolerances, for distances measured in paces and for drift of
+odometry."""
 
 
 def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
     """Return the reason why the recorded positions contradict the planned placement, or None.
 
-    Robots are at their places when an attempt starts, whatever moves later. So the recorded distance of two robots
+    Robots are at their places when an attempt starts, even if they move later. So the recorded distance of two robots
     must equal the planned one at some time of the attempt.
     """
     return next(_contradictions(scene, evidence), None)

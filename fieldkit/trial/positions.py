@@ -20,7 +20,7 @@ from fieldkit.trial import gates, journal, manifest, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import Rebuilt, rebuild
 
-MOST_BYTES: Final = 64 << 20
+MAX_BYTES: Final = 64 << 20
 """One day at 10 Hz as GPX."""
 
 
@@ -30,7 +30,7 @@ class AttemptPositions:
 
     Attributes:
         attempt: Its folder's name.
-        told_by: Sources of the positions; None if there are none, except perhaps the testbed's.
+        source: Sources of the positions, as text; None if there are none besides the testbed.
         distances_m: Smallest and largest distance by measurement: `transfer`, `rtt`, `up.rtt`.
         missing: Reasons for missing distances, by measurement.
     """
@@ -95,8 +95,8 @@ def _demand_file(path: Path) -> None:
         raise ConfigurationError(
             "there is no such file", where=str(path), remedy="name GPX, CSV, or a place: 48.1,11.5"
         )
-    if (size_bytes := path.stat().st_size) > MOST_BYTES:
-        problem = f"it has {format_bytes(size_bytes)}, the limit is {format_bytes(MOST_BYTES)}"
+    if (size_bytes := path.stat().st_size) > MAX_BYTES:
+        problem = f"it has {format_bytes(size_bytes)}, the limit is {format_bytes(MAX_BYTES)}"
         raise ConfigurationError(problem, where=str(path), remedy="cut it to the time of the trial")
 
 

@@ -264,9 +264,9 @@ class PlacedStep:
         for mine, theirs in product(self.step.listens(), other.step.listens()):
             is_exclusive = not (mine.shared and theirs.shared)
             if is_simultaneous and is_exclusive and (mine.role, mine.port) == (theirs.role, theirs.port):
-                return f"port {mine.port} comes twice at the same time on {mine.role}; give one another {mine.by}"
+                return f"port {mine.port} is used twice at the same time on {mine.role}; give one another {mine.by}"
             if is_captured and mine.looks_like(theirs):
-                conflict = f"port {mine.port} comes twice in one capture, from {mine.peer} to {mine.role}"
+                conflict = f"port {mine.port} is used twice in one capture, from {mine.peer} to {mine.role}"
                 return f"{conflict}; give one another {mine.by}, or a separate capture each"
         return None
 
@@ -287,8 +287,8 @@ def _file_conflict(step: Step, name: str, files: Set[str]) -> str | None:
 def _claimed_twice(step: Step, claim: str) -> str:
     """Return the message for two steps that claim the same exclusive resource under one name."""
     if step.prefix:
-        return f"{claim} named {step.prefix} comes twice; give one another name, inside for: with its variable"
-    return f"{claim} comes twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
+        return f"{claim} named {step.prefix} is defined twice; give one another name, inside for: with its variable"
+    return f"{claim} is defined twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
 
 
 def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[PlacedStep]:

@@ -73,13 +73,13 @@ def describe(plan: Plan, row: Row) -> str:
     steps = sorted(
         (placed.step for placed in plan.procedure.walk()), key=lambda step: isinstance(step, Nest) and step.disturbs
     )
-    parts_by_step = [(step.prefix, list(_of_step(step, row))) for step in steps]
-    losses = [text for name, parts in parts_by_step for text in _named(name, filter(_is_loss, parts))]
-    others = [text for name, parts in parts_by_step for text in _named(name, filterfalse(_is_loss, parts))]
+    parts_by_step = [(step.prefix, list(_step_numbers(step, row))) for step in steps]
+    losses = [text for name, parts in parts_by_step for text in _with_step_name(name, filter(_is_loss, parts))]
+    others = [text for name, parts in parts_by_step for text in _with_step_name(name, filterfalse(_is_loss, parts))]
     return ", ".join([*([NOTHING_ARRIVED] if _lost_all(row) else []), *losses, *others])
 
 
-def _of_step(step: Step, row: Row) -> Iterator[str]:
+def _step_numbers(step: Step, row: Row) -> Iterator[str]:
     """Return the most important numbers of a step, from the columns with its prefix."""
     prefix = step_prefixed(step.prefix, "")
     return iter(
@@ -89,7 +89,7 @@ def _of_step(step: Step, row: Row) -> Iterator[str]:
     )
 
 
-def _named(name: str, parts: Iterable[str]) -> Iterator[str]:
+def _with_step_name(name: str, parts: Iterable[str]) -> Iterator[str]:
     """Yield parts, the first preceded by the name of their step."""
     for index, part in enumerate(parts):
         yield f"{name}: {part}" if name and not index else part

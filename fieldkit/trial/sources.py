@@ -49,12 +49,12 @@ class Sources:
         """The columns whose words are counted, by name and in order."""
         return {column.name: column for column in worded(self.columns)}
 
-    def condition(self, text: str, *, asked: str = "--by") -> tuple[str, ...]:
+    def condition(self, text: str, *, option: str = "--by") -> tuple[str, ...]:
         """Return the columns that define a condition, without duplicates.
 
         Args:
             text: Comma-separated names.
-            asked: The option or argument that gave them; for the message.
+            option: The option or argument that gave them; for the message.
 
         Raises:
             ConfigurationError: There is no such column.
@@ -64,33 +64,33 @@ class Sources:
         for name in names:
             if name not in names_allowed:
                 raise ConfigurationError(
-                    f"{asked}: there is no column {name!r}",
+                    f"{option}: there is no column {name!r}",
                     remedy=did_you_mean(name, names_allowed, "fieldkit columns lists them"),
                 )
         return tuple(dict.fromkeys(names))
 
     def chosen(
-        self, names: Collection[str], *, asked: str = "--quantity"
+        self, names: Collection[str], *, option: str = "--quantity"
     ) -> tuple[list[Quantity] | None, list[Column] | None]:
         """Return the quantities and the word columns of some names; both are None, meaning all, if no name is given.
 
         Raises:
-            ConfigurationError: As for `quantity`, with `asked` in the message.
+            ConfigurationError: As for `quantity`, with `option` in the message.
         """
         if not names:
             return None, None
-        quantities = [self.quantity(name, asked=asked) for name in names if name not in self.words]
+        quantities = [self.quantity(name, option=option) for name in names if name not in self.words]
         return quantities, [self.words[name] for name in names if name in self.words]
 
-    def quantity(self, name: str, *, asked: str = "--quantity") -> Quantity:
-        """Return the quantity of a name; `asked` as for `condition`.
+    def quantity(self, name: str, *, option: str = "--quantity") -> Quantity:
+        """Return the quantity of a name; `option` as for `condition`.
 
         Raises:
             ConfigurationError: There is no such quantity.
         """
         if name not in self.quantities:
             raise ConfigurationError(
-                f"{asked}: repeats are not aggregated over {name!r}",
+                f"{option}: repeats are not aggregated over {name!r}",
                 remedy=did_you_mean(name, self.quantities, f"it is one of: {', '.join(self.quantities)}"),
             )
         return self.quantities[name]

@@ -83,7 +83,7 @@ class Agents:
                 self._update_names(states, now_ns)
         except AttributeError:
             raise FederateError(
-                f"physics, asked to advance to {seconds_text(now_ns)}, returned {states!r}, which is not a "
+                f"physics, requested to advance to {seconds_text(now_ns)}, returned {states!r}, which is not a "
                 "mapping of states"
             ) from None
         self._at_ns = now_ns
@@ -93,7 +93,7 @@ class Agents:
         """Update the names of the agents; agents may appear during a run, but must not disappear."""
         if lost := self._names - states.keys():
             names = ", ".join(sorted(lost))
-            raise FederateError(f"physics, asked to advance to {seconds_text(now_ns)}, has no state of {names}")
+            raise FederateError(f"physics, requested to advance to {seconds_text(now_ns)}, has no state of {names}")
         self.new_agents |= states.keys() - self._names
         self._names = frozenset(states)
 

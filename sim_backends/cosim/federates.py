@@ -37,17 +37,17 @@ def federate_error(error: BaseException, federate: str, request: str) -> Federat
     Args:
         error: The error.
         federate: Name of the federate or program, for the message.
-        request: What it was asked to do, with simulated times: `advance from 0 s to 1 s`.
+        request: The requested action, with simulated times: `advance from 0 s to 1 s`.
     """
     if isinstance(error, FederateError):
         return error
     if isinstance(error, AnswerTimeoutError):
         return UnansweredError(
-            f"{federate} has not answered for {error.limit_s:g} s: asked to {request}",
+            f"{federate} has not answered for {error.limit_s:g} s: request to {request}",
             remedy="check what it waits for, or give it a longer deadline",
         )
     return FederateError(
-        f"{federate} failed when it was asked to {request}: {type(error).__name__}: {error}",
+        f"{federate} failed at the request to {request}: {type(error).__name__}: {error}",
         remedy=error.remedy if isinstance(error, FieldkitError) else "",
     )
 

@@ -11,7 +11,7 @@ from sim_backends.cosim.federates import FederateError, seconds_text
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.radio.random_streams import PacketIdentity
-from sim_backends.world.motion import STILL, DeadReckoned, State, moved_on
+from sim_backends.world.motion import STILL, DeadReckoned, State, extrapolate
 
 
 def transmitters(network: object) -> tuple[str, ...]:
@@ -120,11 +120,11 @@ class PacketLedger:
         since_step_s = at_ns % self._step_ns / 1e9
         ends = true[source], true[destination]
         if since_step_s:
-            ends = moved_on(ends[0], since_step_s), moved_on(ends[1], since_step_s)
+            ends = extrapolate(ends[0], since_step_s), extrapolate(ends[1], since_step_s)
         fate = Fate(packet, (assumed[source], assumed[destination]), ends)
         if self._measured or self._has_fixed_emitters:
             names = self._measured | {source, destination}
-            states = [moved_on(true[name], since_step_s) for name in names]
+            states = [extrapolate(true[name], since_step_s) for name in names]
             fate.position_error_m = max_position_error_m(
                 assumed, states, names, has_fixed_emitters=self._has_fixed_emitters
             )
@@ -147,8 +147,8 @@ class PacketLedger:
             )
         if not max(begin_ns, packet.enters_ns) <= arrival.at_ns <= last_ns:
             raise FederateError(
-                f"the network, asked to advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}, delivered "
-                f"packet {packet.packet_id}, which entered at {seconds_text(packet.enters_ns)}, at "
+                f"the network, requested to advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}, "
+                f"delivered packet {packet.packet_id}, which entered at {seconds_text(packet.enters_ns)}, at "
                 f"{seconds_text(arrival.at_ns)}"
             )
         fate.arrived_ns = arrival.at_ns

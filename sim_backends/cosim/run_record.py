@@ -24,10 +24,10 @@ class Fate:
             extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
         arrived_ns: Time when the network delivered it, or None.
         counted_ns: Time when its receiver got it, which depends on the policy: the window's end, or `arrived_ns`.
-        late_ns: How far the receiver had passed `counted_ns` already.
+        late_ns: Time by which the receiver was already past `counted_ns`.
         reason: Why it never arrived; empty if it arrived or is under way.
         position_error_m: Largest error of the relative position that the network assumed for two of the agents that
-            matter for the packet; None if these are source and destination only (`geometry.position_error_m`).
+            matter for the packet; None if these are source and destination only (`packet_ledger.position_error_m`).
     """
 
     packet: Packet

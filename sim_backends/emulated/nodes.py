@@ -121,9 +121,9 @@ class Node:
         """Raise the errors of `Worker.check_alive` if the node does not run."""
         self._worker.check_alive()
 
-    def hang_up(self) -> None:
+    def request_exit(self) -> None:
         """Request that the node stops, without waiting for it; requests under way fail immediately."""
-        self._worker.hang_up()
+        self._worker.request_exit()
 
     def close(self) -> None:
         """Stop the node and wait until its processes have exited; a second call does nothing."""
@@ -287,7 +287,7 @@ def running_robots(
         list(started)
         yield RunningRobots(up, medium, places, {key: pair.public for key, pair in host_keys.items()}, login.private)
         for robot in up.values():
-            robot.hang_up()
+            robot.request_exit()
 
 
 def _build(robot: EmulatedRobot) -> None:

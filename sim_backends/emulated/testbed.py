@@ -68,9 +68,9 @@ class EmulatedOracle:
         """Implement `Oracle.lateness`."""
         return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self._medium.stats().late)
 
-    def links(self, *, go_on: bool) -> dict[Role, list[LinkSample]]:
+    def links(self, *, continue_sampling: bool) -> dict[Role, list[LinkSample]]:
         """Implement `Oracle.links`."""
-        links = self._medium.links(go_on=go_on)
+        links = self._medium.links(continue_sampling=continue_sampling)
         return {role: links.get(name, []) for role, name in self._names.items()}
 
     def record_air(self, folder: Path | None) -> None:
@@ -84,7 +84,7 @@ class EmulatedTestbed:
 
     Args:
         cast: The robot of each role.
-        up: The running robots and their medium.
+        running: The running robots and their medium.
         shells: Control connection of each robot.
         options: The lab's options.
         world: The world around the robots.
@@ -95,7 +95,7 @@ class EmulatedTestbed:
     def __init__(
         self,
         cast: Cast,
-        up: RunningRobots[Role],
+        running: RunningRobots[Role],
         shells: Mapping[Role, Shell],
         *,
         options: EmulatedOptions,
@@ -104,14 +104,14 @@ class EmulatedTestbed:
         operator: Operator,
     ) -> None:
         self.operator = operator
-        self.robots = up.robots
-        self.medium = up.medium
+        self.robots = running.robots
+        self.medium = running.medium
         self._laptop = laptop
         self._shells = shells
         self._boot_s = options.boot
-        self._mobility = Mobility(cast, up.medium, world, laptop, up.robots, show=up.places.write)
-        names = {role: robot.name for role, robot in up.robots.items()}
-        self._oracle = EmulatedOracle(names, up.medium, self._mobility, options)
+        self._mobility = Mobility(cast, running.medium, world, laptop, running.robots, show=running.places.write)
+        names = {role: robot.name for role, robot in running.robots.items()}
+        self._oracle = EmulatedOracle(names, running.medium, self._mobility, options)
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
@@ -151,7 +151,7 @@ class EmulatedTestbed:
         return 0.0
 
     def bring_back(self, role: Role, *, by_itself: bool) -> None:  # noqa: ARG002 (all repeats must start alike)
-        """Implement `Testbed.bring_back`; the robot is exactly at its place, whatever its odometry reports."""
+        """Implement `Testbed.bring_back`; the robot is exactly at its place, independently of its odometry."""
         self._mobility.return_to_place(role)
 
     def watching(self) -> AbstractContextManager[object]:
@@ -195,9 +195,9 @@ def bring_up(
         world: The world around the robots.
         ros: Source of ROS for robots with ROS 1, `debian` or `builtin`.
         seed: Seed of all random numbers of the medium.
-        control: True if SSH uses the radio; if so, a robot out of the laptop's range cannot be reached.
+        control: Network of SSH; over the radio, a robot out of the laptop's range cannot be reached.
         patience_s: How long to wait for a lost control connection.
-        notice: Called with a message when a control connection is lost, and when it is back.
+        notice: Called with a message when a control connection is lost or restored.
         operator: The person who answers the questions of steps.
 
     Raises:
@@ -238,8 +238,7 @@ def _shell(
     def connect(timeout_s: float) -> socket.socket:
         if laptop is None:
             return robot.connect(timeout_s)
-        up.medium.check_alive()  # fail now instead of waiting for an answer that no process carries
-
+        up.medium.check_alive()  # otherwise a connection attempt would wait for an answer that cannot arrive
         robot.check_alive()
         return laptop.reach(robot.spec.ip, timeout_s)
 

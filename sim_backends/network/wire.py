@@ -49,7 +49,7 @@ class Wire(Protocol):
         ...
 
     def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
-        """Call `call` on a host at `at_ns`, which is not in the past, or when the host is on again if it is off then.
+        """Call `call` on a host at `at_ns`, which is not in the past; if the host is off then, when it is on again.
 
         Calls cannot be cancelled; a function whose timer was stopped must do nothing.
         """
@@ -68,7 +68,7 @@ class Transport(Protocol):
     """A transport that carries packets of programs in IP packets."""
 
     def send(self, packet: Packet) -> None:
-        """Send a program's packet, which its source passes now."""
+        """Send a program's packet; its source calls this at the time of sending."""
         ...
 
     def receive(self, host: str, packet: IpPacket) -> None:

@@ -1,7 +1,7 @@
 """Contacts of upright cylinders with their surroundings: they stop there, and slide along it.
 
 A moving body slides around an obstacle as far as possible; no body is pushed. A move is divided into pieces shorter
-than half a radius, so that a body cannot pass through anything, however thin. A body that would still overlap stays
+than half a radius, so that a body cannot pass through even a thin obstacle. A body that would still overlap stays
 at its previous position, which was free, so no body ever overlaps another body or an obstacle.
 """
 

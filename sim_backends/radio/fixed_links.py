@@ -1,4 +1,4 @@
-"""Links that behave the same wherever the stations are: each with a queue, a rate, a delay and a loss.
+"""Links that behave the same at all positions of the stations: each has a queue, a rate, a delay and a loss.
 
 The model uses no clock and no socket. The caller passes the time, in integer nanoseconds that never decrease: the
 medium reads it from the monotonic clock; tests and co-simulations use virtual time.
@@ -353,7 +353,7 @@ def mesh(options: RadioOptions, names: Iterable[str]) -> dict[Pair, LinkParamete
 
 
 class UniformLinks(FixedLinks[Payload]):
-    """Links between all stations that behave the same wherever the stations are.
+    """Links between all stations that behave the same at all positions.
 
     Args:
         seed: Seed of all random draws.

@@ -51,7 +51,7 @@ def _checked_rate(text: str) -> str:
 class RadioOptions(Strict):
     """The radio of an emulated lab: Wi-Fi in its world, or links that behave the same everywhere.
 
-    With `loss`, `delay`, `rate` or `jitter` every link is fixed, wherever the robots are: no robot is out of range,
+    With `loss`, `delay`, `rate` or `jitter` every link is fixed for all positions: no robot is out of range,
     robots do not contend for the channel, and of the other options only `queue_packets` applies. In a master topology
     a packet between two stations crosses two links, and each of the four applies twice.
 
@@ -76,8 +76,8 @@ class RadioOptions(Strict):
             rate to acknowledgements.
         queue_packets: Queue length per station, or per fixed link, in packets, without the packet on the air; 1000 is
             Linux's default.
-        loss: Fixed links: share of packets lost per link, whatever their length; 0 % if only others of these four are
-            given.
+        loss: Fixed links: share of packets lost per link, independently of their length; 0 % if only others of these
+            four are given.
         delay: Fixed links: delay of a link in addition to queueing and serialization. The default is 0.2 ms, about
             DIFS, mean first backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the host's
             interrupt.

@@ -141,7 +141,7 @@ class WorldChannel(RadioChannel):
             Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
         )
         count = len(self.names)
-        # The first end of a link is the one whose name sorts first, whatever the order of the stations.
+        # The first end of a link is the one whose name sorts first, for any order of the stations.
         by_name = np.array(sorted(range(count), key=self.names.__getitem__), dtype=np.int64)
         self._ends = by_name[np.stack(np.triu_indices(count, 1))]
         self._link_of = np.zeros((count, count), dtype=np.int64)

@@ -109,7 +109,7 @@ def _leg(start: Vector, end: Vector, start_ns: int, end_ns: int) -> tuple[int, i
 
 
 class OnGround:
-    """A motion whose robots stay on the ground, whatever heights it has.
+    """A motion whose robots stay on the ground; the heights of the motion are ignored.
 
     Args:
         motion: The motion.
@@ -134,7 +134,7 @@ class OnGround:
         return state._replace(position_m=(east_m, north_m, self._up_m((east_m, north_m))))
 
 
-def moved_on(state: State, seconds: float) -> State:
+def extrapolate(state: State, seconds: float) -> State:
     """Return the state after this time, at constant velocity."""
     (e, n, u), (v_e, v_n, v_u) = state.position_m, state.velocity_m_s
     return state._replace(position_m=(e + seconds * v_e, n + seconds * v_n, u + seconds * v_u))
@@ -148,7 +148,7 @@ class _Extrapolated(Mapping[str, State]):
         self._seconds = seconds
 
     def __getitem__(self, name: str) -> State:
-        return moved_on(self._states[name], self._seconds)
+        return extrapolate(self._states[name], self._seconds)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._states)

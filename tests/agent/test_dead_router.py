@@ -22,12 +22,12 @@ from tests.helpers.host import alive
 from tests.helpers.mavlink_router import MavlinkRouter
 from tests.helpers.sshd import wait_until
 
-UNHEARD_S: Final = 5.0
-"""Replaces `landing.UNHEARD_S` by a shorter time, which is longer than the 4 s before an alarm."""
+NO_HEARTBEAT_S: Final = 5.0
+"""Replaces `landing.NO_HEARTBEAT_S` by a shorter time, which is longer than the 4 s before an alarm."""
 PROGRAM: Final = f"""\
 import sys
 from fieldkit.agent import landing
-landing.UNHEARD_S = {UNHEARD_S}
+landing.NO_HEARTBEAT_S = {NO_HEARTBEAT_S}
 from fieldkit.agent.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -74,11 +74,11 @@ def test_all_programs_stop_in_time_after_a_signal(tmp_path: Path) -> None:
                 assert [process.wait(60) for process in (pilot, guard)] == [landing.REFUSED] * 2
                 ended_s = time.monotonic() - began_s
                 wait_until(lambda: not alive(server), Deadline.after(60))
-        assert ended_s >= UNHEARD_S
+        assert ended_s >= NO_HEARTBEAT_S
         assert autopilot.vehicle.armed, "it received no command"
     for log in logs:
         texts = lines(log)
-        assert texts[-1] == f"error: no heartbeat of the autopilot for {UNHEARD_S:g} s"
+        assert texts[-1] == f"error: no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s"
         first = next(text for text in texts if text.startswith("ALARM: THE DRONE MAY STILL BE IN THE AIR"))
         assert "LAST HEARTBEAT 4 S AGO" in first
         assert first.endswith(landing.MANUAL_ACTION)

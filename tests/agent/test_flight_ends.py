@@ -123,7 +123,7 @@ def test_silent_autopilot_ends_the_flight_with_an_alarm(
 ) -> None:
     """As behind a stopped router: the alarm is logged first, and the program exits some time later."""
     monkeypatch.setattr(loop, "_SILENT_S", 5.0)
-    monkeypatch.setattr(landing, "UNHEARD_S", 1.0)
+    monkeypatch.setattr(landing, "NO_HEARTBEAT_S", 1.0)
     silent, over, codes = threading.Event(), threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
     with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame]) as (port, autopilot):

@@ -131,7 +131,7 @@ def test_stop_signal_does_not_stop_the_rescue(tmp_path: Path) -> None:
 def test_missing_heartbeat_ends_with_an_alarm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(rescue, "UNHEARD_S", 1.0)
+    monkeypatch.setattr(rescue, "NO_HEARTBEAT_S", 1.0)
     (tmp_path / "liveness").touch()
     with drones.autopilot_at_udp(damage=lambda _: []) as (port, _):
         assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.REFUSED
@@ -144,7 +144,7 @@ def test_missing_heartbeat_ends_with_an_alarm(
 def test_connection_that_cannot_be_opened_ends_with_an_alarm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(rescue, "UNHEARD_S", 1.0)
+    monkeypatch.setattr(rescue, "NO_HEARTBEAT_S", 1.0)
     (tmp_path / "liveness").touch()
     closed = FlightPlan("tcp:127.0.0.1:9", "", "land", 0.0, rescues=True, liveness=str(tmp_path / "liveness"))
     assert flight.fly(closed, threading.Event()) == landing.REFUSED

@@ -52,7 +52,7 @@ def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) 
     return packages | {name.partition(".")[0] for name in names} & LIBRARIES
 
 
-MOST_LINES = {"--dry-run": 25_000, "--repeats 1 --record 1s --yes": 40_500}
+MAX_LINES = {"--dry-run": 25_000, "--repeats 1 --record 1s --yes": 40_500}
 """Maximum of own lines that a trial of the paper's procedure imports, by its options."""
 
 COUNT_LINES = """
@@ -83,7 +83,7 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
     kinds = {name for name in names if name.startswith("fieldkit.steps.kinds.")}
     assert kinds == {f"fieldkit.steps.kinds.{kind}" for kind in ("capture", "ping", "record", "transfer")}
     assert not any(name.startswith("fieldkit.motion") for name in names)
-    assert int(count) <= MOST_LINES[options]
+    assert int(count) <= MAX_LINES[options]
 
 
 @pytest.mark.parametrize("words", ["--version", "--help"])

@@ -91,7 +91,7 @@ def test_a_link_inside_of_the_lab_is_followed() -> None:
         ("pipe", lambda: os.mkfifo("pipe"), "cannot be read: it is a pipe"),
         (
             "large",
-            lambda: write_program("large", bytes(program_files.MOST_BYTES + 1)),
+            lambda: write_program("large", bytes(program_files.MAX_BYTES + 1)),
             "more than 8.4 MB; install it",
         ),
     ],
@@ -104,8 +104,8 @@ def test_invalid_program_is_rejected_with_its_line(name: str, make: Callable[[],
 
 
 def test_program_of_the_maximum_size_is_accepted() -> None:
-    write_program("large", bytes(program_files.MOST_BYTES))
-    assert put("large").size_bytes == program_files.MOST_BYTES
+    write_program("large", bytes(program_files.MAX_BYTES))
+    assert put("large").size_bytes == program_files.MAX_BYTES
 
 
 def test_changed_or_missing_program_is_rejected() -> None:

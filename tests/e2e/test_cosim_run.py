@@ -271,7 +271,7 @@ def test_an_unresponsive_federate_is_named_and_the_recording_is_kept(lab: Path) 
     stall = "faults=[{kind: stalled-federate, federate: network, from: 200ms, stall: 1min}]"
     run = cosim(lab, "run", "pass.yaml", "--set", stall, "--deadline", "200ms", "--out", "sim")
     assert run.code == 3
-    assert "network has not answered for 0.2 s: asked to advance from 0.19" in run.err
+    assert "network has not answered for 0.2 s: request to advance from 0.19" in run.err
     replayed = cosim(lab, "replay", "sim")
     assert "(failed): UnansweredError: network has not answered" in replayed.err
     assert event_hash(replayed) == event_hash(run)

@@ -157,7 +157,7 @@ def test_replies_and_phases_are_those_of_the_evidence(read_messages: list[Read])
         BEGIN_NS + 3 * SECOND_NS + 200_000_000 * index for index in range(3)
     ]
     assert [message.said["message"] for message in of(read_messages, "/sender/log")] == [
-        f"icmp_seq=4: {recorded.SENDER} says Destination Host Unreachable"
+        f"icmp_seq=4: {recorded.SENDER} reports Destination Host Unreachable"
     ]
     assert [message.said["phase"] for message in of(read_messages, "/receiver/phase")] == ["transfer", "idle"]
     # The time stamps of the bag are those of the trial's start.

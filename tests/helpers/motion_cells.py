@@ -86,7 +86,7 @@ RESCUE_S: Final = 1.0
 RESCUE_STARTS_S: Final = 2.0
 """Time from the detection to the first command: Python starts on the robot and receives a heartbeat, sent at 1 Hz."""
 
-UNHEARD_S: Final = 60.0
+NO_HEARTBEAT_S: Final = 60.0
 """Programs that land a drone exit this long after their start if they receive nothing from the autopilot."""
 ENDS_S: Final = 5.0
 """`fieldkit abort` reaches the robot and waits 2 s for its jobs; the link server exits 1 s after its last client."""
@@ -285,7 +285,7 @@ def _flight_expectation(cell: MotionCell) -> Expectation:
     has_control_link = not parties & _CONTROL  # fieldkit runs and reaches the drone
     delay_s = (SERVER_S if Party.SERVER in parties else 0.0) + (paused_s if Party.ROUTER in parties else 0.0)
     if cell.fault is InjectedFault.ABORT:
-        does, ends_s = "behaviour of the autopilot", UNHEARD_S + ENDS_S + LOAD_S
+        does, ends_s = "behaviour of the autopilot", NO_HEARTBEAT_S + ENDS_S + LOAD_S
         expectation = Expectation("pilot, guard", does, None, alarm=True, judged=False, programs_s=ends_s)
     elif Party.OPERATOR in parties:
         expectation = _lands("operator", OPERATOR_S)

@@ -101,7 +101,7 @@ def _one_link(module: ModuleType, folder: Path) -> None:
     replace(module, "DISTANCES_M", {("g54", False): (10,)})
     replace(module, "SECONDS", 0.2)
     replace(module, "BATCH", 2)
-    replace(module, "MOST_RUNS", 2)
+    replace(module, "MAX_RUNS", 2)
 
 
 def _few_losses(module: ModuleType, folder: Path) -> None:
@@ -140,8 +140,8 @@ def _slow_iperf(module: ModuleType, folder: Path) -> None:
 def _small_swarm(module: ModuleType, folder: Path) -> None:
     _slow_iperf(module, folder)
     _one_radio(module, folder)
-    replace(module, "ALL_TALK", dict.fromkeys(module.ALL_TALK, 500))
-    replace(module, "ONE_TALKS", 500)
+    replace(module, "ALL_SENDERS_PACKETS_S", dict.fromkeys(module.ALL_SENDERS_PACKETS_S, 500))
+    replace(module, "ONE_SENDER_PACKETS_S", 500)
 
 
 def _one_radio(module: ModuleType, folder: Path) -> None:

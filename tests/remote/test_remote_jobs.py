@@ -289,7 +289,7 @@ def test_job_after_its_parting_text_may_run_until_the_evidence_is_fetched(
     into.mkdir()
     jobs.start(shell, job_spec)
     for _ in range(2):  # the first answer may have been lost
-        assert jobs.stop(shell, job_spec, grace_s=30, parting="counted") == 0
+        assert jobs.stop(shell, job_spec, grace_s=30, end_text="counted") == 0
     if code:
         with pytest.raises(RobotError, match="job job ended with exit code 3"):
             fetching.fetch(shell, FOLDER, "sender", "lo", into)
@@ -303,7 +303,7 @@ def test_job_that_does_not_end_after_its_parting_text_is_killed(shell: LocalShel
     script = "trap 'echo counted; while :; do sleep 0.05; done' INT; echo up; while :; do sleep 0.05; done"
     job_spec = replace(job("sh", "-c", script), ready="log:up")
     jobs.start(shell, job_spec)
-    assert jobs.stop(shell, job_spec, grace_s=30, parting="counted") == 0
+    assert jobs.stop(shell, job_spec, grace_s=30, end_text="counted") == 0
     with pytest.raises(RobotError, match=f"job job ended with exit code {jobs.KILLED}"):
         fetching.fetch(shell, FOLDER, "sender", "lo", tmp_path)
     assert jobs.list_running(shell, Deadline.after(30)) == ()
@@ -312,7 +312,7 @@ def test_job_that_does_not_end_after_its_parting_text_is_killed(shell: LocalShel
 def test_job_that_ends_without_its_parting_text_returns_its_exit_code(shell: LocalShell) -> None:
     job_spec = replace(job("sh", "-c", "trap 'exit 9' INT; echo up; while :; do sleep 0.05; done"), ready="log:up")
     jobs.start(shell, job_spec)
-    assert jobs.stop(shell, job_spec, grace_s=30, parting="counted") == 9
+    assert jobs.stop(shell, job_spec, grace_s=30, end_text="counted") == 9
 
 
 def test_job_that_a_reboot_interrupted_is_reported(shell: LocalShell) -> None:

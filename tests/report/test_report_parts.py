@@ -120,7 +120,7 @@ def test_runs_cover_the_marked_packets(marked: list[bool]) -> None:
     assert drawn.tolist() == marked
 
 
-@given(st.lists(st.floats(0, 10), min_size=1, max_size=distribution.MOST_STEPS))
+@given(st.lists(st.floats(0, 10), min_size=1, max_size=distribution.MAX_STEPS))
 def test_distribution_equals_that_of_scipy(times: list[float]) -> None:
     x, shares = distribution._steps(np.sort(times))
     expected = stats.ecdf(times).cdf
@@ -139,7 +139,7 @@ def test_labels_of_equal_distances_are_sorted_by_text(tmp_path: Path) -> None:
 def test_a_long_distribution_is_drawn_through_quantiles() -> None:
     times = np.sort(np.random.default_rng(1).exponential(size=5000))
     x, shares = distribution._steps(times)
-    assert len(x) == distribution.MOST_STEPS + 1
+    assert len(x) == distribution.MAX_STEPS + 1
     assert np.abs(np.searchsorted(times, x, side="right") / len(times) - shares).max() <= 1 / 5000
 
 
@@ -151,9 +151,9 @@ def test_strip_of_many_repeats_keeps_all_void_ones(tmp_path: Path) -> None:
     evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
     ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), evidence))
-    assert len(strip.marks) == strips.MOST_MARKS
+    assert len(strip.marks) == strips.MAX_MARKS
     assert sum(mark.status == "void" for mark in strip.marks) == 48
-    assert strip.left_out == 2400 - strips.MOST_MARKS
+    assert strip.left_out == 2400 - strips.MAX_MARKS
     assert strip.marks[-1].title == "udp-2400, void: no capture, UDP datagram loss 5.56 %"
 
 

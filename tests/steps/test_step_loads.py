@@ -87,7 +87,7 @@ def test_soak_runs_around_the_steps_inside() -> None:
         ("iperf3: {from: sender, to: receiver, protocol: sctp}", "tcp"),
         (
             "soak: {from: sender, to: receiver, port: 5201, during: [{iperf3: {from: relay, to: receiver}}]}",
-            "port 5201 comes twice",
+            "port 5201 is used twice",
         ),
     ],
 )

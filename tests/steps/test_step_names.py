@@ -162,12 +162,16 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
     [
         ("ping: {name: up, ", "ping: {name: 2up, ", "'2up' is not a name: small letters, digits and _"),
         ("ping: {name: up, ", "ping: {name: up.2, ", "'up.2' is not a name"),
-        ("ping: {name: up, ", "ping: {", "a ping comes twice; give each a name:"),
-        ("transfer: {name: bare", "transfer: {name: up", "a transfer named up comes twice; give one another name"),
-        ("name: imu}", "name: scan}", "a recording on sender comes twice; give each a name:"),
+        ("ping: {name: up, ", "ping: {", "a ping is defined twice; give each a name:"),
+        (
+            "transfer: {name: bare",
+            "transfer: {name: up",
+            "a transfer named up is defined twice; give one another name",
+        ),
+        ("name: imu}", "name: scan}", "a recording on sender is defined twice; give each a name:"),
         ("file: imu", "file: odom", "sends odom, but no recording of that name is made on sender before it"),
         (", file: imu", "", "names no file, but 2 files are recorded there before it: write file:"),
-        ("            name: inner\n", "", "a capture on sender comes twice; give each a name:"),
+        ("            name: inner\n", "", "a capture on sender is defined twice; give each a name:"),
         ("robots: [sender]", "robots: [sender, sender]", "a robot is named twice"),
     ],
 )

@@ -279,7 +279,7 @@ HOSTILE = {
     "a flag of metres": "- {name: a, unit: m, meaning: x, figure: {label: a, kind: flag, rank: 1}}",
     "a figure of a text": "- {name: a, unit: text, meaning: x, figure: {label: a, kind: mean, rank: 1}}",
     "no list": "  a: b",
-    "too many": "".join(f"- {{name: a{n}, unit: m, meaning: x}}\n" for n in range(frozen.MOST_COLUMNS + 1)),
+    "too many": "".join(f"- {{name: a{n}, unit: m, meaning: x}}\n" for n in range(frozen.MAX_COLUMNS + 1)),
 }
 
 

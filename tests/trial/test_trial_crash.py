@@ -69,7 +69,15 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
     def nothing(*_words: object, **_more: object) -> dict[str, object]:
         return {}
 
-    for verb in ("begin", "measure", "demand_held", "end_jobs", "end_left", "hang_up", "delete_remote"):
+    for verb in (
+        "begin",
+        "measure",
+        "demand_held",
+        "end_jobs",
+        "stop_leftover_jobs",
+        "close_connections",
+        "delete_remote",
+    ):
         monkeypatch.setattr(Robots, verb, nothing)
     monkeypatch.setattr(Robots, "fetch", fetch)
     monkeypatch.setattr(preflight, "preflight", nothing)

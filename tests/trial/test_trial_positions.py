@@ -101,7 +101,7 @@ def test_invalid_positions_are_rejected_and_change_nothing(
     shutil.copy("walk.csv", "walk.txt")
     Path("bad.csv").write_text("t,x_m,y_m\nnoon,1,2\n", encoding="ascii")
     with Path("huge.gpx").open("wb") as huge:
-        huge.truncate(positions.MOST_BYTES + 1)
+        huge.truncate(positions.MAX_BYTES + 1)
     before = {path: path.read_bytes() for path in trial.iterdir() if path.is_file()}
     exit_code, output = said(capsys, *words)
     assert (exit_code, complaint in output) == (code, True), output

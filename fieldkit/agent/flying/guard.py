@@ -137,7 +137,7 @@ class FlightGuard:
         log_line(f"{self._plan.abort}: {error}")
         self._state = LANDING
         try:
-            with landing_marker(self._plan.unhurried):
+            with landing_marker(self._plan.landing_marker):
                 bring_down(self._session, self._plan.abort, self._may_command, self._update)
         except FlightError:
             log_line(alarm(drone))

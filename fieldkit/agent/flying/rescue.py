@@ -12,8 +12,8 @@ from fieldkit.agent.flying.liveness import LivenessFile
 from fieldkit.agent.flying.talk import AutopilotSession
 from fieldkit.agent.landing import (
     MANUAL_ACTION,
+    NO_HEARTBEAT_S,
     REFUSED,
-    UNHEARD_S,
     FlightError,
     alarm,
     bring_down,
@@ -33,15 +33,15 @@ def rescue(plan: FlightPlan) -> None:
         plan: A plan with the liveness file that the pilot and the guard share.
 
     Raises:
-        FlightError: No heartbeat arrived for `UNHEARD_S`, another party flies the drone, or it did not land.
+        FlightError: No heartbeat arrived for `NO_HEARTBEAT_S`, another party flies the drone, or it did not land.
         OSError: The liveness file cannot be opened.
         ValueError: The name of the connection is invalid.
     """
     for own in (liveness.PILOT, liveness.GUARD):
         LivenessFile(plan.liveness, own).kill_other()
     log_line(f"{plan.abort}: neither the pilot nor the guard runs")
-    deadline_s = time.monotonic() + UNHEARD_S
-    with landing_marker(plan.unhurried):
+    deadline_s = time.monotonic() + NO_HEARTBEAT_S
+    with landing_marker(plan.landing_marker):
         session = _open_session(plan.connection, deadline_s)
         try:
             _wait_for_autopilot(session, deadline_s)
@@ -78,14 +78,14 @@ def _open_session(connection: str, deadline_s: float) -> AutopilotSession:
         if not has_warned:
             log_line(f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {connection} CANNOT BE OPENED. {MANUAL_ACTION}")
         has_warned = True
-    raise FlightError(REFUSED, f"{connection} could not be opened in {UNHEARD_S:g} s")
+    raise FlightError(REFUSED, f"{connection} could not be opened in {NO_HEARTBEAT_S:g} s")
 
 
 def _wait_for_autopilot(session: AutopilotSession, deadline_s: float) -> None:
     warning_s = time.monotonic() + _WARNS_S
     while not session.drone.alive:
         if time.monotonic() > deadline_s:
-            raise FlightError(REFUSED, f"no heartbeat of the autopilot in {UNHEARD_S:g} s")
+            raise FlightError(REFUSED, f"no heartbeat of the autopilot in {NO_HEARTBEAT_S:g} s")
         if time.monotonic() > warning_s:
             log_line(alarm(session.drone))
             warning_s = deadline_s

@@ -17,7 +17,7 @@ class AutopilotSession:
 
     Args:
         connection: Name of the connection, as for `mavlink_links.open_link`.
-        poll: Called at the end of each `exchange` with the state of the autopilot.
+        on_state: Called at the end of each `exchange` with the state of the autopilot.
         component: Component id of this program.
 
     Attributes:

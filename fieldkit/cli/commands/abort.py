@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
                 sink(Note(_NONE))
                 return 0
             question = f"terminate every job of fieldkit on {', '.join(robots)}"
-            if not arguments.yes and not confirmed(question, unasked="fieldkit abort --yes"):
+            if not arguments.yes and not confirmed(question, remedy="fieldkit abort --yes"):
                 print_text("nothing was terminated")
                 return FieldkitError.exit_code
             results = locks.abort(robots, runtime.user_at_host())

@@ -26,8 +26,8 @@ def add(parser: Parser) -> None:
         action="append",
         default=[],
         metavar="WIDTH",
-        help="report how many more repeats make an interval the value +-WIDTH, in any unit: 2%% for shares, 1ms for "
-        "times, 100kbit/s for rates, 2dB for dBm; may be given more than once; implies --all",
+        help="report how many more repeats are needed for an interval of the value +-WIDTH, in any unit: 2%% for "
+        "shares, 1ms for times, 100kbit/s for rates, 2dB for dBm; may be given more than once; implies --all",
     )
     parser.add_choice(
         "--format",

@@ -43,7 +43,9 @@ def add(parser: Parser) -> None:
     )
     shared.add_bag(action)
     action.add_argument("to", type=Path, metavar="NEW", help="NAME.bag for ROS 1, else a folder for ROS 2")
-    action.add_choice("--storage", STORAGES, default=STORAGES[0], help="of a bag of ROS 2 (default: mcap)")
+    action.add_choice(
+        "--storage", STORAGES, default=STORAGES[0], help="storage format of a ROS 2 bag (default: mcap)"
+    )
     action.add_choice(
         "--distribution",
         DISTRIBUTIONS,

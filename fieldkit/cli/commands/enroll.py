@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit enroll`."""
     parser.description = (
-        "Ask a robot for its SSH host key (ed25519 if it has one) without logging in, show type and fingerprint, ask "
+        "Read the SSH host key of a robot (ed25519 if it has one) without logging in, show type and fingerprint, ask "
         "for confirmation, and write the key into the site file as host_key; nothing else in the file changes. A key "
         "that is already pinned is not changed. If the robot offers another key, enroll ends with both fingerprints "
         "and exit code 3. After the answer no the exit code is 1."
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
             "answered",
         )
     _show(address, offered, pinned)
-    if not arguments.yes and not confirmed("pin it", unasked="compare the fingerprints, then add --yes"):
+    if not arguments.yes and not confirmed("pin it", remedy="compare the fingerprints, then add --yes"):
         print_text("not pinned")
         return FieldkitError.exit_code
     pin_host_key(path, name, offered.text)

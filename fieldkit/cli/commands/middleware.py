@@ -102,14 +102,13 @@ def _parse_share(text: str, option: str, most: float = 1.0) -> float:
     """Return the share in an option's value.
 
     Raises:
-        ConfigurationError: It is not a share, or above `most`; or it is 0, which proves nothing, if `most` is below
-            1.
+        ConfigurationError: It is not a share, or above `most`; or it is 0 and `most` is below 1.
     """
     share = parse_amount(text, "share", option)
     if share > most or (most < 1 and not share):
         least = "above 0" if most < 1 else "0"
         raise ConfigurationError(
-            f"{option}: {text[:40]!r} is not a share that repeats can show",
+            f"{option}: {text[:40]!r} is not a valid share",
             remedy=f"write {least} to {100 * most:g} %",
         )
     return share

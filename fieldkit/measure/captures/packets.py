@@ -69,7 +69,7 @@ class Packets(Table):
     """IP packets in the order of the capture, one numpy column per field.
 
     Attributes:
-        time_ns: Time of capture, nanoseconds since 1970 UTC, or `frames.NO_TIME`.
+        time_ns: Time of capture, nanoseconds since 1970 UTC, or `arrays.NO_TIME`.
         wire_bytes: Length of the whole frame on the link, even if fewer bytes were captured.
         src: Source address.
         dst: Destination address.

@@ -1,6 +1,6 @@
 """Contradictions within the JSON of one end of an iperf3 test, and between the JSON of both ends.
 
-The checks hold for versions 3.1.3 to 3.17.1 in both directions, whatever the link loses, duplicates or delays.
+The checks hold for versions 3.1.3 to 3.17.1 in both directions, for any loss, duplication or delay.
 """
 
 import math

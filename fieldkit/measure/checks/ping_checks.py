@@ -180,7 +180,7 @@ def _summary(output: Ping) -> Iterator[str]:
 
 
 def compare_with_capture(
-    output: Ping, captured: CapturedPing, interval_s: float, role: str, *, asks: bool
+    output: Ping, captured: CapturedPing, interval_s: float, role: str, *, is_requester: bool
 ) -> Iterator[str]:
     """Yield the contradictions between the output and one ping in a capture.
 
@@ -189,7 +189,7 @@ def compare_with_capture(
         captured: The echoes of one identifier.
         interval_s: Time between requests.
         role: Role of the capturing robot.
-        asks: True if this robot sends the requests; otherwise its capture has the replies as it sends them.
+        is_requester: True if this robot sends the requests; otherwise its capture has the replies as it sends them.
     """
     if output.transmitted is None or output.transmitted > _MAX_SEQUENCE:
         return
@@ -199,7 +199,7 @@ def compare_with_capture(
     not_captured = sorted(answers.keys() - (captured.requested_ns.keys() & captured.replied_ns.keys()))
     if not_captured:
         yield f"ping has a reply to request {not_captured[0]}, but the {role}'s capture lacks request or reply"
-    if not asks:
+    if not is_requester:
         return
     yield from _unprinted_replies(output, captured, interval_s, role)
     captured_replies = [reply for seq, reply in answers.items() if seq not in not_captured]

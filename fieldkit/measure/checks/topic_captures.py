@@ -103,14 +103,16 @@ def check_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured
     ):
         return
     if captured.publisher is not None:
-        yield from _of_content(captured.publisher.heads, sent.samples, sent.samples.sequence, "publisher")
-        yield from _of_sending(captured.publisher.heads)
+        yield from _content_contradictions(captured.publisher.heads, sent.samples, sent.samples.sequence, "publisher")
+        yield from _sending_contradictions(captured.publisher.heads)
     if captured.subscriber is not None:
-        yield from _of_content(captured.subscriber.heads, received.samples, None, "subscriber")
-        yield from _of_arrivals(plan, received, captured.subscriber, complete=captured.complete)
+        yield from _content_contradictions(captured.subscriber.heads, received.samples, None, "subscriber")
+        yield from _arrival_contradictions(plan, received, captured.subscriber, complete=captured.complete)
 
 
-def _of_arrivals(plan: TopicPlan, received: TopicLog, subscriber: SampleFlow, *, complete: bool) -> Iterator[str]:
+def _arrival_contradictions(
+    plan: TopicPlan, received: TopicLog, subscriber: SampleFlow, *, complete: bool
+) -> Iterator[str]:
     """Yield the contradictions between the subscriber's log and its capture."""
     arrived = first_arrivals(received)
     yield from _Arrivals.of(arrived, subscriber, complete=complete, reliable=plan.reliable).contradictions()
@@ -148,8 +150,8 @@ def withheld(
         "mean": float(latency_s.mean()),
         "95th percentile": float(np.percentile(latency_s, 95)),
         "largest": float(latency_s.max()),
-        "median of those sent": _of_sent(latency_s, values, 0.5),
-        "95th percentile of those sent": _of_sent(latency_s, values, 0.95),
+        "median of those sent": _quantile_of_sent(latency_s, values, 0.5),
+        "95th percentile of those sent": _quantile_of_sent(latency_s, values, 0.95),
     }
     reasons = {}
     for name, figure in SHARE_FIGURES.items():
@@ -160,7 +162,7 @@ def withheld(
     return reasons
 
 
-def _of_sent(latency_s: Floats, values: Mapping[str, Value], share: float) -> float:
+def _quantile_of_sent(latency_s: Floats, values: Mapping[str, Value], share: float) -> float:
     """Return the quantile of the received samples that corresponds to this quantile of the sent samples."""
     sent, received = values.get("topic_sent"), values.get("topic_received")
     sent_per_received = sent / received if isinstance(sent, int) and isinstance(received, int) and received else 1.0
@@ -264,7 +266,9 @@ def _before_next_ns(subscriber: SampleFlow, heads: SampleHeads) -> Ints:
     return last
 
 
-def _of_content(heads: SampleHeads, samples: TopicSamples, numbers: Ints | None, name: str) -> Iterator[str]:
+def _content_contradictions(
+    heads: SampleHeads, samples: TopicSamples, numbers: Ints | None, name: str
+) -> Iterator[str]:
     """Yield differences in the time of sending between capture and log, and captured samples without a record."""
     if numbers is not None and (unlogged := int((~np.isin(heads.sequence, numbers)).sum())):
         yield f"{format_count(unlogged, 'sample')} in the {name}'s capture are not in its log"
@@ -275,7 +279,7 @@ def _of_content(heads: SampleHeads, samples: TopicSamples, numbers: Ints | None,
         yield f"{what} have another time of sending than in its capture"
 
 
-def _of_sending(publisher: SampleHeads) -> Iterator[str]:
+def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
     """Yield contradictions between the times of sending and the publisher's capture."""
     first = publisher.first()
     after_ns = first.at_ns - first.sent_ns
@@ -295,7 +299,7 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
     shown_numbers, shown_copies = np.unique(subscriber.heads.sequence, return_counts=True)
     known = np.isin(numbers, shown_numbers)
     max_copies = np.ones(len(numbers), dtype=np.int64)
-    if not subscriber.is_tcp:  # TCP delivers every byte once, however often it arrived
+    if not subscriber.is_tcp:  # TCP delivers every byte once, even if it arrived several times
         max_copies[known] = shown_copies[np.searchsorted(shown_numbers, numbers[known])]
     if surplus := int(((copies > max_copies) & (known | subscriber.is_tcp)).sum()):
         yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"
@@ -399,7 +403,7 @@ def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_m
 
 
 def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:
-    """Return how many samples are missing in a log by the TCP bytes that arrived, if the capture has no heads."""
+    """Return the number of samples missing in a log by the TCP bytes that arrived, if the capture has no heads."""
     if not subscriber.is_tcp:
         return 0
     max_bytes = plan.size_bytes + plan.envelope_bytes + _OVERHEAD_BYTES

@@ -1,6 +1,6 @@
 """Sources of the columns of a transfer, and contradictions between its two captures and two files.
 
-A contradiction shows that a capture or a file is incomplete, whatever the link loses, duplicates or reorders, and for
+A contradiction shows that a capture or a file is incomplete, for any loss, duplication or reordering, and for
 any clock offset.
 """
 

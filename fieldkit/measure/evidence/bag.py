@@ -15,7 +15,7 @@ METADATA: Final = "metadata.yaml"
 ROS2: Final = {".db3", ".mcap"}
 """Suffixes of the data files of ROS 2 bags."""
 
-# The ratio of a full three-cell battery's voltage to its nominal voltage is 12.6 V / 11.1 V, below this bound.
+# Largest value that is a fraction and not a percentage: a full three-cell battery has 12.6 V / 11.1 V.
 _MAX_FRACTION: Final = 1.5
 
 _READER: Final = SandboxedReader("fieldkit.measure.evidence.bag_reader")
@@ -114,7 +114,7 @@ def topic_stats(path: Path) -> Mapping[str, TopicStats]:
     if not path.is_file():
         raise EvidenceError("there is no bag", where=str(path), remedy="read the recorder's log: did it start?")
     try:
-        topics = _query(path, heard="true")["topics"]
+        topics = _query(path, topic_stats="true")["topics"]
     except ReaderError as error:
         raise EvidenceError(f"the bag cannot be read: {error}", where=str(path)) from error
     return {topic: TopicStats(**fields) for topic, fields in topics.items()}

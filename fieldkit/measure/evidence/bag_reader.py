@@ -24,8 +24,8 @@ _MAX_TOPICS: Final = 10_000
 def answer(question: Json) -> Json:
     """Return the answer to a query about the bag at `path`.
 
-    A query with `heard` returns the message times by topic, with `topic` the last battery state, with `positions` the
-    positions in one topic, and any other query the contents of the bag.
+    A query with `topic_stats` returns the message times by topic, with `topic` the last battery state, with
+    `positions` the positions in one topic, and any other query the contents of the bag.
 
     Raises:
         Exception: The bag cannot be read; rosbags and its dependencies raise any exception for invalid bytes.
@@ -36,8 +36,8 @@ def answer(question: Json) -> Json:
     if "topic" in question:
         share = battery_share(path, question["topic"])
         return {"share": None if math.isnan(share) else share}
-    if "heard" in question:
-        return {"topics": heard(_open_ros2(path.parent) if path.suffix in bag.ROS2 else rosbag1.Reader(path))}
+    if "topic_stats" in question:
+        return {"topics": topic_stats(_open_ros2(path.parent) if path.suffix in bag.ROS2 else rosbag1.Reader(path))}
     if path.suffix not in bag.ROS2:
         return contents(rosbag1.Reader(path))
     if path.suffix == ".db3":
@@ -71,14 +71,14 @@ def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
         }
 
 
-def heard(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
+def topic_stats(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
     """Return number and times of the messages by topic, keyed by the attributes of `TopicStats`."""
     by_topic: dict[str, dict[str, int]] = {}
     with reader:
         for connection, stamp_ns, _ in reader.messages():
             at_ns, topic = _checked_count(stamp_ns), _checked_topic(connection.topic)
-            new = {"messages": 0, "first_utc_ns": at_ns, "last_utc_ns": at_ns, "gap_ns": 0}
-            stats = by_topic.setdefault(topic, new)
+            initial = {"messages": 0, "first_utc_ns": at_ns, "last_utc_ns": at_ns, "gap_ns": 0}
+            stats = by_topic.setdefault(topic, initial)
             if len(by_topic) > _MAX_TOPICS:
                 raise ValueError(f"it has more than {_MAX_TOPICS} topics")
             stats["messages"] += 1

@@ -5,8 +5,8 @@ chrony) change both equally (clock_gettime(2)). Their difference changes only if
 ADJ_SETOFFSET of adjtimex(2), or a leap second. A change of the difference is therefore a clock step.
 
 A state file has lines `BEFORE TIME AFTER`: the clock between two readings of /proc/uptime, which is truncated to
-10 ms. Each line gives a lower and an upper bound of the difference, however long the reading took; several lines give
-closer bounds.
+10 ms. Each line gives a lower and an upper bound of the difference for any duration of the reading; several lines
+give closer bounds.
 """
 
 import re

@@ -41,14 +41,14 @@ COLUMNS: Final = columns(
     (
         "iperf3_interval_min_bit_s",
         "bit/s",
-        "Payload rate in the slowest of these seconds.",
+        "Smallest payload rate of a second that iperf3_throughput_bit_s includes.",
         Figure("iperf3 slowest second", Kind.MEDIAN, rank=61),
     ),
-    ("iperf3_interval_median_bit_s", "bit/s", "Median of the payload rates of these seconds."),
+    ("iperf3_interval_median_bit_s", "bit/s", "Median payload rate of the seconds of iperf3_throughput_bit_s."),
     ("iperf3_sent_bytes", "B", "Payload sent, as reported by iperf3's sender."),
     ("iperf3_received_bytes", "B", "Payload received, as reported by iperf3's receiver."),
     ("iperf3_datagrams_sent", "count", "UDP datagrams that iperf3's receiver expected. Empty for TCP."),
-    ("iperf3_datagrams_received", "count", "Of these, the datagrams that it received. Empty for TCP."),
+    ("iperf3_datagrams_received", "count", "iperf3_datagrams_sent that iperf3's receiver received. Empty for TCP."),
     (
         "iperf3_loss",
         "share",

@@ -38,14 +38,14 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
             "dBm",
             (
                 f"Median over the repeat of the signal that the {role}'s radio receives from its peer, the station "
-                "or access point with which it exchanges the most packets. This and the following columns are empty "
-                "for a robot without Wi-Fi or iw, and if its driver does not report the value."
+                "or access point with which it exchanges the most packets. The columns of a radio are empty for a "
+                "robot without Wi-Fi or iw, and if its driver does not report the value."
             ),
             Figure(f"signal, {role}", Kind.MEDIAN, rank=BACKGROUND),
             _DBM,
         ),
-        (f"{role}_signal_min_dbm", "dBm", "Weakest of these samples.", _DBM),
-        (f"{role}_signal_last_dbm", "dBm", "Last of these samples.", _DBM),
+        (f"{role}_signal_min_dbm", "dBm", f"Weakest signal that the {role}'s radio receives from its peer.", _DBM),
+        (f"{role}_signal_last_dbm", "dBm", f"Last signal that the {role}'s radio receives from its peer.", _DBM),
         (f"{role}_noise_dbm", "dBm", f"Median over the repeat of the noise in the {role}'s channel.", _DBM),
         (
             f"{role}_busy_share",
@@ -59,23 +59,27 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
             f"Median over the samples of the PHY rate of the {role}'s last frame to the peer.",
             Figure(f"PHY rate, {role}", Kind.MEDIAN, rank=BACKGROUND + 1),
         ),
-        (f"{role}_rx_rate_bit_s", "bit/s", "Median over the samples of the PHY rate of the last frame from it."),
+        (f"{role}_rx_rate_bit_s", "bit/s", "Median over the samples of the PHY rate of the peer's last frame."),
         (f"{role}_radio_tx_packets", "count", f"Packets that the {role}'s radio sent to the peer, of all programs."),
-        (f"{role}_radio_rx_packets", "count", "Packets that it received from the peer."),
+        (f"{role}_radio_rx_packets", "count", f"Packets that the {role}'s radio received from the peer."),
         (
             f"{role}_tx_retries",
             "count",
-            "Frames that were retransmitted to the peer because the acknowledgement was missing.",
+            f"Frames that the {role}'s radio retransmitted to the peer because no acknowledgement arrived.",
             Figure(f"Wi-Fi retries, {role}", Kind.MEDIAN, rank=BACKGROUND + 2),
         ),
-        (f"{role}_tx_failures", "count", "Packets to the peer that were dropped after the last retry."),
-        (f"{role}_beacon_losses", "count", "Number of times that beacons of the peer were lost."),
+        (
+            f"{role}_tx_failures",
+            "count",
+            f"Packets to the peer that the {role}'s radio dropped after the last retry.",
+        ),
+        (f"{role}_beacon_losses", "count", f"Number of times that the {role}'s radio missed beacons of the peer."),
         (
             f"{role}_roams",
             "count",
             f"Number of times that the {role} roamed to another access point; empty if it is not a station.",
         ),
-        (f"{role}_link_samples", "count", f"Samples of the {role}'s link."),
+        (f"{role}_link_samples", "count", f"Samples of the {role}'s radio that the columns include."),
     )
 
 

@@ -26,15 +26,14 @@ LATENESS_COLUMNS: Final = columns(
         "s",
         (
             "99th percentile of the lateness with which packets were delivered to the robots, compared with the "
-            "emulator's radio model, over the whole repeat; rounded up by at most an eighth. This and the next two "
-            "columns are empty for real radios."
+            "emulator's radio model, over the whole repeat; rounded up by at most an eighth. Empty for real radios."
         ),
     ),
-    ("emulator_late_max_s", "s", "Largest lateness of these packets."),
+    ("emulator_late_max_s", "s", "Largest lateness of these packets; see emulator_late_p99_s."),
     (
         "emulator_too_late",
         "count",
-        "Packets that were later than the site file's emulated.late_bound; above 0 the repeat is void.",
+        "Packets later than emulated.late_bound of the site file; above 0 the repeat is void. Empty for real radios.",
     ),
 )
 

@@ -36,9 +36,9 @@ def _observer(kind: FaultKind) -> str:
 
 def declared(kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns of a kind of fault."""
-    outage_meaning = f"Longest time without an answer around the fault {kind}; empty if the robot did not recover."
-    recovery_meaning = f"Part of the outage after the cause of {kind} had ended; empty if that time is unknown."
-    recovered_meaning = f"Whether the robot recovered within the limit after {kind}."
+    outage_meaning = f"Longest time without a reply around the fault {kind}; empty if the robot did not recover."
+    recovery_meaning = f"Part of this outage after the end of the cause of {kind}; empty if that end is unknown."
+    recovered_meaning = f"True if the robot recovered from the fault {kind} within the time limit."
     bound_meaning = f"Lower bound of the recovery time if the robot did not recover from {kind}; otherwise empty."
     index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")
     recovered = Figure(f"{_observer(kind)} back after {kind}", Kind.FLAG, rank=70 + index)

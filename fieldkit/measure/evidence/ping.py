@@ -60,15 +60,15 @@ GAP_COLUMNS: Final = columns(
         "rtt_gap_s",
         "s",
         (
-            "Longest time between consecutive answers; empty if ping printed no time stamps, or if it started or "
-            "ended without answers for a longer time, or for 1 s or more."
+            "Longest time between consecutive replies; empty if ping printed no time stamps, or if it started or "
+            "ended without replies for a longer time, or for 1 s or more."
         ),
         Figure("longest gap between answers", Kind.MEDIAN, at_least="rtt_gap_at_least_s"),
     ),
     (
         "rtt_gap_lost",
         "count",
-        "Echo requests without an answer in that time; empty if rtt_gap_s is.",
+        "Echo requests without a reply during rtt_gap_s; empty if rtt_gap_s is empty.",
         Figure("lost in the gap", Kind.MEDIAN, at_least="rtt_gap_lost_at_least"),
     ),
 )
@@ -78,11 +78,11 @@ OPEN_GAP_COLUMNS: Final = columns(
         "rtt_gap_at_least_s",
         "s",
         (
-            "Lower bound of rtt_gap_s if ping started or ended in the gap: the longest observed time without an "
-            "answer. Empty otherwise."
+            "Lower bound of rtt_gap_s if ping started or ended in the gap: the longest observed time without a "
+            "reply. Empty otherwise."
         ),
     ),
-    ("rtt_gap_lost_at_least", "count", "Lower bound of rtt_gap_lost in the same case."),
+    ("rtt_gap_lost_at_least", "count", "Lower bound of rtt_gap_lost if ping started or ended in the gap."),
 )
 _SEQUENCE_NUMBERS: Final = 1 << 16
 """Number of ICMP sequence numbers."""
@@ -98,14 +98,14 @@ MOTION_COLUMNS: Final = columns(
         "m",
         "Distance between sender and receiver at the first ping reply that has a time stamp.",
     ),
-    ("rtt_distance_min_m", "m", "Smallest distance between that reply and the last one."),
-    ("rtt_distance_mean_m", "m", "Mean distance over that time."),
-    ("rtt_distance_max_m", "m", "Largest distance in that time."),
-    ("rtt_sender_speed_m_s", "m/s", "Mean speed of the sender over that time."),
+    ("rtt_distance_min_m", "m", "Smallest distance from the first ping reply to the last."),
+    ("rtt_distance_mean_m", "m", "Mean distance from the first ping reply to the last."),
+    ("rtt_distance_max_m", "m", "Largest distance from the first ping reply to the last."),
+    ("rtt_sender_speed_m_s", "m/s", "Mean speed of the sender from the first ping reply to the last."),
     (
         "rtt_relative_speed_m_s",
         "m/s",
-        "Mean magnitude of the relative velocity of sender and receiver over that time.",
+        "Mean magnitude of the relative velocity of sender and receiver from the first ping reply to the last.",
     ),
 )
 

@@ -86,10 +86,10 @@ def position_accounts(evidence: AttemptEvidence) -> Accounts:
     Raises:
         EvidenceError: A file that lists them is damaged.
     """
-    return evidence.cached(_given)
+    return evidence.cached(_read_accounts)
 
 
-def _given(evidence: AttemptEvidence) -> Accounts:
+def _read_accounts(evidence: AttemptEvidence) -> Accounts:
     of_attempt = (
         evidence.read(position_sources.read, position_sources.FILE)
         if evidence.has(position_sources.FILE)
@@ -124,10 +124,10 @@ def trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> 
     Raises:
         EvidenceError: A robot has no source, a source cannot be read, or the frames differ.
     """
-    return evidence.cached(_of_two, ends)
+    return evidence.cached(_trajectories_of_pair, ends)
 
 
-def _of_two(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
+def _trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
     sources = position_accounts(evidence)
     source, destination = (samples_of(evidence, role) for role in ends)
     if source.frame != destination.frame:
@@ -198,7 +198,7 @@ def _read_cached(path: Path, _mtime_ns: int, _size_bytes: int) -> Samples:
 
 
 def _ahead_ns(sources: Accounts, role: Role) -> int:
-    """Return how far a robot's clock was ahead of the laptop's; 0 if that was not measured."""
+    """Return the offset of a robot's clock from the laptop's, positive if it was ahead; 0 if it was not measured."""
     return round(sources.clocks[role].offset_s * 1e9) if role in sources.clocks else 0
 
 

@@ -15,9 +15,9 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import bag, reading
 from fieldkit.measure.evidence.sandbox import ReaderError, SandboxedReader
 from fieldkit.measure.positions.position_sources import Account
-from fieldkit.measure.positions.samples import MOST_SAMPLES, PLACED, WGS84, Samples, read_csv, require_increasing
+from fieldkit.measure.positions.samples import MAX_SAMPLES, PLACED, WGS84, Samples, read_csv, require_increasing
 
-MOST_STALE_S: Final = 10.0
+MAX_STALE_S: Final = 10.0
 """If stamps and reception times differ by more than this, the stamps are from another clock."""
 
 PositionReader = Callable[[Path, Account], Samples]
@@ -27,7 +27,7 @@ _GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
 
 
 def read_file(path: Path) -> Samples:
-    """Return the samples in a GPX or CSV file, distinguished by the file name's suffix. Times are the file's.
+    """Return the samples in a GPX or CSV file, distinguished by the file name's suffix, with the times in the file.
 
     Raises:
         EvidenceError: The file has another suffix or is invalid.
@@ -45,8 +45,8 @@ def _read_gpx(path: Path) -> Samples:
         points = _GPX_READER.query({"path": str(path.absolute())}, reading.size(path))["points"]
     except ReaderError as error:
         raise EvidenceError(f"cannot be read as GPX: {error}", where=str(path)) from error
-    if len(points) > MOST_SAMPLES:
-        raise EvidenceError(f"has more than {MOST_SAMPLES} points", where=str(path), remedy="cut it to the trial")
+    if len(points) > MAX_SAMPLES:
+        raise EvidenceError(f"has more than {MAX_SAMPLES} points", where=str(path), remedy="cut it to the trial")
     try:
         require_increasing(
             [at_ns for at_ns, *_ in points], [f"point {number}" for number in range(1, len(points) + 1)]
@@ -63,7 +63,7 @@ def _read_gpx(path: Path) -> Samples:
 
 
 def read_topic(path: Path, account: Account) -> Samples:
-    """Return the samples in a topic of a bag, or of a message type in a telemetry log. Times are the recorder's.
+    """Return the samples in a topic of a bag, or of a message type in a telemetry log, by the recorder's clock.
 
     Raises:
         EvidenceError: The file cannot be read or has no positions.
@@ -80,7 +80,7 @@ def _readers() -> Mapping[str, EntryPoint]:
 
 
 def read_bag(path: Path, account: Account) -> Samples:
-    """Return the samples in a topic of a bag. Times are the robot's.
+    """Return the samples in a topic of a bag, by the robot's clock.
 
     If several messages have the same time, the first is used.
 
@@ -105,7 +105,7 @@ def read_bag(path: Path, account: Account) -> Samples:
     values = np.array([row[2:] for row in topic_data["rows"]], dtype=float)
     stamped = account.stamps == "header"
     stale_s = abs(np.median(times[:, 0] - times[:, 1])) / 1e9
-    if stamped and stale_s > MOST_STALE_S:
+    if stamped and stale_s > MAX_STALE_S:
         raise EvidenceError(
             f"the stamps of {topic} differ by {stale_s:.0f} s from the times of reception",
             where=str(path),

@@ -24,8 +24,8 @@ WGS84: Final = "WGS 84"
 LOCAL: Final = "metres"
 """Frame of a file that gives metres from an unknown origin."""
 
-MOST_SAMPLES: Final = 1_000_000
-_MOST_NS: Final = 2**62
+MAX_SAMPLES: Final = 1_000_000
+_MAX_NS: Final = 2**62
 _NS_PER: Final = {"t_s": 10**9, "t_ms": 10**6, "t_us": 10**3, "t_ns": 1}
 _COUNTED: Final = re.compile(r"-?[0-9]{1,20}(?:\.[0-9]*)?", re.ASCII)
 _AXES: Final = ("x", "y", "z")
@@ -63,7 +63,7 @@ def require_increasing(times_ns: Sequence[int], where: Sequence[str]) -> None:
     if not times_ns:
         raise EvidenceError("has no position with a time", remedy="export the track again, with times")
     for index, at_ns in enumerate(times_ns):
-        if not 0 <= at_ns < _MOST_NS:
+        if not 0 <= at_ns < _MAX_NS:
             raise EvidenceError(
                 "a time is before 1970 or after 2116", where=where[index], remedy="check the unit of the times"
             )
@@ -96,8 +96,8 @@ def read_csv(path: Path) -> Samples:
         where = f"{path}:{number}"
         if len(row) != len(names):
             raise EvidenceError(f"has {len(row)} cells, but the header has {len(names)}", where=where)
-        if len(values) == MOST_SAMPLES:
-            raise EvidenceError(f"has more than {MOST_SAMPLES} lines", where=str(path), remedy="cut it to the trial")
+        if len(values) == MAX_SAMPLES:
+            raise EvidenceError(f"has more than {MAX_SAMPLES} lines", where=str(path), remedy="cut it to the trial")
         times_ns.append(_time_ns(names[columns.time], row[columns.time].strip(), where))
         values.append(columns.value(row, where))
         line_places.append(where)
@@ -180,7 +180,7 @@ def _time_ns(name: str, text: str, where: str) -> int:
     """Return a time in nanoseconds since 1970 UTC."""
     invalid = EvidenceError(f"{text[:40]!r} is not a time", where=where, remedy="write it as 2026-11-22T10:00:00.5Z")
     if name != "t":
-        if not _COUNTED.fullmatch(text):  # rejects 1.7e9 as well, because exponents are written with lost digits
+        if not _COUNTED.fullmatch(text):  # also rejects 1.7e9, because a time with an exponent has lost digits
             raise invalid
         return round(Decimal(text) * _NS_PER[name])  # a float cannot represent nanoseconds since 1970
     try:

@@ -23,31 +23,31 @@ COLUMNS: Final = columns(
         "one_way_min_s",
         "s",
         (
-            "Smallest delay of the transfer's packets from one capture to the other (TCP: frames with payload). "
-            "This and the next three are empty if one_way_error_s is above a tenth of them."
+            "Smallest one-way delay of the transfer's packets from one capture to the other (TCP: frames with "
+            "payload). Each one-way delay is empty if one_way_error_s is above a tenth of it."
         ),
     ),
     (
         "one_way_median_s",
         "s",
-        "Median of that delay.",
+        "Median one-way delay; empty as for one_way_min_s.",
         Figure("one-way delay", Kind.MEDIAN, rank=31, of_sent="one_way_median_sent_s"),
     ),
-    ("one_way_mean_s", "s", "Mean of that delay."),
-    ("one_way_p95_s", "s", "95th percentile of that delay."),
-    ("one_way_error_s", "s", "Maximum error of each of these from the clocks."),
-    ("one_way_withheld", "text", "Reason why some or all of them are empty; empty if none is."),
+    ("one_way_mean_s", "s", "Mean one-way delay; empty as for one_way_min_s."),
+    ("one_way_p95_s", "s", "95th percentile of the one-way delay; empty as for one_way_min_s."),
+    ("one_way_error_s", "s", "Maximum error of each one-way delay that is caused by the clocks."),
+    ("one_way_withheld", "text", "Reason why one-way delays are empty; empty if none is."),
     (
         "delay_variation_median_s",
         "s",
-        "Median delay of the same packets relative to the fastest, which needs no common clock (RFC 5481).",
+        "Median delay of the transfer's packets relative to the fastest, which needs no common clock (RFC 5481).",
         Figure("delay variation", Kind.MEDIAN, rank=32),
     ),
-    ("delay_variation_p95_s", "s", "95th percentile of that."),
+    ("delay_variation_p95_s", "s", "95th percentile of the delay relative to the fastest packet (RFC 5481)."),
     (
         "jitter_s",
         "s",
-        "Interarrival jitter of the same packets after the last one (RFC 3550, section 6.4.1).",
+        "Interarrival jitter of the transfer's packets, after the last one (RFC 3550, section 6.4.1).",
         Figure("last jitter value (RFC 3550)", Kind.MEDIAN, rank=33),
     ),
     (
@@ -60,7 +60,10 @@ COLUMNS: Final = columns(
     (
         "clock_skew_ppm",
         "ppm",
-        "How much faster the receiver's clock runs than the sender's; empty if it can be wrong by more than 100 ppm.",
+        (
+            "Skew of the receiver's clock relative to the sender's, positive if it is faster. Empty if its error "
+            "can be above 100 ppm."
+        ),
     ),
     ("clock_skew_error_ppm", "ppm", "Maximum error of clock_skew_ppm."),
 )

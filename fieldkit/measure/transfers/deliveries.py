@@ -204,7 +204,7 @@ def stream_delivery(
 def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
     """Return the values to add to the sender's times at the start and at the end of a flow."""
     if not len(pairs):
-        raise EvidenceError("no packet of it is known to be in both captures")
+        raise EvidenceError("no packet of the flow is known to be in both captures")
     order = np.argsort(pairs.receiver_ns, kind="stable")
     first_and_last = pairs.where(order[:_EDGE_PACKETS]), pairs.where(order[-_EDGE_PACKETS:])
     start_offset_ns, end_offset_ns = (int((part.receiver_ns - part.sender_ns).min()) for part in first_and_last)
@@ -214,7 +214,7 @@ def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
 def _require_times(sent_ns: Ints, received_ns: Ints) -> None:
     """Raise an error for captures from which durations cannot be computed."""
     if not len(sent_ns):
-        raise EvidenceError("no packet of it is in the sender's capture")
+        raise EvidenceError("no packet of the flow is in the sender's capture")
     for times_ns in (sent_ns, received_ns):
         if (times_ns == NO_TIME).any():
             raise EvidenceError("a capture lacks times")

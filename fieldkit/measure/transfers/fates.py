@@ -117,32 +117,32 @@ def _relative_seq(base: int, tcp_seq: Ints) -> NDArray[np.int64]:
 
 CROSSING_COLUMNS: Final = columns(
     0,
-    ("sent_ns", "ns", "Time of sending by the sender's clock, since 1970 UTC."),
+    ("sent_ns", "ns", "Time of sending by the sender's clock, nanoseconds since 1970 UTC."),
     (
         "received_ns",
         "ns",
         (
-            "Time at which its first copy arrived, by the receiver's clock; for a TCP frame the last byte's. Empty if"
-            " it was lost, if it is ambiguous, and if offload joined it to others."
+            "Arrival time of the packet's first copy by the receiver's clock; for a TCP frame, of its last byte. "
+            "Empty if the packet was lost or is ambiguous, and if segmentation offload joined it to others."
         ),
     ),
     (
         "lost",
         "bool",
-        "True if it did not arrive, or for a TCP frame if any byte did not; empty if ambiguous.",
+        "True if the packet, or any byte of a TCP frame, did not arrive; empty if ambiguous.",
     ),
-    ("sent_again", "bool", "True if any of its bytes had been sent before. Empty for UDP."),
+    ("sent_again", "bool", "True if any byte of the frame had been sent before. Empty for UDP."),
     ("wire_bytes", "B", "Length of the frame at the sender."),
-    ("payload_bytes", "B", "Length after the IP header."),
+    ("payload_bytes", "B", "Length of the packet after the IP header."),
     (
         "delay_s",
         "s",
-        "One-way delay by the estimated clock offset; empty if received_ns or that offset is unknown.",
+        "One-way delay by the estimated clock offset; empty if received_ns or the clock offset is unknown.",
     ),
     (
         "delay_error_s",
         "s",
-        "Maximum error of delay_s from the clocks, equal for all packets that have one.",
+        "Maximum error of delay_s that is caused by the clocks; equal for all packets that have a delay.",
     ),
 )
 

@@ -144,7 +144,7 @@ JITTER: Final = columns(
     (
         "iperf3_captured_variation_p95_s",
         "s",
-        "95th percentile of that.",
+        "95th percentile of the datagrams' delay relative to the fastest (RFC 5481). Empty for TCP.",
         Figure("iperf3 delay variation, 95 % (RFC 5481, captured)", Kind.MEDIAN, rank=63),
     ),
 )
@@ -235,7 +235,7 @@ def measure_stalls(flow: str, load: LoadStreams, sender: Packets | None, receive
     """Return the columns of the stalls of a load; a capture that is missing or damaged is None.
 
     Args:
-        flow: Prefix of the columns' names, as for `stalls.declared`.
+        flow: Prefix of the columns' names, as for `stalls.declare_columns`.
         load: The load.
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.

@@ -40,9 +40,9 @@ class Match:
         sent_index: For each received packet the index of the sent packet of which it is a copy; `NONE` if there is no
             such packet in the sender's capture. Shape (m,).
         duplicates: Mask of received packets that are further copies of a packet that had arrived. Shape (m,).
-        doubtful: Mask of ambiguous sent packets: others are equal and were sent at nearly the same time, so that it
-            is unknown which of them arrived in which order. They are matched in the order of sending, so that of n
-            sent and m received, min(n, m) arrived. Shape (n,).
+        ambiguous: Mask of sent packets that cannot be distinguished: others are equal and were sent at nearly the
+            same time, so it is unknown which of them arrived in which order. They are matched in the order of
+            sending: if n were sent and m received, min(n, m) arrived. Shape (n,).
         possible_copy: Mask of received packets that count as arrived but may be copies of another packet, because
             packets with their key arrived closer together than they were sent. Shape (m,).
     """
@@ -165,7 +165,7 @@ def match_keys(
     ambiguous = np.zeros(len(key), dtype=np.bool_)
     ambiguous[sent_order] = (~is_clear & (received_count > 0))[group]
     possible_copy = np.zeros(len(received_key), dtype=np.bool_)
-    # If a single one arrived it cannot be a copy of another, whichever it is.
+    # If only one packet of a group arrived, it cannot be a copy of another.
     possible_copy[received_order] = (~is_clear & ~no_copy & (received_count > 1))[received_group]
     possible_copy &= ~duplicates
     return Match(received_index, sent_index, duplicates, ambiguous, possible_copy)
@@ -281,7 +281,7 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
     time to one of them, it is assigned to that one, and the group is clear. In all other groups, each received item
     is assigned to the nearest in time, subject to two conditions: the order is kept, and each item of the smaller
     side, sent or received, is assigned. A group has no copies if each received item is clearly nearest to another
-    sent item, however close they were sent.
+    sent item, even if these were sent close together.
 
     Args:
         group: Group of each sent item, ascending.

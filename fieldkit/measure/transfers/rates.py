@@ -3,8 +3,8 @@
 Throughput counts IP-layer bits, header and payload of every received packet (RFC 5136, section 2.3.1). Goodput counts
 the bits that the application received: without headers and duplicates (RFC 2647, section 3.17; RFC 5166, section
 2.1). Data that had arrived at the start of the measured time is not counted, as in the dispersion of a packet train
-(Dovrolis, Ramanathan and Moore 2001, INFOCOM, eq. 8): packets that arrive at the rate of a link then give that rate,
-however few they are.
+(Dovrolis, Ramanathan and Moore 2001, INFOCOM, eq. 8): any number of packets that arrive at the rate of a link then
+gives that rate.
 """
 
 from dataclasses import dataclass

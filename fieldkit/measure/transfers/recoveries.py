@@ -123,24 +123,24 @@ class FaultRecovery:
 def declare_columns(flow: str, kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns for a kind of flow and a kind of fault."""
     recovery, outage = (f"{flow}_{fault_column_name(kind, part)}" for part in ("recovery", "outage"))
-    place = list(FaultKind).index(kind)
+    index = list(FaultKind).index(kind)
     return columns(
         stalls.RANK,
         (
             f"{outage}_s",
             "s",
-            f"Longest time without new payload of the {flow} that overlaps the fault {kind}; empty if it had no end.",
-            Figure(f"{flow} outage around {kind}", Kind.MEDIAN, rank=80 + place, at_least=f"{outage}_at_least_s"),
+            f"Longest time without new payload of the {flow} that overlaps the fault {kind}; empty if it has no end.",
+            Figure(f"{flow} outage around {kind}", Kind.MEDIAN, rank=80 + index, at_least=f"{outage}_at_least_s"),
         ),
         (
             f"{recovery}_s",
             "s",
             (
                 f"Time from the end of the cause of {kind} to the first new payload of the {flow} at its receiver; "
-                "with several streams the longest. Empty if there was none, if the end of the cause is unknown, "
-                f"and if the receiver's clock can be wrong by more than {MAX_ERROR_S:g} s."
+                "with several streams the longest. Empty if no new payload arrived, if the end of the cause is "
+                f"unknown, and if the error of the receiver's clock can be above {MAX_ERROR_S:g} s."
             ),
-            Figure(f"{flow} recovery after {kind}", Kind.MEDIAN, rank=80 + place, at_least=f"{recovery}_at_least_s"),
+            Figure(f"{flow} recovery after {kind}", Kind.MEDIAN, rank=80 + index, at_least=f"{recovery}_at_least_s"),
         ),
         (f"{outage}_at_least_s", "s", f"Lower bound of {outage}_s if the outage had not ended, else empty."),
         (f"{recovery}_at_least_s", "s", f"Lower bound of {recovery}_s if no new payload arrived, else empty."),
@@ -151,20 +151,20 @@ def find(delivery: Delivery, began_ns: int, ended_ns: int | None) -> FaultRecove
     """Return the effect of a fault on a stream; times are by the receiver's clock.
 
     Raises:
-        EvidenceError: The stream was not active during the fault, or nothing of it arrived.
+        EvidenceError: The stream was not active during the fault, or no packet of it arrived.
     """
     at_ns, cause_end_ns = delivery.at_ns, began_ns if ended_ns is None else max(began_ns, ended_ns)
     if not len(at_ns):
-        raise EvidenceError("nothing of it arrived")
+        raise EvidenceError("no packet of the flow arrived")
     if delivery.begin_ns > cause_end_ns:
-        raise EvidenceError("it began after the fault")
+        raise EvidenceError("the flow started after the fault")
     last_ns = int(at_ns[-1]) if delivery.end_ns is None else max(delivery.end_ns, int(at_ns[-1]))
     if last_ns <= began_ns:
-        raise EvidenceError("it was over before the fault")
-    before, after = (int(np.searchsorted(at_ns, moment, side="right")) for moment in (began_ns, cause_end_ns))
+        raise EvidenceError("the flow ended before the fault")
+    before, after = (int(np.searchsorted(at_ns, time_ns, side="right")) for time_ns in (began_ns, cause_end_ns))
     recovered = after < len(at_ns)
     if not recovered and delivery.end_ns is None:
-        raise EvidenceError("all of it had arrived before the cause ended")
+        raise EvidenceError("all payload of the flow arrived before the end of the cause")
     longest_gap_s = float(np.diff(at_ns[max(before - 1, 0) : after + 1]).max(initial=0)) / 1e9
     before_first_s = 0.0 if before else (int(at_ns[0]) - delivery.begin_ns) / 1e9
     after_last_s = 0.0 if recovered else (last_ns - int(at_ns[-1])) / 1e9
@@ -197,7 +197,7 @@ def measure(
     except EvidenceError as error:
         return Measured.all_missing(declared_columns, error.what)
     if not streams:
-        return Measured.all_missing(declared_columns, "no packet of it is in a capture")
+        return Measured.all_missing(declared_columns, "no packet of the flow is in a capture")
     recovery, outage = (f"{flow}_{fault_column_name(kind, part)}" for part in ("recovery", "outage"))
     values = {
         _column_name(outage, any(stream.outage_open for stream in streams)): max(
@@ -223,6 +223,6 @@ def _fault_times_at(times: FaultTimes | None, role: Role) -> tuple[int, int | No
     if ahead is None:
         raise EvidenceError(f"the clock offset of the {role} is unknown")
     if ahead.error_s > MAX_ERROR_S:
-        raise EvidenceError(f"the clock offset of the {role} is known only to {ahead.error_s:.3f} s")
+        raise EvidenceError(f"the clock offset of the {role} has an error of up to {ahead.error_s:.3f} s")
     ahead_ns = round(1e9 * ahead.offset_s)
     return times.began_ns + ahead_ns, None if times.ended_ns is None else times.ended_ns + ahead_ns

@@ -3,8 +3,8 @@
 Payload is overdue from the previous delivery on; in a flow with a fixed rate, from one sending interval later. Time
 in which the sender had nothing to send is therefore not part of a stall. Overdue time longer than
 `Delivery.min_stall_s` is a stall. Time before the first payload, during which a connection is established, and after
-the last one, while more was due, is included only if it is that long. A stall after the last payload had not ended
-when the flow did: it is right-censored.
+the last one, while more was due, is included only if it is that long. A stall after the last payload is
+right-censored: it had not ended when the flow ended.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,7 +66,7 @@ def declare_columns(flow: str, label: str, rank: int) -> tuple[Column, ...]:
             f"{flow}_stall_s",
             "s",
             (
-                "Longest time during which new payload was overdue at the receiver, of all streams. "
+                "Longest time of any stream during which new payload was overdue at the receiver. "
                 "Empty if a stall had not ended, and without complete captures of both ends."
             ),
             Figure(f"longest stall of {label}", Kind.MEDIAN, rank=rank, at_least=bound),
@@ -75,8 +75,8 @@ def declare_columns(flow: str, label: str, rank: int) -> tuple[Column, ...]:
             f"{flow}_stalls",
             "count",
             (
-                "Number of times that it was overdue for more than 0.2 s, 2 round trips of TCP's handshake and 3 "
-                "sending intervals, in all streams together."
+                "Number of times that new payload was overdue for more than 0.2 s, 2 round trips of TCP's handshake "
+                "and 3 sending intervals, in all streams together."
             ),
             Figure(f"stalls of {label}", Kind.MEAN, rank=rank),
         ),
@@ -117,7 +117,7 @@ def find(delivery: Delivery) -> Stalls:
         after_s = (delivery.end_ns - int(at_ns[-1])) / 1e9 - delivery.interval_s
     ends_s = [seconds for seconds in (before_s, after_s) if seconds > min_stall_s]
     if not len(overdue_s) and not ends_s:
-        raise EvidenceError("a single packet of it arrived, so no time can be computed")
+        raise EvidenceError("only one packet of the flow arrived, so no time can be computed")
     return Stalls(
         longest_s=max(float(overdue_s.max(initial=0.0)), *ends_s, 0.0),
         count=int((overdue_s > min_stall_s).sum()) + len(ends_s),
@@ -126,10 +126,10 @@ def find(delivery: Delivery) -> Stalls:
 
 
 def _stall_without_arrivals(delivery: Delivery) -> Stalls:
-    """Return the stall of a stream of which nothing arrived: all of its duration."""
+    """Return the stall of a stream without any arrival: all of its duration."""
     duration_s = ((delivery.end_ns or delivery.begin_ns) - delivery.begin_ns) / 1e9
     if duration_s <= 0:
-        raise EvidenceError("nothing of it arrived, and its sender sent a single packet")
+        raise EvidenceError("no packet of the flow arrived, and only one was sent")
     return Stalls(duration_s, 1, is_open=True)
 
 
@@ -146,11 +146,11 @@ def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured
     except EvidenceError as error:
         return Measured.all_missing(declared_columns, error.what)
     if not streams:
-        return Measured.all_missing(declared_columns, "no packet of it is in a capture")
+        return Measured.all_missing(declared_columns, "no packet of the flow is in a capture")
     longest_s, count = max(stream.longest_s for stream in streams), sum(stream.count for stream in streams)
     if any(stream.is_open for stream in streams):
         values = {f"{flow}_stall_at_least_s": longest_s, f"{flow}_stalls": count}
-        return Measured(values, {f"{flow}_stall_s": "a stall had not ended when the flow did"})
+        return Measured(values, {f"{flow}_stall_s": "a stall had not ended at the end of the flow"})
     values = {f"{flow}_stall_s": longest_s, f"{flow}_stalls": count}
     return Measured(values, {f"{flow}_stall_at_least_s": "every stall ended"})
 
@@ -210,7 +210,7 @@ def measure_topic(
 
     Args:
         flow: Identifies its packets.
-        logs: Logs of publisher and subscriber as for `delivery`.
+        logs: Logs of publisher and subscriber as for `topic_delivery`.
         captured: Packets that their robots captured; None without a complete capture.
         expected: Known properties of the stream.
     """

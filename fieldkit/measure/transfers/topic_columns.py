@@ -26,7 +26,7 @@ from fieldkit.measure.transfers.udp import with_ports
 _COUNTS: Final = columns(
     100,
     ("topic_sent", "count", "Samples that the publisher's middleware accepted."),
-    ("topic_received", "count", "topic_sent that the subscriber received, each once."),
+    ("topic_received", "count", "Samples of topic_sent that the subscriber received, each counted once."),
     (
         "topic_loss",
         "share",
@@ -45,7 +45,7 @@ _COUNTS: Final = columns(
     (
         "topic_discovery_s",
         "s",
-        "Time from the start of the publisher's middleware, with the subscriber running, until that discovery.",
+        "Time from the start of the publisher's middleware until it discovered the subscription.",
         Figure("topic discovery", Kind.MEDIAN, rank=72),
     ),
 )
@@ -55,20 +55,20 @@ _TIMES: Final = columns(
         "topic_delay_median_s",
         "s",
         (
-            "Median delay from before a sample is passed to the middleware until the subscriber has it. This, the "
-            "next three, and the two of age are empty if topic_delay_error_s is above a tenth of them, or unknown."
+            "Median delay from just before a sample is passed to the middleware until the subscriber receives it. "
+            "Each delay and age of a topic is empty if topic_delay_error_s is unknown or above a tenth of it."
         ),
         Figure("topic delay", Kind.MEDIAN, rank=73, of_sent="topic_delay_median_sent_s"),
     ),
-    ("topic_delay_mean_s", "s", "Mean of that delay."),
+    ("topic_delay_mean_s", "s", "Mean delay of samples; empty as for topic_delay_median_s."),
     (
         "topic_delay_p95_s",
         "s",
-        "95th percentile of it.",
+        "95th percentile of the delay of samples; empty as for topic_delay_median_s.",
         Figure("topic delay, 95 %", Kind.MEDIAN, rank=74, of_sent="topic_delay_p95_sent_s"),
     ),
-    ("topic_delay_max_s", "s", "Largest of it."),
-    ("topic_delay_error_s", "s", "Maximum error of each of these from the clocks, estimated from the captures."),
+    ("topic_delay_max_s", "s", "Largest delay of a sample; empty as for topic_delay_median_s."),
+    ("topic_delay_error_s", "s", "Maximum error of each delay that is caused by the clocks, from the captures."),
     (
         "topic_delay_variation_p95_s",
         "s",
@@ -78,7 +78,7 @@ _TIMES: Final = columns(
     (
         "topic_jitter_s",
         "s",
-        "Interarrival jitter after the last sample (RFC 3550, section 6.4.1).",
+        "Interarrival jitter of the samples, after the last one (RFC 3550, section 6.4.1).",
         Figure("topic's last jitter value (RFC 3550)", Kind.MEDIAN, rank=76),
     ),
     (
@@ -90,7 +90,7 @@ _TIMES: Final = columns(
     (
         "topic_age_peak_s",
         "s",
-        "Mean of the age just before each newer sample arrived (Costa, Codreanu and Ephremides 2016).",
+        "Mean age of information just before each newer sample arrived (Costa, Codreanu and Ephremides 2016).",
         Figure("peak age of information", Kind.MEDIAN, rank=78),
     ),
     (
@@ -106,23 +106,27 @@ _TRAFFIC: Final = columns(
     (
         "topic_data_bytes",
         "B",
-        "Bytes of these with their frames' headers.",
+        "Bytes of topic_data_packets with the headers of their frames.",
         Figure("topic data bytes", Kind.MEAN, rank=80),
     ),
     (
         "topic_packet_loss",
         "share",
         (
-            "Share of the IP packets of its data from publisher to subscriber over UDP, each fragment separately, "
-            "that are not in the subscriber's capture. Empty over TCP."
+            "Share of the IP packets of the topic's data from publisher to subscriber over UDP, each fragment "
+            "separately, that are not in the subscriber's capture. Empty over TCP."
         ),
         Figure("topic packet loss", Kind.MEAN, rank=82),
     ),
-    ("topic_discovery_packets", "count", "IP packets of the discovery between its ends, at the publisher."),
+    (
+        "topic_discovery_packets",
+        "count",
+        "IP packets of discovery between publisher and subscriber, at the publisher.",
+    ),
     (
         "topic_discovery_bytes",
         "B",
-        "Bytes of these with their frames' headers.",
+        "Bytes of topic_discovery_packets with the headers of their frames.",
         Figure("topic discovery bytes", Kind.MEAN, rank=81),
     ),
 )
@@ -137,7 +141,14 @@ _OF_SENT: Final = columns(
             "them or more were lost, and if topic_delay_error_s is above a tenth of it."
         ),
     ),
-    ("topic_delay_p95_sent_s", "s", "95th percentile of the same; empty if about 5 % or more were lost."),
+    (
+        "topic_delay_p95_sent_s",
+        "s",
+        (
+            "95th percentile of the delay of all samples sent; a lost one counts as later than all others. Empty if "
+            "about 5 % or more were lost."
+        ),
+    ),
 )
 
 _WITHHELD: Final = columns(

@@ -142,8 +142,8 @@ def _is_intact(content: bytes | mmap, end: np.void, *, required: bool) -> bool:
         return not required
     record = end.tobytes()
     starts_at = content.rfind(record)
-    blank = record[:_SIZE_AT] + bytes(4) + record[_SIZE_AT + 4 :]
-    return zlib.crc32(blank, zlib.crc32(memoryview(content)[:starts_at])) == int(end["size"])
+    without_checksum = record[:_SIZE_AT] + bytes(4) + record[_SIZE_AT + 4 :]
+    return zlib.crc32(without_checksum, zlib.crc32(memoryview(content)[:starts_at])) == int(end["size"])
 
 
 _WORD_BYTES: Final = 8
@@ -293,7 +293,7 @@ def sample_flow(
 
     Args:
         packets: Packets of the capture.
-        occurrences: Result of `find` for the same capture.
+        occurrences: Result of `find_heads` for the same capture.
         ports: Ports of the topic's data.
         size_bytes: Data bytes of a sample.
         is_forward: Returns a mask of the packets from publisher to subscriber.
@@ -305,8 +305,8 @@ def sample_flow(
     carrier = packets.where(occurrences.packet)
     tcp_header_bytes = carrier.ip_payload_bytes - carrier.tcp_payload_bytes
     is_tcp = carrier.protocol == TCP
-    begins = occurrences.offset + _LAYOUT.size - np.where(is_tcp, tcp_header_bytes, UDP_HEADER_BYTES)
-    ends = begins + size_bytes
+    starts = occurrences.offset + _LAYOUT.size - np.where(is_tcp, tcp_header_bytes, UDP_HEADER_BYTES)
+    ends = starts + size_bytes
     heads = SampleHeads(
         sequence=occurrences.first,
         sent_ns=occurrences.second,

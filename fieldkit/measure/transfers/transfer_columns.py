@@ -68,7 +68,7 @@ LAYERS: Final = columns(
             " are ambiguous and some were lost."
         ),
     ),
-    ("ip_loss_longest_burst", "count", "Packets in the longest of these runs; empty in the same cases."),
+    ("ip_loss_longest_burst", "count", "Packets in the longest run of lost packets; empty if ip_loss_bursts is."),
     ("datagrams_sent", "count", "UDP datagrams that left the sender. Empty for TCP."),
     (
         "datagrams_received",
@@ -159,18 +159,18 @@ DISTANCE: Final = columns(
         "transfer_distance_start_m",
         "m",
         (
-            "Distance between sender and receiver when the transfer's first packet was sent. This and the next "
-            "eleven are empty if no positions are known, as in the field."
+            "Distance between sender and receiver when the transfer's first packet was sent. All distances and "
+            "speeds are empty if no positions are known."
         ),
     ),
-    ("transfer_distance_min_m", "m", "Smallest distance from that packet to the last one sent."),
-    ("transfer_distance_mean_m", "m", "Mean distance over that time."),
-    ("transfer_distance_max_m", "m", "Largest distance in that time."),
-    ("transfer_sender_speed_m_s", "m/s", "Mean speed of the sender over that time."),
+    ("transfer_distance_min_m", "m", "Smallest distance from the first packet sent to the last."),
+    ("transfer_distance_mean_m", "m", "Mean distance from the first packet sent to the last."),
+    ("transfer_distance_max_m", "m", "Largest distance from the first packet sent to the last."),
+    ("transfer_sender_speed_m_s", "m/s", "Mean speed of the sender from the first packet sent to the last."),
     (
         "transfer_relative_speed_m_s",
         "m/s",
-        "Mean magnitude of the sender's velocity relative to the receiver over that time.",
+        "Mean magnitude of the relative velocity of sender and receiver from the first packet sent to the last.",
     ),
 )
 PAPER: Final = columns(
@@ -186,12 +186,16 @@ PAPER: Final = columns(
         "Frames counted at the receiver by the paper's filter, dst and port of the transfer.",
     ),
     ("paper_window_bytes", "B", "Ping payload that the paper uses for the protocol: TCP 502, UDP 8192."),
-    ("paper_delay_s", "s", "Mean RTT with that payload; empty if the ping had another."),
+    (
+        "paper_delay_s",
+        "s",
+        "Mean RTT of a ping with paper_window_bytes of payload; empty if its payload was different.",
+    ),
     ("paper_transfer_s", "s", "paper_packets * paper_delay_s."),
     (
         "paper_loss",
         "share",
-        "1 - paper_received/paper_packets; counts first fragments only.",
+        "1 - paper_received/paper_packets; of a fragmented packet only the first fragment counts.",
         Figure("paper's loss (eq. 1)", Kind.COUNTED, "paper_received", "paper_packets", rank=15),
         NEGATIVE_LOSS_BOUNDS,
     ),

@@ -20,7 +20,7 @@ def datagrams(packets: Packets) -> tuple[Ints, Ints]:
     is none before it. Its datagram is `NO_DATAGRAM` if there is none at all.
     """
     is_fragment = packets.more_fragments | (packets.fragment_offset > 0)
-    # An unfragmented packet has no other fragments, whatever its id.
+    # An unfragmented packet has no other fragments, even if another packet has the same id.
     kind = packets.protocol << 1 | is_fragment
     key = row_hashes(*packets.src.T, *packets.dst.T, kind, packets.ip_id)
     order = np.lexsort((packets.time_ns, key))

@@ -31,27 +31,27 @@ COLUMNS: Final = columns(
     (
         "drive_out_m",
         "m",
-        "Distance driven until it turned back, by its odometry; so are all following columns.",
+        "Distance driven until the robot turned back. Distances, speeds and headings of a drive are by odometry.",
         Figure("distance driven", Kind.MEDIAN),
     ),
-    ("drive_farthest_m", "m", "Largest distance from its starting position."),
+    ("drive_farthest_m", "m", "Largest distance of the robot from its starting position."),
     (
         "drive_speed_median_m_s",
         "m/s",
-        "Median of its speeds on the outward path, each over half a second; empty for a shorter path.",
+        "Median speed of the robot on the outward path, each over half a second; empty for a shorter path.",
         Figure("drive speed", Kind.MEDIAN),
     ),
-    ("drive_speed_max_m_s", "m/s", "Largest of these speeds, outward and return path."),
+    ("drive_speed_max_m_s", "m/s", "Largest speed of the robot over half a second, on outward and return path."),
     (
         "drive_back_off_m",
         "m",
-        "Distance from its starting position after its return; empty if it did not return.",
+        "Distance of the robot from its starting position after its return; empty if it did not return.",
         Figure("position error", Kind.MEDIAN),
     ),
     (
         "drive_back_turned_rad",
         "rad",
-        "Heading after its return relative to the start, positive to the left.",
+        "Heading of the robot after its return relative to the start, positive to the left.",
         (-math.pi, math.pi),
     ),
     (

@@ -28,7 +28,10 @@ COLUMNS: Final = columns(
     (
         "fly_height_median_m",
         "m",
-        "Median height over the take-off position while the inner steps ran; by its autopilot, as all columns below.",
+        (
+            "Median height over the take-off position while the inner steps ran. All columns of a flight are values "
+            "that the autopilot reported."
+        ),
         Figure("flight height", Kind.MEDIAN),
         _HEIGHT_BOUNDS_M,
     ),
@@ -42,7 +45,7 @@ COLUMNS: Final = columns(
     (
         "fly_speed_median_m_s",
         "m/s",
-        "Median of its speed on its path; empty without a path.",
+        "Median speed of the drone on its path; empty without a path.",
         Figure("flight speed", Kind.MEDIAN),
     ),
     ("fly_speed_max_m_s", "m/s", "Largest speed during the whole flight."),

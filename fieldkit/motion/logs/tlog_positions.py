@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.positions.position_files import MOST_STALE_S
+from fieldkit.measure.positions.position_files import MAX_STALE_S
 from fieldkit.measure.positions.position_sources import Account
 from fieldkit.measure.positions.samples import PLACED, WGS84, Samples, require_increasing
 from fieldkit.motion.logs import tlog
@@ -29,7 +29,7 @@ def read_tlog(path: Path, account: Account) -> Samples:
     times_ns = received_ns
     if account.stamps == "header":
         boot_ns = np.array([row[1] for row in rows], dtype=np.int64) * 1_000_000
-        if (np.diff(boot_ns) < -MOST_STALE_S * 1e9).any():
+        if (np.diff(boot_ns) < -MAX_STALE_S * 1e9).any():
             raise EvidenceError("the autopilot restarted", where=str(path), remedy="write times: received")
         times_ns = boot_ns + (received_ns - boot_ns).min()
     times_ns, first = np.unique(times_ns, return_index=True)

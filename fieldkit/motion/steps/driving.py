@@ -388,7 +388,9 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
 def _bring_back(
     testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, by_hand: bool
 ) -> str:
-    """Let a robot drive back; if it fails and `by_hand` is set, let the operator bring it. Return `DriveLease.why`.
+    """Let a robot drive back; if it fails and `by_hand` is set, let the operator bring it.
+
+    Return `DriveLease.end_state`.
 
     Without `by_hand` a robot that did not come back stays where it is: before robots move again, a person is asked to
     put it at its place (`fieldkit.motion.running.permission`).

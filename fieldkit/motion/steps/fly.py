@@ -98,7 +98,7 @@ class FlyStep(Nest):
         then: Where it lands: `return` to the take-off point, or `land` where it is.
         lease: How long it continues without contact to the laptop, 3 s to 10 min; then it does what `on_abort` says,
             or lands.
-        during: Steps that run meanwhile.
+        during: Steps that run at the same time.
     """
 
     cross_checks = motion_sources.OF_FLIGHT

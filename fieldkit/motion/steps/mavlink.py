@@ -89,7 +89,7 @@ class MavlinkStep(Nest):
         times: Time of a message: `header`, the autopilot's own time, or `received`, when it arrived.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
         heights: Whether heights above the sea are used, with `global`.
-        during: Steps that run meanwhile.
+        during: Steps that run at the same time.
     """
 
     cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.OF_POSITIONS)

@@ -50,7 +50,7 @@ class MoveStep(Nest):
             Otherwise the trial is refused.
         driven: Whether there are columns of its [automatic drive](motion.md#evidence-of-a-drive). A robot that
             fieldkit drives always has them.
-        during: Steps that run meanwhile.
+        during: Steps that run at the same time.
     """
 
     leads = True

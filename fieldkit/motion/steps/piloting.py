@@ -71,7 +71,7 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
         plan: Argument of the program; the file of its orders is in the folder of the attempt.
         limit_s: Time limit of the job.
     """
-    robot, complete_plan = scene.robot(role), replace(plan, unhurried=jobs.landing_marker_file(name))
+    robot, complete_plan = scene.robot(role), replace(plan, landing_marker=jobs.landing_marker_file(name))
     argv = streams.agent_command(robot, "fly", streams.compact(asdict(complete_plan)))
     log = f"{name}.log"
     job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")

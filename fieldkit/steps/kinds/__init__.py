@@ -27,7 +27,8 @@ _OWN: Final = MappingProxyType(
         "topics": "TopicsStep",
     }
 )
-"""Class of each built-in kind, in the module of that name in this package; in the order of messages."""
+"""Class of each built-in kind. The kind is also the name of its module in this package. Messages list the kinds in
+this order."""
 
 
 def builtin() -> frozenset[str]:

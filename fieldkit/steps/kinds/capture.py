@@ -43,8 +43,8 @@ _RECORD_BYTES: Final = 16
 # Without immediate mode the kernel delivers packets within a second: of 215, none after 0.5 s, all after 1.0 s.
 RING_S: Final = 2
 
-# Last line of tcpdump; after it the kernel needs 15 to 31 ms to close the socket.
-COUNTED: Final = "dropped by kernel"
+# Text of tcpdump's last line; after it the kernel needs 15 to 31 ms to close the socket.
+LAST_LINE: Final = "dropped by kernel"
 
 BACK_S: Final = 0.1
 """Maximum step backwards between time stamps: packets received by two processors may be recorded out of order."""
@@ -58,7 +58,7 @@ class CaptureStep(Nest):
 
     The filter accepts the ports of the steps inside, ICMP, and every later IP fragment between their ends (a port
     filter matches first fragments only). Losses and delays of a transfer need a capture on both of its ends around
-    it; without, these columns are empty. With a `ping` inside, after the transfer, the captures give the offset
+    it; otherwise these columns are empty. With a `ping` inside, after the transfer, the captures give the offset
     between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP transfer has no
     answer, and the offset needs packets in both directions. Leaves `ROLE.pcap` and `ROLE-capture.log`.
 
@@ -83,7 +83,7 @@ class CaptureStep(Nest):
             "`ROLE.pcap`, `ROLE-capture.log`",
             ("each other", "each robot's clock before and after", "the order of times in the file"),
             "0.1 s backwards between two packets, because two processors receive them; packets dropped before "
-            "tcpdump where only topics and pings run inside, which withhold what depends on them",
+            "tcpdump if only topics and pings run inside, which withhold the columns that depend on them",
         ),
     )
 
@@ -212,7 +212,7 @@ class CaptureStep(Nest):
             if not scene.tools(capture.role).immediate_mode:
                 jobs.begin_wait(testbed.shells[capture.role], capture.job, RING_S).end(RING_S + jobs.REPLY_S)
             shell, file = testbed.shells[capture.role], self._file(capture.role)
-            return jobs.stop(shell, capture.job, settle=file, parting=COUNTED)
+            return jobs.stop(shell, capture.job, settle=file, end_text=LAST_LINE)
 
         return run_parallel(stop, captures)
 

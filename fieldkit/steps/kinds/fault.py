@@ -1,4 +1,4 @@
-"""Cause a fault of a robot, and measure from outside how long the robot does not answer."""
+"""Cause a fault of a robot, and measure from outside the time for which the robot does not answer."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -77,7 +77,7 @@ class FaultStep(Nest):
             "outage and recovery",
             ("*_outage_s", "*_recovery_s", "*_recovery_at_least_s", "*_recovered"),
             "`fault-KIND-ping.txt`, `fault-KIND-watch.txt`",
-            ("`fault-KIND.txt`: how long the cause lasted", "how the observer's job ended"),
+            ("`fault-KIND.txt`: duration of the cause", "termination of the observer's job"),
             "two intervals of the observer",
         ),
         *recoveries.CROSS_CHECKS,

@@ -211,7 +211,7 @@ class PingStep(AlongStep):
             candidates = ping_checks.captured_pings(capture.packets, source, destination, result.payload_bytes)
             on_sender = role == self.sender
             reasons = [
-                list(ping_checks.compare_with_capture(result, candidate, self.interval, role, asks=on_sender))
+                list(ping_checks.compare_with_capture(result, candidate, self.interval, role, is_requester=on_sender))
                 for candidate in candidates
             ]
             yield from (f"{self._file}: {why}" for why in min(reasons, key=len, default=[]))

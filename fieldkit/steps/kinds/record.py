@@ -86,7 +86,7 @@ class RecordStep(Step):
             "content of a bag, and times of reception",
             ("*",),
             "the bag",
-            ("the procedure: topics and duration", "how long the recorder ran"),
+            ("the procedure: topics and duration", "duration of the recorder's job"),
             "half of the duration, because a recorder needs time to subscribe",
         ),
     )

@@ -47,7 +47,7 @@ class SoakStep(LoadOptions, Nest):
 
     Attributes:
         port: Port that the receiver listens on; it must differ from that of an `iperf3` inside.
-        during: Steps that run meanwhile.
+        during: Steps that run at the same time.
     """
 
     flow_kind: ClassVar[str] = "soak"

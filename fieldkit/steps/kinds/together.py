@@ -64,10 +64,12 @@ class TogetherStep(Nest):
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         inner = replace(scene, halt=scene.halt.child())
-        prepared = self._each([partial(entry.step.prepare, inner, testbed) for entry in self.during], inner, testbed)
+        prepared = self._run_all(
+            [partial(entry.step.prepare, inner, testbed) for entry in self.during], inner, testbed
+        )
 
         def carry_out(announce: Announce) -> None:
-            self._each([partial(work, announce) for work in prepared], inner, testbed)
+            self._run_all([partial(work, announce) for work in prepared], inner, testbed)
 
         return carry_out
 
@@ -75,7 +77,7 @@ class TogetherStep(Nest):
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         self.prepare(scene, testbed)(announce)
 
-    def _each(self, calls: list[Callable[[], T]], scene: Scene, testbed: Testbed) -> list[T]:
+    def _run_all(self, calls: list[Callable[[], T]], scene: Scene, testbed: Testbed) -> list[T]:
         """Make all calls at the same time; if one fails, stop the jobs for which the others wait."""
 
         def end() -> None:

@@ -29,9 +29,9 @@ _PERIODS: Final = 1.5
 """Recording time after the last step, in periods of the topic."""
 ODOMETRY: Final = "nav_msgs/Odometry"
 
-# Prints "recording" $2 s after the bag $1 has been opened, and executes the command after it; rosbag itself prints
-# its messages only when its output buffer is full. The waiting subshell is not a child of the command, because the
-# command may wait for all its children.
+# Runs the command that follows $1 and $2, and prints "recording" $2 s after the bag $1 has been opened, because
+# rosbag prints its messages only when its output buffer is full. The waiting subshell is not a child of the command,
+# because the command may wait for all its children.
 _RECORDS: Final = (
     '( (until [ -e "$1" ] || [ -e "$1.active" ]; do sleep 0.1; done; sleep "$2"; echo recording >&2) & ); '
     'shift 2; exec "$@"'
@@ -107,7 +107,7 @@ class TrackedRobot(Strict):
 
 
 class TrackStep(Nest):
-    """Records on each robot its own position while the steps in `during` run, by its profile's record command.
+    """Records the position of each robot on that robot, with its profile's record command, while inner steps run.
 
     The distance and speed columns of the transfers and pings inside use these positions
     ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to be where they were
@@ -119,7 +119,7 @@ class TrackStep(Nest):
     Attributes:
         robots: Source of each robot's position, by role.
         heights: Whether heights above the ellipsoid are used; those of satellite receivers are often wrong by 10 m.
-        during: Steps that run meanwhile.
+        during: Steps that run at the same time.
     """
 
     cross_checks = position_checks.OF_POSITIONS

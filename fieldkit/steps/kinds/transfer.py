@@ -305,7 +305,7 @@ class TransferStep(Step):
         return (self.receiver, self.prefixed_name(_LISTEN)), (self.sender, self.prefixed_name(_SEND))
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
-        """Return how a netcat ended, as recorded by the robot; None if it was not recorded."""
+        """Return the recorded termination of a netcat, or None if the robot recorded none."""
         after = view.evidence.read_or_none(host.state, host.after(role))
         return (after.endings or {}).get(job) if after else None
 

@@ -91,7 +91,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     return _judge_tools(profile, sections.get(_TOOLS, NOTHING), report)
 
 
-def ask_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
+def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
     """Report the agent's findings on requirements of steps; the agent is installed if its Python interpreter exists.
 
     Raises:
@@ -114,9 +114,9 @@ def _tools(plan: Plan, role: Role) -> set[Tool]:
     return {planned.tool for planned in _planned(plan, role) if planned.tool is not None}
 
 
-def _judge_tools(profile: RobotProfile, said: CommandResult, report: Report) -> Variants:
+def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -> Variants:
     try:
-        detected = tools.parse(said.text.encode(), profile)
+        detected = tools.parse(result.text.encode(), profile)
     except RobotError as error:
         report.fail(_TOOLS, error.what, error.remedy)
         return variants.expected(profile)

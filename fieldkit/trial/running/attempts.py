@@ -67,7 +67,7 @@ class Attempts:
         self._reached: Status | None = None
 
     def make(self, repeat: RepeatId) -> str:
-        """Make another attempt at a repeat and store it, whatever its result.
+        """Make another attempt at a repeat, and store it with any result.
 
         Returns:
             The remedy of a failed step; empty if none failed.
@@ -150,13 +150,13 @@ class Attempts:
     def _storing_interrupted(self, started: Attempt, partial: Path) -> Iterator[None]:
         """If the body is interrupted, end its jobs and store the attempt as one that does not count.
 
-        Its measurements stay on the robots, and the attempt says so: after a request to stop, nothing is fetched.
+        Its measurements stay on the robots, and its reason states this: after a request to stop, nothing is fetched.
         """
         try:
             yield
         except BaseException as error:
             if not isinstance(error, Exception) or isinstance(error, TestbedLostError):
-                self._robots.hang_up()  # unblocks threads that wait for an answer
+                self._robots.close_connections()  # unblocks threads that wait for an answer
             with suppress(FieldkitError):  # a robot that cannot be reached ends its jobs at their time limits
                 self._robots.end_jobs(started.remote(self._plan.trial))
             if isinstance(error, OSError):

@@ -131,7 +131,7 @@ class Ledger:
         Raises:
             OSError: As for `begin`.
         """
-        with self._stop.whole():
+        with self._stop.saving_files():
             final = store.commit_attempt(evidence, attempt.folder)
             ended = replace(attempt, reason=encodable(attempt.reason))
             row = rows.build(self._plan, ended, measured)
@@ -144,7 +144,7 @@ class Ledger:
 
     def summarize(self) -> tuple[Cell, ...]:
         """Write the table and the summary of all committed attempts and return the summary; errors as for `begin`."""
-        with self._stop.whole():
+        with self._stop.saving_files():
             cells = rows.write_summary(self._folder, self._plan, self._table())
             self._write()
         return cells

@@ -26,12 +26,12 @@ _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (
 
 @dataclass(frozen=True)
 class Holder:
-    """Holder of robots, and the purpose; of each text the letters, digits and `._@-` are used, at most 80.
+    """Holder of a lock on robots, and its purpose. Only letters, digits and `._@-` of a text are used, at most 80.
 
     Attributes:
         token: Identifies the trial; a holder with the same token can lock its robots again.
-        who: `user@laptop`, see `runtime.me`.
-        what: The purpose, for example the trial.
+        user: `user@laptop`, see `runtime.user_at_host`.
+        purpose: The purpose, for example the trial.
     """
 
     token: str
@@ -75,26 +75,28 @@ def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) ->
 
     Raises:
         LinkError: A robot did not answer.
-        RobotError: Another holder has a robot; the message says who, since when, until when, and what to do.
+        RobotError: Another holder has a robot; the message names the holder, start and end of the lock, and a remedy.
     """
-    touched: list[Shell] = []
+    attempted: list[Shell] = []
     in_order = sorted(shells.values(), key=lambda shell: shell.robot)
     run_parallel(
-        lambda shell: jobs.install(shell, Deadline.after(REPLY_S)), in_order, hang_up=lambda: _hang_up(in_order)
+        lambda shell: jobs.install(shell, Deadline.after(REPLY_S)),
+        in_order,
+        on_interrupt=lambda: _close_all(in_order),
     )
     try:
         for shell in in_order:
-            touched.append(shell)  # added before it answers, because the answer of a successful lock may be lost
+            attempted.append(shell)  # added before it answers, because the answer of a successful lock may be lost
             words = (word(holder.token), str(ttl_s), word(holder.user), word(holder.purpose))
             call(shell, "lock", *words, deadline=Deadline.after(REPLY_S))
         yield
     except BaseException as error:
         if not isinstance(error, Exception):
-            _hang_up(touched)
+            _close_all(attempted)
         raise
     finally:
-        if touched:
-            run_parallel(lambda shell: _unlock(shell, holder, sink), touched)
+        if attempted:
+            run_parallel(lambda shell: _unlock(shell, holder, sink), attempted)
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def demand(shell: Shell, token: str) -> None:
     call(shell, "renew", word(token), "0", deadline=Deadline.after(REPLY_S))
 
 
-def _hang_up(shells: Iterable[Shell]) -> None:
+def _close_all(shells: Iterable[Shell]) -> None:
     for shell in shells:
         shell.close()
 
@@ -151,8 +153,8 @@ def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> Mapping[str,
     """Break the lock of every robot and end all of its jobs, of any trial; return the result for each robot.
 
     Args:
-        robots: From `Backend.standing`.
-        who: Name that is shown to the users whose trials end, see `runtime.me`.
+        robots: The robots, from `Backend.persistent_shells`.
+        who: Name that is shown to the users whose trials end, see `runtime.user_at_host`.
     """
     return dict(zip(robots, run_parallel(lambda name: _abort(robots[name], who), robots), strict=True))
 

@@ -31,7 +31,7 @@ _CONNECTION: Final = "connection"
 
 
 def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
-    """Log in on every robot, before a person carries any.
+    """Log in on every robot, before a person carries any robot to its place.
 
     Raises:
         ConfigurationError: There are no credentials.
@@ -97,7 +97,7 @@ def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[R
     """
     checked = check(plan, shells, folder.parent, whole=False)
     findings = checked.findings
-    fields = ((each.robot, each.check, each.status, each.detail, each.remedy) for each in findings)
+    fields = ((finding.robot, finding.check, finding.status, finding.detail, finding.remedy) for finding in findings)
     lines = map("\t".join, fields)
     files.write(folder / store.PREFLIGHT_FILE, "".join(f"{line}\n" for line in lines).encode())
     for finding in findings:
@@ -144,7 +144,7 @@ def _check(
             return
         _judge_jobs(plan, jobs.list_running(shell, Deadline.after(JOBS_S)), report)
         stage = "agent"
-        software.ask_agent(plan, role, sections, shell, report)
+        software.check_agent(plan, role, sections, shell, report)
         if not whole:
             return
         stage = "topics"
@@ -155,12 +155,12 @@ def _check(
 
 
 def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
-    ours = (f"/{plan.trial}/", f"/{bridges.folder_of(plan.session)}/")
-    others = [line for line in left if not any(folder in line for folder in ours)]
+    own_folders = (f"/{plan.trial}/", f"/{bridges.folder_of(plan.session)}/")
+    others = [line for line in left if not any(folder in line for folder in own_folders)]
     for line in others:
-        report.fail("jobs", f"of an earlier trial: {line}", "fieldkit abort")
+        report.fail("jobs", f"a job of an earlier trial runs: {line}", "fieldkit abort")
     if not others:
-        report.ok("jobs", "none of an earlier trial")
+        report.ok("jobs", "no job of an earlier trial runs")
 
 
 def _judge_lock(held: LockState | None, report: Report) -> bool:

@@ -61,7 +61,7 @@ class Robots:
         self._roles = sorted(plan.procedure.roles())
         protocol = plan.procedure.protocols[0]
         self._owners = FileOwners.of(plan.procedure, plan.scene(RepeatId(protocol, 1), ""))
-        self._hung_up = False
+        self._is_fetch_cancelled = False
         self._unfetched: dict[Role, list[str]] = {role: [] for role in self._roles}
         self._boots: dict[Role, str] = {}
 
@@ -76,7 +76,7 @@ class Robots:
         Programs of the lab are copied now, before the first step, so that the copies do not load the radio later.
 
         Raises:
-            FieldkitError: As for `evidence.begin` and `programs.place`; or a program of the lab has changed.
+            FieldkitError: As for `evidence.begin` and `programs.copy`; or a program of the lab has changed.
         """
         plan = self._plan
         puts = [(put, put.program.content()) for put in plan.puts()]
@@ -105,13 +105,13 @@ class Robots:
             self._run_steps(scene, announce)
             return
         before, since_ns = oracle.lateness(), time.time_ns()
-        oracle.links(go_on=True)
+        oracle.links(continue_sampling=True)
         oracle.record_air(scene.laptop_folder)
         try:
             self._run_steps(scene, announce)
         finally:
             oracle.record_air(None)
-        after, where, links = oracle.lateness(), oracle.track(since_ns), oracle.links(go_on=False)
+        after, where, links = oracle.lateness(), oracle.track(since_ns), oracle.links(continue_sampling=False)
         if scene.laptop_folder is not None:
             (scene.laptop_folder / track.FILE).write_text(track.text(where), encoding="ascii")
             (scene.laptop_folder / link_samples.FILE).write_text(link_samples.text(links), encoding="ascii")
@@ -135,7 +135,7 @@ class Robots:
                 try:
                     self.check_alive()
                 except TestbedLostError:
-                    self.hang_up()
+                    self.close_connections()
 
         watching = Thread(target=watch, name="testbed", daemon=True)
         if self.transient:
@@ -160,7 +160,7 @@ class Robots:
         Returns:
             The problems, one sentence each.
         """
-        self._hung_up = False
+        self._is_fetch_cancelled = False
         problems = self._everywhere(lambda role: self._collect(role, remote, into, clean=clean))
         failed = [(role, *problem) for role, problem in zip(self._roles, problems, strict=True) if problem]
         for role, reason, is_there in failed:
@@ -176,7 +176,7 @@ class Robots:
             name = f"collect evidence, {progress_text} of {self._plan.cast[role].name}"
             self._sink(PhaseStarted(name, attempt.rpartition("-")[0], left_s))
 
-        progress = FetchProgress(announce, lambda: self._hung_up)
+        progress = FetchProgress(announce, lambda: self._is_fetch_cancelled)
         expected_bytes = size.evidence_bytes(self._plan, role)
         try:
             if not clean:
@@ -194,8 +194,8 @@ class Robots:
         except LinkError as error:
             return error.located, True
         except (RobotError, EvidenceError) as error:
-            return self._rebooted(role) or error.located, not isinstance(error, (NoFolderError, LateError))
-        rebooted = None if clean else self._rebooted(role)
+            return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateError))
+        rebooted = None if clean else self._reboot_message(role)
         return (rebooted, False) if rebooted else None
 
     def mark_unfetched(self, remote: str, into: Path, reason: str) -> None:
@@ -212,7 +212,7 @@ class Robots:
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
     def restore_unfetched(self, ended: Attempt, kept: Path) -> None:
-        """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder says so."""
+        """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder is marked so."""
         if ended.status is not Status.VALID and not self.transient:
             for role in self._roles:
                 if (kept / unfetched_file(role)).is_file():
@@ -224,7 +224,7 @@ class Robots:
             return {}
         return {self._plan.cast[role].name: folders for role, folders in self._unfetched.items() if folders}
 
-    def _rebooted(self, role: Role) -> str | None:
+    def _reboot_message(self, role: Role) -> str | None:
         """Return a message if a robot rebooted unexpectedly during the attempt; None if it did not, or is unknown."""
         booted = self._boots.get(role) if role not in hosts.restarted(self._plan.procedure) else None
         with suppress(FieldkitError):
@@ -258,7 +258,7 @@ class Robots:
         """End every job of an attempt; errors as `evidence.end_jobs`."""
         self._everywhere(lambda role: evidence.end_jobs(self.shells[role], remote))
 
-    def end_left(self) -> None:
+    def stop_leftover_jobs(self) -> None:
         """End every job of this trial that remains from a killed run; errors as for `evidence.end_all`."""
 
         def end(role: Role) -> None:
@@ -267,9 +267,9 @@ class Robots:
 
         self._everywhere(end)
 
-    def hang_up(self) -> None:
+    def close_connections(self) -> None:
         """Close every control connection and cancel fetching; the next command opens a new connection."""
-        self._hung_up = True
+        self._is_fetch_cancelled = True
         for shell in self.shells.values():
             shell.close()
 
@@ -293,4 +293,4 @@ class Robots:
         return self._plan.cast[role].profile.radio.interface
 
     def _everywhere(self, call: Callable[[Role], T]) -> list[T]:
-        return run_parallel(call, self._roles, hang_up=self.hang_up)
+        return run_parallel(call, self._roles, on_interrupt=self.close_connections)

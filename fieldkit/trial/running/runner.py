@@ -100,7 +100,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
     """Run preflight on robots at their places, and run every repeat.
 
     If the trial ends early, its folder contains the plan, the journal, every attempt that ended, their rows and a
-    manifest, and `continue_trial` resumes it. Only after a kill the summary is missing; `rebuild` writes it.
+    manifest, and `continue_trial` resumes it. If fieldkit was killed, the summary is missing; `rebuild` writes it.
 
     Args:
         plan: The trial.
@@ -162,7 +162,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
         sink(Note(f"the evidence has changed since it was stored: {manifest.summarize(ledger.differences)}"))
     try:
         sink(TrialStarted(str(folder), ledger.done, len(repeats)))
-        robots.end_left()
+        robots.stop_leftover_jobs()
         sink(PhaseStarted("preflight"))
         variants = preflight.preflight(plan, robots.shells, folder, sink)
         permission = motion_control.permission(plan, testbed, folder)
@@ -176,8 +176,8 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
             motions=stop.motions,
             origins=permission.origins,
         )
-        for cut in ledger.interrupted:
-            attempts.recover(cut)
+        for interrupted in ledger.interrupted:
+            attempts.recover(interrupted)
         for repeat in repeats:
             started_s = time.monotonic()
             while not ledger.is_over(repeat):
@@ -188,9 +188,9 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
                     remedy = attempts.make(repeat)
                     if ledger.is_over(repeat):
                         past.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))
-                    left = [other for other in repeats if not ledger.is_over(other)]
+                    remaining = [other for other in repeats if not ledger.is_over(other)]
                     # Inside the context, so that a repeat that a stop request let finish is reported too.
-                    sink(_ended(plan, ledger, len(repeats), _left(plan, left, past), remedy))
+                    sink(_repeat_event(plan, ledger, len(repeats), _remaining_time(plan, remaining, past), remedy))
     except BaseException as error:
         if report_resume:
             sink(TrialStopped(str(folder), ledger.done, len(repeats)))
@@ -211,10 +211,10 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
 
 def _show_judgements(judgements: Iterable[Judgement], sink: Sink) -> None:
     for judgement in judgements:
-        sink(_judged(judgement))
+        sink(_judgement_event(judgement))
 
 
-def _judged(judgement: Judgement) -> ExpectationJudged:
+def _judgement_event(judgement: Judgement) -> ExpectationJudged:
     _, protocol, measured, interval, _ = wording.judgement_texts(judgement)
     estimate = judgement.estimate
     return ExpectationJudged(
@@ -237,13 +237,13 @@ def _report_unfetched(robots: Robots, sink: Sink) -> None:
         sink(Note(f"{robot}: evidence that was not fetched stays on it; delete it when it is not needed: {where}"))
 
 
-def _left(plan: Plan, left: Sequence[RepeatId], past: Sequence[FinishedRepeat]) -> TimeEstimate:
+def _remaining_time(plan: Plan, remaining: Sequence[RepeatId], past: Sequence[FinishedRepeat]) -> TimeEstimate:
     """Return the estimated duration of the remaining repeats."""
-    counts = Counter(repeat.protocol for repeat in left)
+    counts = Counter(repeat.protocol for repeat in remaining)
     return estimates.total(estimates.of_repeats(plan, protocol, counts[protocol], past) for protocol in counts)
 
 
-def _ended(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: str) -> RepeatEnded:
+def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: str) -> RepeatEnded:
     attempt, row = ledger.last
     return RepeatEnded(
         repeat=str(attempt.repeat),
@@ -265,7 +265,7 @@ def _writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        first = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "fix that"
+        first = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct the cause"
         raise ConfigurationError(
             f"cannot be written: {error.strerror or error}; the repeats that ended are saved",
             where=str(error.filename or folder),

@@ -14,18 +14,18 @@ class Stop:
     runs; otherwise after the running repeat.
 
     Attributes:
-        asked: Whether the trial must stop after the running repeat.
-        patient: Whether a repeat is running that may be finished first.
+        after_repeat: Whether the trial must stop after the running repeat.
+        can_finish: Whether a repeat is running that may be finished first.
         saving: Whether files are being written that must not be left incomplete.
-        due: Whether to stop as soon as they are written.
+        after_saving: Whether to stop as soon as they are written.
         motions: The robots that move without a person.
     """
 
     def __init__(self) -> None:
-        self.asked = False
-        self.patient = False
+        self.after_repeat = False
+        self.can_finish = False
         self.saving = False
-        self.due = False
+        self.after_saving = False
         self.motions = Motions()
         self._ends = Deadline.after(0.0)
 
@@ -40,22 +40,22 @@ class Stop:
 
         Args:
             lasts_s: Estimated duration of the body, in seconds.
-            motions: See `Motions.ahead`: until the body clears it, a request to stop takes effect immediately.
+            motions: See `Motions.stop_notes`: until the body clears it, a request to stop takes effect immediately.
 
         Raises:
             KeyboardInterrupt: The body has finished, and a stop was requested meanwhile.
         """
         self._ends, self.motions.stop_notes = Deadline.after(lasts_s), motions
-        self.patient = True
+        self.can_finish = True
         try:
             yield
         finally:
-            self.patient, self.motions.stop_notes = False, ()
-        if self.asked:
+            self.can_finish, self.motions.stop_notes = False, ()
+        if self.after_repeat:
             raise KeyboardInterrupt
 
     @contextmanager
-    def whole(self) -> Iterator[None]:
+    def saving_files(self) -> Iterator[None]:
         """Let the body, which is short, finish before a stop.
 
         Raises:
@@ -66,5 +66,5 @@ class Stop:
             yield
         finally:
             self.saving = False
-        if self.due:
+        if self.after_saving:
             raise KeyboardInterrupt

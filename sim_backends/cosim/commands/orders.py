@@ -31,16 +31,23 @@ from sim_backends.cosim.studies.local_errors import (
 from sim_backends.cosim.studies.seeds import Task, run_many
 
 WINDOWS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
-BEGINS: Final = 20
-"""Number of windows that begin in the reference of each seed."""
+START_TIMES: Final = 20
+"""Number of times in the exact reference of each seed at which a window of each policy is started."""
 _COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "actual window, mean", 1e3),
-    SheetColumn("delivery_s", "time (ms)", "delivery time less the reference's, magnitude, mean", 1e3),
-    SheetColumn("late_s", "late (ms)", "how far receivers had passed an arrival, mean", 1e3),
-    SheetColumn("position_m", "place (mm)", "error of the network's relative position of two agents, mean", 1e3),
+    SheetColumn(
+        "delivery_s",
+        "time (ms)",
+        "mean magnitude of the difference between the delivery time and the reference's",
+        1e3,
+    ),
+    SheetColumn("late_s", "late (ms)", "mean time by which the receiver was past an arrival", 1e3),
+    SheetColumn(
+        "position_m", "place (mm)", "mean error of the relative position of two agents that the network assumes", 1e3
+    ),
     SheetColumn("fates", "fate (%)", "packets with another fate", 100),
-    SheetColumn("path_m", "path (mm)", "position error of agents at the window's end, mean", 1e3),
+    SheetColumn("path_m", "path (mm)", "mean position error of agents at the end of a window", 1e3),
 )
 _HEADS: Final[Mapping[str, str]] = MappingProxyType(
     {column.name: column.head.partition(" (")[0] for column in _COLUMNS if column.name in MEASURES}
@@ -80,14 +87,14 @@ def _measure(
     report = partial(progress_reporter(sink), "local errors", len(tasks))
     report(0)
     results = run_many(partial(_local_errors, scenario, windows_s), tasks, progress=report)
-    of_seeds: dict[str, list[LocalErrors]] = {}
+    errors_by_policy: dict[str, list[LocalErrors]] = {}
     failures: dict[str, PolicyError] = {}
     for task, result in zip(tasks, results, strict=True):
         if isinstance(result, PolicyError):
             failures.setdefault(task.policy, result)
         else:
-            of_seeds.setdefault(task.policy, []).append(result)
-    return {name: pooled(errors) for name, errors in of_seeds.items() if name not in failures}, failures
+            errors_by_policy.setdefault(task.policy, []).append(result)
+    return {name: pooled(errors) for name, errors in errors_by_policy.items() if name not in failures}, failures
 
 
 def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Task) -> LocalErrors | PolicyError:
@@ -101,9 +108,9 @@ def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Tas
 
     until_ns = scenario.duration_ns - TAIL_NS - round(max(windows_s) * 1e9)
     step_ns = scenario.physics.step_ns
-    begins_ns = low_discrepancy_times_ns(0, max(until_ns, step_ns), BEGINS, step_ns)
+    starts_ns = low_discrepancy_times_ns(0, max(until_ns, step_ns), START_TIMES, step_ns)
     try:
-        return local_errors(make, {task.policy: method}, windows_s, begins_ns)[task.policy]
+        return local_errors(make, {task.policy: method}, windows_s, starts_ns)[task.policy]
     except PolicyError as error:
         return error
 

@@ -27,7 +27,12 @@ _COLUMNS: Final = (
     SheetColumn("median_window_s", "made (ms)", "median of the windows that the rule computed from it", 1e3),
     SheetColumn("loss", "lost (%)", "share of packets whose fate is decided", 100),
     SheetColumn("fate_disagreement", "fate (%)", "lost here or in the reference, but not in both", 100),
-    SheetColumn("delivery_error_mean_s", "time (ms)", "delivery time less the reference's, magnitude, mean", 1e3),
+    SheetColumn(
+        "delivery_error_mean_s",
+        "time (ms)",
+        "mean magnitude of the difference between the delivery time and the reference's",
+        1e3,
+    ),
     SheetColumn("position_error_mean_m", "place (mm)", "error of the network's relative positions, mean", 1e3),
     SheetColumn("exchanges", "exchanges", "cost of the round"),
 )

@@ -107,7 +107,7 @@ def _values(cell: PaperCell) -> tuple[Value, ...]:
 
 
 def summary(rows: Sequence[PaperRow]) -> str:
-    """Return a sentence on how many cells of a table agree."""
+    """Return a sentence with the number of cells of a table that agree."""
     cells = [cell for row in rows for cell in (row.delay, row.loss)]
     agree = [cell for cell in cells if cell.agreement is Agreement.AGREES]
     by_mean = sum(cell.agrees_by_mean for cell in agree)

@@ -94,9 +94,9 @@ def make_policy(name: str, **parameters: float) -> SyncPolicy:
         raise ConfigurationError(f"there is no sync policy {name!r}", remedy=unknown_policy(name))
     kind = policies()[name]
     accepted = inspect.signature(kind).parameters
-    given = {"window_s": _WINDOW_S} | parameters
+    values = {"window_s": _WINDOW_S} | parameters
     try:
-        return kind(**{key: value for key, value in given.items() if key in accepted})
+        return kind(**{key: value for key, value in values.items() if key in accepted})
     except ConfigurationError:
         raise
     except Exception as error:

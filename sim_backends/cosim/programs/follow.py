@@ -1,12 +1,12 @@
 """Programs that follow other agents, using only the states that the network delivers.
 
-A received state is as old as its transmission took, which its time stamp shows; it is extrapolated to the present at
-its velocity. So every delay, and every error of a delivery time, becomes a position error: after a time d, a leader
-that changes its velocity by a per second is a d^2 / 2 away from its extrapolated position. A follower that receives
-nothing for longer than a timeout stops.
+The age of a received state is its transmission delay, which is known from its time stamp. The state is extrapolated
+to the present time with its velocity. So every delay, and every error of a delivery time, becomes a position error:
+after a time d, a leader with the acceleration a is a d^2 / 2 away from its extrapolated position. A follower that
+receives no state for longer than a timeout stops.
 
-`FollowAtHeadway` keeps a constant time headway h, so a distance r + h v. With the error e = gap - r - h v it
-accelerates by ((v_leader - v) + k e) / h, so that e decays by exp(-k t) (Ioannou and Chien, "Autonomous intelligent
+`FollowAtHeadway` keeps a constant time headway h, which is a distance r + h v. With the error e = gap - r - h v its
+acceleration is ((v_leader - v) + k e) / h, so that e decays as exp(-k t) (Ioannou and Chien, "Autonomous intelligent
 cruise control", IEEE Trans. Veh. Technol. 42, 1993). For a leader whose states arrive with the delay d and are
 extrapolated, the transfer function from leader to follower is
 
@@ -14,7 +14,7 @@ extrapolated, the transfer function from leader to follower is
 
 A row of such vehicles is string stable if |Gamma(jw)| <= 1 for all w (Ploeg, van de Wouw and Nijmeijer, "Lp string
 stability of cascaded systems", IEEE Trans. Control Syst. Technol. 22, 2014). Since |Gamma|^2 - 1 has the sign of
-(1 + k d)^2 - 1 - (h k)^2 - (h w)^2, it is here if d <= (sqrt(1 + (h k)^2) - 1) / k.
+(1 + k d)^2 - 1 - (h k)^2 - (h w)^2, this row is string stable if d <= (sqrt(1 + (h k)^2) - 1) / k.
 """
 
 import math
@@ -27,7 +27,7 @@ from sim_backends.cosim.federates import Action
 from sim_backends.cosim.programs.way_points import PERIOD_NS, NeverSends, PeriodicTimer, drive_towards
 from sim_backends.network.packets import Received
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.world.motion import State, moved_on
+from sim_backends.world.motion import State, extrapolate
 
 TIMEOUT_NS: Final = 1_000_000_000
 """Default time without a state after which a follower stops."""
@@ -65,7 +65,7 @@ class LatestStates:
         """Return the extrapolated states of the agents whose latest state is still valid."""
         latest = (self._latest[name] for name in self._names if name in self._latest)
         return [
-            moved_on(datagram.payload, (now_ns - datagram.sent_ns) / 1e9)
+            extrapolate(datagram.payload, (now_ns - datagram.sent_ns) / 1e9)
             for datagram in latest
             if now_ns - datagram.arrived_ns <= self._timeout_ns
         ]

@@ -48,14 +48,14 @@ def _is_due(program: Program, now_ns: int) -> bool:
 
 
 class Outage:
-    """A program that is off for a time: it receives and sends nothing, and its body gets a command to stop.
+    """A program that is off during an interval: it receives and sends nothing, and its body gets a command to stop.
 
-    When it is on again, it continues as if all its packets in that time had been lost.
+    When it is on again, it continues as if all its packets in the interval had been lost.
 
     Args:
         program: The program.
-        begin_ns: Time when it goes off.
-        end_ns: Time when it is on again; None for never.
+        begin_ns: Start of the interval.
+        end_ns: End of the interval; None if the program stays off.
         stop: Command that stops the body; None if there is no body to stop.
     """
 
@@ -97,8 +97,8 @@ class AgentClock:
     Attributes:
         begin_ns: Beginning of the interval.
         end_ns: End of the interval, when the clock is set right again; None for never.
-        offset_ns: How far it is ahead at `begin_ns`; negative if it is behind.
-        rate_ppb: By how much it gains, in nanoseconds per second.
+        offset_ns: Offset of the clock at `begin_ns`, positive if it is ahead.
+        rate_ppb: Rate error of the clock in nanoseconds per second, positive if it is fast.
 
     Raises:
         ConfigurationError: The clock would stop or run backwards.
@@ -142,7 +142,7 @@ class _Stamped:
 
 
 class Clocked:
-    """A program whose only clock is its computer's, which also stamps its datagrams.
+    """A program that uses only the clock of its computer, also for the time stamps of its datagrams.
 
     If the clock of one agent is wrong, the programs of all agents are wrapped, so that all can read the time stamps.
 

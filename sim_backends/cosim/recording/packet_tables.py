@@ -47,22 +47,32 @@ _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
     "packets": pa.schema(
         [
             _field("packet_id", pa.int64(), "", "number of the packet in the run"),
-            _field("flow", _TEXT, "", "name of its flow"),
-            _field("number", pa.int64(), "", "its number in the flow"),
+            _field("flow", _TEXT, "", "name of the packet's flow"),
+            _field("number", pa.int64(), "", "number of the packet in its flow"),
             _field("source", _TEXT, "", "sending agent"),
             _field("destination", _TEXT, "", "receiving agent"),
-            _field("protocol", _TEXT, "", "its transport"),
-            _field("size_bytes", pa.int64(), "B", "its size"),
-            _field("sent_ns", pa.int64(), "ns", "time when its program sent it"),
-            _field("enters_ns", pa.int64(), "ns", "time when it entered the network"),
-            _field("entered_window", pa.int64(), "", "number of the window in which it entered the network"),
+            _field("protocol", _TEXT, "", "transport of the packet"),
+            _field("size_bytes", pa.int64(), "B", "size of the packet"),
+            _field("sent_ns", pa.int64(), "ns", "time when the program sent the packet"),
+            _field("enters_ns", pa.int64(), "ns", "time when the packet entered the network"),
+            _field("entered_window", pa.int64(), "", "number of the window in which the packet entered the network"),
             _field(
-                "arrived_ns", pa.int64(), "ns", "time of arrival by the network's clock; empty if it never arrived"
+                "arrived_ns",
+                pa.int64(),
+                "ns",
+                "time of arrival by the network's clock; empty if the packet never arrived",
             ),
-            _field("counted_ns", pa.int64(), "ns", "time of arrival by the policy; empty if it never arrived"),
-            _field("late_ns", pa.int64(), "ns", "how far its receiver had passed that time"),
-            _field("reason", _TEXT, "", "why it never arrived; empty if it did, or was under way at the end"),
-            _field("ended_window", pa.int64(), "", "number of the window in which its fate was decided"),
+            _field(
+                "counted_ns", pa.int64(), "ns", "time of arrival by the policy; empty if the packet never arrived"
+            ),
+            _field("late_ns", pa.int64(), "ns", "time by which the receiver was already past counted_ns"),
+            _field(
+                "reason",
+                _TEXT,
+                "",
+                "reason why the packet never arrived; empty if it did, or was under way at the end",
+            ),
+            _field("ended_window", pa.int64(), "", "number of the window in which the packet arrived or was dropped"),
             *_end_fields("known", "assumed by the network when the packet entered it,"),
             *_end_fields("true", "true when the packet was sent,"),
         ]
@@ -71,17 +81,24 @@ _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
         [
             _field("at_ns", pa.int64(), "ns", "time"),
             _field("agent", _TEXT, "", "name of the agent"),
-            _field("position_m", _VECTOR, "m", "its position, east, north, up"),
-            _field("velocity_m_s", _VECTOR, "m/s", "its velocity, east, north, up"),
-            _field("heading_rad", pa.float64(), "rad", "its heading from east towards north; empty if there is none"),
+            _field("position_m", _VECTOR, "m", "position of the agent, east, north, up"),
+            _field("velocity_m_s", _VECTOR, "m/s", "velocity of the agent, east, north, up"),
+            _field(
+                "heading_rad",
+                pa.float64(),
+                "rad",
+                "heading of the agent from east towards north; empty if there is none",
+            ),
         ]
     ),
     "windows": pa.schema(
         [
-            _field("window", pa.int64(), "", "its number, from 0"),
-            _field("begin_ns", pa.int64(), "ns", "its beginning"),
-            _field("end_ns", pa.int64(), "ns", "its end"),
-            _field("decided_by", _TEXT, "", "what determined its length; empty if the policy does not report it"),
+            _field("window", pa.int64(), "", "number of the window, from 0"),
+            _field("begin_ns", pa.int64(), "ns", "start of the window"),
+            _field("end_ns", pa.int64(), "ns", "end of the window"),
+            _field(
+                "decided_by", _TEXT, "", "reason for the length of the window; empty if the policy does not report it"
+            ),
             _field("agents_s", pa.float64(), "s", "wall time of physics and programs"),
             _field("network_s", pa.float64(), "s", "wall time of the network"),
             _field("exchange_s", pa.float64(), "s", "wall time of the policy and the coordinator"),

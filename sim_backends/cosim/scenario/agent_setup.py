@@ -174,7 +174,7 @@ def path_points_m(plan: WayPointsPlan, start_m: Vector) -> list[Vector]:
     ]
 
 
-ONCE_WITHIN_S: Final = 0.1
+START_INTERVAL_S: Final = 0.1
 """Traffic without a period begins at a random time in this interval: the longest usual window (`policy.longest`)."""
 
 
@@ -206,7 +206,7 @@ def programs(
 
 def _sender(traffic: Traffic, flow: str, to: str, seed: int) -> Program:
     phase = RandomStream(seed, flow, "phase").draw(0)
-    begin_ns = _ns(traffic.start + phase * (traffic.period_s or ONCE_WITHIN_S))
+    begin_ns = _ns(traffic.start + phase * (traffic.period_s or START_INTERVAL_S))
     match traffic:
         case StreamTraffic():
             return Periodic(

@@ -148,7 +148,7 @@ class Simulation:
             progress: As for `Coordinator.advance`.
 
         Raises:
-            PolicyError: The policy has no window. `coordinator.run` has the record so far, also after other errors.
+            PolicyError: The policy has no window. `Coordinator.run` has the record so far, also after other errors.
             FederateError: Physics, network or a program failed, or did not answer in time.
         """
         return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns, progress)

@@ -130,7 +130,7 @@ class ClockSkewFault(_TimedFault):
         agent: The agent.
         offset_ms: How far the clock is ahead at the beginning of the fault, in milliseconds; negative if it is
             behind.
-        rate_ppm: By how much it gains from then on, in microseconds per second.
+        rate_ppm: Rate error of the clock from then on, in microseconds per second; positive if it is fast.
     """
 
     kind: Literal["clock-skew"]

@@ -83,8 +83,7 @@ def longest_for_all(
 ) -> tuple[float, Sequence[FixedCost]]:
     """Return the longest fixed window, to 2 %, that keeps a bound in all runs, and its cost in each.
 
-    It is the window that one would have to choose before the next run. If there is none, the result is nan and an
-    empty sequence.
+    It is the window to choose before the next run. If there is none, the result is nan and an empty sequence.
 
     Args:
         longest_s: The longest window that keeps the bound in each run.

@@ -101,7 +101,7 @@ def speeds_m_s(times_s: Floats, places_m: Floats) -> Floats:
 
 
 def spacing_errors_m(times_s: Floats, places_m: Floats, standstill_m: float, headway_s: float) -> Floats:
-    """Return how much the gap before each follower exceeds the desired one, which is `standstill_m + headway_s v`.
+    """Return the gap before each follower minus the desired gap, which is `standstill_m + headway_s v`.
 
     Args:
         times_s: Times, shape (times,).
@@ -202,7 +202,7 @@ def has_followers(scenario: CosimScenario) -> bool:
 
 
 def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
-    """Return how well followers kept their positions; `NO_FORMATION` if there are fewer than two samples.
+    """Return the errors of followers' positions; `NO_FORMATION` if there are fewer than two samples.
 
     Args:
         scenario: The scenario with the followers.

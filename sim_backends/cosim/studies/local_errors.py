@@ -83,7 +83,7 @@ def local_errors(
     make: Callable[[SyncPolicy], Coordinator],
     methods: Mapping[str, Callable[[float], SyncPolicy]],
     parameters: Sequence[float],
-    begins_ns: Sequence[int],
+    starts_ns: Sequence[int],
     tail_ns: int = TAIL_NS,
 ) -> dict[str, LocalErrors]:
     """Return the local errors of each method.
@@ -92,14 +92,14 @@ def local_errors(
         make: Builds the co-simulation of one scenario and seed.
         methods: Functions that return a policy for a parameter: the length of a window in seconds, or its equivalent.
         parameters: The parameters.
-        begins_ns: Times when windows begin, ascending; whole steps of the physics.
+        starts_ns: Start times of windows, ascending; whole steps of the physics.
         tail_ns: Time that forks continue after the window; packets whose fate is undecided then are ignored.
 
     Raises:
         PolicyError: A method has no window for a situation.
         FieldkitError: A fork changed its original: the scenario has an object that cannot be copied.
     """
-    shape = len(parameters), len(begins_ns)
+    shape = len(parameters), len(starts_ns)
     results = {
         name: LocalErrors(
             np.zeros(shape), *({measure: np.zeros(shape) for measure in MEASURES} for _ in ("sums", "counts"))
@@ -107,36 +107,36 @@ def local_errors(
         for name in methods
     }
     reference = make(EventDriven())
-    for column, begin_ns in enumerate(begins_ns):
-        _delete_decided(reference.advance(begin_ns))
+    for column, start_ns in enumerate(starts_ns):
+        _delete_decided(reference.advance(start_ns))
         exact: dict[int, _Aftermath] = {}
         for name, method in methods.items():
             for row, parameter in enumerate(parameters):
                 fork = reference.fork()
                 fork.policy = method(parameter)
-                end_ns = fork.advance(begin_ns + _LONGEST_NS, max_windows=1).windows_ns[-1]
-                if end_ns == begin_ns + _LONGEST_NS:
+                end_ns = fork.advance(start_ns + _LONGEST_NS, max_windows=1).windows_ns[-1]
+                if end_ns == start_ns + _LONGEST_NS:
                     continue  # there are no more events
                 if end_ns not in exact:
                     exact_fork = reference.fork()
                     exact_fork.advance(end_ns)
                     exact[end_ns] = _aftermath(exact_fork, end_ns, tail_ns)
                 actual = _aftermath(fork, end_ns, tail_ns)
-                results[name].window_s[row, column] = (end_ns - begin_ns) / 1e9
-                for measure, values in _differences(begin_ns, end_ns, exact[end_ns], actual).items():
+                results[name].window_s[row, column] = (end_ns - start_ns) / 1e9
+                for measure, values in _differences(start_ns, end_ns, exact[end_ns], actual).items():
                     results[name].sums[measure][row, column] = sum(values)
                     results[name].counts[measure][row, column] = len(values)
-    _check_unchanged(make, begins_ns, reference)
+    _check_unchanged(make, starts_ns, reference)
     return results
 
 
-def low_discrepancy_times_ns(begin_ns: int, end_ns: int, count: int, step_ns: int) -> list[int]:
+def low_discrepancy_times_ns(start_ns: int, end_ns: int, count: int, step_ns: int) -> list[int]:
     """Return evenly distributed times at whole steps, whose phases within any period are practically random.
 
     They are multiples of the golden ratio modulo 1, the sequence of lowest discrepancy in one dimension.
     """
     golden = (5**0.5 - 1) / 2
-    times_ns = {round((begin_ns + (end_ns - begin_ns) * (golden * k % 1)) / step_ns) * step_ns for k in range(count)}
+    times_ns = {round((start_ns + (end_ns - start_ns) * (golden * k % 1)) / step_ns) * step_ns for k in range(count)}
     return sorted(times_ns)
 
 
@@ -155,13 +155,13 @@ def _aftermath(fork: Coordinator, end_ns: int, tail_ns: int) -> _Aftermath:
     return _Aftermath(fork.advance(end_ns + tail_ns).fates, states)
 
 
-def _differences(begin_ns: int, end_ns: int, exact: _Aftermath, actual: _Aftermath) -> dict[str, list[float]]:
+def _differences(start_ns: int, end_ns: int, exact: _Aftermath, actual: _Aftermath) -> dict[str, list[float]]:
     """Return each error of a window for all packets and agents that it affected."""
     differences: dict[str, list[float]] = {measure: [] for measure in MEASURES}
     for identity, fate in exact.fates.items():
         other = actual.fates.get(identity)
-        is_sent = begin_ns < fate.packet.sent_ns <= end_ns
-        has_arrived = fate.arrived_ns is not None and begin_ns < fate.arrived_ns <= end_ns
+        is_sent = start_ns < fate.packet.sent_ns <= end_ns
+        has_arrived = fate.arrived_ns is not None and start_ns < fate.arrived_ns <= end_ns
         if not (is_sent or has_arrived) or other is None or not (fate.is_decided and other.is_decided):
             continue
         if is_sent:
@@ -193,11 +193,11 @@ def _delete_decided(run: Run) -> None:
 
 
 def _check_unchanged(
-    make: Callable[[SyncPolicy], Coordinator], begins_ns: Sequence[int], reference: Coordinator
+    make: Callable[[SyncPolicy], Coordinator], starts_ns: Sequence[int], reference: Coordinator
 ) -> None:
     without_forks = make(EventDriven())
-    for begin_ns in begins_ns:
-        _delete_decided(without_forks.advance(begin_ns))
+    for start_ns in starts_ns:
+        _delete_decided(without_forks.advance(start_ns))
     if without_forks.run.digest != reference.run.digest:
         raise FieldkitError(
             "a fork changed the run from which it was forked, so the measured errors are wrong",

@@ -93,7 +93,7 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
             rows = [row for row in ROWS if row[0] in chosen]
             ours, theirs = ([flows[_name(system, *row)] for row in rows] for system in (ADAPTIVE, than))
             claimed = CLAIMS.get((than, lines), (None, None))
-            tabled = _tabled(chosen) if than == MASTER else (math.nan, math.nan)
+            tabled = _changes_in_paper_tables(chosen) if than == MASTER else (math.nan, math.nan)
             delay, used = delay_change(_delays_s(ours), _delays_s(theirs))
             loss = mean((_losses(ours) - _losses(theirs)).mean(axis=0))
             all_claims.append(Claim(than, lines, "delay", claimed[0], tabled[0], delay, used))
@@ -130,15 +130,17 @@ def delay_change(ours_s: Floats, theirs_s: Floats) -> tuple[IntervalEstimate, in
     return change, int(used.sum())
 
 
-def _tabled(lines: Sequence[Sight]) -> tuple[float, float]:
+def _changes_in_paper_tables(lines: Sequence[Sight]) -> tuple[float, float]:
     """Return the changes of delay and loss from the paper's table 3, by TCP, to its table 1."""
     ours, theirs = [PRINTED["1"][line, "topic"] for line in lines], [PRINTED["3"][line, "ros1"] for line in lines]
-    delay, _ = delay_change(*(_printed([columns.delays_s for columns in system]) for system in (ours, theirs)))
-    losses = (_printed([columns.losses for columns in system]) for system in (ours, theirs))
+    delay, _ = delay_change(
+        *(_printed_numbers([columns.delays_s for columns in system]) for system in (ours, theirs))
+    )
+    losses = (_printed_numbers([columns.losses for columns in system]) for system in (ours, theirs))
     return delay.value, float(np.subtract(*losses).mean())
 
 
-def _printed(columns: Sequence[Sequence[Printed]]) -> Floats:
+def _printed_numbers(columns: Sequence[Sequence[Printed]]) -> Floats:
     """Return printed numbers as if they were those of one seed, shape (rows, 1)."""
     return np.array([[number.value] for column in columns for number in column], np.float64)
 

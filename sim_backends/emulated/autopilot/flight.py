@@ -162,7 +162,7 @@ def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vect
 
 
 def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
-    """Return where it can come to a stop, relative to home, not below it.
+    """Return the position at which it can stop, relative to home, not below it.
 
     First the distance that attitude lag and velocity gain cost at the current speed, then v^2 / 2a.
     """

@@ -128,5 +128,5 @@ class VehicleParts:
         return VehicleState(self.body.now_ns, self.armed, self.land_detector.landed, self.mode, self.battery)
 
     def _rest_m(self) -> Vector:
-        """Return where it comes to rest if it brakes now, or the nearest point inside the fence."""
+        """Return the position at which it stops if it brakes now, or the nearest point inside the fence."""
         return self.fence.nearest_inside(stop_m(self.body, self.limits))

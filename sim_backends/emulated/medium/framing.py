@@ -60,7 +60,7 @@ def _is_ipv4(packet: bytes) -> bool:
     return packet[0] >> 4 == 4
 
 
-def _by_ip(packet: bytes, routes: Routes) -> str | None:
+def _receiver_by_ip(packet: bytes, routes: Routes) -> str | None:
     address = packet[16:20]
     robot = routes.get(address, NO_ROBOT)
     # Multicast: 224.0.0.0/4, RFC 5771.
@@ -80,7 +80,7 @@ def _is_frame(frame: bytes) -> bool:
     return len(frame) >= _ETHERNET_BYTES
 
 
-def _by_mac(frame: bytes, routes: Routes) -> str | None:
+def _receiver_by_mac(frame: bytes, routes: Routes) -> str | None:
     if frame[0] & _GROUP_BIT:
         return None if routes else NO_ROBOT
     return routes.get(frame[:6], NO_ROBOT)
@@ -90,6 +90,6 @@ def _mac_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Rout
     return {mac_of(address.ip): name for name, address in others.items()}
 
 
-IP: Final = Framing("ip", 0, _is_ipv4, _by_ip, _ip_routes)
-ETHERNET: Final = Framing("ethernet", _ETHERNET_BYTES, _is_frame, _by_mac, _mac_routes)
+IP: Final = Framing("ip", 0, _is_ipv4, _receiver_by_ip, _ip_routes)
+ETHERNET: Final = Framing("ethernet", _ETHERNET_BYTES, _is_frame, _receiver_by_mac, _mac_routes)
 FRAMINGS: Final = {framing.name: framing for framing in (IP, ETHERNET)}

@@ -144,16 +144,16 @@ class MediumClient:
         reply, _ = self._worker.request(request)
         return DelayParts(**reply)
 
-    def links(self, *, go_on: bool) -> dict[str, list[LinkSample]]:
+    def links(self, *, continue_sampling: bool) -> dict[str, list[LinkSample]]:
         """Return the link samples of each robot since the last call, including one taken now.
 
         Args:
-            go_on: True to continue sampling.
+            continue_sampling: True to continue sampling.
 
         Raises:
             LinkError: The medium ended or did not answer.
         """
-        reply, _ = self._worker.request({"do": "links", "go_on": go_on})
+        reply, _ = self._worker.request({"do": "links", "continue_sampling": continue_sampling})
         return unpack_links(reply)
 
     def check_alive(self) -> None:

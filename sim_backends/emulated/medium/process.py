@@ -237,7 +237,7 @@ class Medium:
                 self._record(descriptors)
                 return {}
             case "links":
-                return self._links(go_on=request["go_on"])
+                return self._links(continue_sampling=request["continue_sampling"])
             case "delays" | "stats" as topic:
                 return self._delays(request) if topic == "delays" else pack_stats(self._stats())
             case other:
@@ -306,12 +306,12 @@ class Medium:
         self._sample_ns = now_ns + _SAMPLE_NS
         self._sampled.append(self._model.sample(now_ns, time.time_ns()))
 
-    def _links(self, *, go_on: bool) -> Message:
+    def _links(self, *, continue_sampling: bool) -> Message:
         """Return the link samples since the last request, including one taken now."""
         self._sample()
         reply = pack_links(self._sampled)
         self._sampled.clear()
-        if not go_on:
+        if not continue_sampling:
             self._sample_ns = None
         return reply
 

@@ -57,7 +57,7 @@ def command() -> tuple[str, ...]:
 
 
 def is_root() -> bool:
-    """Return True if this user is root, who needs no permission from anyone."""
+    """Return True if this user is root, which needs no further permissions."""
     return os.geteuid() == 0
 
 

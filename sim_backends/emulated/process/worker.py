@@ -160,11 +160,11 @@ class Worker:
             received = receive(self._channel, deadline)
         except (OSError, ValueError) as error:
             self._channel.close()
-            raise self._gone(_ENDED if isinstance(error, ConnectionError) else str(error)) from error
+            raise self._exit_error(_ENDED if isinstance(error, ConnectionError) else str(error)) from error
         finally:
             self._lock.release()
         if received is None:
-            raise self._gone(_ENDED)
+            raise self._exit_error(_ENDED)
         reply, _ = received
         if "error" in reply:
             raise RobotError(reply["error"], where=self.name, remedy=reply.get("remedy", ""))
@@ -177,16 +177,16 @@ class Worker:
             TestbedLostError: It has exited, or did not answer a request in time.
         """
         if self._channel.fileno() == -1 or self._process.poll() is not None:
-            raise self._gone(_ENDED)
+            raise self._exit_error(_ENDED)
 
-    def hang_up(self) -> None:
+    def request_exit(self) -> None:
         """Request that the process exits, without waiting for it; requests under way fail immediately."""
         if self._channel.fileno() != -1:
             self._channel.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Stop the process and wait until it has exited; a second call does nothing."""
-        self.hang_up()
+        self.request_exit()
         with self._lock:
             self._channel.close()
         try:
@@ -196,7 +196,7 @@ class Worker:
             self._process.wait()
         self._log.close()
 
-    def _gone(self, cause: str) -> TestbedLostError:
+    def _exit_error(self, cause: str) -> TestbedLostError:
         if self._log.closed:
             cause, last_line = "it was stopped", ""
         else:

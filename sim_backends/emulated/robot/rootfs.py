@@ -143,7 +143,7 @@ def write_setup(spec: RobotSpec) -> None:
 
 @contextmanager
 def _writable(folder: Path, replaced: set[str]) -> Iterator[Path]:
-    """Yield where files for `folder` must be written: the folder itself, or a mirror of a folder of the host."""
+    """Yield a writable folder for the files of `folder`: the folder itself, or a mirror of a folder of the host."""
     if os.access(folder, os.W_OK):
         yield folder
         return
@@ -230,7 +230,7 @@ def mount_programs(spec: RobotSpec) -> None:
 def program_layers(spec: RobotSpec) -> dict[str, Layer]:
     """Return the changes to each folder of programs; empty for a robot with the tools of this machine."""
     busybox = spec.userland == "busybox"
-    layers = {folder: _removed(folder) if busybox else {} for folder in _PROGRAM_FOLDERS}
+    layers = {folder: _removed_programs(folder) if busybox else {} for folder in _PROGRAM_FOLDERS}
     programs = layers[_BIN]
     if busybox:
         programs |= dict.fromkeys(_applets(), BUSYBOX)
@@ -248,7 +248,7 @@ def program_layers(spec: RobotSpec) -> dict[str, Layer]:
     return {folder: layer for folder, layer in layers.items() if layer}
 
 
-def _removed(folder: str) -> Layer:
+def _removed_programs(folder: str) -> Layer:
     """Return the removal of each program that a robot with a busybox userland does not have."""
     names = os.listdir(folder)  # noqa: PTH208 (only names are needed)
     return {name: None for name in names if not any(fnmatch(name, pattern) for pattern in _KEPT_WITH_BUSYBOX)}

@@ -192,7 +192,7 @@ class Helm:
         self._path_start_ns: int | None = None
 
     def poll_placement(self, now_ns: int) -> OwnMotion | None:
-        """Return where the lab has put the robot since the last call, or None if it has not.
+        """Return the place at which the lab has put the robot since the last call, or None if it has not.
 
         The first call returns where the robot is, also after the process has been restarted.
 

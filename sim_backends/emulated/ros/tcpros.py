@@ -163,7 +163,7 @@ class Listener:
             stream.close()
 
     def events(self, within_s: float) -> Iterator[tuple[Header, bytes | None]]:
-        """Yield what arrives within a time: (header, None) once per publisher, then (header, message)."""
+        """Yield received data until a timeout: (header, None) once per publisher, then (header, message)."""
         for key, _ in self._selector.select(within_s):
             if isinstance(key.data, _Subscription):
                 yield from self._read(key.data)

@@ -46,13 +46,13 @@ class Block:
         flow: Name of the flow.
         packet_id: Number of the message.
         index: Index of the block in the message.
-        of: Number of blocks of the message.
+        block_count: Number of blocks of the message.
     """
 
     flow: str
     packet_id: int
     index: int
-    of: int
+    block_count: int
 
 
 class TcprosLink:
@@ -227,14 +227,14 @@ class UdprosLink:
         source, destination = self._flow.publisher, self._flow.subscriber
         packet_id, (_, number) = packet.packet_id, packet.identity
         remaining_bytes = LENGTH_BYTES + packet.size_bytes
-        of = -(-remaining_bytes // self._payload_bytes)
+        block_count = -(-remaining_bytes // self._payload_bytes)
         self._open.add(packet_id)
-        for index in range(of):
+        for index in range(block_count):
             payload_bytes = min(remaining_bytes, self._payload_bytes)
             remaining_bytes -= payload_bytes
             size_bytes = _UDP_BYTES + _UDPROS_HEADER_BYTES + payload_bytes
             identity = f"{self._name} block{index}", number
-            block = Block(self._name, packet_id, index, of)
+            block = Block(self._name, packet_id, index, block_count)
             self._wire.transmit(IpPacket(source, destination, TRANSPORT, size_bytes, identity, block))
 
     def receive(self, packet: IpPacket) -> None:
@@ -246,7 +246,7 @@ class UdprosLink:
             self._drop(block.packet_id, OUT_OF_ORDER)
             return
         self._next += 1
-        if self._next == block.of:
+        if self._next == block.block_count:
             self._next = 0
             self._current = -1
             if block.packet_id in self._open:

@@ -141,9 +141,9 @@ class TopicReader:
         number = data.sample.number
         if number < self._next or number in self._complete:
             return
-        fragments, _ = self._fragments.setdefault(number, (set(), data.of))
+        fragments, _ = self._fragments.setdefault(number, (set(), data.fragment_count))
         fragments.update(range(data.first, data.first + data.count))
-        if len(fragments) < data.of:
+        if len(fragments) < data.fragment_count:
             # More fragments of the sample itself may be in flight.
             self._last = max(self._last, number - 1)
             return
@@ -194,8 +194,8 @@ class TopicReader:
             if number in self._complete:
                 continue
             if number in self._fragments:
-                fragments, of = self._fragments[number]
-                missing_fragments = [part for part in range(of) if part not in fragments]
+                fragments, fragment_count = self._fragments[number]
+                missing_fragments = [part for part in range(fragment_count) if part not in fragments]
                 return tuple(numbers), _MissingFragments(
                     number, tuple(part for part in missing_fragments if part < missing_fragments[0] + _MAX_BITS)
                 )

@@ -61,14 +61,14 @@ class Data:
         sample: The sample; its reader uses only its number and size.
         first: Index of the first fragment, from 0.
         count: Number of consecutive fragments.
-        of: Number of fragments of the whole sample.
+        fragment_count: Number of fragments of the whole sample.
         fragment_bytes: Size of each fragment except the last.
     """
 
     sample: Sample
     first: int
     count: int
-    of: int
+    fragment_count: int
     fragment_bytes: int
 
     @property
@@ -76,7 +76,7 @@ class Data:
         """Its size, with a timestamp before the first fragment."""
         begin = self.first * self.fragment_bytes
         payload = min(self.count * self.fragment_bytes, self.sample.size_bytes - begin)
-        header = _DATA_BYTES if self.of == 1 else _DATA_FRAG_BYTES
+        header = _DATA_BYTES if self.fragment_count == 1 else _DATA_FRAG_BYTES
         return header + payload + (0 if self.first else INFO_TIMESTAMP_BYTES)
 
 

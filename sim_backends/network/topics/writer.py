@@ -142,11 +142,12 @@ class TopicWriter:
         self._last += 1
         sample.number = self._last
         evicted = self._history.insert(sample) if self._reliable else None
-        of = sample.fragments(self._timing.fragment_bytes)
+        fragment_count = sample.fragments(self._timing.fragment_bytes)
         per_message = max(self._timing.message_bytes // self._timing.fragment_bytes, 1)
-        for first in range(0, of, per_message):
-            submessages: tuple[Submessage, ...] = (self._data(sample, first, min(per_message, of - first)),)
-            if self._reliable and first + per_message >= of:
+        for first in range(0, fragment_count, per_message):
+            count = min(per_message, fragment_count - first)
+            submessages: tuple[Submessage, ...] = (self._data(sample, first, count),)
+            if self._reliable and first + per_message >= fragment_count:
                 submessages += self._piggyback()
             self._transmit(submessages, (f"data{first}", sample.key))
         if evicted is not None:
@@ -239,8 +240,8 @@ class TopicWriter:
         if sample is None:
             self._respond([Gap(nack.number, nack.number + 1)] if nack.number <= self._last else [])
         else:
-            of = sample.fragments(self._timing.fragment_bytes)
-            self._respond([self._data(sample, fragment, 1) for fragment in nack.missing if fragment < of])
+            fragment_count = sample.fragments(self._timing.fragment_bytes)
+            self._respond([self._data(sample, fragment, 1) for fragment in nack.missing if fragment < fragment_count])
 
     def _respond(self, submessages: list[Submessage] | tuple[()]) -> None:
         """Send the requested data and a heartbeat in as few messages as possible."""

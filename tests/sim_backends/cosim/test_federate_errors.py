@@ -62,9 +62,9 @@ def pair(
 @pytest.mark.parametrize(
     ("federate", "message"),
     [
-        ("physics", "physics has not answered for 0.25 s: asked to advance from 0.006 s to 0.009 s"),
-        ("network", "network has not answered for 0.25 s: asked to advance from 0.006 s to 0.009 s"),
-        ("program", "the program of a has not answered for 0.25 s: asked to act at 0.012 s"),
+        ("physics", "physics has not answered for 0.25 s: request to advance from 0.006 s to 0.009 s"),
+        ("network", "network has not answered for 0.25 s: request to advance from 0.006 s to 0.009 s"),
+        ("program", "the program of a has not answered for 0.25 s: request to act at 0.012 s"),
     ],
 )
 def test_a_timeout_names_the_federate_and_the_request(federate: str, message: str) -> None:
@@ -90,7 +90,7 @@ def test_an_error_of_a_policy_that_looks_ahead_has_the_time_that_the_window_has_
                 next(iter(()))
             return situation.now_ns + MS
 
-    with pytest.raises(FederateError, match=r"policy error_bounded failed when .* StopIteration") as raised:
+    with pytest.raises(FederateError, match=r"policy error_bounded failed at the request .* StopIteration") as raised:
         pair(policy=Faulty()).advance(1000 * MS)
     assert "extend the window beyond 0.007 s" in str(raised.value)
 
@@ -160,14 +160,26 @@ class Broken(Disc):
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"physics": Failing(10 * MS)}, r"physics failed when .* from 0\.009 s to 0\.012 s: KeyError: 'wheel'"),
-        ({"network": FailingDisc(1.0, MS)}, r"network failed when .* from 0 s to 0\.003 s: ValueError: no air"),
+        (
+            {"physics": Failing(10 * MS)},
+            r"physics failed at the request .* from 0\.009 s to 0\.012 s: KeyError: 'wheel'",
+        ),
+        (
+            {"network": FailingDisc(1.0, MS)},
+            r"network failed at the request .* from 0 s to 0\.003 s: ValueError: no air",
+        ),
         (
             {"network": Broken(1.0, MS), "policy": EventDriven()},
-            r"network failed when .* its next event after 0 s: ValueError: no heap",
+            r"network failed at the request .* its next event after 0 s: ValueError: no heap",
         ),
-        ({"program": Failing(MS)}, r"the program of a failed when .* act at 0\.005 s: RuntimeError: no plan"),
-        ({"program": Failing(0)}, r"the program of a failed when .* next wake time after 0 s: OSError: no clock"),
+        (
+            {"program": Failing(MS)},
+            r"the program of a failed at the request .* act at 0\.005 s: RuntimeError: no plan",
+        ),
+        (
+            {"program": Failing(0)},
+            r"the program of a failed at the request .* next wake time after 0 s: OSError: no clock",
+        ),
     ],
 )
 def test_a_failure_names_the_federate_and_its_last_time(parts: dict[str, Any], message: str) -> None:
@@ -214,7 +226,7 @@ def test_a_physics_that_loses_an_agent_is_refused() -> None:
             return states if to_ns < 5 * MS else {"a": states["a"]}
 
     losing = Losing([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
-    with pytest.raises(FederateError, match=r"physics, asked to advance to 0\.006 s, has no state of b"):
+    with pytest.raises(FederateError, match=r"physics, requested to advance to 0\.006 s, has no state of b"):
         pair(physics=losing).advance(1000 * MS)
 
 

@@ -66,7 +66,7 @@ LACKING = [
     ({"advance": lambda to_ns, commands: {}}, "has no state of drone, follower, leader"),
     ({"advance": lambda to_ns, commands: dict.fromkeys(SCENARIO.agents, (0, 0, 0))}, "which is not a State"),
     ({"advance": lambda to_ns, commands: None}, "which is not a mapping of states"),
-    ({"advance": lambda to_ns: {}}, "physics failed when it was asked to advance"),
+    ({"advance": lambda to_ns: {}}, "physics failed at the request to advance"),
 ]
 
 

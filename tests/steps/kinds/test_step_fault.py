@@ -142,7 +142,7 @@ def test_steps_inside_a_fault_can_be_excluded() -> None:
 
 def test_two_faults_of_one_kind_are_refused() -> None:
     again = NESTED + "  - fault: {robot: sender, kind: out-of-range, for: 1s}\n"
-    with pytest.raises(ConfigurationError, match="a fault out-of-range comes twice"):
+    with pytest.raises(ConfigurationError, match="a fault out-of-range is defined twice"):
         schema.validate(schema.parse(again, source="x"), Procedure)
 
 

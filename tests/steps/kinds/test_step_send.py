@@ -138,7 +138,7 @@ def test_send_without_name_conflicts_with_transfer() -> None:
     ends = "from: sender, to: receiver"
     record = "- record: {robot: sender, topics: [/scan], duration: 1s}\n"
     text = f"{head}{record}- transfer: {{{ends}}}\n- send: {{{ends}, size: 1kB}}\n"
-    with pytest.raises(ConfigurationError, match="a transfer comes twice"):
+    with pytest.raises(ConfigurationError, match="a transfer is defined twice"):
         schema.validate(schema.parse(text, source="x.yaml"), Procedure)
     named = text.replace("size: 1kB", "size: 1kB, name: up")
     assert schema.validate(schema.parse(named, source="x.yaml"), Procedure)

@@ -9,7 +9,7 @@ import pytest
 
 from fieldkit.agent import ros1
 from fieldkit.agent.middleware import Network, Topic
-from fieldkit.agent.stream import LEAST_BYTES, Stream
+from fieldkit.agent.stream import MIN_BYTES, Stream
 from fieldkit.cli import main
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
@@ -111,7 +111,7 @@ def test_ports_of_dds_follow_rtps() -> None:
 
 
 def test_constants_of_laptop_and_agent_are_equal() -> None:
-    assert streams.LEAST_BYTES == LEAST_BYTES
+    assert streams.MIN_BYTES == MIN_BYTES
     assert set(ports.ros1_node(0)) == set(ros1.PORTS)
 
 
@@ -185,7 +185,7 @@ def together(*several: str, within: str = "together") -> str:
 def test_simultaneous_streams_need_different_domains(over: str) -> None:
     """In one domain they would listen on the same ports of the receiver, the router or the master."""
     keys = f"from: sender, to: receiver, over: {over}", f"from: relay, to: receiver, over: {over}, topic: /b"
-    with pytest.raises(ConfigurationError, match=r"comes twice at the same time on .*; give one another domain"):
+    with pytest.raises(ConfigurationError, match=r"is used twice at the same time on .*; give one another domain"):
         schema.validate(schema.parse(together(*keys), source="x.yaml"), Procedure)
     schema.validate(schema.parse(together(keys[0], f"{keys[1]}, domain: 7"), source="x.yaml"), Procedure)
 
@@ -194,7 +194,7 @@ def test_streams_of_dds_may_share_a_domain_but_not_a_pair_in_a_capture() -> None
     keys = "from: sender, to: receiver"
     schema.validate(schema.parse(together(keys, "from: relay, to: receiver"), source="x.yaml"), Procedure)
     schema.validate(schema.parse(together(keys, f"{keys}, domain: 7"), source="x.yaml"), Procedure)
-    with pytest.raises(ConfigurationError, match=r"comes twice in one capture.*; give one another domain"):
+    with pytest.raises(ConfigurationError, match=r"is used twice in one capture.*; give one another domain"):
         schema.validate(schema.parse(together(keys, f"{keys}, topic: /b"), source="x.yaml"), Procedure)
 
 

@@ -42,8 +42,8 @@ class Medium:
     def lateness(self) -> Lateness:
         raise AssertionError
 
-    def links(self, *, go_on: bool) -> dict[Role, list[LinkSample]]:
-        raise AssertionError(go_on)
+    def links(self, *, continue_sampling: bool) -> dict[Role, list[LinkSample]]:
+        raise AssertionError(continue_sampling)
 
     def record_air(self, folder: Path | None) -> None:
         raise AssertionError(folder)

@@ -27,16 +27,16 @@ class Slow(LocalShell):
     def __init__(self, home: Path, fetching: Callable[[], None]) -> None:
         super().__init__(home)
         self.fetching = fetching
-        self.hung_up = threading.Event()
+        self.is_closed = threading.Event()
 
     def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         to.write_bytes(b"the beginning of a tar")
         self.fetching()
-        assert self.hung_up.wait(deadline.remaining_s)
+        assert self.is_closed.wait(deadline.remaining_s)
         return Completed((), 0, b"", b"")
 
     def close(self) -> None:
-        self.hung_up.set()
+        self.is_closed.set()
 
 
 def slow_testbed(home: Path) -> IdleTestbed:
@@ -54,7 +54,7 @@ def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: P
     others = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
         robots.fetch("x", into, clean=True)
-    robots.hang_up()
+    robots.close_connections()
     kept = into.rename(tmp_path / "kept")
     wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(60))
     assert list(kept.iterdir()) == [], "partially fetched files are removed before the attempt is stored"
@@ -124,14 +124,14 @@ class Impatient(LocalShell):
 
     def __init__(self, home: Path) -> None:
         super().__init__(home)
-        self.hang_up: Callable[[], None] = lambda: None
+        self.on_command: Callable[[], None] = lambda: None
         self.pieces = 0
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         done = super().fetch(argv, to, deadline=deadline, limit_bytes=limit_bytes)
         if argv[2] == "piece":
             self.pieces += 1
-            self.hang_up()
+            self.on_command()
         return done
 
 
@@ -146,12 +146,12 @@ def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path)
         evidence.begin(shells[role], remote, role, "lo", need_kib=0)
     (tmp_path / Role.SENDER / remote / "scan.bag").write_bytes(bytes(3 * fetching.PIECE_BYTES))
     robots = Robots(plan, IdleTestbed(shells))
-    shells[Role.SENDER].hang_up = robots.hang_up
+    shells[Role.SENDER].on_command = robots.close_connections
     into = tmp_path / "into"
     into.mkdir()
     assert robots.fetch(remote, into, clean=True) == ["the fetch was cancelled"]
     assert shells[Role.SENDER].pieces == 1
-    shells[Role.SENDER].hang_up = lambda: None
+    shells[Role.SENDER].on_command = lambda: None
     for path in into.glob("*.txt"):
         path.unlink()
     assert robots.fetch(remote, into, clean=True) == []

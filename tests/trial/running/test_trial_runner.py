@@ -76,7 +76,7 @@ def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
     stop, fetch = Stop(), Robots.fetch
 
     def asked(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
-        stop.asked = not remote.endswith("tcp-01-1")
+        stop.after_repeat = not remote.endswith("tcp-01-1")
         return fetch(self, remote, into, clean=clean)
 
     monkeypatch.setattr(Robots, "fetch", asked)

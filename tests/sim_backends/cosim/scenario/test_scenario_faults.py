@@ -195,7 +195,7 @@ def test_a_federate_that_stalls_is_named_and_the_record_is_kept(tmp_path: Path, 
     text = SCENARIO + f"  - {{kind: stalled-federate, federate: {federate}, from: 500ms, stall: 1min}}\n"
     path.write_text(text, encoding="utf-8")
     simulation = build(load_scenario(path), deadline_s=0.2)
-    with pytest.raises(UnansweredError, match=f"{federate} has not answered for 0.2 s: asked to advance from 0.4"):
+    with pytest.raises(UnansweredError, match=f"{federate} has not answered for 0.2 s: request to advance from 0.4"):
         simulation.run()
     run = simulation.coordinator.run
     assert run.windows_ns[-1] == pytest.approx(500 * MS, rel=0.1)

@@ -9,8 +9,8 @@ from tests.helpers import drones
 
 def test_the_first_cases_pass() -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER, boot_s=1.0) as (port, autopilot):
-        seen = list(islice(rows(f"udpout:127.0.0.1:{port}"), 3))
-        assert [(row.case, row.passed, row.seen if not row.passed else "") for row in seen] == [
+        results = list(islice(rows(f"udpout:127.0.0.1:{port}"), 3))
+        assert [(row.case, row.passed, row.observation if not row.passed else "") for row in results] == [
             ("can be armed", True, ""),
             ("telemetry is recorded", True, ""),
             ("out and back", True, ""),

@@ -116,10 +116,10 @@ def test_delay_applies_in_both_directions_and_twice_through_the_relay(bench: Ben
 def test_links_are_sampled_while_requested_without_traffic_on_the_air(bench: Bench) -> None:
     medium, spaces = bench("{fading: false}")
     medium.place(PLACES, relay="r")
-    first = medium.links(go_on=True)
+    first = medium.links(continue_sampling=True)
     assert {name: len(samples) for name, samples in first.items()} == {"a": 1, "b": 1, "r": 1}
     assert len(ping(spaces["a"], ADDRESSES["b"], count=80)) == 80
-    last, stats = medium.links(go_on=False), medium.stats()
+    last, stats = medium.links(continue_sampling=False), medium.stats()
     assert len(last["a"]) >= 4, "in 0.8 s"
     sent = {name: port.read - port.not_ipv4 for name, port in stats.ports.items()}
     assert sent == {"a": 80, "b": 80, "r": 0}, "a kernel looks for routers of IPv6 once"
