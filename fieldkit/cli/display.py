@@ -106,8 +106,8 @@ def table(
     last = len(head) - 1
     for index in fold if fold is not None else () if last in right else (last,):
         words = (word for row in cells for word in row[index].split())
-        room = console.width - sum(widths) + widths[index] - 2 * len(widths) - 1
-        widths[index] = min(widths[index], max([room, *map(cell_len, words)]))
+        available = console.width - sum(widths) + widths[index] - 2 * len(widths) - 1
+        widths[index] = min(widths[index], max([available, *map(cell_len, words)]))
     if sys.stdout.isatty() and _table_width(widths) > console.width:
         _print_blocks(cells, title, console)
         return
@@ -342,9 +342,9 @@ def _repeat(event: RepeatEnded, width: int | None) -> Words:
     text = "; ".join(filter(None, (event.reason, measured)))
     left = f"  ({TimeEstimate(event.left_s, event.left_most_s)} left)" if event.left_s > 0 else ""
     if width is not None:  # the live line shows the remaining time
-        left, room = "", width - len(head) - len(status)
-        if cell_len(text) > room:
-            text = _fold_below(text, width) if event.reason else _fold_after(text, width - room, width)
+        left, available = "", width - len(head) - len(status)
+        if cell_len(text) > available:
+            text = _fold_below(text, width) if event.reason else _fold_after(text, width - available, width)
     remedy = f"\n{' ' * _INDENT}remedy: {event.remedy}" if event.remedy else ""
     style = _STYLE[Status.FAILED] if event.summary.startswith(NOTHING_ARRIVED) else ""
     return ((head, ""), (status, _STYLE[event.status]), (text, style), (left, "dim"), (remedy, ""))

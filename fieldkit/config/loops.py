@@ -20,7 +20,7 @@ from fieldkit.config.documents import Document, Location
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 MOST: Final = 1000
-"""Most steps of a file after its loops are expanded."""
+"""Maximum number of steps of a file after its loops are expanded."""
 
 _LOOP: Final = "for"
 _KEYS: Final = ("each", "during")

@@ -60,9 +60,9 @@ def unescape_formula(text: str) -> str:
     return text[1:] if text.startswith("'") and _FORMULA.match(text) else text
 
 
-def shorten(text: str, most: int = 200) -> str:
-    """Return `text` as one line of at most `most` characters, with a `?` for each unprintable one."""
-    return "".join(char if char.isprintable() else "?" for char in " ".join(text.split())[:most])
+def shorten(text: str, max_length: int = 200) -> str:
+    """Return `text` as one line of at most `max_length` characters, with a `?` for each unprintable one."""
+    return "".join(char if char.isprintable() else "?" for char in " ".join(text.split())[:max_length])
 
 
 def encodable(text: str) -> str:

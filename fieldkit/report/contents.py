@@ -39,9 +39,9 @@ _FIRST: Final = "expected and own figures"
 """Quantities with an expectation, and quantities that a lab declares."""
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
 _MAX_FURTHER: Final = 12
-"""Most charts of quantities that are not defined by fieldkit."""
+"""Maximum number of charts of quantities that are not defined by fieldkit."""
 _MAX_IN_TABLE: Final = 8
-"""Most visible columns of quantities that are not defined by fieldkit."""
+"""Maximum number of visible columns of quantities that are not defined by fieldkit."""
 
 
 @dataclass(frozen=True)

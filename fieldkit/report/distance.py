@@ -26,11 +26,11 @@ _ASIDE: Final = 0.009
 _FEWEST_JOINED: Final = 4
 """Fewest distances whose points are joined. A line through fewer suggests a curve that was not measured."""
 _MAX_WIDE: Final = 2
-"""Most panels of a chart of several steps that are drawn large."""
+"""Maximum number of panels of a chart of several steps that are drawn large."""
 _MARGIN: Final = 0.06
 """Margin at each end of the axis, as a share of the axis."""
 _TICKS_APART: Final = 0.16
-"""Least distance between labels, as a share of the axis."""
+"""Minimum distance between labels, as a share of the axis."""
 
 
 def charts(

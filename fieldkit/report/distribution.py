@@ -16,13 +16,13 @@ from fieldkit.report.series import Identities, needs_log, panels
 from fieldkit.report.trial_folders import Evidence
 
 MAX_DISTANCES: Final = 3
-"""Most distances with a panel: the nearest, the middle and the farthest."""
+"""Maximum number of distances with a panel: the nearest, the middle and the farthest."""
 _ROOM: Final = 1.03
 _LOG_ROOM: Final = 1.1
 """Factor between the ends of an axis and the extreme times."""
 _LOG: Final = ", on a logarithmic axis"
 MAX_STEPS: Final = 120
-"""Most steps of a line. A longer line is drawn through this number of its quantiles."""
+"""Maximum number of steps of a line. A longer line is drawn through this number of its quantiles."""
 
 
 @dataclass(frozen=True, eq=False)

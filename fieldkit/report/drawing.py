@@ -34,7 +34,7 @@ _ARROW: Final = 14.0
 _STRIP_LANE: Final = 7.5
 """Font size of lane names in panels of a fixed height."""
 _EDGE_TEXT: Final = 34
-"""Most characters of a text at the edge."""
+"""Maximum number of characters of a text at the edge."""
 
 
 def draw(axes: Axes, panel: Panel) -> None:
@@ -191,9 +191,9 @@ def _draw_edge(axes: Axes, edge: EdgeMark, *, sideways: bool) -> None:
     text.set_in_layout(False)  # the text is inside of the axes, so they must not shrink for it
 
 
-def _shorten(text: str, most: int) -> str:
+def _shorten(text: str, max_length: int) -> str:
     clean = sanitized(text)
-    return clean if len(clean) <= most else f"{clean[: most - 1]}…"
+    return clean if len(clean) <= max_length else f"{clean[: max_length - 1]}…"
 
 
 def handle(label: str, style: Style) -> Line2D:

@@ -66,7 +66,7 @@ _OF_PROTOCOLS: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_b
 _OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
 """Quantities of trials that stream topics, in which pings and transfers only serve clocks and load."""
 _MAX_FIRST: Final = 6
-"""Most headlines of expected quantities and of a lab's quantities."""
+"""Maximum number of headlines of expected quantities and of a lab's quantities."""
 _MAX_PLACES: Final = 3
 _COUNT_TEXTS: Final = {
     "silent": "nothing arrived in {}",

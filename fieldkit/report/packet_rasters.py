@@ -15,11 +15,12 @@ from fieldkit.report.series import panels
 from fieldkit.report.trial_folders import Evidence
 
 MAX_REPEATS: Final = 400
-"""Most repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""
+"""Maximum number of repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""
 MAX_LINES: Final = 20
-"""Most lines of a cell."""
+"""Maximum number of lines of a cell."""
 MAX_COLUMNS: Final = 300
-"""Most columns of a line. A line with more packets combines several in a column, marked if any of them is."""
+"""Maximum number of columns of a line. A line with more packets combines several in a column, which is marked if any
+of them is."""
 
 _WHAT: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments sent again"}
 

@@ -86,10 +86,10 @@ def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
 
 
 MAX_BEHIND: Final = 100
-"""Most single repeats behind one estimate; of more repeats, every k-th is drawn."""
+"""Maximum number of single repeats behind one estimate; of more repeats, every k-th is drawn."""
 _MIN_TOP_PERCENT: Final = 1.0
 _MAX_LENGTH: Final = 2.0
-"""Most length of the axis, as a multiple of the largest value. Wider intervals are cut there."""
+"""Maximum length of the axis, as a multiple of the largest value. Wider intervals are cut there."""
 _MARGIN: Final = 0.25
 """Margins of an axis that does not start at 0, as a share of the range of values."""
 _LOG_FROM_DECADES: Final = 1.5

@@ -16,7 +16,8 @@ from fieldkit.report.theme import Colour
 from fieldkit.report.trial_folders import Evidence
 
 MAX_MARKS: Final = 2000
-"""Most marks on a page, shared by its strips. Of more attempts, valid ones are omitted evenly, others never."""
+"""Maximum number of marks on a page, shared by its strips. If there are more attempts, valid ones are omitted evenly;
+others are never omitted."""
 FEWEST_MARKS: Final = 20
 """Fewest marks of valid attempts in a strip."""
 
@@ -75,13 +76,13 @@ class StripGroup:
 def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[StripGroup]:
     """Yield the strips of all cells, those of a protocol and a topology together."""
     differing = wording.differing(cells) - {"topology"}
-    most_marks = max(FEWEST_MARKS, MAX_MARKS // max(1, len(cells)))
+    max_marks = max(FEWEST_MARKS, MAX_MARKS // max(1, len(cells)))
     for title, group in panels(cells).items():
         heights = _heights(group, [cell for cell in cells if cell.key["protocol"] == group[0].key["protocol"]])
         strips = []
         for cell in group:
             rows = evidence.rows(cell)
-            kept = _thinned(rows, evidence, most_marks)
+            kept = _thinned(rows, evidence, max_marks)
             strips.append(
                 Strip(
                     cell=cell,
@@ -121,13 +122,13 @@ def _heights(group: Sequence[Cell], cells: Sequence[Cell]) -> _Heights:
     return _Heights(loss, max(cell.estimates[loss.name].maximum for cell in cells if loss.name in cell.estimates))
 
 
-def _thinned(rows: NDArray[np.int64], evidence: Evidence, most: int) -> NDArray[np.int64]:
+def _thinned(rows: NDArray[np.int64], evidence: Evidence, max_count: int) -> NDArray[np.int64]:
     is_valid = evidence.repeats.texts["status"][rows] == Status.VALID
     valid, other = np.flatnonzero(is_valid), np.flatnonzero(~is_valid)
-    room = max(FEWEST_MARKS, most - len(other))
-    if len(valid) <= room:
+    max_valid = max(FEWEST_MARKS, max_count - len(other))
+    if len(valid) <= max_valid:
         return rows
-    evenly = valid[np.linspace(0, len(valid) - 1, room).round().astype(np.int64)]
+    evenly = valid[np.linspace(0, len(valid) - 1, max_valid).round().astype(np.int64)]
     kept: NDArray[np.int64] = rows[np.sort(np.concatenate((evenly, other)))]
     return kept
 

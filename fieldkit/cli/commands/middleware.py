@@ -73,7 +73,7 @@ def recommend(arguments: argparse.Namespace) -> int:
         max_delay_s=None if arguments.max_delay is None else parse_amount(arguments.max_delay, "s", "--max-delay"),
         size_bytes=None if arguments.size is None else parse_quantity(arguments.size, BYTES_PER_UNIT, "size"),
         repeats=arguments.repeats,
-        share=None if arguments.share is None else _parse_share(arguments.share, "--share", most=MAX_SHARE),
+        share=None if arguments.share is None else _parse_share(arguments.share, "--share", maximum=MAX_SHARE),
     )
     data = sources.find(arguments.trials, show_note)
     assessments = recommendation.assess(data.read(undeclared=True), criterion)
@@ -98,18 +98,18 @@ def recommend(arguments: argparse.Namespace) -> int:
     return NOTHING
 
 
-def _parse_share(text: str, option: str, most: float = 1.0) -> float:
+def _parse_share(text: str, option: str, maximum: float = 1.0) -> float:
     """Return the share in an option's value.
 
     Raises:
-        ConfigurationError: It is not a share, or above `most`; or it is 0 and `most` is below 1.
+        ConfigurationError: It is not a share, or above `maximum`; or it is 0 and `most` is below 1.
     """
     share = parse_amount(text, "share", option)
-    if share > most or (most < 1 and not share):
-        least = "above 0" if most < 1 else "0"
+    if share > maximum or (maximum < 1 and not share):
+        minimum_text = "above 0" if maximum < 1 else "0"
         raise ConfigurationError(
             f"{option}: {text[:40]!r} is not a valid share",
-            remedy=f"write {least} to {100 * most:g} %",
+            remedy=f"write {minimum_text} to {100 * maximum:g} %",
         )
     return share
 

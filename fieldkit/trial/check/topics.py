@@ -32,7 +32,7 @@ TOLERANCE: Final = 0.5
 # A recorder that is stopped from outside also needs time to start: ros2 takes 3 s to load on a small computer.
 _START_S: Final = 4.0
 # A recorder waits for a missing ROS master; if only the battery is needed, it waits no longer than this.
-_PATIENCE_S: Final = 6.0
+_SHORT_LIMIT_S: Final = 6.0
 _END_BYTES: Final = 4096
 _BATTERY: Final = "sensor_msgs/BatteryState"
 
@@ -53,7 +53,7 @@ def check_topics(plan: Plan, role: Role, shell: Shell, variants: Variants, repor
     scene = plan.scene(RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: variants})
     with tempfile.TemporaryDirectory() as into:
         try:
-            path, recorded_bag = _record(scene, step, shell, Path(into), patient=bool(wanted))
+            path, recorded_bag = _record(scene, step, shell, Path(into), waits_full_time=bool(wanted))
         except EvidenceError as error:
             judge(robot, wanted, None, report, why=error.what)
             return
@@ -111,7 +111,7 @@ def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
     return RecordStep.model_validate({"robot": role, "topics": topics, "duration": f"{duration_s}s"})
 
 
-def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient: bool) -> tuple[Path, Bag]:
+def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, waits_full_time: bool) -> tuple[Path, Bag]:
     """Run a recording; return the path and the content of the fetched bag.
 
     Raises:
@@ -120,7 +120,7 @@ def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient
     robot = scene.robot(step.robot)
     where = (scene.folder, step.robot, robot.profile.radio.interface)
     (planned,) = step.jobs(scene)
-    job = planned.job if patient else replace(planned.job, limit_s=min(planned.job.limit_s, _PATIENCE_S))
+    job = planned.job if waits_full_time else replace(planned.job, limit_s=min(planned.job.limit_s, _SHORT_LIMIT_S))
     evidence.begin(shell, *where)
     jobs.run(shell, job)
     fetching.fetch(shell, *where, into)
