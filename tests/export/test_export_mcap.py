@@ -40,9 +40,9 @@ def exported(trial: Path, name: str = "out.mcap") -> bytes:
     return out.read_bytes()
 
 
-def messages(content: bytes) -> list[Read]:
+def messages(file: bytes) -> list[Read]:
     read_messages = []
-    for schema, channel, message in make_reader(io.BytesIO(content), validate_crcs=True).iter_messages():
+    for schema, channel, message in make_reader(io.BytesIO(file), validate_crcs=True).iter_messages():
         assert schema
         content, form = json.loads(message.data), json.loads(schema.data)
         read_messages.append(Read(channel.topic, message.log_time, content, form, channel.metadata["clock"]))
@@ -101,11 +101,11 @@ def test_the_index_the_statistics_and_the_stream_agree(trial: Path) -> None:
 
 def test_the_log_is_the_journal(read_messages: list[Read], trial: Path) -> None:
     lines = (trial / journal.JOURNAL_FILE).read_text(encoding="utf-8").splitlines()
-    content = [
+    entries = [
         (message.content["level"], message.content["name"], message.content["message"])
         for message in of(read_messages, "/trial/log")
     ]
-    assert content == [
+    assert entries == [
         (2, "udp-01", "attempt 1 running"),
         (3, "udp-01", "attempt 1 void: ping.txt is missing"),
         (2, "udp-01", "attempt 2 running"),
