@@ -325,7 +325,7 @@ READ: dict[str, Setup] = {
     ),
 }
 
-SECTIONS: dict[str, dict[str, Setup]] = {"Typed": TYPED, "Written in YAML": WRITTEN, "Read as trials": READ}
+SECTIONS: dict[str, dict[str, Setup]] = {"Command line": TYPED, "YAML files": WRITTEN, "Stored trials": READ}
 
 
 @pytest.mark.parametrize(("section", "cases"), SECTIONS.items())
