@@ -98,8 +98,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the text that passing tests recorded as the property `said`, for use in issues."""
+    """Print the text that passing tests recorded as the property `result`, for use in issues."""
     for report in terminalreporter.stats.get("passed", []):
         for name, text in report.user_properties:
-            if name == "said":
+            if name == "result":
                 terminalreporter.write_line(text)

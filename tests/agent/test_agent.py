@@ -74,8 +74,8 @@ class Cable:
         """Run the agent on a host; it is ready when the body starts, and is stopped after it."""
         with host.start((sys.executable, str(self.program), verb, json.dumps(arguments), *words)) as process:
             assert process.stderr is not None
-            said = process.stderr.readline()
-            assert said.startswith(b"up, "), said + process.stderr.read()
+            output_text = process.stderr.readline()
+            assert output_text.startswith(b"up, "), output_text + process.stderr.read()
             try:
                 yield process
             finally:
@@ -164,10 +164,10 @@ def test_publisher_stops_without_acknowledgements(cable: Cable, tmp_path: Path) 
             wait_until(lambda: any(row[0] == records.SAMPLE for row in topic_logs.rows(sent)), Deadline.after(60))
             subscriber.send_signal(signal.SIGSTOP)
             try:
-                _, said = publisher.communicate(timeout=60)
+                _, output_text = publisher.communicate(timeout=60)
             finally:
                 subscriber.send_signal(signal.SIGCONT)
-            assert publisher.returncode == 0, said
+            assert publisher.returncode == 0, output_text
     assert topic_logs.rows(sent)[-1][0] == records.END
 
 
@@ -178,9 +178,9 @@ def test_missing_master_is_reported(cable: Cable, tmp_path: Path) -> None:
     with near.start(
         (sys.executable, str(cable.program), "publish", json.dumps(arguments), str(tmp_path / "log"))
     ) as process:
-        _, said = process.communicate(timeout=60)
+        _, output_text = process.communicate(timeout=60)
     assert process.returncode == 3
-    assert said == b"error: no ROS master answers at http://127.0.0.1:11311\n"
+    assert output_text == b"error: no ROS master answers at http://127.0.0.1:11311\n"
 
 
 @pytest.mark.parametrize("argv", [[], ["publish"], ["route", "{}", "log"], ["other", "{}"]])
@@ -216,8 +216,8 @@ def attacked(host: TestHost, *words: str) -> None:
     """Let a host send hostile packets, and wait until it has finished."""
     argv = ("env", f"PYTHONPATH={ROOT}", sys.executable, "-m", "tests.helpers.hostile_wire", *words)
     with host.start(argv) as process:
-        _, said = process.communicate(timeout=120)
-    assert said.endswith(b"done\n"), said.decode()
+        _, output_text = process.communicate(timeout=120)
+    assert output_text.endswith(b"done\n"), output_text.decode()
 
 
 @contextmanager
@@ -254,9 +254,9 @@ def test_forged_heartbeat_silences_a_subscription(cable: Cable, tmp_path: Path) 
     """CycloneDDS follows RTPS: samples before the oldest available one are lost; see docs/studies/hostile.md."""
     with unharmed(cable, tmp_path, "dds") as came:
         attacked(cable.hosts[1], "heartbeat")
-        said = newest(tmp_path / "sent") + 1  # sent, and perhaps not yet in the log
-        wait_until(lambda: newest(tmp_path / "sent") > said + 50, Deadline.after(60))
-        assert 0 <= newest(came) <= said
+        output_text = newest(tmp_path / "sent") + 1  # sent, and perhaps not yet in the log
+        wait_until(lambda: newest(tmp_path / "sent") > output_text + 50, Deadline.after(60))
+        assert 0 <= newest(came) <= output_text
 
 
 def newest(log: Path) -> int:

@@ -128,14 +128,14 @@ from fieldkit.agent import ros2
 from fieldkit.agent.middleware import MiddlewareError, Network, Quality
 made = ros2.profile(Quality("best_effort", "keep_last", 7, "transient_local", 100_000_000, 2_000_000_000))
 policies = [made.reliability.name, made.history.name, made.depth, made.durability.name]
-said = []
+errors = []
 try:
     ros2.message_type("lab_msgs/msg/Radio")
 except MiddlewareError as error:
-    said = str(error)
+    errors = str(error)
 ways = {way: ros2.environment(Network("10.0.0.1", discovery=way, peers=("10.0.0.2", "10.0.0.3"), domain=7))
         for way in ("environment", "multicast", "peers")}
-print(json.dumps([policies, made.deadline.nanoseconds, made.lifespan.nanoseconds, said, ways]))
+print(json.dumps([policies, made.deadline.nanoseconds, made.lifespan.nanoseconds, errors, ways]))
 """
 
 

@@ -71,8 +71,10 @@ def test_shares_cover_for_any_burst_length(
         sent = np.full(lost.shape, packets)
         coverages.append(covered(shares(lost, sent), rate))
         naive.append(covered(wilsons(lost.sum(axis=1), sent.sum(axis=1)), rate))
-    record_property("said", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(coverages)}")
-    record_property("said", f"the same by Wilson: {rounded(naive)}")
+    record_property(
+        "result", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(coverages)}"
+    )
+    record_property("result", f"the same by Wilson: {rounded(naive)}")
     low, high = (96.0, 99.5) if (packets, rate) in RARE else BAND
     assert all(low <= percentage <= high for percentage in coverages)
     assert BAND[0] <= naive[0] <= BAND[1], "Wilson, of losses independent losses"
@@ -93,7 +95,7 @@ def test_shares_of_few_repeats_cover_nearly_as_often(n: int, record_property: Ca
         for rate in RATES
         for burst in BURSTS
     ]
-    record_property("said", f"share, {n} repeats of 36: {min(coverages):.1f} to {max(coverages):.1f} %")
+    record_property("result", f"share, {n} repeats of 36: {min(coverages):.1f} to {max(coverages):.1f} %")
     assert min(coverages) > 92
 
 
@@ -105,7 +107,9 @@ def test_shares_cover_if_repeats_send_different_numbers(
     sent = np.concatenate([np.full((CELLS, 10), size) for size in (36, 215)], axis=1)
     lost = np.concatenate([lost_in_bursts(random, 0.05, burst, (CELLS, 10), size) for size in (36, 215)], axis=1)
     coverages = covered(shares(lost, sent), 0.05)
-    record_property("said", f"share, 10 repeats of 36 and 10 of 215, 5 % lost, bursts of {burst}: {coverages:.1f} %")
+    record_property(
+        "result", f"share, 10 repeats of 36 and 10 of 215, 5 % lost, bursts of {burst}: {coverages:.1f} %"
+    )
     assert BAND[0] <= coverages <= BAND[1]
 
 
@@ -124,7 +128,7 @@ def test_shares_cover_less_if_repeats_differ_strongly(
     label = f"{rate:.0%} lost, ".replace("%", " %") + (
         "all of 36" if largest == 36 else f"half of 36, half of {largest}"
     )
-    record_property("said", f"share, repeats that differ by far, {label}: {rounded(coverages)}")
+    record_property("result", f"share, repeats that differ by far, {label}: {rounded(coverages)}")
     assert in_method(label) == pytest.approx(coverages, abs=0.8)
 
 
@@ -155,8 +159,10 @@ def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Call
     of_mean = [covered(means(values), mean) for values in drawn]
     of_median = [covered(medians(values), middle) for values in drawn]
     plain = covered(percentile_bootstrap(random, drawn[-1]), mean)
-    record_property("said", f"mean, {name}, 5, 10, 20 repeats: {rounded(of_mean)}, percentile bootstrap {plain:.1f}")
-    record_property("said", f"median, {name}, 5, 10, 20 repeats: {rounded(of_median)}")
+    record_property(
+        "result", f"mean, {name}, 5, 10, 20 repeats: {rounded(of_mean)}, percentile bootstrap {plain:.1f}"
+    )
+    record_property("result", f"median, {name}, 5, 10, 20 repeats: {rounded(of_median)}")
     assert BAND[0] <= of_mean[-1] <= BAND[1]
     assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)
     assert abs(of_mean[-1] - 95) < abs(plain - 95)
@@ -172,7 +178,7 @@ def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Call
     of_mean = [covered(mean_shares(values), rate) for values in drawn]
     of_median = [covered(medians(values), middle) for values in drawn]
     plain = covered(percentile_bootstrap(random, drawn[-1]), rate)
-    record_property("said", f"shares lost, bursts of {burst}: mean {rounded(of_mean)}, median {rounded(of_median)}")
+    record_property("result", f"shares lost, bursts of {burst}: mean {rounded(of_mean)}, median {rounded(of_median)}")
     assert all(BAND[0] <= percentage <= BAND[1] for percentage in of_mean)
     assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)
     assert in_method(f"share lost, bursts of {burst}") == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
@@ -206,7 +212,7 @@ def test_medians_have_the_assured_coverage_for_any_distribution(
     random = np.random.default_rng(16)
     draw, middle = SHAPES[name]
     coverages = {n: covered(medians(draw(random, (CELLS, n))), middle) for n in FEW_AND_MANY}
-    record_property("said", f"median, {name}, of {FEW_AND_MANY}: {rounded(list(coverages.values()))}")
+    record_property("result", f"median, {name}, of {FEW_AND_MANY}: {rounded(list(coverages.values()))}")
     assert all(percentage >= 100 * assured(n) - 1 for n, percentage in coverages.items())
     assert in_method(f"median, {name}") == pytest.approx(list(coverages.values()), abs=0.8)
 

@@ -166,7 +166,7 @@ def test_tables_become_data_frames(recorded_trial: Path) -> None:
 
 
 def test_only_data_frames_need_pandas(recorded_trial: Path) -> None:
-    said = """
+    output_text = """
 import sys, fieldkit
 class WithoutPandas:
     def find_spec(self, name, path=None, target=None):
@@ -178,7 +178,7 @@ print(len(trials.repeats), len(trials.cells()) > 0, len(trials.packets("udp-01")
 trials.repeats.to_pandas()
 """
     done = subprocess.run(
-        (sys.executable, "-c", said, str(recorded_trial)), capture_output=True, text=True, check=False
+        (sys.executable, "-c", output_text, str(recorded_trial)), capture_output=True, text=True, check=False
     )
     assert done.stdout == f"2 True {PACKETS}\n"
     assert "ModuleNotFoundError: No module named 'pandas'" in done.stderr
@@ -266,8 +266,8 @@ def test_rebuild_measures_the_evidence_again(recorded_trial: Path) -> None:
 
 
 def test_the_package_imports_its_readers_lazily() -> None:
-    said = "import sys; before = set(sys.modules); import fieldkit; print(*sorted(set(sys.modules) - before))"
-    done = subprocess.run((sys.executable, "-c", said), capture_output=True, text=True, check=True)
+    output_text = "import sys; before = set(sys.modules); import fieldkit; print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run((sys.executable, "-c", output_text), capture_output=True, text=True, check=True)
     assert done.stdout == "fieldkit\n"
     assert fieldkit.load is api.load
     with pytest.raises(AttributeError, match="has no attribute 'lod'"):

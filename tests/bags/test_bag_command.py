@@ -232,7 +232,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "output_text"),
     [
         (("info", "nowhere.bag"), 2, "nowhere.bag: the bag cannot be read: No such file or directory"),
         (("info", "circle.bag"), 2, "circle.bag: the bag cannot be read: Too many levels of symbolic links"),
@@ -260,7 +260,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ids=lambda connection: " ".join(connection) if isinstance(connection, tuple) else "",
 )
 def test_impossible_requests_are_reported(
-    here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, said: str
+    here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, output_text: str
 ) -> None:
     written(here, BagFormat.ROS1, expected(5))
     Path("text.bag").write_text("a text")
@@ -274,7 +274,7 @@ def test_impossible_requests_are_reported(
     shutil.copyfile(KILLED / "bz2.bag.active", "killed.bag")
     names = {path.name for path in here.iterdir()}
     assert main(["bag", *words]) == code
-    assert said in capsys.readouterr().err
+    assert output_text in capsys.readouterr().err
     assert {path.name for path in here.iterdir()} == names, "no file remains"
 
 
@@ -295,10 +295,10 @@ def test_single_mcap_file_is_a_bag(
     with alone.open("r+b") as opened:
         opened.truncate(alone.stat().st_size // 2)
     assert main(["bag", "check", str(alone)]) == EvidenceError.exit_code
-    said = capsys.readouterr().err
-    assert "there is no metadata.yaml" in said
-    assert "bytes before a record does" in said
-    assert "messages can be saved: fieldkit bag repair" in said
+    output_text = capsys.readouterr().err
+    assert "there is no metadata.yaml" in output_text
+    assert "bytes before a record does" in output_text
+    assert "messages can be saved: fieldkit bag repair" in output_text
 
 
 def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -306,10 +306,13 @@ def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureF
     cut = tmp_path / "cut.db3"
     cut.write_bytes(whole.read_bytes()[:30_000])
     assert main(["bag", "check", str(cut)]) == EvidenceError.exit_code
-    said = capsys.readouterr().err
-    assert "there is no metadata.yaml" in said
-    assert f"{cut}: database disk image is malformed" in said
-    assert "no message can be saved; SQLite may read more of it: sqlite3 OLD.db3 .recover | sqlite3 NEW.db3" in said
+    output_text = capsys.readouterr().err
+    assert "there is no metadata.yaml" in output_text
+    assert f"{cut}: database disk image is malformed" in output_text
+    assert (
+        "no message can be saved; SQLite may read more of it: sqlite3 OLD.db3 .recover | sqlite3 NEW.db3"
+        in output_text
+    )
     assert main(["bag", "repair", str(cut), str(tmp_path / "new")]) == EvidenceError.exit_code
     assert "remedy: SQLite may read more of it" in capsys.readouterr().err
 

@@ -42,7 +42,7 @@ def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "said"),
+    ("old", "new", "line", "output_text"),
     [
         ("seed: 7", "sed: 7", 5, "did you mean 'seed'?"),
         ("seed: 7", "", 1, "required key 'seed' is missing"),
@@ -64,12 +64,14 @@ def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
         ("seed: 7", "seed: 7\nexcept: [{}]", 6, "leaves out every trial"),
     ],
 )
-def test_a_wrong_file_is_reported_with_its_line(tmp_path: Path, old: str, new: str, line: int, said: str) -> None:
+def test_a_wrong_file_is_reported_with_its_line(
+    tmp_path: Path, old: str, new: str, line: int, output_text: str
+) -> None:
     assert old in LAWN
     with pytest.raises(ConfigurationError) as caught:
         names(tmp_path, LAWN.replace(old, new))
     assert caught.value.where == f"{tmp_path / 'lawn.yaml'}:{line}"
-    assert said in f"{caught.value.what} {caught.value.remedy}"
+    assert output_text in f"{caught.value.what} {caught.value.remedy}"
     assert caught.value.remedy
 
 

@@ -152,8 +152,8 @@ def test_bags_of_two_robots_need_different_names() -> None:
 
 def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
     document = schema.parse(PROCEDURE.replace("robot: sender", "robot: receiver", 1), source="los.yaml")
-    said = "the transfer from sender names no file, but no step before it records on sender"
-    with pytest.raises(ConfigurationError, match=said):
+    output_text = "the transfer from sender names no file, but no step before it records on sender"
+    with pytest.raises(ConfigurationError, match=output_text):
         schema.validate(document, Procedure)
 
 

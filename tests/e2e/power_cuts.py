@@ -13,7 +13,7 @@ from typing import Final
 
 from tests.helpers.cut_trials import calls_of_a_trial, cuts_in_a_row, robots_with_much_evidence
 from tests.helpers.disks import FILE_SYSTEMS, mount_workspace
-from tests.helpers.host import namespaces_of_our_own
+from tests.helpers.host import separate_namespaces
 
 IN_A_ROW: Final = 6
 
@@ -27,7 +27,7 @@ def main() -> int:
     generator, cuts = random.Random(arguments.seed), Counter[str]()
     with (
         tempfile.TemporaryDirectory(prefix="fieldkit-power-") as folder,
-        namespaces_of_our_own(),
+        separate_namespaces(),
         mount_workspace(Path(folder)) as place,
         robots_with_much_evidence(),
     ):

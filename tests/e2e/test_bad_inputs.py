@@ -325,7 +325,7 @@ READ: dict[str, Setup] = {
     ),
 }
 
-SECTIONS: dict[str, dict[str, Setup]] = {"Typed": TYPED, "Written in YAML": WRITTEN, "Read as trials": READ}
+SECTIONS: dict[str, dict[str, Setup]] = {"Command line": TYPED, "YAML files": WRITTEN, "Stored trials": READ}
 
 
 @pytest.mark.parametrize(("section", "cases"), SECTIONS.items())
@@ -348,12 +348,12 @@ def test_a_bad_input_gives_one_message_with_a_remedy(
 
 def check(row: Row, code: int, err: str) -> None:
     assert err.count("error: ") == 1, err
-    message = said(row.message, err)
+    message = output_text(row.message, err)
     assert message, (row.message, err)
-    assert said(row.remedy, err[message.end() :]), (row.remedy, err)
+    assert output_text(row.remedy, err[message.end() :]), (row.remedy, err)
     assert code == row.code, err
 
 
-def said(pattern: str, text: str) -> re.Match[str] | None:
+def output_text(pattern: str, text: str) -> re.Match[str] | None:
     words = (re.escape(part) for part in pattern.split("..."))
     return re.search(".*?".join(words), text, re.DOTALL)

@@ -70,7 +70,7 @@ def test_the_command_runs_with_its_declared_options(fieldkit: Fieldkit) -> None:
 
 
 def test_its_help_and_errors_look_like_those_of_other_commands(fieldkit: Fieldkit, tmp_path: Path) -> None:
-    assert "Name the repeats of a trial that lost most." in fieldkit("worst", "--help").stdout
+    assert "List the repeats of a trial with the largest loss." in fieldkit("worst", "--help").stdout
     refused = fieldkit("worst", str(TRIAL), "--by", "rtt_los")
     assert (refused.returncode, refused.stderr.count("did you mean 'rtt_loss'?")) == (2, 1), refused.stderr
     missing = fieldkit("worst", str(tmp_path))

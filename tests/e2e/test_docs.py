@@ -16,9 +16,11 @@ import pytest
 
 from docs.generator import pages as reference
 from docs.generator.commands import GUIDES
+from docs.generator.models import rows
 from fieldkit import cli
 from fieldkit.config import documentation
 from fieldkit.steps.base import Step
+from fieldkit.steps.kinds.run import RunStep
 from tests.helpers.paths import ROOT
 
 PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
@@ -150,6 +152,11 @@ def test_every_row_of_the_reference_has_a_meaning() -> None:
     for name, text in reference.pages().items():
         empty = [line for line in text.splitlines() if line.startswith("| ") and line.endswith("|  |")]
         assert not empty, name
+
+
+def test_a_key_has_the_meaning_of_its_field_and_not_of_an_attribute_of_the_base_class() -> None:
+    meanings = {key: meaning for key, _, meaning in rows(RunStep)}
+    assert meanings["`columns`"] == "Columns of `trial.csv`, each read from the output."
 
 
 def test_every_page_has_a_place_in_the_sidebar() -> None:

@@ -41,10 +41,10 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 def exported(path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> int:
     out = path.parent / f"out.{form}"
     code = main(["export", str(path), "--format", form, "-o", str(out)])
-    said = capsys.readouterr().err
+    output_text = capsys.readouterr().err
     assert code in {0, 2, 4}
     assert out.exists() is (code == 0), "an incomplete file is removed"
-    assert code == 0 or ("error: " in said and "remedy: " in said)
+    assert code == 0 or ("error: " in output_text and "remedy: " in output_text)
     return code
 
 

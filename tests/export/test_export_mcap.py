@@ -29,7 +29,7 @@ class Read:
 
     topic: str
     time_ns: int
-    said: dict[str, Any]
+    content: dict[str, Any]
     schema: dict[str, Any]
     clock: str
 
@@ -40,12 +40,12 @@ def exported(trial: Path, name: str = "out.mcap") -> bytes:
     return out.read_bytes()
 
 
-def messages(content: bytes) -> list[Read]:
+def messages(file: bytes) -> list[Read]:
     read_messages = []
-    for schema, channel, message in make_reader(io.BytesIO(content), validate_crcs=True).iter_messages():
+    for schema, channel, message in make_reader(io.BytesIO(file), validate_crcs=True).iter_messages():
         assert schema
-        said, form = json.loads(message.data), json.loads(schema.data)
-        read_messages.append(Read(channel.topic, message.log_time, said, form, channel.metadata["clock"]))
+        content, form = json.loads(message.data), json.loads(schema.data)
+        read_messages.append(Read(channel.topic, message.log_time, content, form, channel.metadata["clock"]))
     return read_messages
 
 
@@ -65,10 +65,12 @@ def of(read_messages: list[Read], topic: str) -> list[Read]:
 
 def test_every_message_conforms_to_its_schema_and_has_its_own_time(read_messages: list[Read]) -> None:
     for message in read_messages:
-        jsonschema.validate(message.said, message.schema)
-        stamp = message.said["transforms"][0]["timestamp"] if message.topic == "/tf" else message.said["timestamp"]
+        jsonschema.validate(message.content, message.schema)
+        stamp = (
+            message.content["transforms"][0]["timestamp"] if message.topic == "/tf" else message.content["timestamp"]
+        )
         assert stamp["sec"] * SECOND_NS + stamp["nsec"] == message.time_ns
-        assert message.said.keys() <= message.schema["properties"].keys(), "a field that is not in the schema"
+        assert message.content.keys() <= message.schema["properties"].keys(), "a field that is not in the schema"
 
 
 def test_the_index_the_statistics_and_the_stream_agree(trial: Path) -> None:
@@ -99,19 +101,19 @@ def test_the_index_the_statistics_and_the_stream_agree(trial: Path) -> None:
 
 def test_the_log_is_the_journal(read_messages: list[Read], trial: Path) -> None:
     lines = (trial / journal.JOURNAL_FILE).read_text(encoding="utf-8").splitlines()
-    said = [
-        (message.said["level"], message.said["name"], message.said["message"])
+    entries = [
+        (message.content["level"], message.content["name"], message.content["message"])
         for message in of(read_messages, "/trial/log")
     ]
-    assert said == [
+    assert entries == [
         (2, "udp-01", "attempt 1 running"),
         (3, "udp-01", "attempt 1 void: ping.txt is missing"),
         (2, "udp-01", "attempt 2 running"),
         (2, "udp-01", "attempt 2 valid"),
     ]
     for message in of(read_messages, "/trial/log"):
-        entry = json.loads(lines[message.said["line"] - 1])
-        assert (message.said["file"], message.time_ns) == (journal.JOURNAL_FILE, entry["utc_ns"])
+        entry = json.loads(lines[message.content["line"] - 1])
+        assert (message.content["file"], message.time_ns) == (journal.JOURNAL_FILE, entry["utc_ns"])
 
 
 def test_each_packet_has_its_robots_time_and_its_fate(read_messages: list[Read]) -> None:
@@ -119,9 +121,9 @@ def test_each_packet_has_its_robots_time_and_its_fate(read_messages: list[Read])
     first_ns = BEGIN_NS + 2 * SECOND_NS
     assert [message.time_ns for message in sent] == [first_ns + 1_000_000 * index for index in range(PACKETS)]
     assert came[0].time_ns == first_ns + AHEAD_NS
-    assert [index for index, message in enumerate(sent) if message.said["lost"]] == list(LOST)
-    assert [message.said["copy"] for message in came] == [False] * (PACKETS - len(LOST)) + [True]
-    assert sent[REPEATED].said == {
+    assert [index for index, message in enumerate(sent) if message.content["lost"]] == list(LOST)
+    assert [message.content["copy"] for message in came] == [False] * (PACKETS - len(LOST)) + [True]
+    assert sent[REPEATED].content == {
         "timestamp": {"sec": first_ns // SECOND_NS, "nsec": 1_000_000 * REPEATED},
         "repeat": "udp-01",
         "protocol": 17,
@@ -152,25 +154,25 @@ def test_every_topic_names_its_clock(read_messages: list[Read]) -> None:
 
 def test_replies_and_phases_are_those_of_the_evidence(read_messages: list[Read]) -> None:
     replies = of(read_messages, "/sender/rtt")
-    assert [message.said["rtt_s"] for message in replies] == [rtt_ms / 1e3 for rtt_ms in RTT_MS]
+    assert [message.content["rtt_s"] for message in replies] == [rtt_ms / 1e3 for rtt_ms in RTT_MS]
     assert [message.time_ns for message in replies] == [
         BEGIN_NS + 3 * SECOND_NS + 200_000_000 * index for index in range(3)
     ]
-    assert [message.said["message"] for message in of(read_messages, "/sender/log")] == [
+    assert [message.content["message"] for message in of(read_messages, "/sender/log")] == [
         f"icmp_seq=4: {recorded.SENDER} reports Destination Host Unreachable"
     ]
-    assert [message.said["phase"] for message in of(read_messages, "/receiver/phase")] == ["transfer", "idle"]
+    assert [message.content["phase"] for message in of(read_messages, "/receiver/phase")] == ["transfer", "idle"]
     # The time stamps of the bag are those of the trial's start.
     starts_ns = {
-        message.said["phase"]: message.time_ns
+        message.content["phase"]: message.time_ns
         for message in of(read_messages, "/sender/phase")
-        if message.said["phase"] != "idle"
+        if message.content["phase"] != "idle"
     }
     assert starts_ns == {"record": START_NS, "transfer": BEGIN_NS + 2 * SECOND_NS, "ping": BEGIN_NS + 3 * SECOND_NS}
 
 
 def test_the_robots_are_at_their_planned_places(read_messages: list[Read]) -> None:
-    transforms = [transform for read in of(read_messages, "/tf")[:3] for transform in read.said["transforms"]]
+    transforms = [transform for read in of(read_messages, "/tf")[:3] for transform in read.content["transforms"]]
     assert {transform["child_frame_id"]: transform["translation"] for transform in transforms} == {
         "duckiedrone-1": {"x": 0, "y": 0, "z": 0},
         "turtlebot-1": {"x": pytest.approx(-9.144), "y": 0, "z": 0},
@@ -179,7 +181,7 @@ def test_the_robots_are_at_their_planned_places(read_messages: list[Read]) -> No
 
 
 def test_the_numbers_of_each_attempt_leave_out_what_is_missing(read_messages: list[Read]) -> None:
-    void, valid = (message.said for message in of(read_messages, "/repeat/udp"))
+    void, valid = (message.content for message in of(read_messages, "/repeat/udp"))
     assert (void["repeat"], void["status"], void["reason"]) == ("udp-01.void1", "void", "ping.txt is missing")
     assert "ip_loss" not in void
     assert valid["ip_loss"] == pytest.approx(len(LOST) / PACKETS)
@@ -197,7 +199,7 @@ def test_many_packets_go_into_several_compressed_chunks(tmp_path: Path) -> None:
     assert summary
     assert len(summary.chunk_indexes) > 2
     assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
-    lost = [message.said["lost"] for message in messages(content) if message.topic == "/sender/packets"]
+    lost = [message.content["lost"] for message in messages(content) if message.topic == "/sender/packets"]
     assert (len(lost), sum(lost)) == (10_000, 1_000)
 
 
@@ -206,9 +208,11 @@ def test_a_damaged_capture_gives_what_is_before_the_damage_and_no_fates(trial: P
     path.write_bytes(path.read_bytes()[:-1])
     read_messages = messages(exported(trial))
     assert len(of(read_messages, "/receiver/packets")) == PACKETS - len(LOST)
-    assert not any("lost" in message.said or "copy" in message.said for message in read_messages)
+    assert not any("lost" in message.content or "copy" in message.content for message in read_messages)
     (warning,) = (
-        message.said for message in of(read_messages, "/trial/log") if message.said["file"].endswith("receiver.pcap")
+        message.content
+        for message in of(read_messages, "/trial/log")
+        if message.content["file"].endswith("receiver.pcap")
     )
     assert warning["message"].startswith("ends inside the packet at byte")
     assert warning["level"] == 3
@@ -225,7 +229,7 @@ def test_frames_of_offload_have_no_fates(trial: Path, payload_bytes: int, has_fa
     sent = [recorded.segment(number, payload_bytes) for number in range(10)]
     (folder / "sender.pcap").write_bytes(file_bytes(timed(sent)))
     (folder / "receiver.pcap").write_bytes(file_bytes(timed(sent[1:])))
-    lost = [message.said.get("lost") for message in of(messages(exported(trial)), "/sender/packets")]
+    lost = [message.content.get("lost") for message in of(messages(exported(trial)), "/sender/packets")]
     assert lost == ([True] + [False] * 9 if has_fates else [None] * 10)
 
 
@@ -242,7 +246,7 @@ def test_packets_that_cannot_be_matched_have_no_fates(trial: Path, ip_id: int, t
     (folder / "receiver.pcap").write_bytes(file_bytes(received))
     read_messages = messages(exported(trial))
     assert (len(of(read_messages, "/sender/packets")), len(of(read_messages, "/receiver/packets"))) == (10, 9)
-    assert not any("lost" in message.said or "copy" in message.said for message in read_messages)
+    assert not any("lost" in message.content or "copy" in message.content for message in read_messages)
 
 
 def test_replies_without_a_time_stamp_are_left_out_and_reported(trial: Path) -> None:
@@ -252,7 +256,7 @@ def test_replies_without_a_time_stamp_are_left_out_and_reported(trial: Path) -> 
     read_messages = messages(exported(trial))
     assert not of(read_messages, "/sender/rtt")
     (warning,) = (
-        message.said for message in of(read_messages, "/trial/log") if message.said["file"].endswith("ping.txt")
+        message.content for message in of(read_messages, "/trial/log") if message.content["file"].endswith("ping.txt")
     )
     assert warning["message"] == "3 replies have no time stamp and are left out"
 
@@ -277,10 +281,10 @@ def test_a_track_replaces_the_planned_places(trial: Path) -> None:
     ]
     (folder / "track.csv").write_text(track.text(went), encoding="ascii")
     read_messages = messages(exported(trial, "tracked.mcap"))
-    places = [message.said["transforms"][0]["translation"] for message in of(read_messages, "/tf")]
+    places = [message.content["transforms"][0]["translation"] for message in of(read_messages, "/tf")]
     assert places == [{"x": 1.0, "y": 2.0, "z": 0.2}, {"x": 1.5, "y": 2.0, "z": 0.2}]
     assert all(
-        message.said["transforms"][0]["child_frame_id"] == "turtlebot-1" for message in of(read_messages, "/tf")
+        message.content["transforms"][0]["child_frame_id"] == "turtlebot-1" for message in of(read_messages, "/tf")
     )
     times_ns = [message.time_ns for message in of(read_messages, "/tf")]
     assert times_ns == sorted(times_ns)
@@ -299,14 +303,14 @@ def test_added_positions_replace_the_testbeds_track(trial: Path) -> None:
     assert main(["positions", str(trial), f"receiver={trial.parent / 'walk.csv'}", "sender=1m,2m"]) == 0
     read_messages = messages(exported(trial, "messages.mcap"))
     for message in read_messages:
-        jsonschema.validate(message.said, message.schema)
-    transforms = [message.said["transforms"][0] for message in of(read_messages, "/tf")]
+        jsonschema.validate(message.content, message.schema)
+    transforms = [message.content["transforms"][0] for message in of(read_messages, "/tf")]
     assert {(transform["parent_frame_id"], transform["child_frame_id"]) for transform in transforms} == {
         ("metres", "turtlebot-1")
     }
     fixes = of(read_messages, "/receiver/location")
-    assert all("altitude" not in message.said for message in fixes)
-    assert {message.said["longitude"] for message in fixes} == {12, 13}, (
+    assert all("altitude" not in message.content for message in fixes)
+    assert {message.content["longitude"] for message in fixes} == {12, 13}, (
         "the position at the start of an attempt, not of another day"
     )
     assert fixes[0].time_ns == began_ns
@@ -318,10 +322,10 @@ def test_link_samples_have_a_channel_per_robot(trial: Path) -> None:
     samples = [LinkSample(BEGIN_NS, (known,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]
     (folder / link_samples.FILE).write_text(link_samples.text({Role.SENDER: samples}), encoding="ascii")
     (sample,) = of(messages(exported(trial)), "/sender/link")
-    jsonschema.validate(sample.said, sample.schema)
+    jsonschema.validate(sample.content, sample.schema)
     assert (sample.time_ns, sample.clock) == (BEGIN_NS, "sender turtlebot-1")
-    assert (sample.said["noise_dbm"], sample.said["active_s"], sample.said["busy_s"]) == (-95.0, 2.0, 1.0)
-    assert sample.said["stations"] == [
+    assert (sample.content["noise_dbm"], sample.content["active_s"], sample.content["busy_s"]) == (-95.0, 2.0, 1.0)
+    assert sample.content["stations"] == [
         {
             "station": "turtlebot-2",
             "signal_dbm": -51.25,

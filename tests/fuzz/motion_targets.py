@@ -174,9 +174,9 @@ def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
     assert all(math.isfinite(float(value)) for value in found.values.values())  # gates reject excessive distances
     position_columns.distances_m(evidence, _ENDS)
     position_columns.readable_samples(evidence)
-    said = position_sources.read(folder / position_sources.FILE)
-    (place / "again.json").write_text(position_sources.text(said), encoding="utf-8")
-    assert position_sources.read(place / "again.json") == said
+    output_text = position_sources.read(folder / position_sources.FILE)
+    (place / "again.json").write_text(position_sources.text(output_text), encoding="utf-8")
+    assert position_sources.read(place / "again.json") == output_text
     position_columns.sources_text(evidence)
     assert math.isfinite(position_columns.clock_error_s(evidence) or 0.0)
 

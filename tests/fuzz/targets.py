@@ -144,9 +144,12 @@ def _measure_fault(data: bytes, place: Path) -> None:
 def _judge_sections(data: bytes, _: Path) -> None:
     """Judge a robot by a mutated probe, and by sections that all have the same text."""
     text = data.decode(errors="replace")
-    the_plan, said = los_plan(), CommandResult(text.strip("\n"), 0)
+    the_plan, output_text = los_plan(), CommandResult(text.strip("\n"), 0)
     names = ("wifi-info", "wifi-link", "wifi-stations", "wifi-power-save", "interface", "offloads", "control", "disk")
-    for sections in (probe.parse(text), dict.fromkeys((*names, "listeners", "batteries", "tools", "wireless"), said)):
+    for sections in (
+        probe.parse(text),
+        dict.fromkeys((*names, "listeners", "batteries", "tools", "wireless"), output_text),
+    ):
         report = Report("robot")
         for role, robot in CAST.items():
             radio.judge(robot, sections, report)

@@ -55,7 +55,7 @@ STRICTEST: Final = FILE_SYSTEMS[1]
 def mount_workspace(folder: Path) -> Iterator[Path]:
     """Yield `folder` with a file system in memory, for disks and images.
 
-    Call it in a separate mount namespace (`host.namespaces_of_our_own`): the kernel removes all mounts in it, and
+    Call it in a separate mount namespace (`host.separate_namespaces`): the kernel removes all mounts in it, and
     their loop devices, when the thread that owns the namespace ends.
     """
     _run("mount", "-t", "tmpfs", "-o", "size=8g", "power", str(folder))

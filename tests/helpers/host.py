@@ -48,7 +48,7 @@ def host_state() -> HostState:
 
 
 @contextmanager
-def namespaces_of_our_own() -> Iterator[None]:
+def separate_namespaces() -> Iterator[None]:
     """Give the calling thread and its children a separate network with only loopback, and separate mounts.
 
     No other process of the machine adds anything there, so everything that remains is a leak of the test.

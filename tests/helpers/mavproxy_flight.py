@@ -138,7 +138,7 @@ def fly(port: int, state: DroneState) -> dict[str, object]:
         type_until("long DO_SET_MODE 157 4 6", lambda: state.place_m[2] < HEIGHT_M / 2)  # PX4's AUTO and LAND
         until(lambda: DISARMED in output and not state.armed)
         output_text = output.decode(errors="replace")
-    return {"nearest_m": state.nearest_m, "height_m": state.place_m[2], "said": output_text}
+    return {"nearest_m": state.nearest_m, "height_m": state.place_m[2], "output": output_text}
 
 
 def main(host: str, port: str, loss: str) -> None:

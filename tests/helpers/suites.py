@@ -28,8 +28,8 @@ class SuiteRun:
 
     Attributes:
         code: Exit code.
-        said: Output.
-        ended: Result of each test: `passed`, `failure` or `error`.
+        output: Output.
+        results: Result of each test: `passed`, `failure` or `error`.
         properties: Recorded properties of each test, as pairs of name and value.
     """
 

@@ -112,7 +112,7 @@ class Ended:
     """The result of a recorder."""
 
     code: int
-    said: dict[str, Any]
+    output_text: dict[str, Any]
     log: Path
 
 
@@ -136,9 +136,9 @@ def recording(program: Path, log: Path, connection: str, **arguments: object) ->
             assert process.stderr.readline() == b"up, MAVLink\n"
             yield ended
             process.send_signal(signal.SIGINT)
-            said, errors = process.communicate(timeout=60)
+            output_text, errors = process.communicate(timeout=60)
             assert errors == b""
-            ended.code, ended.said = process.returncode, json.loads(said)
+            ended.code, ended.output_text = process.returncode, json.loads(output_text)
         finally:
             process.kill()
 
@@ -232,9 +232,9 @@ def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path
         wait_until_size(ended.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
     assert ended.code == 0
     types = kinds(ended.log)
-    read = tlog.read(ended.log, 0, ended.said["ended_us"])
-    assert ended.said["frames"] == read.frames == len(types)
-    assert (ended.said["refused"], ended.said["left_out"]) == ({}, 0)
+    read = tlog.read(ended.log, 0, ended.output_text["ended_us"])
+    assert ended.output_text["frames"] == read.frames == len(types)
+    assert (ended.output_text["refused"], ended.output_text["left_out"]) == ({}, 0)
     assert read.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
     assert read.values["mavlink_loss"] == 0
     assert types.count("LOCAL_POSITION_NED") > 3 * types.count("ATTITUDE")
@@ -265,7 +265,7 @@ def test_refused_rate_is_reported(program: Path, tmp_path: Path) -> None:
         recording(program, tmp_path / "x.tlog", connection, intervals_us={"12345": 1, "1": 500_000}) as ended,
     ):
         pass
-    assert ended.said["refused"] == {"12345": d.MAV_RESULT_FAILED}
+    assert ended.output_text["refused"] == {"12345": d.MAV_RESULT_FAILED}
 
 
 def test_waits_for_the_given_system_and_reports_it(program: Path, tmp_path: Path) -> None:
@@ -395,7 +395,7 @@ def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
         with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended:
             wait_until_size(ended.log, 12_000)
     assert ended.code == 0
-    read = tlog.read(ended.log, drones.SYSTEM, ended.said["ended_us"])
-    assert read.frames == ended.said["frames"]
+    read = tlog.read(ended.log, drones.SYSTEM, ended.output_text["ended_us"])
+    assert read.frames == ended.output_text["frames"]
     assert int(read.values["mavlink_damaged"]) > 10
     assert read.kinds["LOCAL_POSITION_NED"] > 5

@@ -193,10 +193,10 @@ def ran(folder: Path) -> SuiteRun:
     return suites.run(folder)
 
 
-def part(said: str, title: str) -> str:
+def part(output_text: str, title: str) -> str:
     """Return the output of pytest for one test that did not pass."""
-    match = re.search(rf"^_+ {title} _+$(.*?)(?=^_{{3,}} \S|^={{3,}} |\Z)", said, re.MULTILINE | re.DOTALL)
-    assert match, said
+    match = re.search(rf"^_+ {title} _+$(.*?)(?=^_{{3,}} \S|^={{3,}} |\Z)", output_text, re.MULTILINE | re.DOTALL)
+    assert match, output_text
     return match[1]
 
 
@@ -213,10 +213,10 @@ def test_tests_pass_fail_and_have_errors_of_the_lab(ran: SuiteRun) -> None:
 
 
 def test_a_failure_is_reported_with_the_line_of_the_test(ran: SuiteRun) -> None:
-    said = part(ran.output, "test_fails_because_of_a_program")
-    assert '>       robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])' in said
-    assert "rover: `sh -c 'echo broken >&2; exit 3'` exited with code 3: broken" in said
-    assert "/fieldkit/" not in said, "no internals of fieldkit are shown"
+    output_text = part(ran.output, "test_fails_because_of_a_program")
+    assert '>       robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])' in output_text
+    assert "rover: `sh -c 'echo broken >&2; exit 3'` exited with code 3: broken" in output_text
+    assert "/fieldkit/" not in output_text, "no internals of fieldkit are shown"
     assert "rover: `sleep 60` did not end in time" in part(ran.output, "test_fails_because_of_a_timeout")
     assert "where inf = CellFigure(name='file_loss', unit='share', n=1" in part(
         ran.output, "test_fails_because_of_a_figure"
@@ -225,9 +225,9 @@ def test_a_failure_is_reported_with_the_line_of_the_test(ran: SuiteRun) -> None:
 
 
 def test_an_error_of_the_lab_is_reported_with_its_remedy(ran: SuiteRun) -> None:
-    said = part(ran.output, "ERROR at setup of test_uses_an_unknown_robot")
-    assert "there is no robot 'sendr' in this lab\n  remedy: did you mean 'sender'?" in said
-    assert "requested at test_robots.py:" in said
+    output_text = part(ran.output, "ERROR at setup of test_uses_an_unknown_robot")
+    assert "there is no robot 'sendr' in this lab\n  remedy: did you mean 'sender'?" in output_text
+    assert "requested at test_robots.py:" in output_text
     assert "the site file gives no roles for topology master" in part(
         ran.output, "ERROR at setup of test_uses_robots_missing_in_the_site"
     )
@@ -281,6 +281,6 @@ def test_nothing_remains_after_ctrl_c(tmp_path: Path) -> None:
     started = descendants(process.pid)
     assert len(started) > 3, "two robots and the radio model"
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=120)
-    assert (process.returncode, "KeyboardInterrupt" in said) == (2, True), said
+    output_text, _ = process.communicate(timeout=120)
+    assert (process.returncode, "KeyboardInterrupt" in output_text) == (2, True), output_text
     wait_for_end(started, within_s=60.0)

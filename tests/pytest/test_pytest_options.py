@@ -17,8 +17,8 @@ ASKS = "def test_asks(robots):\n    pass\n"
 TOLD = """
 def test_told(lab_options, pytestconfig):
     from fieldkit.pytest import plugin_options
-    said = lab_options, plugin_options.output(pytestconfig), plugin_options.keep(pytestconfig)
-    print(*(f"[{one}]" for one in said), sep="\\n")
+    values = lab_options, plugin_options.output(pytestconfig), plugin_options.keep(pytestconfig)
+    print(*(f"[{one}]" for one in values), sep="\\n")
 """
 OTHERS = """
 import sys
@@ -108,11 +108,11 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
     below = pytester.mkdir("below")
     suites.write(below, site=None, test_told=TOLD)
     os.chdir(below)
-    said = run(pytester, "-s", "--fieldkit-backend", "field", "--fieldkit-output", "mine").stdout.str()
-    assert f"site=PosixPath('{pytester.path}/ours.yaml')" in said
-    assert "LabOptions(backend='field'" in said
-    assert "topology='masterless'" in said
-    assert f"[{below}/mine]\n[all]" in said
+    output_text = run(pytester, "-s", "--fieldkit-backend", "field", "--fieldkit-output", "mine").stdout.str()
+    assert f"site=PosixPath('{pytester.path}/ours.yaml')" in output_text
+    assert "LabOptions(backend='field'" in output_text
+    assert "topology='masterless'" in output_text
+    assert f"[{below}/mine]\n[all]" in output_text
 
 
 @pytest.mark.parametrize(
@@ -129,17 +129,17 @@ def test_an_invalid_lab_is_an_error_of_set_up(
     suites.write(pytester.path, test_asks=ASKS)
     done = run(pytester, *words)
     assert (done.ret, done.parseoutcomes()) == (1, {"errors": 1})
-    said = done.stdout.str()
-    assert "ERROR at setup of test_asks" in said
-    assert what in said
-    assert remedy in said
-    assert "/fieldkit/" not in said, "no internals of fieldkit are shown"
+    output_text = done.stdout.str()
+    assert "ERROR at setup of test_asks" in output_text
+    assert what in output_text
+    assert remedy in output_text
+    assert "/fieldkit/" not in output_text, "no internals of fieldkit are shown"
 
 
 def test_a_full_traceback_is_shown_on_request(pytester: pytest.Pytester) -> None:
     suites.write(pytester.path, test_asks=ASKS)
-    said = run(pytester, "--fieldkit-backend", "emulatd", "--tb=long").stdout.str()
-    assert "fieldkit/backends/registry.py" in said
+    output_text = run(pytester, "--fieldkit-backend", "emulatd", "--tb=long").stdout.str()
+    assert "fieldkit/backends/registry.py" in output_text
 
 
 @pytest.mark.parametrize(

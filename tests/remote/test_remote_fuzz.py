@@ -107,19 +107,19 @@ def fetched(content: bytes) -> dict[str, bytes] | None:
     with tempfile.TemporaryDirectory() as folder:
         into = Path(folder, "outer", "into")
         into.mkdir(parents=True)
-        said: FieldkitError | None = None
+        output_text: FieldkitError | None = None
         try:
             fetching.fetch(Sender(Path(folder), content), "x", "sender", "lo", into)
         except FieldkitError as error:
-            said = error
-        assert said is None or harmless(said)
+            output_text = error
+        assert output_text is None or harmless(output_text)
         assert [path.name for path in Path(folder).iterdir()] == ["outer"]
         assert [path.name for path in Path(folder, "outer").iterdir()] == ["into"]
         everything = list(into.rglob("*"))
         assert not [path for path in everything if path.is_symlink() or not (path.is_file() or path.is_dir())]
         assert not [path for path in everything if path.name.startswith(".")]
         files = {str(path.relative_to(into)): path.read_bytes() for path in everything if path.is_file()}
-        return files if said is None else None
+        return files if output_text is None else None
 
 
 @given(st.lists(ENTRIES | WHOLE, max_size=5), st.binary(max_size=30))
@@ -201,9 +201,9 @@ def test_output_of_a_robot_is_one_printable_line(data: bytes) -> None:
 
 
 @given(BYTES, st.integers(0, 255), st.sampled_from([b"", b"job.sh: ", b"job.sh: held ", b"job.sh: aborted 1 "]))
-def test_any_answer_of_the_script_raises_an_error_of_fieldkit(said: bytes, code: int, start: bytes) -> None:
+def test_any_answer_of_the_script_raises_an_error_of_fieldkit(output_text: bytes, code: int, start: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        shell = Sender(Path(folder), said, code=code, stderr=start + said)
+        shell = Sender(Path(folder), output_text, code=code, stderr=start + output_text)
         said_then: FieldkitError | None = None
         try:
             script.call(shell, "left", deadline=Deadline.after(1))
@@ -215,7 +215,7 @@ def test_any_answer_of_the_script_raises_an_error_of_fieldkit(said: bytes, code:
 
 
 @pytest.mark.parametrize(
-    ("code", "said", "kind"),
+    ("code", "output_text", "kind"),
     [
         (75, b"job.sh: held 99999999999 99999999999 99999999999 \x1b[2J x", RobotError),
         (76, b"job.sh: aborted 99999999999 \xe2\x80\xae x", LockLostError),
@@ -224,9 +224,11 @@ def test_any_answer_of_the_script_raises_an_error_of_fieldkit(said: bytes, code:
         (76, b"", RobotError),
     ],
 )
-def test_invented_lock_of_a_robot_is_reported(code: int, said: bytes, kind: type[RobotError], tmp_path: Path) -> None:
+def test_invented_lock_of_a_robot_is_reported(
+    code: int, output_text: bytes, kind: type[RobotError], tmp_path: Path
+) -> None:
     with pytest.raises(kind) as caught:
-        script.call(Sender(tmp_path, code=code, stderr=said), "begin", deadline=Deadline.after(1))
+        script.call(Sender(tmp_path, code=code, stderr=output_text), "begin", deadline=Deadline.after(1))
     assert caught.value.what.isprintable()
 
 

@@ -640,7 +640,7 @@ EMPTY_SUM = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 
 
 @pytest.mark.parametrize(
-    ("members", "link", "said"),
+    ("members", "link", "output_text"),
     [
         ({"../evil": b""}, "", "not a regular file"),
         ({"//etc/evil": b""}, "", "hash differs or file missing: etc/evil"),
@@ -658,12 +658,12 @@ EMPTY_SUM = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     ],
 )
 def test_archive_cannot_leave_the_folder_or_skip_checks(
-    tmp_path: Path, members: dict[str, bytes], link: str, said: str
+    tmp_path: Path, members: dict[str, bytes], link: str, output_text: str
 ) -> None:
     home, into = tmp_path / "home", tmp_path / "into"
     home.mkdir()
     into.mkdir()
-    with pytest.raises(EvidenceError, match=said):
+    with pytest.raises(EvidenceError, match=output_text):
         fetching.fetch(HostileShell(home, members, link=link), FOLDER, "sender", "lo", into)
     assert {path.name for path in tmp_path.iterdir()} == {"home", "into"}
     assert not list(into.glob(".*"))

@@ -74,8 +74,8 @@ WHOLE = {"camera.bag", "scan/scan_0.db3", "small.bag", "sender-before.txt", "sen
 
 
 def test_large_files_are_fetched_in_pieces_and_small_ones_in_an_archive(robot: Flaky, into: Path) -> None:
-    said: list[tuple[str, float]] = []
-    fetch(robot, into, progress=FetchProgress(lambda text, left_s: said.append((text, left_s))))
+    output_text: list[tuple[str, float]] = []
+    fetch(robot, into, progress=FetchProgress(lambda text, left_s: output_text.append((text, left_s))))
     assert names(into) == WHOLE
     assert (into / "camera.bag").read_bytes() == LARGE[::-1]
     assert (into / "scan" / "scan_0.db3").read_bytes() == LARGE
@@ -231,7 +231,7 @@ class HostileShell(LocalShell):
 
 
 @pytest.mark.parametrize(
-    ("large", "said"),
+    ("large", "output_text"),
     [
         ("100 ../../evil\n", "not a regular file"),
         ("100 /etc/evil\n", "not a regular file"),
@@ -244,12 +244,14 @@ class HostileShell(LocalShell):
         ("100 a.bag\n", "hash differs"),
     ],
 )
-def test_list_of_a_robot_cannot_leave_the_folder_or_fill_the_disk(tmp_path: Path, large: str, said: str) -> None:
+def test_list_of_a_robot_cannot_leave_the_folder_or_fill_the_disk(
+    tmp_path: Path, large: str, output_text: str
+) -> None:
     home, into = tmp_path / "home", tmp_path / "outer" / "into"
     home.mkdir()
     into.mkdir(parents=True)
     hashes = f"{hashlib.sha256(bytes(100)).hexdigest()}  {'x' if 'x' in large else 'y'}\n"
-    with pytest.raises((EvidenceError, RobotError), match=said):
+    with pytest.raises((EvidenceError, RobotError), match=output_text):
         fetching.fetch(HostileShell(home, large, hashes.encode()), FOLDER, "sender", "lo", into)
     assert [path.name for path in (tmp_path / "outer").iterdir()] == ["into"]
     assert names(into) <= {"x", ".sender.x.part"}

@@ -144,7 +144,7 @@ def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], FakeServer
 
 
 @pytest.mark.parametrize(
-    ("at", "said"),
+    ("at", "output_text"),
     [
         ("banner", "robot did not send its SSH banner in time"),
         ("keys", "robot did not agree on keys in time"),
@@ -155,7 +155,7 @@ def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], FakeServer
     ],
 )
 def test_any_hang_of_a_server_is_reported(
-    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., FakeServer], clock: Clock, *, at: str, said: str
+    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., FakeServer], clock: Clock, *, at: str, output_text: str
 ) -> None:
     def serve(stream: socket.socket) -> object:
         if at in {"banner", "keys"}:
@@ -166,7 +166,7 @@ def test_any_hang_of_a_server_is_reported(
         return ssh_server(stream, rsa, at, clock.something_hangs)
 
     shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
-    with pytest.raises(LinkError, match=said) as caught:
+    with pytest.raises(LinkError, match=output_text) as caught:
         shell.run(("true",), deadline=Deadline.after(HANGS_S))
     assert caught.value.where == "robot"
     assert "ssh " in caught.value.remedy
@@ -216,7 +216,7 @@ def test_flooding_server_fills_no_memory_while_nothing_is_read(
 
 
 @pytest.mark.parametrize(
-    ("flood", "said"),
+    ("flood", "output_text"),
     [
         (b"x" * 128, "its banner has more than 65536 bytes"),
         (b"SSH-2.0-x\r\n" + b"\x7f\xff\xff\xfc" * 1024, "announced a packet of"),
@@ -224,7 +224,7 @@ def test_flooding_server_fills_no_memory_while_nothing_is_read(
     ids=["banner", "packet"],
 )
 def test_flood_before_the_login_closes_the_connection(
-    server: Server, fakes: Callable[..., FakeServer], flood: bytes, said: str
+    server: Server, fakes: Callable[..., FakeServer], flood: bytes, output_text: str
 ) -> None:
     def serve(stream: socket.socket) -> object:
         def send() -> None:
@@ -236,12 +236,12 @@ def test_flood_before_the_login_closes_the_connection(
         return None
 
     shell = server.shell(connect=fakes(serve).connect, timing=QUICK)
-    with pytest.raises(FieldkitError, match=said):
+    with pytest.raises(FieldkitError, match=output_text):
         shell.run(("true",), deadline=soon())
 
 
 @pytest.mark.parametrize(
-    ("option", "names", "said"),
+    ("option", "names", "output_text"),
     [
         ("ciphers", ("aes128-cbc", "3des-cbc"), "no acceptable ciphers"),
         ("digests", ("hmac-md5", "hmac-sha1-96"), "no acceptable macs"),
@@ -254,7 +254,7 @@ def test_server_with_weak_ciphers_only_gets_no_login(
     *,
     option: str,
     names: tuple[str, ...],
-    said: str,
+    output_text: str,
 ) -> None:
     def serve(stream: socket.socket) -> object:
         transport = paramiko.Transport(stream)
@@ -264,7 +264,7 @@ def test_server_with_weak_ciphers_only_gets_no_login(
         return transport
 
     shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
-    with pytest.raises(RobotError, match=f"cannot be trusted with a login: {said}") as caught:
+    with pytest.raises(RobotError, match=f"cannot be trusted with a login: {output_text}") as caught:
         shell.run(("true",), deadline=soon())
     assert caught.value.remedy.startswith("update it")
 
@@ -308,7 +308,7 @@ def raising(error: OSError) -> Callable[[float], socket.socket]:
 
 
 @pytest.mark.parametrize(
-    ("connect", "said", "command"),
+    ("connect", "output_text", "command"),
     [
         (
             raising(socket.gaierror(socket.EAI_NONAME, "Name or service not known")),
@@ -322,7 +322,7 @@ def raising(error: OSError) -> Callable[[float], socket.socket]:
     ],
 )
 def test_reason_of_a_failed_connection_is_reported_immediately(
-    server: Server, connect: Callable[[float], socket.socket], said: str, command: str
+    server: Server, connect: Callable[[float], socket.socket], output_text: str, command: str
 ) -> None:
     tries: list[float] = []
 
@@ -330,7 +330,7 @@ def test_reason_of_a_failed_connection_is_reported_immediately(
         tries.append(timeout_s)
         return connect(timeout_s)
 
-    with pytest.raises(LinkLostError, match=said) as caught:
+    with pytest.raises(LinkLostError, match=output_text) as caught:
         server.shell(connect=counted).run(("true",), deadline=soon())
     assert caught.value.remedy.startswith(command) or command in caught.value.remedy
     assert len(tries) == 1, "the first connection is not retried"

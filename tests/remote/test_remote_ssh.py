@@ -241,15 +241,15 @@ def test_quote_escapes_backslashes_for_fish() -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "text"),
+    ("output_text", "text"),
     [
         (b"Subscribing to /scan\nRecording", "to /scan Recording"),
         (b"x" * 21, "x" * 20),
         (b"all of it is here", "all of it is here"),
     ],
 )
-def test_long_output_is_shortened_between_words(said: bytes, text: str) -> None:
-    assert printable(said, limit=20) == text
+def test_long_output_is_shortened_between_words(output_text: bytes, text: str) -> None:
+    assert printable(output_text, limit=20) == text
 
 
 @given(st.binary(max_size=200))

@@ -71,8 +71,8 @@ class Site:
     def completed(self, *argv: str) -> subprocess.CompletedProcess[str]:
         """Run a command on the host with ROS 1, and return its result."""
         with self.started(self.near, *argv) as process:
-            said, errors = process.communicate()
-        return subprocess.CompletedProcess(argv, process.returncode, said, errors)
+            output_text, errors = process.communicate()
+        return subprocess.CompletedProcess(argv, process.returncode, output_text, errors)
 
     def bridge_line(self, over: str, *words: str) -> tuple[str, ...]:
         line = ("bridge", "--from", "ros1", "--to", over, "--address", self.near.address, "--domain", str(DOMAIN))
@@ -83,8 +83,8 @@ class Site:
         """Run a bridge while the body runs; it is ready when the body starts."""
         with self.started(self.near, *self.bridge_line(over, *words)) as process:
             assert process.stderr is not None
-            said = process.stderr.readline()
-            assert said.startswith("note: the bridge is up"), said + process.stderr.read()
+            output_text = process.stderr.readline()
+            assert output_text.startswith("note: the bridge is up"), output_text + process.stderr.read()
             yield process
 
     def ros1(self, verb: str) -> AbstractContextManager[Process]:
@@ -161,7 +161,7 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, over: str)
             received(ros1_subscriber, number_of_ros1),
         )
         running.send_signal(signal.SIGINT)
-        said, errors = running.communicate()
+        output_text, errors = running.communicate()
     assert [line for _, line in received_by_wire] == [scan(number) for number, _ in received_by_wire], (
         "as serialized by rosbags"
     )
@@ -172,7 +172,7 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, over: str)
         assert len(set(numbers)) == len(numbers), "no sample arrives twice"
 
     assert (running.returncode, errors) == (0, "")
-    report = {(counts["source"], counts["target"]): counts for counts in json.loads(said)}
+    report = {(counts["source"], counts["target"]): counts for counts in json.loads(output_text)}
     assert report.keys() == {("ros1", over), (over, "ros1")}
     size_bytes = {"ros1": len(shipped().ros2.cdr_to_ros1(bytes.fromhex(scan(1)), TYPE)), over: len(scan(1)) // 2}
     for (source, _), counts in report.items():
@@ -201,10 +201,10 @@ def test_stopped_bridge_leaves_no_process_and_file(site: Site) -> None:
     with site.bridge("dds", SCAN) as running:
         assert " * /fieldkit_bridge " in site.completed("rostopic", "info", "/scan").stdout
         running.send_signal(signal.SIGTERM)
-        said, _ = running.communicate()
+        output_text, _ = running.communicate()
     assert running.returncode == 0
-    assert "/scan" in said
-    assert "ros1 to dds" in said
+    assert "/scan" in output_text
+    assert "ros1 to dds" in output_text
     assert "/fieldkit_bridge" not in site.completed("rostopic", "info", "/scan").stdout
     assert not list(site.folder.glob("fieldkit-*"))
     assert not list(site.folder.glob("ros/log/*bridge*"))
@@ -304,7 +304,7 @@ def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output_text"),
     [
         (("--from", "ros1", "--to", "dds"), "no topic is given"),
         (("--from", "ros1", "--to", "dds", "/scan"), "'/scan' is not a topic with its type"),
@@ -327,10 +327,10 @@ def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
     ],
 )
 def test_invalid_arguments_are_reported_before_anything_starts(
-    words: Sequence[str], said: str, capsys: pytest.CaptureFixture[str]
+    words: Sequence[str], output_text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["bridge", *words]) == 2
-    assert said in capsys.readouterr().err.replace("\n", " ")
+    assert output_text in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_command_line_accepts_all_middlewares() -> None:

@@ -305,7 +305,7 @@ def _compare_transfer(
 def test_enough_procedures_of_each_kind_were_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
     if not SEEN:
         pytest.fail("this runs behind the test above, in one process")
-    record_property("said", f"random procedures: {dict(sorted(SEEN.items()))}")
+    record_property("result", f"random procedures: {dict(sorted(SEEN.items()))}")
     assert min(SEEN[what] for what in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 40
     assert min(SEEN[what] for what in ("valid, two pings or more", "valid, two transfers or more")) >= 15
     assert min(SEEN[what] for what in ("valid, at the same time", "valid, iperf3 captured")) >= 15

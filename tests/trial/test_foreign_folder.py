@@ -80,9 +80,9 @@ def test_a_link_to_a_local_file_is_rejected_in_one_sentence(
     (trial / place).symlink_to(ours)
     out = [str(trial.parent / "out.mcap") if word == "out.mcap" else word for word in command[1:]]
     assert main([command[0], str(trial), *out]) == EvidenceError.exit_code
-    said = capsys.readouterr().err
-    assert f"{place}: it is a symbolic link, not a regular file" in " ".join(said.split())
-    assert "remedy: get a copy with plain files from" in " ".join(said.split())
+    output_text = capsys.readouterr().err
+    assert f"{place}: it is a symbolic link, not a regular file" in " ".join(output_text.split())
+    assert "remedy: get a copy with plain files from" in " ".join(output_text.split())
     assert ours.read_text(encoding="utf-8") == OURS
 
 

@@ -96,11 +96,11 @@ def test_every_command_prints_a_table_or_an_error(
         ("export", str(folder), "--format", "parquet", "-o", f"{out}.parquet"),
     ):
         code = main([*words])
-        said = capsys.readouterr().err
+        output_text = capsys.readouterr().err
         assert code in {0, 2, 4}, words
-        assert "Traceback" not in said
+        assert "Traceback" not in output_text
         if code:
-            assert "remedy:" in said, (words, said)
-            assert "own" in said or "trial.yaml" in said, (words, said)
+            assert "remedy:" in output_text, (words, output_text)
+            assert "own" in output_text or "trial.yaml" in output_text, (words, output_text)
         if words[0] == "rebuild" and code:
             assert (folder / store.TRIAL_CSV).read_bytes() == before, "nothing is written"

@@ -63,8 +63,8 @@ def test_packets_captured_before_the_filter_are_ignored(folder: Path) -> None:
 
 
 def test_a_tcpdump_without_a_match_count_is_accepted(folder: Path) -> None:
-    said = [line for line in log().splitlines(keepends=True) if "received by filter" not in line]
-    (folder / "sender-capture.log").write_text("".join(said), encoding="utf-8")
+    output_text = [line for line in log().splitlines(keepends=True) if "received by filter" not in line]
+    (folder / "sender-capture.log").write_text("".join(output_text), encoding="utf-8")
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
@@ -150,11 +150,11 @@ def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monke
         raise OverflowError("int too large to convert to float")
 
     monkeypatch.setattr(PingStep, "measure", measure)
-    (said,) = problems(PLAN, Protocol.UDP, folder)
+    (output_text,) = problems(PLAN, Protocol.UDP, folder)
     what = "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
-    assert re.fullmatch(rf"{what} \(test_trial_gates.py, line [0-9]+\)", said)
+    assert re.fullmatch(rf"{what} \(test_trial_gates.py, line [0-9]+\)", output_text)
     judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
-    assert judged.measured.missing["rtt_loss"] == said
+    assert judged.measured.missing["rtt_loss"] == output_text
     (traceback,) = judged.step_errors
     assert "in measure" in traceback
     assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size

@@ -39,7 +39,7 @@ def walk(trial: Path, name: str = "walk.csv", *, late_ns: int = 0) -> list[int]:
     return [time_ns - first_ns for time_ns in at_ns]
 
 
-def said(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+def output_text(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
     code = main(["positions", "trial", *words])
     output = capsys.readouterr()
     return code, output.out + output.err
@@ -55,23 +55,23 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
 ) -> None:
     before = {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()}
     elapsed_ns = walk(trial)
-    code, output = said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
+    code, output = output_text(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
     assert code == 0, output
     assert output.startswith("changed: trial.csv")
     means = [float(metres) for metres in means_m(trial)]
     assert all(65 <= metres <= 5 + max(elapsed_ns) / 1e9 for metres in means)
     assert manifest.verify(trial) == []
     assert {path.name for path in trial.glob("positions*")} == {"positions.json", "positions-receiver.csv"}
-    assert said(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(means)
+    assert output_text(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(means)
 
     walk(trial, "again.CSV", late_ns=2 * 10**9)
-    said(capsys, "receiver=again.CSV", "sender=0m,0m", "--gap", "1000min", "--offset", "-1s")
+    output_text(capsys, "receiver=again.CSV", "sender=0m,0m", "--gap", "1000min", "--offset", "-1s")
     assert [float(metres) for metres in means_m(trial)] == pytest.approx([metres + 3 for metres in means])
-    said(capsys, "receiver=again.CSV", "sender=0m,0m")
+    output_text(capsys, "receiver=again.CSV", "sender=0m,0m")
     assert means_m(trial) == [""] * len(means)
-    assert "have a gap of" in said(capsys)[1]
+    assert "have a gap of" in output_text(capsys)[1]
 
-    assert said(capsys, "--clear")[0] == 0
+    assert output_text(capsys, "--clear")[0] == 0
     assert {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
 
@@ -103,7 +103,7 @@ def test_invalid_positions_are_rejected_and_change_nothing(
     with Path("huge.gpx").open("wb") as huge:
         huge.truncate(positions.MAX_BYTES + 1)
     before = {path: path.read_bytes() for path in trial.iterdir() if path.is_file()}
-    exit_code, output = said(capsys, *words)
+    exit_code, output = output_text(capsys, *words)
     assert (exit_code, complaint in output) == (code, True), output
     assert {path: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
@@ -112,10 +112,10 @@ def test_invalid_positions_are_rejected_and_change_nothing(
 def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     walk(trial)
     with journal.claimed(trial):
-        assert said(capsys, "receiver=walk.csv")[0] == 2
+        assert output_text(capsys, "receiver=walk.csv")[0] == 2
     file = next(trial.glob("repeats/*/ping.txt"))
     file.write_bytes(file.read_bytes() + b"\n")
-    code, output = said(capsys, "receiver=walk.csv")
+    code, output = output_text(capsys, "receiver=walk.csv")
     assert (code, "the evidence is not what was measured" in output) == (4, True)
     assert not list(trial.glob("positions*"))
 
@@ -124,7 +124,7 @@ def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pyte
 @pytest.mark.parametrize("how", ["changed", "gone", "unsummed"])
 def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.CaptureFixture[str], how: str) -> None:
     walk(trial)
-    assert said(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
+    assert output_text(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
     kept = trial / "positions-receiver.csv"
     if how == "changed":
         kept.write_bytes(kept.read_bytes() + b"\n")
@@ -134,7 +134,7 @@ def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.Ca
         shutil.copy(kept, trial / "positions-sender.csv")
     assert main(["rebuild", "trial"]) == 4
     assert "positions-" in capsys.readouterr().err
-    assert said(capsys, "--clear")[0] == 0
+    assert output_text(capsys, "--clear")[0] == 0
     assert main(["rebuild", "trial"]) == 0
 
 

@@ -17,7 +17,7 @@ from tests.measure.evidence.test_measure_bag import SUFFIXES
 
 BEGAN_NS = 1_795_208_123_219_164_628
 S = 10**9
-# What rosbag 1.15.15 said, colours and all; see tests/data/rosbag.
+# Output of rosbag 1.15.15 with its colours; see tests/data/rosbag.
 ROSBAG = "\x1b[0m[ INFO] [{s}.{ns:09d}]: Subscribing to {topic}\x1b[0m\n"
 RECORDING = "\x1b[0m[ INFO] [1795208130.000000000]: Recording to 'scan.bag'.\x1b[0m\n"
 ROS2 = (

@@ -142,7 +142,7 @@ def test_a_snap_length_within_the_headers_does_not_appear_as_loss(protocol: Prot
     assert f"in the {end}'s capture were truncated in their TCP or UDP header" in reason
 
 
-def test_similar_traffic_is_not_taken_for_a_translation() -> None:
+def test_similar_traffic_is_not_mistaken_for_a_translation() -> None:
     sent, received = _udp(lambda packet: packet)
     stranger = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
     of_another = [Frame(frame.time_ns, source(frame.data), 2000) for frame in stranger]
@@ -162,7 +162,7 @@ def test_similar_traffic_is_not_taken_for_a_translation() -> None:
 
 @given(st.integers(0, 2**32), st.sampled_from((1, 40)), st.booleans(), st.booleans())
 @settings(max_examples=30)
-def test_losses_copies_and_reordering_are_not_taken_for_a_translation(
+def test_losses_copies_and_reordering_are_not_mistaken_for_a_translation(
     seed: int, offload: int, ids: bool, stamped: bool
 ) -> None:
     link = Link(seed, loss=0.3, copied=0.1, late=0.1)

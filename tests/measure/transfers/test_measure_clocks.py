@@ -224,7 +224,7 @@ def test_without_queues_the_skew_is_exact_and_the_error_is_half_a_round_trip() -
     assert world.ahead_s(middle)[0] - _ahead_s(clocks, middle)[0] == pytest.approx(0.001, abs=0.0001)
 
 
-def test_a_growing_queue_is_not_taken_for_drift() -> None:
+def test_a_growing_queue_is_not_mistaken_for_drift() -> None:
     """Moon's one-way hull would take a buffer that fills up for a fast clock; packets in reverse contradict it."""
     world = World(0.25, 0.0)
     sent_s = np.linspace(0, 200, 500)

@@ -33,7 +33,7 @@ class Link:
         if self.broken > 0:
             self.broken -= 1
             raise LinkError("is out of range", where=self.robot, remedy="wait")
-        return Completed(tuple(argv), 0, b"said", b"")
+        return Completed(tuple(argv), 0, b"output", b"")
 
     @property
     def lines(self) -> list[str]:
@@ -55,7 +55,7 @@ def keeper(link: Link, silent_lease_s: float | None = None) -> LeaseKeeper:
 def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
     link = Link()
     with keeper(link) as lease:
-        assert lease.output == b"said"
+        assert lease.output == b"output"
         link.broken = 2
         assert link.many.wait(60)
         lease.give_order("go")

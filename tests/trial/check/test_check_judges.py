@@ -31,7 +31,7 @@ PLAN = los_plan()
 OK, WARN, FAIL = Verdict.OK, Verdict.WARN, Verdict.FAIL
 
 
-def said(name: str, code: int = 0) -> CommandResult:
+def output_text(name: str, code: int = 0) -> CommandResult:
     return CommandResult((DATA / name).read_text(encoding="utf-8").strip("\n"), code)
 
 
@@ -42,7 +42,7 @@ def only(findings: Sequence[Finding], check: str) -> Finding:
 
 def heard(robot: Robot, **sections: CommandResult) -> list[Finding]:
     """Judge the radio; an underscore in the name of a section is replaced by a hyphen."""
-    base = {"interface": said("ip/6.1.0/up.txt")}
+    base = {"interface": output_text("ip/6.1.0/up.txt")}
     report = Report(robot.name)
     radio.judge(robot, base | {name.replace("_", "-"): text for name, text in sections.items()}, report)
     return report.findings
@@ -60,7 +60,7 @@ def heard(robot: Robot, **sections: CommandResult) -> list[Finding]:
     ],
 )
 def test_an_interface_must_be_up_and_connected(file: str, code: int, status: Verdict, detail: str) -> None:
-    finding = only(heard(SENDER, interface=said(file, code)), "interface wlan0")
+    finding = only(heard(SENDER, interface=output_text(file, code)), "interface wlan0")
     assert finding.status is status
     assert detail in finding.detail
     assert bool(finding.remedy) == (status is FAIL)
@@ -72,7 +72,7 @@ def test_an_interface_with_another_address_is_a_failure() -> None:
 
 
 def test_offloads_are_for_the_record() -> None:
-    finding = only(heard(SENDER, offloads=said("ethtool/6.1/tun.txt")), "offloads")
+    finding = only(heard(SENDER, offloads=output_text("ethtool/6.1/tun.txt")), "offloads")
     assert (finding.status, finding.detail) == (OK, "GSO on, TSO off, GRO on")
     assert only(heard(SENDER), "offloads").status is OK
 
@@ -80,9 +80,9 @@ def test_offloads_are_for_the_record() -> None:
 def test_a_station_has_access_point_channel_signal_and_rate() -> None:
     findings = heard(
         SENDER,
-        wifi_info=said("iw/info-station.txt"),
-        wifi_link=said("iw/link-station.txt"),
-        wifi_power_save=said("iw/power-save-off.txt"),
+        wifi_info=output_text("iw/info-station.txt"),
+        wifi_link=output_text("iw/link-station.txt"),
+        wifi_power_save=output_text("iw/power-save-off.txt"),
     )
     assert only(findings, "Wi-Fi").detail == (
         "managed 'knowhere', at f0:99:bf:0e:86:98, channel 11, -65 dBm, 65.0 MBit/s"
@@ -91,60 +91,68 @@ def test_a_station_has_access_point_channel_signal_and_rate() -> None:
 
 
 def test_a_signal_near_the_sensitivity_is_a_warning() -> None:
-    link = said("iw/link-station.txt")
+    link = output_text("iw/link-station.txt")
     # The TurtleBot's sensitivity is -82 dBm.
     for dbm, status in ((-72, OK), (-73, WARN)):
         weak = CommandResult(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
-        findings = heard(SENDER, wifi_info=said("iw/info-station.txt"), wifi_link=weak)
+        findings = heard(SENDER, wifi_info=output_text("iw/info-station.txt"), wifi_link=weak)
         assert only(findings, "Wi-Fi").status is status
 
 
 def test_power_save_is_a_warning_with_the_command_that_disables_it() -> None:
     findings = heard(
         SENDER,
-        wifi_info=said("iw/info-station.txt"),
-        wifi_link=said("iw/link-station.txt"),
-        wifi_power_save=said("iw/power-save-on.txt"),
+        wifi_info=output_text("iw/info-station.txt"),
+        wifi_link=output_text("iw/link-station.txt"),
+        wifi_power_save=output_text("iw/power-save-on.txt"),
     )
     finding = only(findings, "power save")
     assert (finding.status, finding.remedy) == (WARN, "sudo iw dev wlan0 set power_save off")
 
 
 def test_a_station_without_a_network_fails() -> None:
-    findings = heard(SENDER, wifi_info=said("iw/info-txpower.txt"), wifi_link=said("iw/link-none.txt"))
+    findings = heard(SENDER, wifi_info=output_text("iw/info-txpower.txt"), wifi_link=output_text("iw/link-none.txt"))
     assert only(findings, "Wi-Fi").status is FAIL
 
 
 def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
-    findings = heard(RELAY, wifi_info=said("iw/info-ap.txt"), wifi_stations=said("iw/stations-ap.txt"))
+    findings = heard(RELAY, wifi_info=output_text("iw/info-ap.txt"), wifi_stations=output_text("iw/stations-ap.txt"))
     assert only(findings, "Wi-Fi").detail == "AP 'xx', channel 1, 1 stations, -57 dBm"
     assert "power save" not in {finding.check for finding in findings}
 
 
 def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
-    ibss = CommandResult(said("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
-    findings = heard(SENDER, wifi_info=ibss, wifi_link=said("iw/link-ibss.txt"))
+    ibss = CommandResult(output_text("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
+    findings = heard(SENDER, wifi_info=ibss, wifi_link=output_text("iw/link-ibss.txt"))
     assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
 
 
 def test_outputs_of_the_kernels_wifi_stack_are_read_in_every_mode() -> None:
-    station = heard(SENDER, wifi_info=said("iw/info-hwsim-station-6.txt"), wifi_link=said("iw/link-hwsim-6.txt"))
+    station = heard(
+        SENDER, wifi_info=output_text("iw/info-hwsim-station-6.txt"), wifi_link=output_text("iw/link-hwsim-6.txt")
+    )
     assert only(station, "Wi-Fi").detail == "managed 'lawn', at 02:00:00:00:00:00, channel 6, -30 dBm, 1.0 MBit/s"
-    relay = heard(RELAY, wifi_info=said("iw/info-hwsim-ap-6.txt"), wifi_stations=said("iw/stations-hwsim-ap-6.txt"))
+    relay = heard(
+        RELAY,
+        wifi_info=output_text("iw/info-hwsim-ap-6.txt"),
+        wifi_stations=output_text("iw/stations-hwsim-ap-6.txt"),
+    )
     assert only(relay, "Wi-Fi").detail == "AP 'lawn', channel 6, 2 stations, -30 dBm"
-    ibss = heard(SENDER, wifi_info=said("iw/info-hwsim-ibss-5.txt"), wifi_link=said("iw/link-hwsim-ibss-6.txt"))
+    ibss = heard(
+        SENDER, wifi_info=output_text("iw/info-hwsim-ibss-5.txt"), wifi_link=output_text("iw/link-hwsim-ibss-6.txt")
+    )
     assert only(ibss, "Wi-Fi").detail == "IBSS 'lawn', at 26:9f:2e:55:bf:8b, channel 6"
-    down = heard(SENDER, wifi_info=said("iw/info-hwsim-down-5.txt"), wifi_link=said("iw/link-none.txt"))
+    down = heard(SENDER, wifi_info=output_text("iw/info-hwsim-down-5.txt"), wifi_link=output_text("iw/link-none.txt"))
     assert only(down, "Wi-Fi").detail == "joined to no network"
 
 
 def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:
-    findings = heard(SENDER, wifi_info=said("iw/no-wifi.txt", 1))
+    findings = heard(SENDER, wifi_info=output_text("iw/no-wifi.txt", 1))
     assert {finding.check for finding in findings} == {"interface wlan0", "control", "offloads"}
 
 
 def test_a_radio_without_iw_is_a_warning() -> None:
-    ether = CommandResult(said("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
+    ether = CommandResult(output_text("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
     findings = heard(SENDER, interface=ether, wireless=CommandResult("/sys/class/net/wlan0/phy80211", 0))
     assert only(findings, "Wi-Fi").remedy == "sudo apt-get install iw"
 
@@ -354,13 +362,13 @@ def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
     tools = TURTLEBOT.tools.model_copy(update={"capture_right": "sudo"})
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"tools": tools})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
-    for said, remedy in (
+    for output_text, remedy in (
         (CommandResult("sudo: a password is required", 1), "sudo tee /etc/sudoers.d/fieldkit"),
         (CommandResult("sh: 9: sudo: not found", CommandResult.MISSING), "capture_right: direct"),
     ):
         (failed,) = [
             finding
-            for finding in judged(installed(plan) | {"right to capture": said}, plan)
+            for finding in judged(installed(plan) | {"right to capture": output_text}, plan)
             if finding.status is not OK
         ]
         assert remedy in failed.remedy
@@ -456,9 +464,9 @@ def test_the_route_of_ssh_is_detected(connection: str, control: Control, status:
 @pytest.mark.parametrize("file", ["ip/6.1.0/nope.txt", "busybox/1.35.0/ip-nope.txt"])
 def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
     refused = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
-    sections = installed() | {"right to capture": refused, "interface": said(file, 1)}
+    sections = installed() | {"right to capture": refused, "interface": output_text(file, 1)}
     assert "right to capture" not in {finding.check for finding in judged(sections)}
-    there = judged(sections | {"interface": said("ip/6.1.0/up.txt")})
+    there = judged(sections | {"interface": output_text("ip/6.1.0/up.txt")})
     assert only(there, "right to capture").status is FAIL
 
 

@@ -174,6 +174,6 @@ def test_a_tool_that_does_not_exit_is_killed(tmp_path: Path) -> None:
 
 
 def test_output_of_a_tool_may_look_like_a_section_header() -> None:
-    said = b"OpenBSD netcat\n==> ping <==\nmore"
-    detected = tools.parse(USER + section("netcat", said, 1) + b"==> capture <==\nno end", TURTLEBOT)
+    output_text = b"OpenBSD netcat\n==> ping <==\nmore"
+    detected = tools.parse(USER + section("netcat", output_text, 1) + b"==> capture <==\nno end", TURTLEBOT)
     assert (detected.netcat, set(detected.versions)) == (Netcat.OPENBSD, {Tool.NETCAT})

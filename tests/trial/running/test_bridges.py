@@ -164,7 +164,7 @@ def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "output_text"),
     [
         ("{to: dds}", "it carries no topics"),
         ("{to: ros1, topics: ['/scan:sensor_msgs/LaserScan']}", "bridge.to"),
@@ -175,11 +175,11 @@ def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
         ("{to: dds, topic: ['/scan:sensor_msgs/LaserScan']}", "topics"),
     ],
 )
-def test_a_wrong_profile_is_reported_with_its_location(text: str, said: str, tmp_path: Path) -> None:
+def test_a_wrong_profile_is_reported_with_its_location(text: str, output_text: str, tmp_path: Path) -> None:
     own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     file = tmp_path / "own.yaml"
     file.write_text(own.replace("ros:\n  variant: ros1\n", f"ros:\n  variant: ros1\n  bridge: {text}\n"))
-    with pytest.raises(ConfigurationError, match=said) as caught:
+    with pytest.raises(ConfigurationError, match=output_text) as caught:
         schema.load(file, RobotProfile)
     assert "own.yaml:" in str(caught.value)
 

@@ -170,19 +170,19 @@ def test_checksums_are_kept_and_differences_reported(
 ) -> None:
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
     befalls(trial / CHANGED)
-    said = [f"{name}: {kind}" for name, kind in what.items()]
+    output_text = [f"{name}: {kind}" for name, kind in what.items()]
     to = again(trial)
     assert to.differences == what
     to.summarize()
-    assert set(said) <= set(manifest.verify(trial))
+    assert set(output_text) <= set(manifest.verify(trial))
     with pytest.raises(EvidenceError, match="the tables are not changed") as caught:
         rebuild(trial)
-    assert all(text in caught.value.what for text in said)
+    assert all(text in caught.value.what for text in output_text)
     assert {name: (trial / name).read_bytes() for name in tables} == tables
     assert main(["aggregate", str(trial), "--rebuild"]) == 0
-    assert all(text in " ".join(capsys.readouterr().err.split()) for text in said)
+    assert all(text in " ".join(capsys.readouterr().err.split()) for text in output_text)
     assert main(["export", str(trial), "--format", "mcap", "-o", str(trial.parent / "out.mcap")]) == 0
-    assert all(text in " ".join(capsys.readouterr().err.split()) for text in said)
+    assert all(text in " ".join(capsys.readouterr().err.split()) for text in output_text)
 
 
 def test_changes_of_plan_journal_and_table_are_reported(trial: Path) -> None:

@@ -112,10 +112,10 @@ class Rebooted(LocalShell):
 def test_a_void_attempt_reports_that_its_robot_rebooted(tmp_path: Path) -> None:
     robots = Robots(los_plan(), IdleTestbed({role: Rebooted(tmp_path) for role in (Role.SENDER, Role.RECEIVER)}))
     robots.begin("x", old=None)
-    said = robots.fetch("x", tmp_path, clean=False)
+    output_text = robots.fetch("x", tmp_path, clean=False)
     reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
-    assert sorted(said) == sorted(reasons)
-    shown = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *said])
+    assert sorted(output_text) == sorted(reasons)
+    shown = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *output_text])
     assert sorted(shown) == sorted(["scan.bag: there is no bag", *reasons])
 
 
@@ -174,7 +174,7 @@ def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: P
     robots = Robots(plan, IdleTestbed(shells))
     into = tmp_path / "into"
     into.mkdir()
-    (said,) = robots.fetch(remote, into, clean=True)
-    assert said.endswith("job capture ended with exit code 3")
-    assert "exit code 1" not in said, "the message is from the robot"
+    (output_text,) = robots.fetch(remote, into, clean=True)
+    assert output_text.endswith("job capture ended with exit code 3")
+    assert "exit code 1" not in output_text, "the message is from the robot"
     assert robots.unfetched() == {}

@@ -319,10 +319,10 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
     fetch = Robots.fetch
 
     def moving(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
-        said = fetch(self, remote, into, clean=clean)
+        output_text = fetch(self, remote, into, clean=clean)
         if remote.endswith("tcp-02-1"):
             only(tmp_path).rename(tmp_path / "moved")
-        return said
+        return output_text
 
     monkeypatch.setattr(Robots, "fetch", moving)
     with pytest.raises(ConfigurationError, match="cannot be written: No such file or directory") as caught:

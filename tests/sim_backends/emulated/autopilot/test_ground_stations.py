@@ -70,4 +70,4 @@ def test_mavproxy_flies_a_mission_where_every_twentieth_datagram_is_lost(up: Emu
     seen = fly(up, "mavproxy_flight")
     assert seen["height_m"] < 0.2
     for words in ("Loaded 4 waypoints in ", "COMPONENT_ARM_DISARM: ACCEPTED", "DISARMED"):
-        assert words in seen["said"]
+        assert words in seen["output"]

@@ -30,14 +30,14 @@ from pathlib import Path
 from sim_backends.emulated.robot import services
 
 def work():
-    said = {
+    text = {
         "name": Path("/proc/self/comm").read_text().strip(),
         "session": os.getsid(0) == os.getpid(),
         "open": sorted(fd for fd in range(256) if Path(f"/proc/self/fd/{fd}").exists()),
         "wakes": signal.set_wakeup_fd(-1),
         "children": signal.getsignal(signal.SIGCHLD) == signal.SIG_DFL,
     }
-    print(json.dumps(said))
+    print(json.dumps(text))
     raise RuntimeError("no more")
 
 ours, theirs = os.pipe2(os.O_NONBLOCK)
