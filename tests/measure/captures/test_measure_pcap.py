@@ -118,7 +118,7 @@ def test_sizes_and_times_equal_what_tcpdump_prints(name: str) -> None:
 
 def _checksum(header: bytes) -> int:
     """The Internet checksum of RFC 1071, section 4.1, word by word; the header's own is 0."""
-    total = sum(struct.unpack(f">{len(header) // 2}H", header))
+    total: int = sum(struct.unpack(f">{len(header) // 2}H", header))
     while total >> 16:
         total = (total & 0xFFFF) + (total >> 16)
     return ~total & 0xFFFF
