@@ -132,15 +132,26 @@ def _same_suffix_files(attempt: Stored, other: Stored, name: str) -> list[Path]:
 
 def with_wrong_time(capture: bytes, index: int, microseconds: int) -> bytes:
     """A little-endian pcap file in which the time of one packet is changed; `index` is modulo the packet count."""
-    positions, position = [], _PCAP_HEADER_BYTES
-    while position < len(capture):
-        positions.append(position)
-        position += _PCAP_RECORD.size + _PCAP_RECORD.unpack_from(capture, position)[2]
-    changed, position = bytearray(capture), positions[index % len(positions)]
+    changed, position = bytearray(capture), _record_at(capture, index)
     seconds, fraction, *lengths = _PCAP_RECORD.unpack_from(capture, position)
     time = divmod(10**6 * seconds + fraction + microseconds, 10**6)
     _PCAP_RECORD.pack_into(changed, position, *time, *lengths)
     return bytes(changed)
+
+
+def with_changed_bit(capture: bytes, index: int, bit: int) -> bytes:
+    """A little-endian pcap file in which one bit of a packet is changed; arguments as for `with_wrong_time`."""
+    changed = bytearray(capture)
+    changed[_record_at(capture, index) + _PCAP_RECORD.size + bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+def _record_at(capture: bytes, index: int) -> int:
+    positions, position = [], _PCAP_HEADER_BYTES
+    while position < len(capture):
+        positions.append(position)
+        position += _PCAP_RECORD.size + _PCAP_RECORD.unpack_from(capture, position)[2]
+    return positions[index % len(positions)]
 
 
 def flip(content: bytes, draw: random.Random) -> bytes:

@@ -18,6 +18,8 @@ conf.l2types.register_num2layer(12, IPv46)
 
 Row = tuple[int, ...]
 
+_COMPUTED = {"content", "wrong_checksum"}
+
 
 def write(path: Path, frames: Sequence[Packet], link_type: int, order: str = "<", *, nano: bool = True) -> None:
     writer = PcapWriter(str(path), linktype=link_type, endianness=order, nano=nano)
@@ -33,8 +35,8 @@ def dissected(path: Path) -> list[Row]:
 
 
 def rows(packets: Packets) -> list[Row]:
-    """The rows of columns, with addresses as numbers; `content` is omitted, since its values have no meaning."""
-    columns = {name: getattr(packets, name) for name in Packets.__dataclass_fields__ if name != "content"}
+    """The rows of columns, with addresses as numbers; those that compute something from the packet are omitted."""
+    columns = {name: getattr(packets, name) for name in Packets.__dataclass_fields__ if name not in _COMPUTED}
     for name in ("src", "dst"):
         columns[name] = [int(upper) << 64 | int(lower) for upper, lower in columns[name].tolist()]
     return [tuple(map(int, row)) for row in zip(*columns.values(), strict=True)]

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates
-from tests.helpers.changed_evidence import ATTEMPTS, Stored, changes, stored, with_wrong_time
+from tests.helpers.changed_evidence import ATTEMPTS, Stored, changes, stored, with_changed_bit, with_wrong_time
 
 Change = Callable[[bytes], bytes]
 TRIAL = ATTEMPTS[0][0]
@@ -91,6 +91,23 @@ def everywhere(key: str, factor: float) -> Change:
 def other_test(name: str) -> Change:
     return lambda _: (attempt(Protocol.UDP).folder / name).read_bytes()
 
+
+CAPTURES = ("sender.pcap", "receiver.pcap", "back.sender.pcap", "back.receiver.pcap")
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(Protocol), st.sampled_from(CAPTURES), st.integers(0), st.integers(0, 63))
+def test_one_changed_bit_in_an_address_of_a_packet_is_found(
+    tmp_path_factory: pytest.TempPathFactory, protocol: Protocol, name: str, index: int, bit: int
+) -> None:
+    def change(capture: bytes) -> bytes:
+        return with_changed_bit(capture, index, 8 * _ADDRESSES_AT + bit)
+
+    demand(protocol, name, change, tmp_path_factory.mktemp("changed"), "packets have a wrong IPv4 header checksum")
+
+
+_ADDRESSES_AT = 12
+"""Position of source and destination in an IPv4 header, with which the captured frames start (DLT_RAW)."""
 
 JSON = "receiver-iperf3.json"
 SENT = "sender-iperf3.json"

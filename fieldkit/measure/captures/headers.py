@@ -2,7 +2,7 @@
 
 Extension headers are skipped. Headers: https://www.tcpdump.org/linktypes.html, https://www.radiotap.org, IEEE 802.1Q,
 IEEE 802.11-2020 section 9; RFC 791 (IPv4), RFC 8200 (IPv6 and its extension headers), RFC 4302 (authentication),
-RFC 2675 (jumbograms).
+RFC 2675 (jumbograms), RFC 1071 (checksums).
 """
 
 from collections.abc import Callable, Mapping
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.captures.arrays import BIG, LITTLE, Frames, Integers, Ints, Mask, Table, layout
+from fieldkit.measure.captures.arrays import BIG, LITTLE, Fields, Frames, Integers, Ints, Mask, Table, layout
 
 NO_HEADER: Final = -1
 """Position for a frame without an IP header."""
@@ -188,8 +188,10 @@ _IPV4: Final = layout(
     ip_id=(4, 2),
     fragment=(6, 2),
     protocol=(9, 1),
+    checksum=(10, 2),
     src=(12, 4),
     dst=(16, 4),
+    **{f"word{number}": (4 * number, 4) for number in range(3)},
 )
 _IPV6_HEADER_BYTES: Final = 40
 _MAPPED: Final = 0xFFFF << 32
@@ -217,6 +219,7 @@ class Headers(Table):
         header_bytes: Length of the header and its extension headers.
         payload_at: Index of the first byte after the header and its extension headers in the file.
         payload_bytes: Length of the payload by the header, even if fewer bytes were captured.
+        wrong_checksum: True if the header checksum of IPv4 is wrong.
     """
 
     frame: Ints
@@ -229,6 +232,7 @@ class Headers(Table):
     header_bytes: Ints
     payload_at: Ints
     payload_bytes: Ints
+    wrong_checksum: Mask
 
 
 @lru_cache(maxsize=64)
@@ -277,9 +281,34 @@ def _ipv4(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
         header_bytes=header,
         payload_at=at + header,
         payload_bytes=total - header,
+        wrong_checksum=_wrong_checksums(integers, head, at, np.minimum(header, kept)),
     )
     valid = (header >= _IPV4_HEADER_BYTES) & (header <= kept) & (total >= header)
     return ipv4 if valid.all() else ipv4.where(valid)
+
+
+def _wrong_checksums(integers: Integers, head: Fields, at: Ints, header: Ints) -> Mask:
+    """Return a mask of the headers whose checksum is wrong (RFC 1071: the words of a header add up to -0).
+
+    A checksum of 0 was not computed: some systems leave that to the adapter, after the capture. Linux computes it
+    before the capture, also with offload, and drops received packets in which it is wrong.
+
+    Args:
+        integers: The file.
+        head: The headers without options.
+        at: Position of each header.
+        header: Length of each header with its options, as far as it was captured.
+    """
+    total = head["word0"] + head["word1"] + head["word2"] + head["src"] + head["dst"]
+    longer = np.flatnonzero(header > _IPV4_HEADER_BYTES)
+    option = _IPV4_HEADER_BYTES
+    while len(longer):
+        total[longer] += integers.u32(at[longer] + option)
+        option += 4
+        longer = longer[header[longer] > option]
+    # 2**16 is 1 modulo 0xFFFF, so words of 32 bits have the same sum in one's complement as words of 16 bits.
+    wrong: Mask = (total % 0xFFFF != 0) & (head["checksum"] != 0)
+    return wrong
 
 
 def _mapped(value: Ints) -> Addresses:
@@ -320,6 +349,7 @@ def _ipv6(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
         header_bytes=payload_at - at,
         payload_at=payload_at,
         payload_bytes=np.maximum(payload_end - payload_at, 0),
+        wrong_checksum=np.zeros(len(at), dtype=np.bool_),
     )
 
 

@@ -80,6 +80,7 @@ class Packets(Table):
         ip_header_bytes: Length of the IP header and its extensions.
         ip_payload_bytes: Length after the IP header and its extensions, by the header, even if fewer bytes were
             captured.
+        wrong_checksum: True if the header checksum of IPv4 is wrong, so that a field of the header was altered.
         sport: Source port of TCP, UDP and SCTP, or `NO_PORT`.
         dport: Destination port, or `NO_PORT`.
         tcp_seq: TCP sequence number; 0 without a TCP header.
@@ -107,6 +108,7 @@ class Packets(Table):
     more_fragments: Mask
     ip_header_bytes: Ints
     ip_payload_bytes: Ints
+    wrong_checksum: Mask
     sport: Ints
     dport: Ints
     tcp_seq: Ints
@@ -176,6 +178,7 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         more_fragments=ip.more_fragments,
         ip_header_bytes=ip.header_bytes,
         ip_payload_bytes=payload,
+        wrong_checksum=ip.wrong_checksum,
         sport=np.where(ports, head["sport"], NO_PORT),
         dport=np.where(ports, head["dport"], NO_PORT),
         tcp_seq=np.where(tcp, head["seq"], 0),

@@ -3,6 +3,10 @@
 A router that translates addresses or ports (NAT), changes ids or sequence numbers, or fragments packets differently,
 alters them so that they match nothing in the sender's capture and would count as lost. With complete captures, the
 receiver has no packet of the transfer that is not in the sender's capture.
+
+A router computes the checksum of the IPv4 header again. A wrong one shows that the header changed on a link or in the
+file: the packet belongs to no flow any more, so it would count as lost, or as never sent. Packets of other flows,
+which tcpdump captures before its filter is attached, have correct checksums.
 """
 
 from typing import Final
@@ -23,6 +27,16 @@ _MAX_STRAGGLERS: Final = 3
 
 _DUPLICATE_NS: Final = 1_000_000
 """No sender retransmits a packet within this time with the same IP id."""
+
+
+def header_problem(packets: Packets) -> str | None:
+    """Return the reason why a capture has altered packets, or None if all checksums of IPv4 headers are correct."""
+    if not (wrong := int(packets.wrong_checksum.sum())):
+        return None
+    return (
+        f"{wrong} of {len(packets)} packets have a wrong IPv4 header checksum:"
+        " they were altered on a link or in the file"
+    )
 
 
 def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:

@@ -22,6 +22,7 @@ from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import host, tcpdump_log
 from fieldkit.measure.evidence.tcpdump_log import capture_file, log_file
+from fieldkit.measure.transfers import altered_packets
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
@@ -81,7 +82,12 @@ class CaptureStep(Nest):
             "packets captured and dropped",
             ("*_captured", "*_capture_dropped"),
             "`ROLE.pcap`, `ROLE-capture.log`",
-            ("each other", "each robot's clock before and after", "the order of times in the file"),
+            (
+                "each other",
+                "each robot's clock before and after",
+                "the order of times in the file",
+                "checksums of IPv4 headers",
+            ),
             "0.1 s backwards between two packets, because two processors receive them; packets dropped before "
             "tcpdump if only topics and pings run inside, which withhold the columns that depend on them",
         ),
@@ -279,6 +285,8 @@ def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bo
     elif capture.frames != log.captured:
         yield f"the file has {capture.frames} packets, tcpdump counted {log.captured}"
     else:
+        if altered := altered_packets.header_problem(capture.packets):
+            yield altered
         yield from _time_problems(role, capture, view)
 
 

@@ -1,3 +1,4 @@
+import struct
 import subprocess
 from pathlib import Path
 
@@ -113,3 +114,44 @@ def test_sizes_and_times_equal_what_tcpdump_prints(name: str) -> None:
     assert lengths == (packets.wire_bytes - 14).tolist()
     stamps = [line.split()[0].replace(".", "") + "000" for line in heads]
     assert np.array(stamps).astype(np.int64).tolist() == packets.time_ns.tolist()
+
+
+def _checksum(header: bytes) -> int:
+    """The Internet checksum of RFC 1071, section 4.1, word by word; the header's own is 0."""
+    total: int = sum(struct.unpack(f">{len(header) // 2}H", header))
+    while total >> 16:
+        total = (total & 0xFFFF) + (total >> 16)
+    return ~total & 0xFFFF
+
+
+_FIELDS = st.tuples(
+    st.integers(0, 255),  # type of service
+    st.integers(100, 1500),  # total length
+    st.integers(0, 0xFFFF),  # identification
+    st.integers(0, 0x3FFF),  # flags and fragment offset
+    st.integers(0, 255),  # time to live
+    st.integers(0, 255),  # protocol
+    st.binary(min_size=8, max_size=8),  # addresses
+    st.integers(0, 10).flatmap(lambda words: st.binary(min_size=4 * words, max_size=4 * words)),  # options
+)
+
+
+@given(_FIELDS, st.data())
+def test_any_changed_bit_of_an_ipv4_header_makes_its_checksum_wrong(
+    fields: tuple[int, int, int, int, int, int, bytes, bytes], data: st.DataObject
+) -> None:
+    *numbers, addresses, options = fields
+    words = 5 + len(options) // 4
+    start = struct.pack(">BBHHHBB", 0x40 | words, *numbers)
+    right = _checksum(start + bytes(2) + addresses + options)
+    header = bytearray(start + struct.pack(">H", right) + addresses + options)
+    # The first byte has the version and the length of the header, which decide where the checksum and its words are.
+    bit = data.draw(st.integers(8, 8 * len(header) - 1))
+    changed = header.copy()
+    changed[bit // 8] ^= 1 << bit % 8
+    not_computed = header[:10] + bytes(2) + header[12:]
+    frames = timed([bytes(each) + bytes(20) for each in (header, changed, not_computed)])
+    packets = pcap.parse(file_bytes(frames, link_type=101), where="x").packets
+    is_computed, is_decoded = any(changed[10:12]), int.from_bytes(changed[2:4]) >= len(header)
+    expected = [False, *([is_computed] if is_decoded else []), False]
+    assert packets.wrong_checksum.tolist() == expected

@@ -129,6 +129,16 @@ def test_a_delay_below_the_clock_error_is_withheld() -> None:
     assert result["topic_age_mean_s"] == pytest.approx(0.052, abs=1e-3)
 
 
+def test_with_a_single_packet_back_there_is_no_delay() -> None:
+    """No other packet confirms its time, so the error of the clock offset is unlimited."""
+    near, far = captures()
+    back = np.flatnonzero(near.are_from(FLOW.receiver_address))
+    near = near.where(np.setdiff1d(np.arange(len(near)), back[1:]))
+    result = measured(published(10), arrived(range(10), 2 * MS), near, far)
+    assert not {name for name in result if "delay_m" in name or "error" in name or "age" in name}
+    assert result["topic_delay_variation_p95_s"] == 0
+
+
 def test_without_captures_there_is_no_delay() -> None:
     result = measured(published(10), arrived(range(10)))
     assert not {name for name in result if "delay_m" in name or "age" in name}
