@@ -72,6 +72,13 @@ class FieldBackend:
                     where=self._document.where(("robots", robot.name)),
                     remedy="add address: to it",
                 )
+            others = [other.name for other in cast.values() if other.address == robot.address and other is not robot]
+            if others:
+                raise ConfigurationError(
+                    f"robots {robot.name!r} and {others[0]!r} have the same address on the radio, {robot.address}",
+                    where=self._document.where(("robots", robot.name)),
+                    remedy="correct address: of one of them",
+                )
         return {role: robot.model_copy(update=self._permissions(robot.profile)) for role, robot in cast.items()}
 
     def _permissions(self, profile: RobotProfile) -> dict[str, bool]:

@@ -150,10 +150,10 @@ def file_to_write(text: str) -> Path:
     return Path(text)
 
 
-def natural(text: str) -> int:
-    """Return a whole number from 0 with at most 15 digits; argparse reports other texts."""
+def natural(text: str, least: int = 0) -> int:
+    """Return a whole number with at most 15 digits; argparse reports other texts, with the smallest number."""
     if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number from 0")
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number from {least}")
     if len(text) > _MAX_DIGITS:
         raise argparse.ArgumentTypeError(f"a number of {len(text)} digits is too large")
     return int(text)
@@ -161,7 +161,7 @@ def natural(text: str) -> int:
 
 def repeats(text: str) -> int:
     """Return a number of repeats from 1; argparse reports other texts."""
-    if not 1 <= natural(text) <= MAX_REPEATS:
+    if not 1 <= natural(text, least=1) <= MAX_REPEATS:
         raise argparse.ArgumentTypeError(f"must be at least 1, and at most {MAX_REPEATS}")
     return int(text)
 

@@ -248,13 +248,10 @@ def by_kind(
         models = kinds()
         if unknown := next((str(key) for key in data if key not in models), None):
             parent = next((str(key) for key in data if key in models and unknown in _types(models[key])), None)
-            others = f"other kinds of {what} need a package that is not installed"
-            valid = did_you_mean(unknown, models, f"valid keys: {', '.join(models)}")
-            hint = (
-                f"it is a key of {parent}: write it inside"
-                if parent
-                else f"{valid}{' ' if valid.endswith('?') else '; '}{others}"
-            )
+            valid = did_you_mean(unknown, models, f"valid keys: {', '.join(models)};")
+            hint = f"{valid} other kinds of {what} need a package that is not installed"
+            if parent:
+                hint = f"it is a key of {parent}: write it inside"
             outer = [] if parent else [types for model in _ENCLOSING.get() if unknown in (types := _types(model))]
             raise _unknown(unknown, hint, outer[-1] if outer else ())
         if len(data) != 1:

@@ -148,7 +148,7 @@ def _location(problem: Any) -> Location:  # noqa: ANN401 (as in `explain`)
 
 
 def _message(problem: Mapping[str, Any]) -> str:
-    message: str = _MESSAGES.get(problem["type"], problem["msg"])
+    message = _MESSAGES.get(problem["type"], problem["msg"])
     value, context = problem["input"], problem.get("ctx", {})
     match problem["type"]:
         case "model_type" | "dict_type":
@@ -165,12 +165,24 @@ def _message(problem: Mapping[str, Any]) -> str:
         case "too_short":
             least, short = context["min_length"], context["actual_length"]
             message = f"at least {format_count(least, 'item')} are needed here, not {short}"
+        case kind:
+            message = _type_message(kind, message, value)
+    return message
+
+
+def _type_message(kind: str, message: str, value: object) -> str:
+    """Return the message about a value of another type than its key has; `message` for other kinds of problem."""
+    match kind:
         case "string_type" if isinstance(value, bool | int | float):
-            message = f"{message}; put it in quotes"
+            return f"{message}; put it in quotes"
         case "bool_type" if isinstance(value, str):
-            message = f"{message}; write true or false"
+            return f"{message}; write true or false"
         case "int_type" if isinstance(value, str):
-            message = f"{message}, in digits only and without quotes"
+            return f"{message}, in digits only and without quotes"
+        case "int_parsing" | "int_from_float":
+            return f"{value!r} is not a whole number"
+        case "float_parsing" | "float_type":
+            return f"{value!r} is not a number; write it without a unit and without quotes"
     return message
 
 

@@ -25,4 +25,4 @@ def test_error_of_backend_that_cannot_be_loaded_names_entry_point(
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ConfigurationError, match="No module named 'no_such_package'") as caught:
         load_backend("bench", None, None)
-    assert caught.value.where == "entry point bench = no_such_package:Bench"
+    assert caught.value.where == "entry point bench = no_such_package:Bench of bench 1.0"

@@ -93,6 +93,30 @@ def test_mistyped_command_suggests_the_right_one(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().err.endswith("\n  remedy: fieldkit trial --help\n")
 
 
+def test_messages_about_arguments_name_the_smallest_number_and_only_what_is_required(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["trial", "los", "30ft", "--repeats", "-2"]) == 2
+    assert "'-2' is not a whole number from 1" in capsys.readouterr().err
+    assert main(["compare", "a"]) == 2
+    assert capsys.readouterr().err.startswith("error: the following arguments are required: B\n")
+
+
+def test_two_robots_with_one_address_are_an_error(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robots = "".join(
+        f"  {name}: {{profile: turtlebot3_burger, host: {name}, address: 192.0.2.1, user: me, "
+        "host_key: ssh-ed25519 AAAA}\n"
+        for name in ("a", "b")
+    )
+    site = f"robots:\n{robots}roles:\n  masterless: {{sender: a, receiver: b}}\n"
+    (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
+    words = ["trial", "los", "30ft", "--dry-run", "--topology", "masterless", "--backend"]
+    assert main([*words, "field"]) == 2
+    said = "fieldkit.yaml:2: robots 'a' and 'b' have the same address on the radio, 192.0.2.1"
+    assert said in capsys.readouterr().err
+    assert main([*words, "emulated"]) == 0, "which has addresses of its own"
+
+
 def test_full_output_device_has_a_remedy() -> None:
     with Path("/dev/full").open("w", encoding="ascii") as full:
         run = subprocess.run(

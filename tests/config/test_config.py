@@ -173,6 +173,26 @@ def test_error_in_a_site_file(old: str, new: str, message: str) -> None:
     assert message in caught.value.what
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "tx_power_dbm: 17",
+            "tx_power_dbm: 17dBm",
+            "'17dBm' is not a number; write it without a unit and without quotes",
+        ),
+        ("tx_power_dbm: 17", "tx_power_dbm: [17]", "[17] is not a number"),
+    ],
+)
+def test_a_number_of_the_wrong_kind_is_named(old: str, new: str, message: str) -> None:
+    assert old in PROFILE
+    with pytest.raises(ConfigurationError) as caught:
+        schema.validate(
+            schema.parse(PROFILE.replace(old, new, 1), source="robots/turtlebot3_burger.yaml"), RobotProfile
+        )
+    assert message in caught.value.what
+
+
 def test_part_of_a_document_keeps_lines_and_path() -> None:
     document = schema.parse("a:\n  b:\n    robots: 1\n", source="x.yaml").part("a", "b")
     assert document.where(("robots",)) == "x.yaml:3"

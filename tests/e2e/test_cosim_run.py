@@ -170,7 +170,7 @@ def test_replay_and_plot_reject_invalid_recordings(lab: Path) -> None:
         (("run", "pass.yaml", "--set", "duration"), "--set: 'duration' is not KEY=VALUE", "--set policy.window=5ms"),
         (("run", "pass.yaml", "--set", "lasts=1s"), "unknown key lasts", "duration"),
         (("run", "pass.yaml", "--window", "5"), "has no unit", "5s or 5ms"),
-        (("run", "pass.yaml", "--duration", "0s"), "greater than 0", ""),
+        (("run", "pass.yaml", "--duration", "0s"), "greater than 0", "correct the option with this value"),
         (("run", "pass.yaml", "--window", "0s"), "greater than 0", ""),
         (("run", "pass.yaml", "--out", "taken"), "taken: this folder is not empty", "choose another --out"),
         (("run", "pass.yaml", "--out", "pass.yaml"), "cannot be written: File exists", "choose another --out"),

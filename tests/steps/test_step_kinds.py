@@ -76,7 +76,7 @@ def test_error_of_entry_point_that_cannot_be_loaded_names_it(
     with pytest.raises(ConfigurationError, match=message) as caught:
         step_types()["load"]
     assert caught.value.what.startswith("it cannot be loaded: ")
-    assert caught.value.where == f"entry point load = {target}"
+    assert caught.value.where == f"entry point load = {target} of more-steps 1.0"
     assert caught.value.remedy == "fix or uninstall its package"
 
 
@@ -94,14 +94,14 @@ def test_entry_point_without_step_class_is_refused(install: Install, target: str
     install(load=target)
     with pytest.raises(ConfigurationError, match="a kind of step must be a subclass of Step") as caught:
         step_types()["load"]
-    assert caught.value.where == f"entry point load = {target}"
+    assert caught.value.where == f"entry point load = {target} of more-steps 1.0"
 
 
 def test_builtin_kind_cannot_be_replaced(install: Install) -> None:
     install(ping="no_such_package.steps:Ping")
     with pytest.raises(ConfigurationError, match="there is already a kind of step 'ping'") as caught:
         step_types()
-    assert caught.value.where == "entry point ping = no_such_package.steps:Ping"
+    assert caught.value.where == "entry point ping = no_such_package.steps:Ping of more-steps 1.0"
 
 
 def test_abstract_class_is_refused(install: Install) -> None:

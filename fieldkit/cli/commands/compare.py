@@ -29,7 +29,7 @@ def add(parser: Parser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("a", type=Path, metavar="A", help=shared.PATH_HELP)
     parser.add_argument("b", type=Path, metavar="B", help="the same")
-    parser.add_argument("more", type=Path, nargs="*", help=argparse.SUPPRESS)  # a glob may match more than two paths
+    parser.add_argument("more", type=Path, nargs="*", default=[], help=argparse.SUPPRESS)  # a glob may match more
     shared.add_cells(parser, PAIRED_BY)
     parser.add_argument(
         "--threshold",

@@ -75,6 +75,9 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
         if changes:
             error.where = error.where or str(path)
             error.where += f" with {', '.join(f'{key}={value}' for key, value in changes.items())}"
+            error.remedy = error.remedy.replace(
+                "correct this line", "correct the option with this value, or the line"
+            )
         raise
     return scenario
 
