@@ -9,7 +9,7 @@ from fieldkit.trial import journal, rebuild, store
 from fieldkit.trial.journal import Attempt, JournalEntry
 from tests.helpers.captures import Frame, file_bytes, ipv4
 from tests.helpers.casts import CAST, los_plan
-from tests.measure.evidence.test_measure_bag import write_bag
+from tests.ros.bags.test_measure_bag import write_bag
 
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 1_000_000_000
