@@ -25,7 +25,7 @@ from fieldkit.measure.captures.headers import address_text
 from fieldkit.measure.captures.packets import NO_PORT, Packets
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import ping, recordings
-from fieldkit.measure.evidence.recordings import Recording
+from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.transfers import altered_packets
 from fieldkit.measure.transfers.match import Match, match
 from fieldkit.measure.transfers.transfer_spec import Transfer
@@ -164,7 +164,7 @@ class AttemptRecord:
     attempt: Attempt
     captures: Mapping[str, Capture]
     pings: Mapping[str, ping.Ping]
-    bags: Mapping[Role, Recording]
+    bags: Mapping[Role, RecordingContents]
     links: Mapping[Role, Sequence[LinkSample]]
 
     @property

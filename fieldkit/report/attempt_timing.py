@@ -19,7 +19,7 @@ from fieldkit.core.columns import plain_name, step_prefixed
 from fieldkit.core.model import FaultKind, Role, StationSample
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import host, iperf3, link, outage, ping, recordings, track
-from fieldkit.measure.evidence.recordings import Recording
+from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.positions import position_columns
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
@@ -70,7 +70,7 @@ class Moments:
         activities: Activities in order of time.
     """
 
-    recorded: Mapping[str, Recording]
+    recorded: Mapping[str, RecordingContents]
     transfers: Sequence[tuple[Transfer, Fates]]
     pings: Sequence[tuple[str, Role, ping.Ping]]
     ahead_ns: Mapping[Role, int]

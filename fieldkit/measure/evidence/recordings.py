@@ -11,7 +11,7 @@ from fieldkit.core.errors import EvidenceError
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordingContents:
     """Contents of a recording.
 
     Attributes:
@@ -27,11 +27,11 @@ class Recording:
     messages_by_topic: Mapping[str, int]
 
 
-RecordingReader = Callable[[Path], Recording]
+RecordingReader = Callable[[Path], RecordingContents]
 """Returns the contents of a recording, with the errors of `read`."""
 
 
-def read(path: Path) -> Recording:
+def read(path: Path) -> RecordingContents:
     """Return the contents of a recording, whose format is known from its suffix.
 
     Raises:

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence.recordings import Recording
+from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.evidence.sandbox import Json, ReaderError, SandboxedReader
 
 METADATA: Final = "metadata.yaml"
@@ -27,7 +27,7 @@ _MIN_ALLOCATED_BYTES: Final = 64 << 20
 counts."""
 
 
-def read(path: Path) -> Recording:
+def read(path: Path) -> RecordingContents:
     """Return the contents of a bag.
 
     Args:
@@ -69,7 +69,7 @@ def read(path: Path) -> Recording:
             "the bag contains no message", where=where, remedy=f"does the topic publish? try `{tool} TOPIC`"
         )
     by_topic = MappingProxyType(contents["messages_by_topic"])
-    return Recording(messages, contents["started_utc_ns"], contents["duration_s"], by_topic)
+    return RecordingContents(messages, contents["started_utc_ns"], contents["duration_s"], by_topic)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Role
-from fieldkit.measure.evidence.recordings import Recording
+from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
@@ -122,7 +122,9 @@ def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
     return RecordStep.model_validate({"robot": role, "topics": topics, "duration": f"{duration_s}s"})
 
 
-def _record(scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient: bool) -> tuple[Path, Recording]:
+def _record(
+    scene: Scene, step: RecordStep, shell: Shell, into: Path, *, patient: bool
+) -> tuple[Path, RecordingContents]:
     """Run a recording; return the path and the content of the fetched bag.
 
     Raises:
@@ -151,7 +153,9 @@ def _end(log: Path) -> str:
         return printable(file.read(), limit=120)
 
 
-def judge(robot: Robot, topics: Sequence[str], content: Recording | None, report: Report, *, why: str = "") -> None:
+def judge(
+    robot: Robot, topics: Sequence[str], content: RecordingContents | None, report: Report, *, why: str = ""
+) -> None:
     """Report whether each topic is published at its rate, from a recording or the reason why there is none."""
     for topic in topics:
         check, rate_hz = f"topic {topic}", rate_of(robot, topic)

@@ -6,7 +6,7 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Role, Verdict
-from fieldkit.measure.evidence.recordings import Recording
+from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.ros.steps import topic_check
 from fieldkit.steps import variants
 from fieldkit.steps.scene import CommandResult
@@ -68,8 +68,8 @@ def test_ros_1_without_a_master_is_a_warning() -> None:
     assert "ROS_MASTER_URI" in warned.detail
 
 
-def recorded(count: int, span_s: float) -> Recording:
-    return Recording(count, 0, span_s, MappingProxyType({"/scan": count}))
+def recorded(count: int, span_s: float) -> RecordingContents:
+    return RecordingContents(count, 0, span_s, MappingProxyType({"/scan": count}))
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def recorded(count: int, span_s: float) -> Recording:
         (None, FAIL),
     ],
 )
-def test_a_topic_must_be_published_and_should_have_its_rate(bag: Recording | None, status: Verdict) -> None:
+def test_a_topic_must_be_published_and_should_have_its_rate(bag: RecordingContents | None, status: Verdict) -> None:
     report = Report("turtlebot-1")
     topic_check.judge(SENDER, ["/scan"], bag, report)
     assert only(report.findings, "topic /scan").status is status
@@ -92,7 +92,9 @@ def test_a_topic_must_be_published_and_should_have_its_rate(bag: Recording | Non
 
 def test_a_topic_missing_in_the_profile_has_no_rate() -> None:
     report = Report("turtlebot-1")
-    topic_check.judge(SENDER, ["/tf_static"], Recording(3, 0, 1.0, MappingProxyType({"/tf_static": 3})), report)
+    topic_check.judge(
+        SENDER, ["/tf_static"], RecordingContents(3, 0, 1.0, MappingProxyType({"/tf_static": 3})), report
+    )
     assert only(report.findings, "topic /tf_static").status is OK
 
 
