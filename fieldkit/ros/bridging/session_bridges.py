@@ -20,8 +20,8 @@ _READY_S: Final = 40
 """A small computer needs seconds to load Python, rospy and a middleware."""
 _LOG: Final = "bridge.log"
 _REMEDY: Final = (
-    "on the robot: python3 -m pip install 'fieldkit[ros2]', or correct ros.bridge.program, or leave ros.bridge out; "
-    "see fieldkit docs bridge"
+    "see its requirements: fieldkit docs bridge; on the robot: python3 -m pip install 'fieldkit[ros2]'; or correct "
+    "ros.bridge, or leave it out, in a copy of the profile"
 )
 
 

@@ -130,7 +130,8 @@ class TopicsStep(StreamOptions, AlongStep):
             log=self.prefixed_name(f"{role}-serve.log"),
             ready="log:up," if is_router else jobs.ready_when_bound(Protocol.TCP, self.listening_port),
         )
-        return Planned(role, job, program=program, setup=setup, permitted_causes=BY_FIELDKIT)
+        remedy = "" if is_router else f"sudo apt-get install python3-{MASTER}"
+        return Planned(role, job, program=program, setup=setup, permitted_causes=BY_FIELDKIT, remedy=remedy)
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:

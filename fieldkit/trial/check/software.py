@@ -41,7 +41,6 @@ _PACKAGES: Final = {
     "busybox": "busybox",
     "iperf3": "iperf3",
     "python3": "python3",
-    "rosmaster": "python3-rosmaster",
 }
 _TOOLS: Final = "tools"
 _AGENT_S: Final = 30.0
