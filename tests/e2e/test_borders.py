@@ -29,6 +29,7 @@ HARNESS_TESTS: Final = (
     "tests/config/test_site_file.py",
     "tests/core/test_columns.py",
     "tests/core/test_plugins.py",
+    "tests/export/test_export_table.py",
     "tests/measure/evidence/test_measure_host.py",
     "tests/measure/evidence/test_measure_ping.py",
     "tests/measure/evidence/test_recordings.py",

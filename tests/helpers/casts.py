@@ -39,7 +39,7 @@ steps:
       robots: [sender, receiver]
       port: 1234
       during:
-        - send: {from: sender, to: receiver, size: 100kB, port: 1234}
+        - send: {from: sender, to: receiver, size: 100kB, into: recv.bag, port: 1234}
         - ping: {from: sender, to: receiver, count: 10, interval: 200ms, payload_bytes: {tcp: 502, udp: 8192}}
 """
 
