@@ -29,9 +29,9 @@ from typing import Any, Final
 from fieldkit.agent import middleware
 from fieldkit.agent.middleware import Network, Topic
 from fieldkit.agent.stream import HEAD, MAGIC
-from fieldkit.ros import topics
-from fieldkit.ros.qos import PROFILES
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.qos import PROFILES
+from fieldkit.ros.interfaces.types import shipped
 
 HOST: Final = "127.0.0.1"
 DOMAIN: Final = 61

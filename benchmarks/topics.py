@@ -26,10 +26,10 @@ from typing import Any, Final
 from benchmarks.bridge import HOST, SIZE, TYPE, Running, Way, free_port, spread
 from fieldkit.analysis import statistics
 from fieldkit.core.threads import run_parallel
-from fieldkit.measure.transfers import topic_samples
-from fieldkit.ros import topics
-from fieldkit.ros.qos import PROFILES
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.qos import PROFILES
+from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.streams import topic_samples
 
 PLAIN: Final = {"dds": ("plain",), "zenoh": ("plain", "attached"), "ros1": ("plain",)}
 """Pairs of each middleware that are compared with the agent's."""

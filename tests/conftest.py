@@ -9,8 +9,6 @@ from typing import Final
 import pytest
 from hypothesis import HealthCheck, settings
 
-from fieldkit.bags import contents
-from fieldkit.measure.evidence import bag
 from fieldkit.measure.positions import position_files
 from tests.helpers.sshd import server
 
@@ -71,15 +69,22 @@ _LONG: Final = (
 )
 
 
+_READERS: Final = (
+    ("fieldkit.motion.logs.tlog", "_READER"),
+    ("fieldkit.ros.bags.bag", "_READER"),
+    ("fieldkit.ros.bags.contents", "_WORKER"),
+)
+"""Modules of packages that a copy may lack, and their readers."""
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _stop_readers() -> Iterator[None]:
     """Stop the file readers: each would wait a minute for another file, and the process check would wait for it."""
     yield
-    bag._READER.stop()
-    contents._WORKER.stop()
     position_files._GPX_READER.stop()
-    if tlog := sys.modules.get("fieldkit.motion.logs.tlog"):
-        tlog._READER.stop()
+    for name, reader in _READERS:
+        if module := sys.modules.get(name):
+            getattr(module, reader).stop()
 
 
 # Objects created by collection live until the end of the run, so the garbage collector must not scan them.

@@ -28,27 +28,36 @@ MAY_IMPORT = {
     "analysis": set(),
     "backends": {"config", "remote"},
     "lab": {"backends", "config"},
-    "ros": {"agent"},  # the bridge
     "agent": set(),  # it runs on robots, where not even `core` is available: see tests/agent
-    "steps": {"agent", "backends", "config", "measure", "remote", "ros"},
+    "steps": {"agent", "backends", "config", "measure", "remote"},
     "trial": {"analysis", "backends", "config", "measure", "remote", "steps"},
     "campaign": {"backends", "config", "trial"},
     "report": {"analysis", "lab", "measure", "trial"},
     "export": {"analysis", "measure", "trial"},
     "api": {"analysis", "export", "measure", "report", "trial"},
-    "bags": {"measure"},
     "cli": {
         "agent",
         "analysis",
         "backends",
-        "bags",
         "campaign",
         "config",
         "export",
         "lab",
         "remote",
         "report",
-        "ros",
+        "steps",
+        "trial",
+    },
+    # Found by entry points:
+    "ros": {
+        "agent",
+        "analysis",
+        "backends",
+        "cli",
+        "config",
+        "measure",
+        "remote",
+        "report",
         "steps",
         "trial",
     },
@@ -63,7 +72,7 @@ MAY_IMPORT = {
         "ros",
         "steps",
         "trial",
-    },  # by entry points
+    },
     "pytest": {"analysis", "api", "backends", "cli", "measure", "remote", "trial"},
 }
 # Measurement and analysis must not depend on how the files of a lab are read.
@@ -101,7 +110,7 @@ ONE_IMPORTER = {
     # neither, write their own tables.
     "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/packet_tables.py",
     # Messages of trials, messages of co-simulation recordings, and recovery of truncated bags.
-    "mcap": "fieldkit/bags/salvage.py fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
+    "mcap": "fieldkit/ros/bags/salvage.py fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
     # Trials and simulations draw different figures; `report.theme` defines their style.
     "matplotlib": "fieldkit/report/drawing.py fieldkit/report/figures.py sim_backends/cosim/plots.py",
     "jinja2": "fieldkit/report/page.py",
@@ -115,7 +124,7 @@ ONE_IMPORTER = {
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # Messages of the drone, and, in a separate process, reading its log.
     "pymavlink": "fieldkit/motion/logs/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",
-    "lz4": "fieldkit/bags/salvage.py",
+    "lz4": "fieldkit/ros/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/dds.py",
     "zenoh": "fieldkit/agent/zenoh.py",
     # On a robot, and in the relay of an emulated robot's sensors to its master.
@@ -173,13 +182,25 @@ def test_imports_point_one_way(path: Path) -> None:
             assert own_package in {"__init__.py", "__main__.py"}, f"{path} is in no package"
 
 
-@pytest.mark.parametrize("folder", ["fieldkit", "sim_backends"])
-def test_only_entry_points_lead_to_motion(folder: str) -> None:
-    """`tests/e2e/test_motion_border.py` removes the package and runs tests of the harness."""
-    for path in modules(folder):
-        if not path.is_relative_to(ROOT / "fieldkit" / "motion"):
-            assert not any(name.startswith("fieldkit.motion") for name in imported_names(path)), path
+@pytest.mark.parametrize(
+    ("package", "importers"),
+    [("fieldkit.motion", ()), ("fieldkit.ros", ("fieldkit/motion", "sim_backends"))],
+    ids=["motion", "ros"],
+)
+def test_only_entry_points_lead_to_a_product(package: str, importers: tuple[str, ...]) -> None:
+    """`tests/e2e/test_borders.py` removes these packages and runs tests of the harness.
 
+    Robots drive by messages of ROS, and emulated robots publish them.
+    """
+    inside = (package.replace(".", "/"), *importers)
+    for path in modules("fieldkit") + modules("sim_backends"):
+        if not str(path.relative_to(ROOT)).startswith(inside):
+            names = imported_names(path)
+            assert not any(name == package or name.startswith(f"{package}.") for name in names), path
+
+
+ROS_SEAMS = ("fieldkit.ros.interfaces", "fieldkit.ros.middlewares.ports")
+"""The modules of `fieldkit.ros` that `sim_backends` imports: message types, names, quality of service, ports."""
 
 # Commands of other packages declare arguments, display and draw like fieldkit's commands (docs/add-a-command.md).
 COMMAND_SEAMS = (
@@ -196,8 +217,8 @@ def test_backends_import_only_the_seams(path: Path) -> None:
     seams = COMMAND_SEAMS if str(path.relative_to(ROOT)).startswith(COMMANDS) else ()
     for name in imported_names(path):
         if name.startswith("fieldkit."):
-            assert package_name(name) in {"core", "config", "backends", "remote", "ros", "agent"} or name.startswith(
-                ("fieldkit.lab.protocol", *seams)
+            assert package_name(name) in {"core", "config", "backends", "remote", "agent"} or name.startswith(
+                ("fieldkit.lab.protocol", *ROS_SEAMS, *seams)
             ), f"{path} imports {name}"
 
 
@@ -261,7 +282,8 @@ def imports_between(folder: Path) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize(
-    "folder", ["fieldkit", "fieldkit/measure", "fieldkit/trial", "sim_backends", "sim_backends/emulated"]
+    "folder",
+    ["fieldkit", "fieldkit/measure", "fieldkit/ros", "fieldkit/trial", "sim_backends", "sim_backends/emulated"],
 )
 def test_packages_have_no_import_cycles(folder: str) -> None:
     graph = imports_between(ROOT / folder)

@@ -23,10 +23,11 @@ from typing import Any, Final
 
 from benchmarks.studies.middleware import LAB, ROOT
 from fieldkit.core import files
-from fieldkit.measure.transfers import topic_samples
-from fieldkit.ros import topics, tuning
-from fieldkit.ros.qos import PROFILES
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.qos import PROFILES
+from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.middlewares import tuning
+from fieldkit.ros.streams import topic_samples
 
 BEGIN: Final = "<!-- written by benchmarks.studies.zenoh_images: from here -->"
 END: Final = "<!-- written by benchmarks.studies.zenoh_images: to here -->"

@@ -5,7 +5,7 @@ system call, so that logging does not delay samples. The file grows by pieces th
 are mapped: a full disk raises an error then, instead of a signal at a later store. (A failing disk still causes a
 signal.) If a log was not closed, zeros follow its last record.
 
-`fieldkit.measure.transfers.topic_samples` reads it.
+`fieldkit.ros.streams.topic_samples` reads it.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 By docs/design.md of github.com/ros2/rmw_zenoh the key expression contains the type's name and hash, each sample has
 an attachment, and each node and endpoint a liveliness token. The laptop computes the key expressions
-(`fieldkit.ros.names`).
+(`fieldkit.ros.interfaces.names`).
 """
 
 from __future__ import annotations

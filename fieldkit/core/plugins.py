@@ -15,6 +15,15 @@ STEPS: Final = "fieldkit.steps"
 """Entry point group of step kinds: `NAME = "package.module:Class"`, a `Step`."""
 MOTION: Final = "fieldkit.motion"
 """Entry point group of the package that moves robots: `control`; see `fieldkit.trial.running.motion_control`."""
+RECORDINGS: Final = "fieldkit.recordings"
+"""Entry point group of readers of recordings: `SUFFIX = "package.module:function"`, without the dot; see
+`fieldkit.measure.evidence.recordings`."""
+SESSION_JOBS: Final = "fieldkit.session_jobs"
+"""Entry point group of jobs that run during a whole session: `NAME = "package.module:function"`; see
+`fieldkit.trial.session_jobs`."""
+CHECKS: Final = "fieldkit.checks"
+"""Entry point group of checks of a robot: `NAME = "package.module:function"`; see
+`fieldkit.trial.running.preflight`."""
 POSITIONS: Final = "fieldkit.positions"
 """Entry point group of readers of positions: `SUFFIX = "package.module:function"`, without the dot; see
 `fieldkit.measure.positions.recorded`."""

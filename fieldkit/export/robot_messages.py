@@ -24,7 +24,8 @@ from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.headers import address_text
 from fieldkit.measure.captures.packets import NO_PORT, Packets
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence import bag, ping
+from fieldkit.measure.evidence import ping, recordings
+from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.transfers import altered_packets
 from fieldkit.measure.transfers.match import Match, match
 from fieldkit.measure.transfers.transfer_spec import Transfer
@@ -163,7 +164,7 @@ class AttemptRecord:
     attempt: Attempt
     captures: Mapping[str, Capture]
     pings: Mapping[str, ping.Ping]
-    bags: Mapping[Role, bag.Bag]
+    bags: Mapping[Role, RecordingContents]
     links: Mapping[Role, Sequence[LinkSample]]
 
     @property
@@ -176,7 +177,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
     """Return the readable recordings of an attempt."""
     captures = {name: evidence.read_or_none(pcap.read, name) for name in plan.captures()}
     pings = {pinging.file: evidence.read_or_none(ping.read, pinging.file) for pinging in plan.pingings()}
-    bags = {role: evidence.read_or_none(bag.read, name) for role, name in plan.bags().items()}
+    bags = {role: evidence.read_or_none(recordings.read, name) for role, name in plan.bags().items()}
     return AttemptRecord(
         plan=plan,
         attempt=attempt,

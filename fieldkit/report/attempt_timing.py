@@ -1,7 +1,7 @@
 """Times and flows in one attempt on the clock of the first sending robot.
 
-Times are those of packets, pings, jobs, faults and moves. Flows over time are the rate of iperf3, the samples of
-topics and the payload of transfers.
+Times are those of packets, pings, jobs, faults and moves. Flows over time are the rate of iperf3, the payload of
+transfers, and the panels of steps that draw them (`DrawsPanels`).
 """
 
 import math
@@ -9,17 +9,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
 from fieldkit.analysis.repeats import Repeats
+from fieldkit.core import model
 from fieldkit.core.columns import plain_name, step_prefixed
-from fieldkit.core.model import FaultKind, Protocol, Role, StationSample
+from fieldkit.core.model import FaultKind, Role, StationSample
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import bag, host, iperf3, link, outage, ping, track
+from fieldkit.measure.evidence import host, iperf3, link, outage, ping, recordings, track
+from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.positions import position_columns
-from fieldkit.measure.transfers import fates, topic_samples
+from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report.charts import Panel, Series
@@ -68,7 +70,7 @@ class Moments:
         activities: Activities in order of time.
     """
 
-    recorded: Mapping[str, bag.Bag]
+    recorded: Mapping[str, RecordingContents]
     transfers: Sequence[tuple[Transfer, Fates]]
     pings: Sequence[tuple[str, Role, ping.Ping]]
     ahead_ns: Mapping[Role, int]
@@ -82,7 +84,7 @@ class Moments:
 
 def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> Moments:
     """Return the times from the evidence of the attempt in a row."""
-    transfers = plan.transfers(Protocol(repeats.texts["protocol"][row]))
+    transfers = plan.transfers(model.Protocol(repeats.texts["protocol"][row]))
     first = next(iter(transfers), None)
     ends = (first.source, first.destination) if first else (Role.SENDER, Role.RECEIVER)
     packets = [
@@ -90,7 +92,7 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> M
         for transfer in transfers
         if (packet_fates := fates.read(evidence, transfer)) is not None
     ]
-    bags = {transfer.sent_file: evidence.read_or_none(bag.read, transfer.sent_file) for transfer in transfers}
+    bags = {transfer.sent_file: evidence.read_or_none(recordings.read, transfer.sent_file) for transfer in transfers}
     outputs = [
         (pinging.name, pinging.role, evidence.read_or_none(ping.read, pinging.file)) for pinging in plan.pingings()
     ]
@@ -248,16 +250,28 @@ def _activities_of_moves(evidence: AttemptEvidence) -> Iterator[Activity]:
             yield Activity(f"move {role}", changes[0][0], changes[-1][1], "orange")
 
 
-MAX_SAMPLES: Final = 1500
-"""Maximum number of samples of each kind in a panel; of more samples, every k-th is drawn."""
-_TIME: Final = "time [s]"
+@runtime_checkable
+class DrawsPanels(Protocol):
+    """A step whose evidence is drawn over time, in panels of the time line of an attempt."""
+
+    def panels(self, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+        """Yield the panels; there are none without evidence.
+
+        Args:
+            evidence: Evidence of the attempt.
+            times: Times of the attempt.
+            zero_ns: Start of the time axis, in nanoseconds since 1970 UTC.
+        """
+        ...
+
+
+TIME_LABEL: Final = "time [s]"
+"""Label of the time axis of the panels."""
 _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
-_RECEIVED: Final = Style("green", "^", "none")
-_LOST: Final = Style("lost", "x", "none")
 
 
 def flow_panels(evidence: AttemptEvidence, plan: Plan, times: Moments, zero_ns: int) -> Iterator[Panel]:
-    """Yield a panel for each test of iperf3 and each topic whose evidence has times.
+    """Yield the panels of steps whose evidence has times: tests of iperf3, and steps that draw their panels.
 
     Args:
         evidence: Evidence of the attempt.
@@ -268,8 +282,8 @@ def flow_panels(evidence: AttemptEvidence, plan: Plan, times: Moments, zero_ns: 
     for placed in plan.procedure.walk():
         if placed.kind == "iperf3":
             yield from _iperf3(placed, evidence, times, zero_ns)
-        elif placed.kind == "topics":
-            yield from _topic(placed, evidence, times, zero_ns)
+        elif isinstance(placed.step, DrawsPanels):
+            yield from placed.step.panels(evidence, times, zero_ns)
 
 
 def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
@@ -290,49 +304,8 @@ def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_
     if series:
         yield Panel(
             title=f"payload of {step.prefixed_name('iperf3')}",
-            x_label=_TIME,
+            x_label=TIME_LABEL,
             y_label="[Mbit/s]",
             series=series,
             words=f"Mbit/s of payload each second: {', '.join(words)}",
         )
-
-
-def _topic(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
-    """Yield the delays of received samples, and the lost samples, by the time of sending."""
-    step = placed.step
-    logs = {
-        role: evidence.read_or_none(topic_samples.read_log, step.prefixed_name(f"{role}-topic.bin"))
-        for verb in ("publish", "subscribe")
-        for role, job in times.jobs
-        if job == step.prefixed_name(verb)
-    }
-    complete = [log for log in logs.values() if log]
-    if len(complete) != 2:
-        return
-    publisher, _ = logs
-    sent, received = (log.samples for log in complete)
-    if not len(sent.sequence):
-        return
-    is_lost = ~np.isin(sent.sequence, received.sequence)
-    lost_s = (sent.at_ns[is_lost] - times.ahead_ns[publisher] - zero_ns) / 1e9
-    took_ms = (
-        received.at_ns - received.sent_ns
-    ) / 1e6  # measured with two clocks, so only differences are meaningful
-    excess_ms = took_ms - took_ms.min(initial=math.inf) if len(took_ms) else took_ms
-    received_s = (received.sent_ns - times.ahead_ns[publisher] - zero_ns) / 1e9
-    kinds = (
-        ("sample received", _RECEIVED, received_s, excess_ms),
-        ("sample lost", _LOST, lost_s, np.zeros(len(lost_s))),
-    )
-    series = []
-    for label, style, at_s, heights in kinds:
-        every_kth = slice(None, None, max(1, -(-len(at_s) // MAX_SAMPLES)))
-        series.append(Series(label, style, at_s[every_kth], heights[every_kth]))
-    yield Panel(
-        title=f"delay of {step.name or 'the topic'} beyond its fastest sample",
-        x_label=_TIME,
-        y_label="[ms]",
-        series=series,
-        words=f"{len(sent.sequence)} samples sent, {int(is_lost.sum())} lost, {len(received.sequence)} received",
-        top=None if len(excess_ms) else 1.0,
-    )

@@ -1,1 +1,1 @@
-"""ROS on the laptop: message types, names for DDS and Zenoh, qualities of service, bridges."""
+"""Robots with ROS: message types, middlewares, streams, bags, steps, bridge. Entry points add it to the harness."""

@@ -16,7 +16,6 @@ from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
-from fieldkit.ros.ports import MAX_DOMAIN
 from sim_backends.emulated.emulated_options import EmulatedOptions, Ros2Options, RosChoice, load_options
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
@@ -239,6 +238,8 @@ def _check_bridges(robots: "Mapping[RobotKey, Robot | LabRobot]", ros: RosChoice
 
 def _check_ros2(name: str, ros: Ros, options: Ros2Options) -> None:
     """Raise ConfigurationError if the lab does not support the ROS 2 settings of a profile."""
+    from fieldkit.ros.middlewares.ports import MAX_DOMAIN  # noqa: PLC0415 (other robots need no package for ROS)
+
     if options.discovery == "router" and ros.middleware != "zenoh":
         raise ConfigurationError(
             "emulated.ros2 has a router, but the profile uses DDS, which has no router",

@@ -17,9 +17,9 @@ import pytest
 from fieldkit.agent import records
 from fieldkit.core.deadline import Deadline
 from fieldkit.remote import agent
-from fieldkit.ros import topics
-from fieldkit.ros.qos import PROFILES
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.qos import PROFILES
+from fieldkit.ros.interfaces.types import shipped
 from tests.helpers import topic_logs
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until

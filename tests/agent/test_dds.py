@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from fieldkit.agent import dds
 from fieldkit.agent.middleware import MiddlewareError, Network, Quality, Topic
-from fieldkit.ros import topics, tuning
-from fieldkit.ros.qos import PROFILES
-from fieldkit.ros.types import MessageTypes, shipped
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.qos import PROFILES
+from fieldkit.ros.interfaces.types import MessageTypes, shipped
+from fieldkit.ros.middlewares import tuning
 
 OWN = "float32[4] level\nstring name\nuint8[] raw\nint16[<=3] few\nbool good\nbyte one\nfloat64 wide\nint64[2] big\n"
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.agent import graph
-from fieldkit.ros import names
-from fieldkit.ros.types import Distribution, MessageTypes
+from fieldkit.ros.interfaces import names
+from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 
 TYPE = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 GUIDS = st.binary(min_size=16, max_size=16)

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.ros import topics
-from fieldkit.ros.crossings import parse_qos
-from fieldkit.ros.types import shipped
+from fieldkit.ros.bridging.crossings import parse_qos
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.types import shipped
 from tests.helpers.paths import ROOT
 from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
-WIRE_END = ROOT / "tests" / "ros" / "wire_end.py"
+WIRE_END = ROOT / "tests" / "ros" / "bridging" / "wire_end.py"
 TYPE = "std_msgs/msg/String"
 DEPTH = 2
 LIMIT_S = "90"

@@ -11,7 +11,7 @@ import pytest
 
 from fieldkit.agent import records
 from fieldkit.agent.records import Log, LogError
-from fieldkit.measure.transfers import topic_samples
+from fieldkit.ros.streams import topic_samples
 from tests.helpers.paths import ROOT
 
 SEVERAL_PIECES = 5 * records.PIECE_BYTES // records.RECORD.size

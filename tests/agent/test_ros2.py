@@ -14,9 +14,9 @@ import pytest
 
 from fieldkit.agent import records
 from fieldkit.remote import agent
-from fieldkit.ros import topics
-from fieldkit.ros.qos import PROFILES
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.qos import PROFILES
+from fieldkit.ros.interfaces.types import shipped
 from tests.helpers.paths import ROOT
 from tests.helpers.two_hosts import TestHost, two_connected_hosts
 

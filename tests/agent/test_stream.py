@@ -16,7 +16,7 @@ from fieldkit.agent import records, stream
 from fieldkit.agent.middleware import Deliver, Topic
 from fieldkit.agent.records import Log, LogError
 from fieldkit.agent.stream import SampleCodec, Stream
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces.types import shipped
 from tests.helpers import topic_logs
 
 TYPE = "std_msgs/msg/UInt8MultiArray"

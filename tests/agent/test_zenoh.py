@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fieldkit.agent import zenoh as adapter
 from fieldkit.agent.middleware import Network
-from fieldkit.ros import tuning
+from fieldkit.ros.middlewares import tuning
 
 numbers = st.integers(-(2**63), 2**63 - 1)
 

@@ -24,6 +24,7 @@ def names(tmp_path: Path, text: str) -> list[str]:
     return [str(trial) for trial in trials_of(campaign, load_procedures(campaign, document), document)]
 
 
+@pytest.mark.ros
 def test_a_campaign_combines_distances_procedures_and_topologies(tmp_path: Path) -> None:
     trial_names = names(tmp_path, LAWN)
     assert sorted(trial_names) == [
@@ -34,6 +35,7 @@ def test_a_campaign_combines_distances_procedures_and_topologies(tmp_path: Path)
     ]
 
 
+@pytest.mark.ros
 def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
     trial_names = names(tmp_path, f"{LAWN}except: [{{topology: master, distance: 240 cm}}]\n".replace("20ft", "2.4m"))
     assert len(trial_names) == 6
@@ -41,6 +43,7 @@ def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
     assert len(names(tmp_path, f"{LAWN}except: [{{procedure: nlos}}]\n")) == 4
 
 
+@pytest.mark.ros
 @pytest.mark.parametrize(
     ("old", "new", "line", "output_text"),
     [

@@ -81,7 +81,10 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
     )
     count, *names = done.stdout.splitlines()[-1].split()
     kinds = {name for name in names if name.startswith("fieldkit.steps.kinds.")}
-    assert kinds == {f"fieldkit.steps.kinds.{kind}" for kind in ("capture", "ping", "record", "transfer")}
+    assert kinds == {f"fieldkit.steps.kinds.{kind}" for kind in ("capture", "ping", "transfer")}
+    assert {name for name in names if name.startswith("fieldkit.ros.steps.")} <= {
+        f"fieldkit.ros.steps.{name}" for name in ("record", "ros_master", "topic_check")
+    }
     assert not any(name.startswith("fieldkit.motion") for name in names)
     assert int(count) <= MAX_LINES[options]
 

@@ -22,7 +22,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.lab import folder, requests
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces.types import shipped
 from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.runs import fieldkit, start
 

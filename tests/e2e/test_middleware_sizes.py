@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from fieldkit.ros import tuning
+from fieldkit.ros.middlewares import tuning
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, only_trial
 

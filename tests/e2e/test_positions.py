@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.model import Role, TrackPoint
-from fieldkit.measure.evidence import bag, ping, track
+from fieldkit.measure.evidence import ping, track
 from fieldkit.measure.evidence.track import Separation
+from fieldkit.ros.bags import bag
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, only_trial, rows
 

@@ -15,6 +15,8 @@ from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers.stored_trials import TRIALS
 
+pytestmark = pytest.mark.ros  # the stored trial records bags
+
 LOSSY = next(TRIALS.glob("20261122T013134*"))
 
 

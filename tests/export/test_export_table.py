@@ -18,7 +18,7 @@ from tests.helpers.runs import rows
 
 @pytest.fixture
 def trial(tmp_path: Path) -> Path:
-    return recorded.make(tmp_path)
+    return recorded.make_plain(tmp_path)
 
 
 def exported(*paths: Path, kind: str, name: str = "out") -> Path:

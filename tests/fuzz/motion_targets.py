@@ -18,7 +18,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.core.prompts import Question
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import ping, recorded_topics
+from fieldkit.measure.evidence import ping
 from fieldkit.measure.positions import position_columns, position_files, position_sources
 from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
@@ -27,15 +27,16 @@ from fieldkit.motion.logs import drive_log
 from fieldkit.motion.steps.driving import DriveLease
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
+from fieldkit.ros.bags import recorded_topics
 from fieldkit.steps.kinds import ask
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
 from tests.helpers.casts import CAST, los_plan
-from tests.measure.evidence.test_recorded_topics import ROS2, log, write
-from tests.measure.positions.test_position_files import BEGAN_NS, S, fix, odometry, transform, written
 from tests.motion.logs.test_drive_log import drive
+from tests.ros.bags.test_bag_positions import BEGAN_NS, S, fix, odometry, transform, written
+from tests.ros.bags.test_recorded_topics import ROS2, log, write
 
 _ENDS: Final = (Role.SENDER, Role.RECEIVER)
 _JOB: Final = Job(folder="f", name="drive", argv=(), limit_s=1.0, log="drive.log")

@@ -25,11 +25,7 @@ from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
 from fieldkit.measure import robot_clock
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.checks import topic_captures, topic_checks
-from fieldkit.measure.checks.topic_captures import CapturedTopic
-from fieldkit.measure.checks.topic_checks import TopicPlan
 from fieldkit.measure.evidence import (
-    bag,
     clock,
     endings,
     host,
@@ -43,11 +39,14 @@ from fieldkit.measure.evidence import (
 )
 from fieldkit.measure.evidence.sandbox import ReaderError
 from fieldkit.measure.positions.position_sources import Account
-from fieldkit.measure.transfers import topic_columns, topic_samples
-from fieldkit.measure.transfers.topic_columns import TopicTraffic
 from fieldkit.motion.logs import tlog, tlog_positions
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
+from fieldkit.ros.bags import bag
+from fieldkit.ros.streams import topic_captures, topic_checks, topic_columns, topic_samples
+from fieldkit.ros.streams.topic_captures import CapturedTopic
+from fieldkit.ros.streams.topic_checks import TopicPlan
+from fieldkit.ros.streams.topic_columns import TopicTraffic
 from fieldkit.steps.scene import CommandResult
 from fieldkit.steps.view import View
 from fieldkit.trial import columns, journal, manifest, plan, rebuild, store
@@ -62,9 +61,9 @@ from tests.fuzz.radio_targets import radio_targets
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
 from tests.helpers.drones import flight
 from tests.helpers.paths import DATA, ROOT
-from tests.measure.evidence.test_measure_bag import write_bag, write_ros2_bag
-from tests.measure.evidence.test_measure_battery import TOPIC, ros1
 from tests.remote.test_remote_fuzz import Sender, entry
+from tests.ros.bags.test_measure_bag import write_bag, write_ros2_bag
+from tests.ros.bags.test_measure_battery import TOPIC, ros1
 
 TRIALS: Final = DATA / "fieldkit" / "4" / "trials"
 LOS: Final = TRIALS / "20261122T013134.573068Z_los_30ft_master"

@@ -3,11 +3,12 @@
 from datetime import UTC, datetime
 
 from fieldkit.backends.protocols import Robot
+from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile, Ros, load_profile
 from fieldkit.core.model import Protocol, Role, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.procedure import load_procedure
+from fieldkit.trial.procedure import Procedure, load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 
 TURTLEBOT = load_profile("turtlebot3_burger")
@@ -26,9 +27,36 @@ def ros_of(profile: RobotProfile) -> Ros:
     return profile.ros
 
 
+PLAIN = """\
+name: los
+summary: "Line of sight without ROS: capture on both ends, transfer a generated file, ping"
+scenario: los
+topology: master
+protocols: [tcp, udp]
+repeats: 20
+steps:
+  - capture:
+      robots: [sender, receiver]
+      port: 1234
+      during:
+        - send: {from: sender, to: receiver, size: 100kB, into: recv.bag, port: 1234}
+        - ping: {from: sender, to: receiver, count: 10, interval: 200ms, payload_bytes: {tcp: 502, udp: 8192}}
+"""
+
+
 def los_plan(*, repeats: int = 2, protocols: tuple[Protocol, ...] = (), record_s: float | None = None) -> Plan:
+    """A trial of the shipped procedure `los`, which records a bag (`fieldkit.ros`)."""
+    return _plan(load_procedure("los"), repeats, protocols, record_s)
+
+
+def plain_plan(*, repeats: int = 2, protocols: tuple[Protocol, ...] = ()) -> Plan:
+    """A trial like that of `los_plan` whose steps need neither `fieldkit.ros` nor `fieldkit.motion`."""
+    return _plan(schema.validate(schema.parse(PLAIN, source="los.yaml"), Procedure), repeats, protocols)
+
+
+def _plan(procedure: Procedure, repeats: int, protocols: tuple[Protocol, ...], record_s: float | None = None) -> Plan:
     request = TrialRequest(
-        procedure=load_procedure("los"),
+        procedure=procedure,
         distance=parse_distance("30ft"),
         topology=Topology.MASTER,
         protocols=protocols,

@@ -19,7 +19,7 @@ from fieldkit.steps.scene import Planned
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
 from tests.helpers.captures import Frame, file_bytes, ipv4
-from tests.measure.evidence.test_measure_bag import write_bag
+from tests.ros.bags.test_measure_bag import write_bag
 
 _START_NS = 1_700_000_000_000_000_000
 _HOP_NS = 2_000_000

@@ -1,15 +1,15 @@
 """A small hand-written trial on disk whose packets, replies and journal entries are all known."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from fieldkit.core.model import Protocol, Status
 from fieldkit.trial import journal, rebuild, store
 from fieldkit.trial.journal import Attempt, JournalEntry
+from fieldkit.trial.plan import Plan
 from tests.helpers.captures import Frame, file_bytes, ipv4
-from tests.helpers.casts import CAST, los_plan
-from tests.measure.evidence.test_measure_bag import write_bag
+from tests.helpers.casts import CAST, los_plan, plain_plan
 
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 1_000_000_000
@@ -39,7 +39,29 @@ def segment(number: int, payload_bytes: int) -> bytes:
 
 def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Path:
     """Write the folder of a trial with one repeat whose first attempt is void."""
+    from tests.ros.bags.test_measure_bag import write_bag  # noqa: PLC0415 (a copy without ROS lacks it)
+
     plan = los_plan(repeats=1, protocols=(Protocol.UDP,), record_s=2.0)
+    return make_of(
+        plan, out, lambda folder: write_bag(folder / "scan.bag", {"/scan": 11}), packets=packets, lost=lost
+    )
+
+
+def make_plain(out: Path) -> Path:
+    """Write the folder of a trial like that of `make` that sends a generated file in place of a bag."""
+    plan = plain_plan(repeats=1, protocols=(Protocol.UDP,))
+    return make_of(plan, out, lambda folder: (folder / "send.bin").write_bytes(bytes(100_000)))
+
+
+def make_of(
+    plan: Plan,
+    out: Path,
+    write_sent: Callable[[Path], object],
+    *,
+    packets: int = PACKETS,
+    lost: Sequence[int] = LOST,
+) -> Path:
+    """Write the folder of a trial; `write_sent` writes the sent file into the folder of an attempt."""
     folder = store.create(out, plan)
     (repeat,) = plan.order()
     void = Attempt(repeat, 1, START_NS, Status.VOID, "ping.txt is missing")
@@ -54,6 +76,7 @@ def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Pa
     journal.append(folder, *entries)
     (folder / store.REPEATS / void.folder).mkdir()
     write_evidence(folder / store.REPEATS / valid.folder, valid.started_utc_ns, packets, lost)
+    write_sent(folder / store.REPEATS / valid.folder)
     rebuild.rebuild(folder)
     return folder
 
@@ -61,7 +84,6 @@ def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Pa
 def write_evidence(folder: Path, start_ns: int, packets: int, lost: Sequence[int]) -> None:
     """Write the evidence of a repeat: the transfer starts after 2 s, the ping after 3 s; one packet arrives twice."""
     folder.mkdir()
-    write_bag(folder / "scan.bag", {"/scan": 11})
     (folder / "recv.bag").touch()
     sent = [Frame(start_ns + 2 * SECOND_NS + 1_000_000 * index, packet(index), 1042) for index in range(packets)]
     received = [

@@ -10,11 +10,10 @@ from fieldkit.agent import records
 from fieldkit.agent.records import Log
 from fieldkit.core.columns import Measured
 from fieldkit.measure.captures import pcap
-from fieldkit.measure.checks import topic_captures, topic_checks
-from fieldkit.measure.checks.topic_captures import CapturedTopic
-from fieldkit.measure.checks.topic_checks import TopicPlan
-from fieldkit.measure.transfers import topic_columns, topic_samples
-from fieldkit.measure.transfers.topic_columns import TopicTraffic
+from fieldkit.ros.streams import topic_captures, topic_checks, topic_columns, topic_samples
+from fieldkit.ros.streams.topic_captures import CapturedTopic
+from fieldkit.ros.streams.topic_checks import TopicPlan
+from fieldkit.ros.streams.topic_columns import TopicTraffic
 from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4
 
 US: Final = 1_000

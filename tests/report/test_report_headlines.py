@@ -108,7 +108,7 @@ def test_quantity_without_its_own_loss_uses_the_other_losses() -> None:
 
 def evidence_with(folder: Path, *expected: str) -> Evidence:
     """Return the evidence of a synthetic trial with expectations."""
-    trial = recorded.make(folder)
+    trial = recorded.make_plain(folder)
     plan = store.read_plan(trial)
     changed = plan.procedure.model_copy(update={"expect": expected})
     (trial / PLAN_FILE).write_text(schema.dump(plan.model_copy(update={"procedure": changed})), encoding="utf-8")

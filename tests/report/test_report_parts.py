@@ -18,7 +18,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import iperf3, ping
-from fieldkit.measure.transfers import fates, iperf3_load, tcp, topic_columns
+from fieldkit.measure.transfers import fates, iperf3_load, tcp
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report import distance, distribution, figures, headlines, packet_rasters, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
@@ -26,6 +26,7 @@ from fieldkit.report.contents import put_together
 from fieldkit.report.series import Identities
 from fieldkit.report.theme import Style
 from fieldkit.report.trial_folders import load_evidence
+from fieldkit.ros.streams import topic_columns
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
 from tests.helpers import lawns, tables

@@ -11,11 +11,11 @@ from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import host, track
-from fieldkit.measure.transfers import topic_samples
 from fieldkit.report import timeline
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import repeat_to_draw
 from fieldkit.report.trial_folders import load_evidence
+from fieldkit.ros.streams import topic_samples
 from fieldkit.trial import procedure, sources, store
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers import recorded

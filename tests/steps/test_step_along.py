@@ -8,9 +8,9 @@ import pytest
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Role
+from fieldkit.ros.steps.topics import TopicsStep
 from fieldkit.steps.kinds.iperf3 import Iperf3Step
 from fieldkit.steps.kinds.ping import PingStep
-from fieldkit.steps.kinds.topics import TopicsStep
 from fieldkit.steps.kinds.wait import WaitStep
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST

@@ -8,8 +8,8 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.remote import jobs
+from fieldkit.ros.steps.record import RecordStep
 from fieldkit.steps.kinds.capture import CaptureStep
-from fieldkit.steps.kinds.record import RecordStep
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan, ros_of

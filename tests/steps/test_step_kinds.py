@@ -15,9 +15,9 @@ from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.trial.columns import installed
 from tests.helpers.outside_packages import write_package
 
-BUILTIN = ["record", "capture", "transfer", "ping", "fault", "wait", "ask", "together"]
-BUILTIN += ["run", "iperf3", "soak", "send", "track", "topics"]
+BUILTIN = ["capture", "transfer", "ping", "fault", "wait", "ask", "together", "run", "iperf3", "soak", "send"]
 MOTION = ["fly", "mavlink", "move"]
+ROS = ["record", "topics", "track"]
 
 Install = Callable[..., None]
 
@@ -40,19 +40,21 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
 
 @pytest.mark.motion
+@pytest.mark.ros
 def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Install) -> None:
     install()
-    assert list(step_types()) == [*BUILTIN, *MOTION]
-    assert kinds.shipped() == {*BUILTIN, *MOTION}
+    assert list(step_types()) == [*BUILTIN, *MOTION, *ROS]
+    assert kinds.shipped() == {*BUILTIN, *MOTION, *ROS}
     for kind in BUILTIN:
         step = step_types()[kind]
         assert (step.__module__, step.__name__) == (f"fieldkit.steps.kinds.{kind}", f"{kind.capitalize()}Step")
 
 
 @pytest.mark.motion
+@pytest.mark.ros
 def test_kinds_of_packages_follow_by_name(install: Install) -> None:
     install(zoom="fieldkit.steps.kinds.ping:PingStep", load="fieldkit.steps.kinds.ping:PingStep")
-    assert list(step_types()) == [*BUILTIN, "fly", "load", "mavlink", "move", "zoom"]
+    assert list(step_types()) == [*BUILTIN, "fly", "load", "mavlink", "move", *ROS, "zoom"]
     assert step_types()["load"] is PingStep
 
 

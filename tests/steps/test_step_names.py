@@ -19,7 +19,7 @@ from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.captures import datagram, file_bytes, timed
 from tests.helpers.casts import CAST, los_plan
-from tests.measure.evidence.test_measure_bag import write_bag
+from tests.ros.bags.test_measure_bag import write_bag
 
 HEAD = "name: x\nsummary: x\nscenario: los\ntopology: master\nprotocols: [udp]\nrepeats: 1\nsteps:\n"
 STEPS = """\

@@ -11,9 +11,9 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
+from fieldkit.ros.steps.record import RecordStep
 from fieldkit.steps.kinds.capture import CaptureStep
 from fieldkit.steps.kinds.ping import PingStep
-from fieldkit.steps.kinds.record import RecordStep
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.trial.procedure import load_procedure
 from tests.helpers.casts import CAST, TURTLEBOT, ros_of

@@ -17,7 +17,7 @@ from fieldkit.trial.procedure import load_procedure
 from tests.helpers.captures import datagram, file_bytes, timed
 from tests.helpers.casts import los_plan
 from tests.helpers.plans import problems, write_states
-from tests.measure.evidence.test_measure_bag import write_bag
+from tests.ros.bags.test_measure_bag import write_bag
 
 PLAN = los_plan(record_s=2.0, protocols=(Protocol.UDP,))
 FRAMES = timed([frame for number in range(4) for frame in datagram(number, 8192)])

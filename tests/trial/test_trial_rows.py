@@ -5,12 +5,12 @@ from pathlib import Path
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.rebuild import rebuild
-from tests.helpers.recorded import make
+from tests.helpers.recorded import make_plain
 from tests.helpers.runs import rows
 
 
 def test_a_rebuilt_row_has_the_schema_version_of_its_measurement(tmp_path: Path) -> None:
-    folder = make(tmp_path)
+    folder = make_plain(tmp_path)
     plan = folder / PLAN_FILE
     current = f"schema_version: {SCHEMA_VERSION}\n"
     old = plan.read_text(encoding="utf-8")

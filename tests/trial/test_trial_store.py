@@ -9,12 +9,12 @@ from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.trial import manifest, store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
-from tests.helpers.casts import los_plan
+from tests.helpers.casts import los_plan, plain_plan
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    made = store.create(tmp_path, los_plan())
+    made = store.create(tmp_path, plain_plan())
     partial = store.open_attempt(made, RepeatId(Protocol.UDP, 1))
     (partial / "scan.bag").write_bytes(b"#ROSBAG V2.0\n" * 100)
     (partial / "ping.txt").write_text("PING", encoding="utf-8")
@@ -27,10 +27,11 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_plan_is_written_and_read_back(folder: Path) -> None:
-    assert store.read_plan(folder) == los_plan()
+    assert store.read_plan(folder) == plain_plan()
     assert schema.dump(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
 
 
+@pytest.mark.ros
 def test_a_plan_contains_the_inputs_of_the_numbers() -> None:
     plan = los_plan(record_s=2.0)
     text = schema.dump(plan)
@@ -45,7 +46,7 @@ def test_a_plan_with_an_invalid_folder_name_is_rejected(folder: Path, name: str)
     """The folder of that name is removed on robots."""
     path = folder / "trial.yaml"
     text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace(f"trial: {los_plan().trial}", f"trial: '{name}'"), encoding="utf-8")
+    path.write_text(text.replace(f"trial: {plain_plan().trial}", f"trial: '{name}'"), encoding="utf-8")
     with pytest.raises(ConfigurationError, match=r"in trial: ") as caught:
         store.read_plan(folder)
     assert caught.value.where.startswith(str(path))
@@ -90,7 +91,7 @@ def test_a_folder_without_a_trial_is_an_error(tmp_path: Path) -> None:
 def test_an_out_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(ConfigurationError, match="cannot create"):
-        store.create(tmp_path / "file", los_plan())
+        store.create(tmp_path / "file", plain_plan())
 
 
 def test_partially_fetched_files_are_kept_only_for_the_next_fetch(folder: Path) -> None:

@@ -45,7 +45,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
 LISTINGS: Final = ("robots", "procedures", "columns")
 """Commands in the module `listings`."""
 
-FROM_ENTRY_POINTS: Final = frozenset({"stop"})
+FROM_ENTRY_POINTS: Final = frozenset({"bag", "bridge", "middleware", "stop"})
 """Commands whose modules are found by entry points (`plugin_targets`); without these the help omits them."""
 
 

@@ -12,16 +12,16 @@ import numpy as np
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence import bag, reading
+from fieldkit.measure.evidence import reading
 from fieldkit.measure.evidence.sandbox import ReaderError, SandboxedReader
 from fieldkit.measure.positions.position_sources import Account
-from fieldkit.measure.positions.samples import MAX_SAMPLES, PLACED, WGS84, Samples, read_csv, require_increasing
+from fieldkit.measure.positions.samples import MAX_SAMPLES, WGS84, Samples, read_csv, require_increasing
 
 MAX_STALE_S: Final = 10.0
 """If stamps and reception times differ by more than this, the stamps are from another clock."""
 
 PositionReader = Callable[[Path, Account], Samples]
-"""Returns the samples of a source in a file, with the errors of `read_bag`."""
+"""Returns the samples of a source in a file, with the errors of `read_topic`."""
 
 _GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
 
@@ -66,56 +66,19 @@ def read_topic(path: Path, account: Account) -> Samples:
     """Return the samples in a topic of a bag, or of a message type in a telemetry log, by the recorder's clock.
 
     Raises:
-        EvidenceError: The file cannot be read or has no positions.
+        EvidenceError: The file cannot be read or has no positions, or no package reads its format.
     """
     point = _readers().get(path.suffix)
-    reader: PositionReader = read_bag if point is None else plugins.load(point)
+    if point is None:
+        raise EvidenceError("is not a recording in a known format", where=str(path))
+    reader: PositionReader = plugins.load(point)
     return reader(path, account)
 
 
 @cache
 def _readers() -> Mapping[str, EntryPoint]:
-    """Return the readers of files other than bags, by the suffix of the files."""
+    """Return the readers by the suffix of the files."""
     return {f".{point.name}": point for point in plugins.entry_points(plugins.POSITIONS)}
-
-
-def read_bag(path: Path, account: Account) -> Samples:
-    """Return the samples in a topic of a bag, by the robot's clock.
-
-    If several messages have the same time, the first is used.
-
-    Raises:
-        EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or its stamps
-            are from another clock.
-    """
-    topic = account.topic
-    topic_data = bag.positions(path, topic, account.child)
-    if not topic_data["rows"]:
-        raise EvidenceError(
-            f"no position in {topic}", where=str(path), remedy="check that a node publishes the topic"
-        )
-    ((kind, *other_kinds), (frame, *other_frames)) = topic_data["types"], topic_data["frames"]
-    if other_kinds or other_frames:
-        raise EvidenceError(
-            f"{topic} has positions in several frames: {', '.join(topic_data['frames'])}",
-            where=str(path),
-            remedy="name the child frame",
-        )
-    times = np.array([row[:2] for row in topic_data["rows"]], dtype=np.int64)
-    values = np.array([row[2:] for row in topic_data["rows"]], dtype=float)
-    stamped = account.stamps == "header"
-    stale_s = abs(np.median(times[:, 0] - times[:, 1])) / 1e9
-    if stamped and stale_s > MAX_STALE_S:
-        raise EvidenceError(
-            f"the stamps of {topic} differ by {stale_s:.0f} s from the times of reception",
-            where=str(path),
-            remedy="write times: received, in the step",
-        )
-    times_ns, first = np.unique(times[:, 0 if stamped else 1], return_index=True)
-    frames = {"sensor_msgs/msg/NavSatFix": WGS84, "nav_msgs/msg/Odometry": PLACED}
-    is_odometry = frames.get(kind) == PLACED
-    yaws_rad = values[first, 3] if is_odometry else None
-    return Samples(times_ns, values[first, :3], frames.get(kind, f"frame {frame}"), yaws_rad)
 
 
 def to_placement_frame(samples: Samples, account: Account) -> Samples:

@@ -8,8 +8,8 @@ right-censored: it had not ended when the flow ended.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -21,16 +21,11 @@ from fieldkit.measure import robot_clock
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.transfers import delay, deliveries, tcp, udp
-from fieldkit.measure.transfers.clock_offset import StampPairs
+from fieldkit.measure.transfers import deliveries, tcp, udp
 from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
 from fieldkit.measure.transfers.tcp import TcpFrames
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.measure.transfers.udp import UdpPackets
-
-if TYPE_CHECKING:  # a trial without topics does not import them
-    from fieldkit.measure.transfers.topic_columns import TopicTraffic
-    from fieldkit.measure.transfers.topic_samples import TopicLog
 
 RANK: Final = 120
 """Position of the columns in trial.csv: after those of earlier versions."""
@@ -153,82 +148,6 @@ def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured
         return Measured(values, {f"{flow}_stall_s": "a stall had not ended at the end of the flow"})
     values = {f"{flow}_stall_s": longest_s, f"{flow}_stalls": count}
     return Measured(values, {f"{flow}_stall_at_least_s": "every stall ended"})
-
-
-TOPIC_COLUMNS = tuple(
-    replace(column, meaning=column.meaning.replace("complete captures", "complete logs"))
-    for column in declare_columns("topic", "the topic", 83)
-)
-
-
-def require_steady_clocks(flow: "TopicTraffic", sender: Packets | None, receiver: Packets | None) -> None:
-    """Raise an error if the captures show that a robot's clock was set.
-
-    Raises:
-        EvidenceError: No clock offset fits both captures.
-    """
-    if sender is None or receiver is None:
-        return
-    ends = flow.sender_address, flow.receiver_address
-    has_packets = (packets.are_from(end).any() for packets in (sender, receiver) for end in ends)
-    if all(has_packets) and delay.clocks_between(sender, receiver, *ends) is None:
-        raise EvidenceError(delay.UNSTEADY)
-
-
-def topic_delivery(sent: "TopicLog | None", received: "TopicLog | None", expected: FlowSchedule) -> Delivery:
-    """Return the deliveries of a topic.
-
-    Args:
-        sent: Log of the publisher; None if it is incomplete.
-        received: Log of the subscriber; None if it is incomplete.
-        expected: Known properties of the stream.
-
-    Raises:
-        EvidenceError: The deliveries cannot be determined from the logs.
-    """
-    if sent is None or received is None:
-        raise EvidenceError("there are no complete logs of both ends")
-    samples = sent.samples
-    if not len(samples):
-        raise EvidenceError("nothing was sent")
-    _, sent_index, received_index = np.intersect1d(samples.sequence, received.samples.sequence, return_indices=True)
-    at_ns = received.samples.at_ns[np.sort(received_index)]
-    if (np.diff(at_ns) < -deliveries.REORDERING_NS).any():
-        raise EvidenceError("a sample is earlier than the one before it: a clock was set back")
-    pairs = StampPairs(samples.sent_ns[sent_index], received.samples.at_ns[received_index])
-    first_ns, last_ns = int(samples.sent_ns.min()), int(samples.sent_ns.max())
-    return deliveries.stream_delivery(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, expected)
-
-
-def measure_topic(
-    flow: "TopicTraffic",
-    logs: "tuple[TopicLog | None, TopicLog | None]",
-    captured: tuple[Packets | None, Packets | None],
-    expected: FlowSchedule,
-) -> Measured:
-    """Return the columns of the stalls of a topic.
-
-    Args:
-        flow: Identifies its packets.
-        logs: Logs of publisher and subscriber as for `topic_delivery`.
-        captured: Packets that their robots captured; None without a complete capture.
-        expected: Known properties of the stream.
-    """
-    return measure("topic", lambda: read_topic_deliveries(flow, logs, captured, expected))
-
-
-def read_topic_deliveries(
-    flow: "TopicTraffic",
-    logs: "tuple[TopicLog | None, TopicLog | None]",
-    captured: tuple[Packets | None, Packets | None],
-    expected: FlowSchedule,
-) -> list[Delivery]:
-    """Return the deliveries of a topic.
-
-    Arguments as for `measure_topic`; raises as `topic_delivery` and `require_steady_clocks`.
-    """
-    require_steady_clocks(flow, *captured)
-    return [topic_delivery(*logs, expected)]
 
 
 def flow_schedule(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> FlowSchedule:

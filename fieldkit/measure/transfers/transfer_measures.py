@@ -18,7 +18,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import NO_TIME, Mask
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence import bag, host, oracle_delays, ping, reading
+from fieldkit.measure.evidence import host, oracle_delays, ping, reading, recordings
 from fieldkit.measure.positions import position_columns
 from fieldkit.measure.transfers import altered_packets, delay, rates, stalls, tcp, udp
 from fieldkit.measure.transfers.deliveries import FlowSchedule
@@ -129,7 +129,7 @@ def loss(arrived: int | None, sent: int | None) -> float | None:
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
     sent = evidence.read_or_none(reading.size, transfer.sent_file)
     received = evidence.read_or_none(reading.size, transfer.received_file)
-    contents = evidence.read_or_none(bag.read, transfer.sent_file)
+    contents = evidence.read_or_none(recordings.read, transfer.sent_file)
     files: dict[str, Value | None] = {
         "sent_bytes": sent,
         "received_bytes": received,

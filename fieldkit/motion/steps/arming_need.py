@@ -8,14 +8,14 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role, Verdict
 from fieldkit.core.text import JSON_ERRORS, sanitized
 from fieldkit.remote import agent
-from fieldkit.steps import streams
+from fieldkit.steps import agent_commands
 from fieldkit.steps.scene import CommandResult, Need
 
 
 def arming_need(robot: Robot, role: Role, plan: FlightPlan) -> Need:
     """Return the preflight check that an autopilot can be armed for this flight."""
-    arguments = streams.compact({"connection": plan.connection, "needs": asdict(plan.needs)})
-    argv = streams.python(robot, agent.path_from_home(), "arming", arguments)
+    arguments = agent_commands.compact({"connection": plan.connection, "needs": asdict(plan.needs)})
+    argv = agent_commands.python(robot, agent.path_from_home(), "arming", arguments)
     return Need(role, "autopilot", argv, _judge, required_program=robot.profile.tools.python, agent=True)
 
 

@@ -27,8 +27,8 @@ from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps import streams
-from fieldkit.steps.middlewares import MiddlewareName
+from fieldkit.ros.middlewares.middleware import MiddlewareName
+from fieldkit.steps import agent_commands
 from fieldkit.steps.origins import RobotMotion
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
 
@@ -96,7 +96,7 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
         _driver_arguments(scene, move, name),
         name.format(drive_log.FILE),
     )
-    setup = streams.setup(robot)
+    setup = agent_commands.setup(robot)
     job = Job(
         folder=scene.folder,
         name=name.format("drive"),
@@ -171,8 +171,8 @@ def _task(robot: Robot, move: Move) -> dict[str, Any]:
 
 def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
     """Return the argument of the driver program, as JSON."""
-    from fieldkit.ros import topics, types  # noqa: PLC0415 (takes 50 ms and is needed only here)
-    from fieldkit.ros.qos import PROFILES  # noqa: PLC0415
+    from fieldkit.ros.interfaces import topics, types  # noqa: PLC0415 (takes 50 ms and is needed only here)
+    from fieldkit.ros.interfaces.qos import PROFILES  # noqa: PLC0415
 
     robot = scene.robot(move.role)
     drive = _drive(robot)
@@ -203,7 +203,7 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
         "status": name.format(_STATUS),
         "stationary": jobs.stationary_file(name.format("drive")),
     }
-    return streams.compact(arguments)
+    return agent_commands.compact(arguments)
 
 
 def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
@@ -217,7 +217,10 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
         return network | {"peers": [robot.address]}
     # The router of rmw_zenoh on the robot announces all sessions there. A session without a router may use its port.
     endpoints = [f"tcp/{address}:{_ZENOH_PORT}" for address in ("127.0.0.1", robot.address)]
-    settings = {"connect/endpoints": streams.compact(endpoints), "listen/endpoints": f'["tcp/{robot.address}:0"]'}
+    settings = {
+        "connect/endpoints": agent_commands.compact(endpoints),
+        "listen/endpoints": f'["tcp/{robot.address}:0"]',
+    }
     return network | {"settings": settings}
 
 

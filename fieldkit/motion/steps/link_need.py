@@ -7,7 +7,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role, Verdict
 from fieldkit.core.text import JSON_ERRORS, sanitized
 from fieldkit.remote import agent
-from fieldkit.steps import streams
+from fieldkit.steps import agent_commands
 from fieldkit.steps.scene import CommandResult, Need
 
 _KINDS = {
@@ -31,7 +31,9 @@ def link_need(robot: Robot, role: Role, connection: str, programs: Sequence[str]
     def judge(result: CommandResult) -> tuple[Verdict, str, str]:
         return _judge(connection, programs, result)
 
-    argv = streams.python(robot, agent.path_from_home(), "survey", streams.compact({"connection": connection}))
+    argv = agent_commands.python(
+        robot, agent.path_from_home(), "survey", agent_commands.compact({"connection": connection})
+    )
     return Need(role, "MAVLink", argv, judge, required_program=robot.profile.tools.python, agent=True)
 
 

@@ -24,7 +24,7 @@ from fieldkit.motion.logs.tlog import GLOBAL, LOCAL, Tlog
 from fieldkit.motion.steps.link_need import link_need
 from fieldkit.remote import agent
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import streams
+from fieldkit.steps import agent_commands
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.nest import Nest
@@ -133,14 +133,14 @@ class MavlinkStep(Nest):
         job = Job(
             folder=scene.folder,
             name=self.prefixed_name("mavlink"),
-            argv=streams.agent_command(robot, "mavlink", streams.compact(arguments), self._file),
+            argv=agent_commands.agent_command(robot, "mavlink", agent_commands.compact(arguments), self._file),
             limit_s=follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log,
             stdout=self._counters_file,
             ready="log:up,",
             ready_s=_READY_S,
         )
-        setup, program = streams.setup(robot), robot.profile.tools.python
+        setup, program = agent_commands.setup(robot), robot.profile.tools.python
         return Planned(self.recorder, job, program=program, setup=setup, permitted_causes=BY_FIELDKIT)
 
     def _connection(self, scene: Scene) -> str:

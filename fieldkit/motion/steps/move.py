@@ -17,7 +17,7 @@ from fieldkit.measure.positions import position_columns
 from fieldkit.motion.logs import drive_checks, drive_log, motion_sources
 from fieldkit.motion.steps import driving
 from fieldkit.motion.steps.lease import run_inside
-from fieldkit.steps import streams
+from fieldkit.ros.streams import stream_options
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.legs import PathLeg
 from fieldkit.steps.nest import Nest
@@ -181,7 +181,7 @@ class MoveStep(Nest):
         """Yield the check of the middleware's Python package for a robot that drives automatically."""
         robot = scene.robot(self.robot)
         if robot.drives:
-            yield streams.need(self.robot, robot, driving.middleware_of(robot))
+            yield stream_options.need(self.robot, robot, driving.middleware_of(robot))
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:

@@ -26,7 +26,7 @@ from fieldkit.motion.steps.robot_mover import RobotMover
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps import streams
+from fieldkit.steps import agent_commands
 from fieldkit.steps.scene import BY_ITSELF, Planned, Scene
 
 LEASE_S: Final = 15.0
@@ -72,7 +72,7 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
         limit_s: Time limit of the job.
     """
     robot, complete_plan = scene.robot(role), replace(plan, landing_marker=jobs.landing_marker_file(name))
-    argv = streams.agent_command(robot, "fly", streams.compact(asdict(complete_plan)))
+    argv = agent_commands.agent_command(robot, "fly", agent_commands.compact(asdict(complete_plan)))
     log = f"{name}.log"
     job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")
     return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_ITSELF)

@@ -11,7 +11,6 @@ from fieldkit.core.errors import ConfigurationError
 _PACKAGE: Final = "fieldkit"
 _OWN: Final = MappingProxyType(
     {
-        "record": "RecordStep",
         "capture": "CaptureStep",
         "transfer": "TransferStep",
         "ping": "PingStep",
@@ -23,8 +22,6 @@ _OWN: Final = MappingProxyType(
         "iperf3": "Iperf3Step",
         "soak": "SoakStep",
         "send": "SendStep",
-        "track": "TrackStep",
-        "topics": "TopicsStep",
     }
 )
 """Class of each built-in kind. The kind is also the name of its module in this package. Messages list the kinds in

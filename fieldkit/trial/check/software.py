@@ -1,6 +1,7 @@
 """Checks of a robot's programs by the probe: those that steps start, and other requirements of steps."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +16,7 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
 from fieldkit.steps.scene import CommandResult, Need, Planned
 from fieldkit.steps.variants import Tool, Variants
+from fieldkit.trial import session_jobs
 from fieldkit.trial.check import radio, tools
 from fieldkit.trial.check.probe import NOTHING, Sections
 from fieldkit.trial.check.report import Report
@@ -39,11 +41,32 @@ _PACKAGES: Final = {
     "busybox": "busybox",
     "iperf3": "iperf3",
     "python3": "python3",
-    "rosmaster": "python3-rosmaster",
 }
 _TOOLS: Final = "tools"
 _AGENT_S: Final = 30.0
-_BRIDGE: Final = "on the robot: python3 -m pip install 'fieldkit[ros2]', or correct ros.bridge.program"
+
+
+@dataclass(frozen=True)
+class Probed:
+    """Result of the probe of a robot, for the checks after it.
+
+    Attributes:
+        sections: Outputs of the commands of the probe.
+        variants: The robot's tools.
+    """
+
+    sections: Sections
+    variants: Variants
+
+    def has_program(self, program: str, needs: Sequence[Need]) -> bool:
+        """Return True if the robot has a program of a step, and whatever this program cannot work without.
+
+        Args:
+            program: The program.
+            needs: The needs of steps on the robot.
+        """
+        names = (_section(program), *(need.name for need in needs if need.missing_program == program))
+        return all(self.sections.get(name, NOTHING).ok for name in names)
 
 
 def commands(plan: Plan, role: Role) -> dict[str, Sequence[str]]:
@@ -52,7 +75,7 @@ def commands(plan: Plan, role: Role) -> dict[str, Sequence[str]]:
     by_section: dict[str, Sequence[str]] = {}
     for program, setup in _programs(plan, role):
         by_section[_section(program)] = with_environment(("sh", "-c", 'command -v "$1"', "sh", program), setup=setup)
-    for need in _needs(plan, role):
+    for need in needs_of(plan, role):
         by_section[need.name] = need.argv
     by_section[_TOOLS] = tools.probe(profile, _tools(plan, role))
     return by_section
@@ -67,11 +90,9 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     profile = plan.cast[role].profile
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
     remedies = {planned.program: planned.remedy for planned in _planned(plan, role)}
-    if profile.ros is not None and profile.ros.bridge is not None:
-        remedies[profile.ros.bridge.program] = f"{_BRIDGE}: {locations.copy_profile_command(profile.name)}"
     present = [program for program in programs if sections.get(_section(program), NOTHING).ok]
     report.ok("programs", ", ".join(present) or "none found")
-    needs = _needs(plan, role)
+    needs = needs_of(plan, role)
     # A recorder that its setup file hides is explained by the finding on that file.
     explained = {need.missing_program for need in needs if not sections.get(need.name, NOTHING).ok}
     for program in programs:
@@ -98,7 +119,7 @@ def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report
         LinkError: The robot did not answer.
         RobotError: The agent cannot be installed.
     """
-    for need in _needs(plan, role, by_agent=True):
+    for need in needs_of(plan, role, by_agent=True):
         if sections.get(_section(need.required_program), NOTHING).ok:
             agent.install(shell)
             done = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
@@ -129,31 +150,20 @@ def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -
     return detected
 
 
-def can_record(plan: Plan, role: Role, sections: Sections) -> bool:
-    """Return True if nothing that a recording needs is known to be missing on the robot."""
-    ros = plan.cast[role].profile.ros
-    if ros is None or not any(placed.step.live_topics(role) for placed in plan.procedure.walk()):
-        return True
-    program = ros.command.record[0]
-    needed = (_section(program), *(need.name for need in _needs(plan, role) if need.missing_program == program))
-    return all(sections.get(name, NOTHING).ok for name in needed)
-
-
 def _programs(plan: Plan, role: Role) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield each program that a step or fieldkit starts, with the files to source before looking for it."""
     yield from ((program, ()) for program in BASE_PROGRAMS)
     yield from dict.fromkeys((planned.program, planned.setup) for planned in _planned(plan, role))
-    ros = plan.cast[role].profile.ros
-    if ros is not None and ros.bridge is not None:
-        yield ros.bridge.program, ros.command.setup
 
 
 def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
+    """Yield the jobs of steps and of the session on a robot."""
     for scene in plan.scenes():
         yield from (job for job in plan.jobs(scene) if job.role is role)
+    yield from (job for job in session_jobs.planned(plan.cast, plan.session) if job.role is role)
 
 
-def _needs(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:
+def needs_of(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:
     """Return the needs of steps on the robot without duplicates: those checked by the probe, or by the agent."""
     scene = plan.scenes()[0]
     needs = (need for placed in plan.procedure.walk() for need in placed.step.needs(scene) if need.role is role)

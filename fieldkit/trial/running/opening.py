@@ -11,9 +11,9 @@ from fieldkit.backends.protocols import Backend, Cast, Testbed, Transient
 from fieldkit.core import runtime
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
-from fieldkit.trial import step_packages, store
+from fieldkit.trial import session_jobs, step_packages, store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import bridges, locks, motion_control, preflight, runner
+from fieldkit.trial.running import locks, motion_control, preflight, runner
 from fieldkit.trial.running.locks import Holder
 from fieldkit.trial.running.resumption import demand_backend, demand_cast, resumable
 from fieldkit.trial.running.runner import Outcome
@@ -24,7 +24,7 @@ from fieldkit.trial.running.stop import Stop
 def opened(
     backend: Backend, cast: Cast, *, session: str, what: str, seed: int, sink: Sink, operator: Operator
 ) -> Iterator[Testbed]:
-    """Yield the testbed of a cast, with every robot logged in and locked, and the bridges running.
+    """Yield the testbed of a cast, with every robot logged in and locked, and the jobs of the session running.
 
     Args:
         backend: The backend.
@@ -47,7 +47,7 @@ def opened(
         on_lost_lock = (lambda _: None) if isinstance(testbed, Transient) else sink
         with (
             locks.held(testbed.shells, Holder(session, runtime.user_at_host(), what), sink=on_lost_lock),
-            bridges.running(cast, testbed.shells, session, sink=sink),
+            session_jobs.running(cast, testbed.shells, session, sink=sink),
         ):
             yield testbed
 

@@ -1,12 +1,12 @@
 """Preflight: the checks of robots and laptop before a trial's first repeat; `fieldkit check` runs all of them."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.core import files
+from fieldkit.core import files, plugins
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, RobotError
 from fieldkit.core.events import Finding, PhaseStarted, Sink
@@ -18,14 +18,19 @@ from fieldkit.remote.script import HELD_REMEDY
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 from fieldkit.steps.variants import Variants
-from fieldkit.trial import store
-from fieldkit.trial.check import contact, probe, radio, software, system, topics
+from fieldkit.trial import session_jobs, store
+from fieldkit.trial.check import contact, probe, radio, software, system
 from fieldkit.trial.check.report import LAPTOP, Report
+from fieldkit.trial.check.software import Probed
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import bridges, locks
+from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import LockState
 
 JOBS_S: Final = 10.0
+
+RobotCheck = Callable[[Plan, Role, Shell, Probed, Report], None]
+"""A check that a package adds to `fieldkit check`, after all others. It adds its findings to the report, and raises
+`LinkError` if the robot did not answer, `RobotError` if it could not be checked."""
 
 _CONNECTION: Final = "connection"
 
@@ -70,7 +75,7 @@ def check(plan: Plan, shells: Shells, out: Path, *, whole: bool) -> Checked:
         plan: The trial.
         shells: The robots.
         out: Folder of the trial.
-        whole: Whether to also check locks, and to make a short recording that checks the topics.
+        whole: Whether to also check locks, and to run the checks that packages add (`plugins.CHECKS`).
     """
     reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
     variants_by_role: dict[Role, Variants] = {}
@@ -147,15 +152,17 @@ def _check(
         software.check_agent(plan, role, sections, shell, report)
         if not whole:
             return
-        stage = "topics"
-        if software.can_record(plan, role, sections):
-            topics.check_topics(plan, role, shell, variants_by_role[role], report)
+        for point in plugins.entry_points(plugins.CHECKS):
+            stage = point.name
+            robot_check: RobotCheck = plugins.load(point)
+            robot_check(plan, role, shell, Probed(sections, variants_by_role[role]), report)
     except FieldkitError as error:
         report.fail(stage, error.what, error.remedy)
 
 
 def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
-    own_folders = (f"/{plan.trial}/", f"/{bridges.folder_of(plan.session)}/")
+    session_folders = {f"{planned.job.folder}/" for planned in session_jobs.planned(plan.cast, plan.session)}
+    own_folders = (f"/{plan.trial}/", *session_folders)
     others = [line for line in left if not any(folder in line for folder in own_folders)]
     for line in others:
         report.fail("jobs", f"a job of an earlier trial runs: {line}", "fieldkit abort")

@@ -21,9 +21,9 @@ from rosbags.serde import SerdeError
 
 from fieldkit.agent import middleware
 from fieldkit.agent.middleware import Network, Publisher, Topic
-from fieldkit.ros import topics
-from fieldkit.ros.qos import PROFILES, QosProfile
-from fieldkit.ros.types import Distribution, MessageTypes
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.qos import PROFILES, QosProfile
+from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 from sim_backends.emulated.robot import base_process, services
 from sim_backends.emulated.robot.spec import Ros2Spec
 from sim_backends.emulated.ros import offered_qos, static_frames

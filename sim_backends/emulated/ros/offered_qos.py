@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from fieldkit.ros.qos import PROFILES, Durability, QosProfile
+from fieldkit.ros.interfaces.qos import PROFILES, Durability, QosProfile
 from sim_backends.emulated.ros import static_frames
 
 BY_TYPE: Final[Mapping[str, QosProfile]] = {

@@ -29,8 +29,8 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
-from fieldkit.ros.qos import QosProfile
-from fieldkit.ros.types import Distribution, MessageTypes
+from fieldkit.ros.interfaces.qos import QosProfile
+from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 from sim_backends.emulated.ros import offered_qos, tcpros
 from sim_backends.emulated.ros.tcpros import Header, Listener, type_of
 

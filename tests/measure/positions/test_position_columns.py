@@ -18,7 +18,7 @@ from fieldkit.measure.positions import position_columns, position_sources
 from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, PLACED, WGS84
 from fieldkit.measure.robot_clock import Offset
-from tests.measure.positions.test_position_files import BEGAN_NS, S, odometry, stamped, written
+from tests.ros.bags.test_bag_positions import BEGAN_NS, S, odometry, stamped, written
 
 SENDER, RECEIVER = Role.SENDER, Role.RECEIVER
 ENDS = (SENDER, RECEIVER)

@@ -26,7 +26,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice

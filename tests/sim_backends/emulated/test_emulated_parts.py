@@ -20,7 +20,7 @@ from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated import emulated_options, placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options

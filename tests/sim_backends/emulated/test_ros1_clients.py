@@ -16,7 +16,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice

@@ -21,9 +21,9 @@ from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Fault, FaultKind, Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.ros import topics
-from fieldkit.ros.qos import PROFILES
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.qos import PROFILES
+from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options
@@ -38,7 +38,7 @@ from tests.helpers.paths import ROOT
 
 ROS2: Final = ROOT / ".ros2" / "bin" / "python"
 LISTENER: Final = ROOT / "tests" / "sim_backends" / "emulated" / "ros2_listener.py"
-WIRE_END: Final = ROOT / "tests" / "ros" / "wire_end.py"
+WIRE_END: Final = ROOT / "tests" / "ros" / "bridging" / "wire_end.py"
 RECEIVED: Final = {
     "/scan": "sensor_msgs/msg/LaserScan",
     "/odom": "nav_msgs/msg/Odometry",

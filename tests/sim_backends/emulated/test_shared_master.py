@@ -14,7 +14,7 @@ from fieldkit.core.model import Fault, FaultKind, Placement, Protocol, Role, Sce
 from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
-from fieldkit.steps import ros_master
+from fieldkit.ros.steps import ros_master
 from fieldkit.steps.scene import CommandResult, Need, Scene
 from sim_backends.emulated import requirements, testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend

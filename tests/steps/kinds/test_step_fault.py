@@ -10,9 +10,9 @@ from fieldkit.config import schema
 from fieldkit.core import model
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, FaultKind, Protocol, Role
+from fieldkit.ros.steps.record import RecordStep
 from fieldkit.steps.kinds.fault import FaultStep
 from fieldkit.steps.kinds.ping import PingStep
-from fieldkit.steps.kinds.record import RecordStep
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.variants import PingTool, expected
 from fieldkit.trial.procedure import Procedure, load_procedure

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from types import MappingProxyType
 
 import pytest
 from hypothesis import given
@@ -11,19 +10,17 @@ from hypothesis import strategies as st
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
-from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
-from fieldkit.measure.evidence.bag import Bag
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial import size
-from fieldkit.trial.check import contact, radio, software, system, topics
+from fieldkit.trial.check import contact, radio, software, system
 from fieldkit.trial.check.probe import Sections, parse
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
-from tests.helpers.casts import CAST, TURTLEBOT, los_plan, ros_of
+from tests.helpers.casts import CAST, TURTLEBOT, los_plan
 from tests.helpers.paths import DATA
 
 SENDER, RECEIVER, RELAY = (CAST[role] for role in (Role.SENDER, Role.RECEIVER, Role.RELAY))
@@ -322,34 +319,6 @@ def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, prog
     assert (failed.check, failed.remedy) == (program, remedy)
 
 
-def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
-    procedure = procedure_of("ping: {from: sender, to: receiver}")
-    robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
-    plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}, "procedure": procedure})
-    sections = installed(plan)
-    assert {finding.status for finding in judged(sections, plan)} == {OK}
-    assert not any("ros" in " ".join(argv) for argv in software.commands(plan, Role.SENDER).values())
-    assert software.can_record(plan, Role.SENDER, sections)
-    assert topics.battery_of(robot) == ""
-    assert topics.recorded(plan, Role.SENDER) == ()
-
-
-def test_a_recording_on_a_robot_without_ros_is_rejected() -> None:
-    robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
-    plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
-    with pytest.raises(ConfigurationError, match="cannot record: its profile turtlebot3_burger has no ros"):
-        plan.scenes()
-
-
-def test_a_setup_file_that_is_missing_is_one_failure() -> None:
-    missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
-    sections = installed() | {"ROS": CommandResult(missing, 1), "program rosbag": CommandResult(missing, 1)}
-    (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
-    assert (failed.check, failed.detail) == ("ROS", missing)
-    assert not software.can_record(PLAN, Role.SENDER, sections)
-    assert software.can_record(PLAN, Role.RECEIVER, {}), "without a recording nothing is needed"
-
-
 def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
     refused = CommandResult("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
     (failed,) = [
@@ -372,59 +341,6 @@ def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
             if finding.status is not OK
         ]
         assert remedy in failed.remedy
-
-
-def test_ros_1_without_a_master_is_a_warning() -> None:
-    (warned,) = [
-        finding for finding in judged(installed() | {"ROS": CommandResult("noetic", 0)}) if finding.status is not OK
-    ]
-    assert "ROS_MASTER_URI" in warned.detail
-
-
-def recorded(count: int, span_s: float) -> Bag:
-    return Bag(count, 0, span_s, MappingProxyType({"/scan": count}))
-
-
-@pytest.mark.parametrize(
-    ("bag", "status"),
-    [
-        (recorded(10, 1.8), OK),
-        (recorded(8, 1.5), OK),
-        (recorded(2, 1.9), WARN),
-        (recorded(30, 1.9), WARN),
-        (recorded(1, 0.0), OK),
-        (recorded(0, 0.0), FAIL),
-        (None, FAIL),
-    ],
-)
-def test_a_topic_must_be_published_and_should_have_its_rate(bag: Bag | None, status: Verdict) -> None:
-    report = Report("turtlebot-1")
-    topics.judge(SENDER, ["/scan"], bag, report)
-    assert only(report.findings, "topic /scan").status is status
-
-
-def test_a_topic_missing_in_the_profile_has_no_rate() -> None:
-    report = Report("turtlebot-1")
-    topics.judge(SENDER, ["/tf_static"], Bag(3, 0, 1.0, MappingProxyType({"/tf_static": 3})), report)
-    assert only(report.findings, "topic /tf_static").status is OK
-
-
-def test_a_check_records_long_enough_for_the_slowest_topic() -> None:
-    assert topics.recorded(PLAN, Role.SENDER) == ("/scan",)
-    assert topics.recorded(PLAN, Role.RELAY) == ()
-    assert topics.recording(Role.SENDER, SENDER, ["/scan"]).duration == topics.RECORD_S
-    assert topics.recording(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages of 1 Hz"
-    topic = ros_of(RELAY.profile).topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
-    ros = ros_of(RELAY.profile).model_copy(update={"topics": (topic,)})
-    slow = RELAY.model_copy(update={"profile": RELAY.profile.model_copy(update={"ros": ros})})
-    assert topics.recording(Role.RELAY, slow, ["/slow"]).duration == 10.0
-    profile = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
-    ros2 = SENDER.model_copy(update={"profile": profile})
-    assert topics.recording(Role.SENDER, ros2, ["/scan"]).duration == 6.0, (
-        "a recorder that fieldkit ends loads for a while first"
-    )
-    assert topics.battery_of(RELAY) == "/pidrone/battery"
-    assert topics.battery_of(slow) == ""
 
 
 @given(st.text())

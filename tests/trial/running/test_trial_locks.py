@@ -18,7 +18,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import Holder, held, locked
 from fieldkit.trial.running.robots import Robots
-from tests.helpers.casts import los_plan
+from tests.helpers.casts import plain_plan
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, userland_path
@@ -304,7 +304,7 @@ def test_aborting_a_free_robot_reports_no_lock(robot: LocalShell) -> None:
 
 def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Path) -> None:
     """The holder is also notified if another robot does not answer."""
-    plan = los_plan()
+    plan = plain_plan()
     anna = Holder(plan.session, "anna@one", plan.trial)
     shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
     with locked({Role.SENDER: robot}, anna, sink=quiet):

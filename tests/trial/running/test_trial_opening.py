@@ -21,7 +21,7 @@ from fieldkit.trial.running import locks, opening, preflight, runner
 from fieldkit.trial.running.locks import Holder
 from fieldkit.trial.running.runner import Outcome
 from fieldkit.trial.running.stop import Stop
-from tests.helpers.casts import CAST, los_plan
+from tests.helpers.casts import CAST, plain_plan
 from tests.helpers.idle_testbed import IdleTestbed
 
 TESTBED = IdleTestbed()
@@ -118,7 +118,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
 
 
 def plans() -> list[Plan]:
-    first = los_plan()
+    first = plain_plan()
     return [first.model_copy(update={"distance": distance}) for distance in ("10ft", "20ft", "30ft")]
 
 
@@ -189,7 +189,7 @@ def resume(made: Recorder, folder: Path, backend: str = "field") -> Outcome | No
 
 
 def test_a_trial_is_resumed_through_the_same_steps(recorder: Callable[..., Recorder], tmp_path: Path) -> None:
-    made, plan = recorder(), los_plan()
+    made, plan = recorder(), plain_plan()
     folder = store.create(tmp_path, plan)
     assert resume(made, folder) == Outcome(folder, (), 2, 0)
     assert made.done == ["open", "meet", "hold", "resume", "hold ends", "open ends"]
@@ -199,7 +199,7 @@ def test_a_trial_is_resumed_through_the_same_steps(recorder: Callable[..., Recor
 def test_a_trial_of_another_backend_is_rejected_before_robots_are_opened(
     recorder: Callable[..., Recorder], tmp_path: Path
 ) -> None:
-    made, folder = recorder(), store.create(tmp_path, los_plan())
+    made, folder = recorder(), store.create(tmp_path, plain_plan())
     with pytest.raises(ConfigurationError):
         resume(made, folder, "emulated")
     assert made.done == []

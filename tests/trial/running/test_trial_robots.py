@@ -15,7 +15,7 @@ from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.shell import Completed
 from fieldkit.trial import hosts
 from fieldkit.trial.running.robots import Robots
-from tests.helpers.casts import los_plan
+from tests.helpers.casts import plain_plan
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import LocalShell
@@ -50,7 +50,7 @@ def slow_testbed(home: Path) -> IdleTestbed:
 def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: Path) -> None:
     into = tmp_path / "into"
     into.mkdir()
-    robots = Robots(los_plan(), slow_testbed(tmp_path))
+    robots = Robots(plain_plan(), slow_testbed(tmp_path))
     others = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
         robots.fetch("x", into, clean=True)
@@ -70,7 +70,7 @@ class Unreachable(LocalShell):
 
 @pytest.mark.emulated
 def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
-    plan, shells = los_plan(), {}
+    plan, shells = plain_plan(), {}
     attempts = {name: jobs.work_folder(plan.trial, name) for name in ("udp-01-1", "udp-01-2")}
     for role, kind in ((Role.SENDER, Unreachable), (Role.RECEIVER, LocalShell)):
         (home := tmp_path / role).mkdir()
@@ -110,7 +110,7 @@ class Rebooted(LocalShell):
 
 
 def test_a_void_attempt_reports_that_its_robot_rebooted(tmp_path: Path) -> None:
-    robots = Robots(los_plan(), IdleTestbed({role: Rebooted(tmp_path) for role in (Role.SENDER, Role.RECEIVER)}))
+    robots = Robots(plain_plan(), IdleTestbed({role: Rebooted(tmp_path) for role in (Role.SENDER, Role.RECEIVER)}))
     robots.begin("x", old=None)
     output_text = robots.fetch("x", tmp_path, clean=False)
     reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
@@ -137,7 +137,7 @@ class Impatient(LocalShell):
 
 @pytest.mark.emulated
 def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path) -> None:
-    plan = los_plan()
+    plan = plain_plan()
     remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
     for role in (Role.SENDER, Role.RECEIVER):
         (home := tmp_path / role).mkdir()
@@ -160,7 +160,7 @@ def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path)
 
 @pytest.mark.emulated
 def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: Path) -> None:
-    plan = los_plan()
+    plan = plain_plan()
     remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
     for role in (Role.SENDER, Role.RECEIVER):
         (home := tmp_path / role).mkdir()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Vector
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated.provisioning import laser_targets, neighbour
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.laser import LaserTarget, Neighbour, Neighbourhood, PlacesWriter, ranges_m

@@ -16,7 +16,7 @@ from fieldkit.config import locations
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import own_motion

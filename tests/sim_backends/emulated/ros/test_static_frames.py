@@ -6,7 +6,7 @@ import pytest
 
 from fieldkit.config import locations
 from fieldkit.config.profiles import load_profile
-from fieldkit.ros.types import shipped
+from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import static_frames
 from tests.helpers.casts import ros_of

@@ -1,0 +1,50 @@
+"""Contents of recordings of sensors; packages add readers of their formats by entry points (`plugins.RECORDINGS`)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+from fieldkit.core import plugins
+from fieldkit.core.errors import EvidenceError
+
+
+@dataclass(frozen=True)
+class RecordingContents:
+    """Contents of a recording.
+
+    Attributes:
+        messages: Number of messages.
+        started_utc_ns: Time of the first message, nanoseconds since 1970 UTC by the recorder's clock.
+        duration_s: Time from the first message to the last, in seconds.
+        messages_by_topic: Number of messages per topic.
+    """
+
+    messages: int
+    started_utc_ns: int
+    duration_s: float
+    messages_by_topic: Mapping[str, int]
+
+
+RecordingReader = Callable[[Path], RecordingContents]
+"""Returns the contents of a recording, with the errors of `read`."""
+
+
+def read(path: Path) -> RecordingContents:
+    """Return the contents of a recording, whose format is known from its suffix.
+
+    Raises:
+        EvidenceError: The file is missing, damaged or without messages, or no package reads its format.
+    """
+    point = _readers().get(path.suffix)
+    if point is None:
+        raise EvidenceError("is not a recording in a known format", where=str(path))
+    reader: RecordingReader = plugins.load(point)
+    return reader(path)
+
+
+@cache
+def _readers() -> Mapping[str, EntryPoint]:
+    """Return the readers by the suffix of the files."""
+    return {f".{point.name}": point for point in plugins.entry_points(plugins.RECORDINGS)}

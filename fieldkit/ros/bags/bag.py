@@ -1,0 +1,145 @@
+"""Contents of a ROS bag, which the rosbags library reads in a sandboxed process."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence.recordings import RecordingContents
+from fieldkit.measure.evidence.sandbox import Json, ReaderError, SandboxedReader
+
+METADATA: Final = "metadata.yaml"
+"""File that a ROS 2 recorder writes next to its data file when it closes the bag."""
+
+ROS2: Final = {".db3", ".mcap"}
+"""Suffixes of the data files of ROS 2 bags."""
+
+# Largest value that is a fraction and not a percentage: a full three-cell battery has 12.6 V / 11.1 V.
+_MAX_FRACTION: Final = 1.5
+
+_READER: Final = SandboxedReader("fieldkit.ros.bags.bag_reader")
+
+_BLOCK_BYTES: Final = 512  # unit of st_blocks on every file system
+_MIN_ALLOCATED_BYTES: Final = 64 << 20
+"""Some file systems update the block count of a file only seconds after a write, so up to this size the file size
+counts."""
+
+
+def read(path: Path) -> RecordingContents:
+    """Return the contents of a bag.
+
+    Args:
+        path: A ROS 1 bag, or the data file of a ROS 2 bag (`.db3`, `.mcap`) in its folder.
+
+    Raises:
+        EvidenceError: The file is missing, empty, unindexed, truncated, without messages, or not a bag.
+    """
+    where = str(path)
+    if not path.is_file():
+        raise EvidenceError("there is no bag", where=where, remedy="read the recorder's log: did it start?")
+    if path.stat().st_size == 0:
+        raise EvidenceError("the bag is empty", where=where, remedy="read the recorder's log: was the disk full?")
+    is_ros2 = path.suffix in ROS2
+    if is_ros2 and not (path.parent / METADATA).is_file():
+        raise EvidenceError(
+            f"the bag has no {METADATA}: its recorder was killed before it could close the bag",
+            where=where,
+            remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
+        )
+    try:
+        contents = _query(path)
+    except ReaderError as error:
+        raise EvidenceError(
+            f"the bag cannot be read, it is unindexed, truncated or not a bag: {error}",
+            where=where,
+            remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
+        ) from error
+    messages, metadata_messages = contents["messages"], contents.get("closed", contents["messages"])
+    if messages != metadata_messages:
+        raise EvidenceError(
+            f"the file contains {messages} messages, {METADATA} states {metadata_messages}",
+            where=where,
+            remedy="is the bag split into several files? omit --max-bag-size and --max-bag-duration in `record`",
+        )
+    if messages == 0:
+        tool = "ros2 topic hz" if is_ros2 else "rostopic hz"
+        raise EvidenceError(
+            "the bag contains no message", where=where, remedy=f"does the topic publish? try `{tool} TOPIC`"
+        )
+    by_topic = MappingProxyType(contents["messages_by_topic"])
+    return RecordingContents(messages, contents["started_utc_ns"], contents["duration_s"], by_topic)
+
+
+@dataclass(frozen=True)
+class TopicStats:
+    """Number and times of the recorded messages of one topic.
+
+    Attributes:
+        messages: Number of messages.
+        first_utc_ns: Time of the first, nanoseconds since 1970 UTC by the recorder's clock.
+        last_utc_ns: Time of the last.
+        gap_ns: Longest time between consecutive messages; 0 if there is only one.
+    """
+
+    messages: int
+    first_utc_ns: int
+    last_utc_ns: int
+    gap_ns: int
+
+
+def topic_stats(path: Path) -> Mapping[str, TopicStats]:
+    """Return number and times of the messages by topic; topics without a message are omitted.
+
+    Raises:
+        EvidenceError: The bag is missing or cannot be read.
+    """
+    if not path.is_file():
+        raise EvidenceError("there is no bag", where=str(path), remedy="read the recorder's log: did it start?")
+    try:
+        topics = _query(path, topic_stats="true")["topics"]
+    except ReaderError as error:
+        raise EvidenceError(f"the bag cannot be read: {error}", where=str(path)) from error
+    return {topic: TopicStats(**fields) for topic, fields in topics.items()}
+
+
+def battery_share(path: Path, topic: str) -> float | None:
+    """Return the charge in the last `sensor_msgs/BatteryState` of `topic`, between 0 and 1; None if unknown.
+
+    According to its definition the field is 0 to 1, or NaN if unknown. Some drivers write per cent, and the
+    TurtleBot3 writes the ratio of voltage to nominal voltage, slightly above 1.
+
+    Raises:
+        EvidenceError: A message of the bag cannot be read.
+    """
+    try:
+        share: float | None = _query(path, topic=topic)["share"]
+    except ReaderError as error:
+        raise EvidenceError(f"a message of {topic} cannot be read: {error}", where=str(path)) from error
+    if share is None or share < 0:
+        return None
+    return min(1.0, share if share <= _MAX_FRACTION else share / 100)
+
+
+def positions(path: Path, topic: str, child: str) -> Json:
+    """Return the robot positions in the messages of a topic; see `bag_reader.positions`.
+
+    Raises:
+        EvidenceError: The bag cannot be read, or the type of its messages contains no position.
+    """
+    try:
+        return _query(path, positions=topic, child=child)
+    except ReaderError as error:
+        raise EvidenceError(f"the positions of {topic} cannot be read: {error}", where=str(path)) from error
+
+
+def _query(path: Path, **parameters: str) -> Json:
+    # The path must be absolute, because the reader keeps the working directory in which it was started.
+    return _READER.query({"path": str(path.absolute()), **parameters}, allocated_bytes(path))
+
+
+def allocated_bytes(path: Path) -> int:
+    """Return the size of a file for the reader's limits, without the holes of a sparse file."""
+    status = path.stat()
+    return min(status.st_size, max(_BLOCK_BYTES * status.st_blocks, _MIN_ALLOCATED_BYTES))

@@ -1,0 +1,130 @@
+"""Discovery time and gaps of recorded topics, from the recorder's log and its bag; both use the robot's clock.
+
+rosbag of ROS 1 logs `[ INFO] [1795208123.219164628]: Subscribing to /scan` before it queries the master for the
+publishers, and that of ROS 2 `[INFO] [1795208123.219164628] [rosbag2_recorder]: Listening for topics...` before it
+starts discovery. The bag has the time of each message by the same clock (recorder.cpp of ros_comm 1.15 and of
+rosbag2).
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.columns import Figure, Kind, Measured, columns
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.evidence import reading
+from fieldkit.ros.bags import bag
+
+COLUMNS: Final = columns(
+    100,
+    (
+        "bag_discovered",
+        "bool",
+        "Whether a message of each recorded topic was received; empty without the recorder's log or a complete bag.",
+        Figure("topics discovered", Kind.FLAG),
+    ),
+    (
+        "bag_discovery_s",
+        "s",
+        (
+            "Time from the recorder's subscription to the first message, for the slowest topic; it includes "
+            "registration, connection and the wait for the message. Empty if no message of a topic was received, or "
+            "if the log does not contain the time of the subscription."
+        ),
+        Figure("discovery", Kind.MEDIAN),
+    ),
+    (
+        "bag_messages",
+        "count",
+        "Messages of the recorded topics in the bag; empty without a complete bag.",
+        Figure("messages recorded", Kind.MEDIAN),
+    ),
+    (
+        "bag_gap_s",
+        "s",
+        (
+            "Longest time without a message of a topic, between its first message and the end of the recording's "
+            "duration. Empty if bag_discovery_s is."
+        ),
+        Figure("longest gap between messages", Kind.MEDIAN),
+    ),
+)
+
+_STAMP: Final = r"\[(?P<s>[0-9]{1,10})\.(?P<ns>[0-9]{9})\]"
+_ROS1: Final = re.compile(rf"\[ INFO\] {_STAMP}: Subscribing to (?P<topic>/[A-Za-z0-9_/]+)(?![A-Za-z0-9_/])")
+_ROS2: Final = re.compile(rf"\[INFO\] {_STAMP} \[rosbag2_recorder\]: Listening for topics")
+_NS: Final = 10**9
+
+
+@dataclass(frozen=True)
+class RecordingReception:
+    """Reception of the topics of a recording.
+
+    Attributes:
+        discovered: Whether a message of each topic was received; None if unknown.
+        messages: Number of messages of its topics; None without a complete bag.
+        discovery_s: Time from the subscription to the first message, for the slowest topic; None if no message of a
+            topic was received, or if the time of the subscription is unknown.
+        gap_s: Longest time without a message of a topic, in seconds; None if `discovery_s` is None.
+    """
+
+    discovered: bool | None
+    messages: int | None
+    discovery_s: float | None
+    gap_s: float | None
+
+
+def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: float) -> RecordingReception:
+    """Return the reception of the topics of a recording.
+
+    Args:
+        folder: The attempt's folder.
+        log: Name of the recorder's log.
+        file: Name of the bag.
+        topics: The recorded topics.
+        duration_s: Duration of the recording from the subscription, in seconds.
+
+    Raises:
+        EvidenceError: The log is missing.
+    """
+    start_ns = subscribed_ns(reading.text(folder / log), topics)
+    all_subscribed = start_ns.keys() >= set(topics)
+    try:
+        by_topic = bag.topic_stats(folder / file)
+    except EvidenceError:
+        # A recorder that cannot reach its master never subscribes and writes no bag.
+        return RecordingReception(None if all_subscribed else False, None, None, None)
+    discovered = by_topic.keys() >= set(topics)
+    messages = sum(by_topic[topic].messages for topic in topics if topic in by_topic)
+    if not (discovered and all_subscribed):
+        return RecordingReception(discovered, messages, None, None)
+    first_ns = (by_topic[topic].first_utc_ns - start_ns[topic] for topic in topics)
+    ends_ns = {topic: start_ns[topic] + round(duration_s * _NS) for topic in topics}
+    gap_ns = (max(by_topic[topic].gap_ns, ends_ns[topic] - by_topic[topic].last_utc_ns) for topic in topics)
+    return RecordingReception(discovered, messages, max(0, *first_ns) / _NS, max(gap_ns) / _NS)
+
+
+def subscribed_ns(log: str, topics: Sequence[str]) -> dict[str, int]:
+    """Return the time of subscription or start of discovery by topic, from the log; nanoseconds since 1970 UTC."""
+    by_topic = {match["topic"]: _stamp_ns(match) for match in _ROS1.finditer(log)}
+    all_topics = _ROS2.search(log)
+    if all_topics is not None:
+        return dict.fromkeys(topics, _stamp_ns(all_topics))
+    return {topic: by_topic[topic] for topic in topics if topic in by_topic}
+
+
+def _stamp_ns(match: re.Match[str]) -> int:
+    return int(match["s"]) * _NS + int(match["ns"])
+
+
+def measure(reception: RecordingReception | None) -> Measured:
+    """Return the columns; `reception` is None without the recorder's log."""
+    if reception is None:
+        return Measured.all_missing(COLUMNS, "the recorder's log is missing")
+    counts = {"bag_discovered": reception.discovered, "bag_messages": reception.messages}
+    times = {"bag_discovery_s": reception.discovery_s, "bag_gap_s": reception.gap_s}
+    return Measured.from_optional(counts, "there is no complete bag") | Measured.from_optional(
+        times, "no message of a topic was received, or the log contains no time"
+    )

@@ -1,0 +1,1 @@
+"""The bridge between ROS 1, DDS and Zenoh."""

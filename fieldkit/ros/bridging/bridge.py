@@ -1,0 +1,232 @@
+"""Bridge topics between two middlewares as serialized messages: ROS 1, DDS and Zenoh.
+
+Between ROS 1 and ROS 2 rosbags converts the bytes without deserializing them. `seq` of a header, which ROS 2 does not
+have, is dropped towards ROS 2, and 0 towards ROS 1. Samples do not loop: each side ignores the samples that it has
+published, identified by caller id (ROS 1), participant (DDS) or session (Zenoh).
+"""
+
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+from rosbags.serde import SerdeError
+
+from fieldkit.agent import middleware
+from fieldkit.agent.middleware import Middleware, MiddlewareError, Network, Publisher, Topic
+from fieldkit.core.errors import ConfigurationError, LinkError
+from fieldkit.ros.bridging import counterparts
+from fieldkit.ros.bridging.counterparts import Counterparts
+from fieldkit.ros.bridging.crossings import Crossing, CrossingCounts, CrossingTally
+from fieldkit.ros.interfaces import topics
+from fieldkit.ros.interfaces.types import MessageTypes
+
+Convert = Callable[[bytes], bytes]
+
+_PACKAGES: Final = "python3 -m pip install 'fieldkit[ros2]', and give an address of this machine"
+_REMEDIES: Final = {
+    "ros1": "start roscore, or give its address; if rospy is missing here: apt-get install python3-rospy",
+    "dds": _PACKAGES,
+    "zenoh": _PACKAGES,
+}
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a bridge.
+
+    Attributes:
+        over: Name of the middleware, one of `middleware.ADAPTERS`.
+        network: Its network settings.
+    """
+
+    over: str
+    network: Network
+
+
+class Carrier:
+    """Forwards a topic in one direction.
+
+    Args:
+        crossing: The topic and its direction.
+        source: The side that it comes from.
+        target: The side that it is forwarded to.
+        described: The topic as described for the source, and for the target.
+        convert: Converts a message of the source to one of the target; raises `SerdeError` for an invalid message.
+    """
+
+    def __init__(
+        self,
+        crossing: Crossing,
+        source: "_RunningSide",
+        target: "_RunningSide",
+        described: tuple[Topic, Topic],
+        convert: Convert,
+    ) -> None:
+        self._crossing, self._source, self._target, self._described = crossing, source, target, described
+        self._convert = convert
+        self._tally = CrossingTally()
+        self._lock = threading.Lock()
+        self._ended = False
+        self._publisher: Publisher = target.running.publisher(described[1])
+        source.running.subscribe(described[0], self._carry)
+
+    def _carry(self, data: bytes, arrived_ns: int) -> None:
+        """Forward a sample. Called in threads of the source; samples are forwarded in sequence."""
+        with self._lock:
+            if self._ended:
+                return
+            try:
+                converted = self._convert(data)
+            except SerdeError:
+                self._tally.unreadable += 1
+                return
+            if self._publisher.write(converted):
+                self._tally.count(len(data), arrived_ns, time.time_ns())
+            else:
+                self._tally.refused += 1
+
+    def end(self) -> None:
+        """Stop to forward samples; a sample that is being forwarded is finished first."""
+        with self._lock:
+            self._ended = True
+
+    def other_types(self) -> Sequence[str]:
+        """Return a sentence for each different type of the topic on either side, which is not forwarded."""
+        sides = zip((self._source, self._target), self._described, strict=True)
+        return [sentence for end, topic in sides for sentence in end.other_types(topic)]
+
+    def counts(self) -> CrossingCounts:
+        """Return the counters of the forwarded samples."""
+        with self._lock:
+            return self._tally.counts(self._crossing, self._source.over, self._target.over)
+
+
+@dataclass(frozen=True)
+class _RunningSide:
+    """A side of a bridge with its running middleware."""
+
+    over: str
+    network: Network
+    running: Middleware
+
+    def other_types(self, topic: Topic) -> Sequence[str]:
+        """Return a sentence for each different type of the topic on this side."""
+        others = sorted(self.running.other_types(topic))
+        return [f"{topic.name} is of type {other} in {self.over}, not {topic.type}" for other in others]
+
+
+@contextmanager
+def bridged(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes) -> Iterator[Sequence[Carrier]]:
+    """Bridge two sides while the body runs.
+
+    Args:
+        near: The source of topics, and the target of those with `Crossing.back`.
+        far: The other side.
+        crossings: The topics.
+        types: The message types.
+
+    Yields:
+        A carrier for each crossing.
+
+    Raises:
+        ConfigurationError: A topic cannot be bridged, or has a different type on one side.
+        LinkError: A middleware does not start: no ROS master answers, or it is not installed.
+    """
+    check(near, far, crossings, types)
+    with ExitStack() as stack:
+        sides = [stack.enter_context(_running_side(side)) for side in (near, far)]
+        carriers: list[Carrier] = []
+        for number, crossing in enumerate(crossings, 1):
+            source, target = reversed(sides) if crossing.back else sides
+            carriers.append(_create_carrier(crossing, source, target, types, number))
+            stack.callback(carriers[-1].end)
+        yield carriers
+
+
+def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes) -> None:
+    """Check that all topics can be bridged, before anything starts.
+
+    Raises:
+        ConfigurationError: A topic cannot be bridged.
+    """
+    if near.over == far.over:
+        # Forwarded samples could not be recognized: both sides are the same node, or share a network.
+        raise ConfigurationError(
+            f"a bridge cannot connect {near.over} with {far.over}", remedy="name two different middlewares"
+        )
+    directions = [(crossing.topic, crossing.back) for crossing in crossings]
+    for crossing in crossings:
+        topic, type_name = crossing.topic, crossing.type_name
+        if directions.count((topic, crossing.back)) > 1:
+            raise ConfigurationError(f"{topic} is named twice for the same direction", remedy="name it once")
+        is_same = counterparts.of_type(types, type_name) if _is_ros1(near, far) else types.get(type_name).rihs01
+        if not is_same:
+            raise ConfigurationError(
+                f"{topic}: {type_name} differs between ROS 1 and ROS 2, or exists in one of them only",
+                remedy="bridge a topic of another type",
+            )
+
+
+def _is_ros1(*sides: "Side | _RunningSide") -> bool:
+    return any(side.over == "ros1" for side in sides)
+
+
+@contextmanager
+def _running_side(side: Side) -> Iterator[_RunningSide]:
+    """Start the middleware of a side, and stop it after the body."""
+    with ExitStack() as stack:
+        if _is_ros1(side):
+            # rospy writes a log, which is not needed.
+            os.environ["ROS_LOG_DIR"] = stack.enter_context(tempfile.TemporaryDirectory(prefix="fieldkit-"))
+        try:
+            running = middleware.adapter(side.over)(side.network)
+        except MiddlewareError as error:
+            raise LinkError(f"the bridge does not start: {error}", remedy=_REMEDIES[side.over]) from error
+        stack.callback(running.close)
+        yield _RunningSide(side.over, side.network, running)
+
+
+def _create_carrier(
+    crossing: Crossing, source: _RunningSide, target: _RunningSide, types: MessageTypes, number: int
+) -> Carrier:
+    sides = (source, target)
+    pair = counterparts.of_type(types, crossing.type_name) if _is_ros1(*sides) else None
+    described = [
+        Topic.from_json(
+            topics.describe(
+                types,
+                crossing.topic,
+                _type_at(end, crossing, pair),
+                crossing.qos,
+                domain=end.network.domain,
+                node=end.network.node,
+                number=number,
+            )
+        )
+        for end in sides
+    ]
+    for end, topic in zip(sides, described, strict=True):
+        # With gradual discovery, endpoints with another type may be discovered only later.
+        for sentence in end.other_types(topic):
+            raise ConfigurationError(sentence, remedy="name the topic with that type")
+    convert = _conversion(_is_ros1(source), pair, types)
+    return Carrier(crossing, source, target, (described[0], described[1]), convert)
+
+
+def _type_at(end: _RunningSide, crossing: Crossing, pair: Counterparts | None) -> str:
+    """Return the name of a crossing's type on one side."""
+    if pair is None:
+        return crossing.type_name
+    return pair.ros1 if _is_ros1(end) else pair.ros2
+
+
+def _conversion(from_ros1: bool, pair: Counterparts | None, types: MessageTypes) -> Convert:
+    if pair is None:
+        return lambda data: data
+    return partial(pair.to_ros2 if from_ros1 else pair.to_ros1, types)

@@ -1,0 +1,243 @@
+"""`fieldkit bridge`: carry topics between middlewares until a signal, then report the counts."""
+
+import argparse
+import ipaddress
+import json
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from fieldkit.agent.middleware import Network
+from fieldkit.cli import shared_arguments as shared
+from fieldkit.cli.display import show_error, show_note, table
+from fieldkit.cli.parser import Parser
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
+from fieldkit.core.text import json_text, print_text
+from fieldkit.core.units import format_bytes
+from fieldkit.ros.bridging import bridge
+from fieldkit.ros.bridging.bridge import Carrier, Side
+from fieldkit.ros.bridging.crossings import Crossing, CrossingCounts
+from fieldkit.ros.interfaces.types import Distribution, MessageTypes
+from fieldkit.ros.middlewares.ports import MAX_DOMAIN
+
+MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
+"""The keys of `agent.middleware.ADAPTERS`, which a test compares, without `ros2`.
+
+That adapter needs the Python of a robot's ROS 2.
+"""
+
+
+def add(parser: Parser) -> None:
+    """Declare the arguments of `fieldkit bridge`."""
+    parser.description = (
+        "Carry topics from one middleware to another until Ctrl-C or SIGTERM, then report the number of messages and "
+        "their delay. TOPIC is NAME:TYPE, or NAME:TYPE:QOS. QOS is a profile of ROS 2 (default, sensor_data, "
+        "services_default, parameters, parameter_events, system_default), or policies (reliable, best_effort, "
+        "keep_all, transient_local, depth=N), or a profile and then policies, separated by commas."
+    )
+    parser.epilog = (
+        "example: fieldkit bridge --from ros1 --to dds /scan:sensor_msgs/LaserScan:sensor_data "
+        "--back /cmd_vel:geometry_msgs/Twist"
+    )
+    parser.add_choice("--from", MIDDLEWARES, dest="near", required=True, help=f"one of: {', '.join(MIDDLEWARES)}")
+    parser.add_choice("--to", MIDDLEWARES, dest="far", required=True, help="another of them")
+    parser.add_argument("topics", metavar="TOPIC", nargs="*", help="goes from the first to the second")
+    for option, text in (("--back", "goes in the other direction"), ("--both", "goes in both directions")):
+        parser.add_argument(
+            option, metavar="TOPIC", action="append", default=[], help=f"{text}; may be given more than once"
+        )
+    parser.add_argument(
+        "--address",
+        metavar="IP",
+        default="127.0.0.1",
+        help="address of this machine in the network of the other nodes (default: 127.0.0.1)",
+    )
+    parser.add_argument(
+        "--master", metavar="HOST[:PORT]", help="master of ROS 1 (default: ROS_MASTER_URI, or this address and 11311)"
+    )
+    parser.add_argument(
+        "--patience", type=shared.natural, default=3, metavar="S", help="seconds to wait for the master (default: 3)"
+    )
+    parser.add_argument("--router", metavar="HOST[:PORT]", help="router of Zenoh, port 7447 (default: scouting)")
+    parser.add_argument(
+        "--peer",
+        metavar="IP",
+        action="append",
+        default=[],
+        help="peer over DDS or Zenoh, contacted in place of multicast discovery; may be given more than once",
+    )
+    parser.add_argument(
+        "--domain", type=shared.natural, metavar="N", help="domain of ROS 2 (default: ROS_DOMAIN_ID, or 0)"
+    )
+    parser.add_argument(
+        "--node",
+        metavar="NAME",
+        default="fieldkit_bridge",
+        help="name of the bridge's node; a second bridge on a master needs another (default: fieldkit_bridge)",
+    )
+    parser.add_choice(
+        "--distribution",
+        ("humble", "jazzy"),
+        default="jazzy",
+        help="distribution of ROS 2 whose types are used, with their hashes (default: jazzy)",
+    )
+    parser.add_argument(
+        "--type",
+        metavar="NAME=FILE",
+        action="append",
+        default=[],
+        help="an additional message type and its .msg file; may be given more than once",
+    )
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print a list with an object per topic and direction in place of the table",
+    )
+    parser.set_defaults(run=f"{__name__}:run")
+
+
+_POLL_S: Final = 1.0
+_ROUTER_PORT: Final = 7447
+_NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Carry topics until SIGINT or SIGTERM."""
+    crossings = _crossings(arguments)
+    types = MessageTypes(Distribution(arguments.distribution), dict(map(_definition, arguments.type)))
+    near, far = (Side(middleware, _network(middleware, arguments)) for middleware in (arguments.near, arguments.far))
+    with _until_signal() as stopped, bridge.bridged(near, far, crossings, types) as carriers:
+        show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C stops it")
+        _watch(carriers, stopped)
+        counts = [carrier.counts() for carrier in carriers]
+    if arguments.json:
+        print_text(json_text([asdict(crossed) for crossed in counts]))
+    else:
+        _show(counts)
+    return 0
+
+
+def _crossings(arguments: argparse.Namespace) -> list[Crossing]:
+    forward = [Crossing.parse(text) for text in (*arguments.topics, *arguments.both)]
+    back = [Crossing.parse(text, back=True) for text in (*arguments.back, *arguments.both)]
+    if not forward and not back:
+        raise ConfigurationError("no topic is given", remedy="for example /scan:sensor_msgs/LaserScan")
+    return forward + back
+
+
+def _definition(text: str) -> tuple[str, str]:
+    name, _, path = text.partition("=")
+    if "/" not in name or not path:
+        raise ConfigurationError(
+            f"{text!r} is not a message type and its file", remedy="write it as lab_msgs/Radio=Radio.msg"
+        )
+    try:
+        return name, Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8"
+        raise ConfigurationError(f"cannot be read: {reason}", where=path, remedy="name a .msg file of ROS") from error
+
+
+def _network(middleware: str, arguments: argparse.Namespace) -> Network:
+    """Return the settings with which the bridge joins a middleware."""
+    if not _NODE.fullmatch(arguments.node):
+        raise ConfigurationError(
+            f"{arguments.node!r} is not a valid node name", remedy="use letters, digits and underscores"
+        )
+    common = {"address": _address(arguments.address), "domain": _domain(arguments.domain), "node": arguments.node}
+    if middleware == "ros1":
+        uri = os.environ.get("ROS_MASTER_URI", "")
+        host, port = _host(arguments.master or urlsplit(uri).netloc or arguments.address, ROS_MASTER_PORT)
+        settings = {"patience_s": str(arguments.patience), "tcp_nodelay": "1"}
+        return Network(discovery="master", server=host, port=port, settings=settings, **common)
+    if middleware == "zenoh" and arguments.router:
+        host, port = _host(arguments.router, _ROUTER_PORT)
+        return Network(discovery="router", server=host, port=port, **common)
+    peers = tuple(map(_address, arguments.peer))
+    # Another Zenoh program of this machine may use the default port.
+    settings = {"listen/endpoints": json.dumps([f"tcp/{common['address']}:0"])} if middleware == "zenoh" else {}
+    return Network(discovery="peers" if peers else "multicast", peers=peers, settings=settings, **common)
+
+
+def _address(text: str) -> str:
+    try:
+        return str(ipaddress.IPv4Address(text))
+    except ValueError:
+        raise ConfigurationError(f"{text!r} is not an IPv4 address", remedy="for example 10.42.0.1") from None
+
+
+def _host(text: str, usual_port: int) -> tuple[str, int]:
+    try:
+        parts = urlsplit(f"//{text}")
+        if parts.hostname and parts.netloc == text:
+            return parts.hostname, parts.port or usual_port
+    except ValueError:
+        pass
+    raise ConfigurationError(f"{text!r} is not a host and port", remedy=f"write it as 10.42.0.1:{usual_port}")
+
+
+def _domain(given: int | None) -> int:
+    text = os.environ.get("ROS_DOMAIN_ID") or "0"
+    number = given if given is not None else int(text) if text.isascii() and text.isdigit() else -1
+    if 0 <= number <= MAX_DOMAIN:
+        return number
+    raise ConfigurationError(
+        f"{text if given is None else given} is not a domain of ROS 2", remedy=f"use 0 to {MAX_DOMAIN}"
+    )
+
+
+@contextmanager
+def _until_signal() -> Iterator[threading.Event]:
+    """Yield an event that SIGINT and SIGTERM set while the body runs."""
+    stopped = threading.Event()
+    previous = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stopped
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _watch(carriers: Sequence[Carrier], stopped: threading.Event) -> None:
+    """Wait for `stopped`. Report once per topic that other nodes use it with another type."""
+    reported: set[str] = set()
+    while not stopped.wait(_POLL_S):
+        for sentence in chain.from_iterable(carrier.other_types() for carrier in carriers):
+            if sentence not in reported:
+                reported.add(sentence)
+                show_error(
+                    f"{sentence}\n  remedy: give the topic with the type of its publishers; messages of another type "
+                    "are not carried"
+                )
+
+
+def _show(counts: Sequence[CrossingCounts]) -> None:
+    head = ("topic", "direction", "messages", "a second", "bytes", "refused", "unreadable", "median", "99 %")
+    rows = [
+        (
+            crossed.topic,
+            f"{crossed.source} to {crossed.target}",
+            str(crossed.messages),
+            "" if crossed.per_s is None else f"{crossed.per_s:.4g}",
+            format_bytes(crossed.bytes),
+            str(crossed.refused),
+            str(crossed.unreadable),
+            _milliseconds(crossed.delay_median_s),
+            _milliseconds(crossed.delay_p99_s),
+        )
+        for crossed in counts
+    ]
+    table(head, rows, right=range(2, len(head)))
+
+
+def _milliseconds(delay_s: float | None) -> str:
+    return "" if delay_s is None else f"{1e3 * delay_s:.3g} ms"

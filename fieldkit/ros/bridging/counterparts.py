@@ -1,0 +1,95 @@
+"""Pairs of message types of ROS 1 and ROS 2 with the same content, and the conversion of serialized messages.
+
+Most types have the same name and members in both. Time and duration are messages of `std_msgs` in ROS 1 and of
+`builtin_interfaces` in ROS 2, with the same two numbers (ros1_bridge maps them in the same way). Since Iron,
+`sensor_msgs/Range` has an additional last member: it is 0 in messages from ROS 1, and is dropped towards ROS 1.
+"""
+
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+from rosbags.serde import SerdeError
+
+from fieldkit.ros.interfaces.types import MessageTypes, full_name
+
+ROS2_NAMES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "std_msgs/msg/Time": "builtin_interfaces/msg/Time",
+        "std_msgs/msg/Duration": "builtin_interfaces/msg/Duration",
+    }
+)
+"""Names in ROS 2 of types with different names, by the name in ROS 1."""
+
+_ROS1_NAMES: Final = {ros2: ros1 for ros1, ros2 in ROS2_NAMES.items()}
+
+ADDED: Final[Mapping[str, Mapping[str, bytes]]] = MappingProxyType(
+    {"sensor_msgs/msg/Range": {"variance": bytes(4)}}  # float32, of which 0 is "unknown" (Range.msg)
+)
+"""Members that ROS 2 adds at the end of a type, with their bytes in messages from ROS 1."""
+
+
+@dataclass(frozen=True)
+class Counterparts:
+    """A type in ROS 1 and in ROS 2.
+
+    Attributes:
+        ros1: Its name in ROS 1, for example `std_msgs/msg/Time`.
+        ros2: Its name in ROS 2, for example `builtin_interfaces/msg/Time`.
+        added: Bytes that are appended to a message from ROS 1, in the serialization of ROS 1.
+    """
+
+    ros1: str
+    ros2: str
+    added: bytes = b""
+
+    def to_ros2(self, types: MessageTypes, data: bytes) -> bytes:
+        """Return a message of ROS 1 in CDR.
+
+        Raises:
+            SerdeError: The data are not a message of this type.
+        """
+        with _any_error_as_serde_error(self.ros1):
+            return bytes(types.ros2.ros1_to_cdr(data + self.added, self.ros2))
+
+    def to_ros1(self, types: MessageTypes, data: bytes) -> bytes:
+        """Return a message in CDR in the serialization of ROS 1.
+
+        Raises:
+            SerdeError: The data are not a message of this type.
+        """
+        with _any_error_as_serde_error(self.ros2):
+            converted = bytes(types.ros2.cdr_to_ros1(data, self.ros2))
+        if len(converted) < len(self.added):
+            raise SerdeError(f"a message of {self.ros2} of {len(converted)} bytes")
+        return converted[: len(converted) - len(self.added)]
+
+
+@contextmanager
+def _any_error_as_serde_error(kind: str) -> Iterator[None]:
+    """Convert the exceptions of rosbags for truncated messages to `SerdeError`, which it raises for most others."""
+    try:
+        yield
+    except (ValueError, IndexError, AssertionError, struct.error) as error:
+        raise SerdeError(f"the bytes are not a message of {kind}: {error}") from error
+
+
+def of_type(types: MessageTypes, name: str) -> Counterparts | None:
+    """Return a type of ROS 1 and ROS 2 by either name, or None if the contents differ.
+
+    Raises:
+        ConfigurationError: Neither has such a type.
+    """
+    full = types.get(full_name(name)).name
+    ros1, ros2 = _ROS1_NAMES.get(full, full), ROS2_NAMES.get(full, full)
+    if ros1 not in types.ros1.fielddefs or ros2 not in types.ros2.fielddefs:
+        return None
+    if ros1 != ros2 or types.translatable(ros2):
+        return Counterparts(ros1, ros2)
+    added = ADDED.get(ros2, {})
+    if added and types.adds_at_end(ros2, tuple(added)):
+        return Counterparts(ros1, ros2, b"".join(added.values()))
+    return None

@@ -1,0 +1,1 @@
+"""Interfaces of ROS: message types and their hashes, names, qualities of service."""

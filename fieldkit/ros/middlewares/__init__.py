@@ -1,0 +1,1 @@
+"""Middlewares of ROS: discovery methods, ports, settings."""

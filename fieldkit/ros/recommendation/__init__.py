@@ -1,0 +1,1 @@
+"""Recommendation of a middleware's configuration from measured trials."""

@@ -1,0 +1,1 @@
+"""Kinds of step of robots with ROS."""

@@ -1,0 +1,276 @@
+"""Record the positions of robots while other steps run: odometry, satellite receivers, or a tracking system."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, Final, Literal
+
+from typing_extensions import override
+
+from fieldkit.backends.protocols import Testbed
+from fieldkit.config import schema
+from fieldkit.config.profiles import TopicName
+from fieldkit.config.schema import Duration, Field, Number, Strict
+from fieldkit.core import geometry
+from fieldkit.core.columns import Column, Measured
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.positions import position_checks, position_sources, samples
+from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.robot_clock import Offset
+from fieldkit.ros.steps.record import SUBSCRIBE_S, RecordStep
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.kinds import follow
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.view import View
+
+_PERIODS: Final = 1.5
+"""Recording time after the last step, in periods of the topic."""
+ODOMETRY: Final = "nav_msgs/Odometry"
+
+# Runs the command that follows $1 and $2, and prints "recording" $2 s after the bag $1 has been opened, because
+# rosbag prints its messages only when its output buffer is full. The waiting subshell is not a child of the command,
+# because the command may wait for all its children.
+_RECORDS: Final = (
+    '( (until [ -e "$1" ] || [ -e "$1.active" ]; do sleep 0.1; done; sleep "$2"; echo recording >&2) & ); '
+    'shift 2; exec "$@"'
+)
+
+
+class Spot(Strict):
+    """A fixed position of a robot: degrees and metres on the earth, or metres in the frame of a tracker.
+
+    Attributes:
+        lat: Degrees north, together with robots that publish `NavSatFix`.
+        lon: Degrees east.
+        alt: Metres above the ellipsoid.
+        frame: A tracker's frame, the `frame_id` of its messages.
+        x: Metres along the first axis of that frame.
+        y: Metres along its second axis.
+        z: Metres along its third axis.
+    """
+
+    lat: Annotated[Number | schema.Int, Field(ge=-90, le=90)] | None = None
+    lon: Annotated[Number | schema.Int, Field(ge=-180, le=180)] | None = None
+    alt: Number | schema.Int | None = None
+    frame: str | None = None
+    x: Number | schema.Int | None = None
+    y: Number | schema.Int | None = None
+    z: Number | schema.Int = 0.0
+
+    @schema.model_validator(mode="after")
+    def _is_one_place(self) -> "Spot":
+        on_earth, in_frame = (self.lat, self.lon), (self.frame, self.x, self.y)
+        if None in (in_frame if self.frame is not None else on_earth) or {*on_earth, *in_frame} - {None} == set():
+            raise schema.validation_error("a position needs lat and lon, or frame, x and y")
+        if self.frame is not None and (*on_earth, self.alt) != (None, None, None):
+            raise schema.validation_error("a position has lat and lon, or frame, x and y, not both")
+        return self
+
+    @property
+    def account(self) -> Account:
+        """The position as a source of positions."""
+        if self.frame is not None:
+            return Account(place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}")
+        up_m = None if self.alt is None else float(self.alt)
+        return Account(place=(float(self.lat or 0), float(self.lon or 0), up_m), frame=samples.WGS84)
+
+
+class TrackedRobot(Strict):
+    """Source of the position of one robot.
+
+    Attributes:
+        topic: `nav_msgs/Odometry`, `sensor_msgs/NavSatFix`, or of a tracker `geometry_msgs/PoseStamped`,
+            `PoseWithCovarianceStamped`, `TransformStamped` or `tf2_msgs/TFMessage`. Either this or `at`.
+        facing: Direction of the robot when the step begins: `away`, `towards`, `left` or `right`, seen by an observer
+            who looks away from the other end of its link; required for odometry.
+        child: Frame of the robot in a tree of transforms, whose parent is the tracker's frame.
+        times: Time of a message: `header`, its stamp, or `received`, when the recorder received it, for stamps of
+            another clock.
+        gap: If two consecutive messages are further apart than this, the position between them is unknown.
+        at: A fixed position, in place of a topic.
+    """
+
+    topic: TopicName | None = None
+    facing: Literal["away", "towards", "left", "right"] | None = None
+    child: str | None = None
+    times: Literal["header", "received"] = "header"
+    gap: Annotated[Duration, Field(gt=0)] = position_sources.GAP_S
+    at: Spot | None = None
+
+    @schema.model_validator(mode="after")
+    def _has_one_source(self) -> "TrackedRobot":
+        if (self.topic is None) is (self.at is None):
+            raise schema.validation_error("a robot needs either topic or at")
+        return self
+
+
+class TrackStep(Nest):
+    """Records the position of each robot on that robot, with its profile's record command, while inner steps run.
+
+    The distance and speed columns of the transfers and pings inside use these positions
+    ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to be where they were
+    placed, unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the
+    columns `positions_from` and `positions_clock_error_s`. Leaves `track_ROLE.bag` (ROS 2: a folder) and
+    `positions.json`, which records the source of each position and how far the robots' clocks were ahead of the
+    laptop's.
+
+    Attributes:
+        robots: Source of each robot's position, by role.
+        heights: Whether heights above the ellipsoid are used; those of satellite receivers are often wrong by 10 m.
+        during: Steps that run at the same time.
+    """
+
+    cross_checks = position_checks.OF_POSITIONS
+
+    robots: Annotated[dict[Role, TrackedRobot], Field(min_length=1)]
+    heights: schema.Bool = False
+    during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
+
+    @override
+    def jobs(self, scene: Scene) -> Iterator[Planned]:
+        yield from self._recordings(scene)
+        yield from self.inside(scene)
+
+    def _recordings(self, scene: Scene) -> list[Planned]:
+        """Return the jobs that record the topics until they are stopped."""
+        limit_s = follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
+        return [self._recording(scene, recorder) for recorder in self._recorders(limit_s).values()]
+
+    def _recording(self, scene: Scene, recorder: RecordStep) -> Planned:
+        (planned,) = recorder.jobs(scene)
+        arguments = (recorder.bag(scene.robot(planned.role)), str(self._period_s(scene, planned.role)))
+        job = replace(
+            planned.job,
+            name=self.prefixed_name("track"),
+            argv=("sh", "-c", _RECORDS, "sh", *arguments, *planned.job.argv),
+            limit_s=recorder.duration,
+            ready="log:recording",
+        )
+        return replace(planned, job=job, permitted_causes=BY_FIELDKIT, least_s=0.0)
+
+    def _recorders(self, duration_s: float) -> Mapping[Role, RecordStep]:
+        """Return the equivalent `record` step of each robot with a topic, for a duration."""
+        return {
+            role: RecordStep.model_validate(
+                {
+                    "robot": role,
+                    "topics": [tracked.topic],
+                    "duration": f"{duration_s:.9g}s",
+                    "name": f"track_{role}"[:31],
+                }
+            )
+            for role, tracked in self.robots.items()
+            if tracked.topic is not None
+        }
+
+    @override
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        """Run the steps inside while the topics are recorded; `check` reads the bags, so exit codes are ignored."""
+        announce("record positions", None)
+        follow.follow(
+            self,
+            scene,
+            testbed,
+            announce,
+            self._recordings(scene),
+            make_accounts=partial(self._accounts, scene),
+            extra_s=lambda recording: self._period_s(scene, recording.role),
+        )
+
+    def _period_s(self, scene: Scene, role: Role) -> int:
+        """Return the time in whole seconds in which a topic publishes at least one message."""
+        ros = scene.robot(role).profile.ros
+        rates_hz = (
+            [topic.rate for topic in ros.topics if topic.name == self.robots[role].topic and topic.rate]
+            if ros
+            else []
+        )
+        return math.ceil(_PERIODS / min(rates_hz, default=1.0))
+
+    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
+        """Return the sources of the robots' positions in an attempt."""
+        places_m = scene.places_m
+        sources = dict(follow.stationary_robots(self, scene))
+        for role, tracked in self.robots.items():
+            if tracked.at is not None:
+                sources[role] = tracked.at.account
+            elif tracked.topic is not None:
+                sources[role] = Account(
+                    file=self._recorders(1.0)[role].bag(scene.robot(role)),
+                    topic=tracked.topic,
+                    child=tracked.child or "",
+                    stamps=tracked.times,
+                    gap_s=tracked.gap,
+                    start=places_m.get(role, (0.0, 0.0, 0.0)),
+                    heading_rad=None if tracked.facing is None else geometry.heading_rad(role, tracked.facing),
+                    began_utc_ns=began_utc_ns,
+                )
+        return Accounts(sources, offsets, self.heights)
+
+    @override
+    def refusals(self, scene: Scene) -> Iterator[Refusal]:
+        """Yield the refusals of the recorders, and a reason for odometry without `facing`."""
+        for role, recorder in self._recorders(1.0).items():
+            yield from recorder.refusals(scene)
+            ros = scene.robot(role).profile.ros
+            kinds = {topic.name: topic.type for topic in ros.topics} if ros else {}
+            if kinds.get(recorder.topics[0]) == ODOMETRY and self.robots[role].facing is None:
+                what = "its odometry needs its direction at the start of the step"
+                yield Refusal(role, what, "write facing: away, towards, left or right, in the step track")
+        yield from super().refusals(scene)
+
+    @override
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        for recorder in self._recorders(1.0).values():
+            yield from recorder.needs(scene)
+
+    @override
+    def live_topics(self, role: Role) -> tuple[str, ...]:
+        recorder = self._recorders(1.0).get(role)
+        return recorder.topics if recorder else ()
+
+    @override
+    def bytes_left(self, scene: Scene, role: Role) -> float:
+        recorder = self._recorders(self.expected_s(scene.protocol)).get(role)
+        return recorder.bytes_left(scene, role) if recorder else 0.0
+
+    @override
+    def reserve_bytes(self, scene: Scene, role: Role) -> int:
+        recorder = self._recorders(1.0).get(role)
+        return recorder.reserve_bytes(scene, role) if recorder else 0
+
+    @override
+    def files(self) -> tuple[str, ...]:
+        return (
+            position_sources.FILE,
+            *(name for recorder in self._recorders(1.0).values() for name in recorder.files()),
+        )
+
+    @override
+    def laptop_files(self) -> tuple[str, ...]:
+        return (position_sources.FILE,)
+
+    @override
+    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+        if any(isinstance(step, TrackStep) for step in earlier):
+            return "a repeat can have only one track: list all robots in it, and put all steps into it"
+        return follow.placement_error("track", within)
+
+    @override
+    def check(self, view: View) -> Iterator[str]:
+        """Yield the reasons why the recorded positions cannot be used."""
+        yield from follow.problems(view, list(self._recorders(1.0)))
+
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        return follow.COLUMNS
+
+    @override
+    def measure(self, view: View) -> Measured:
+        return follow.measure(view)
+
+    @override
+    def expected_s(self, protocol: Protocol) -> float:
+        return 2 * SUBSCRIBE_S + 1.0 + self.inside_s(protocol)

@@ -1,0 +1,1 @@
+"""Streams of samples over a middleware, and their evidence."""

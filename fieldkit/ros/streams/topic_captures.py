@@ -1,0 +1,413 @@
+"""Contradictions between the logs of a topic and the captures of its ends.
+
+A capture shows the head of most samples: number and time of sending (`topic_samples`). Each sample in a log is
+therefore compared with its packet. The clock is the same, because both were recorded on the same robot. If TCP or a
+middleware put several samples into one packet, so that the capture shows no heads, counts and bytes are compared.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.columns import Value
+from fieldkit.core.units import format_count
+from fieldkit.measure.captures.arrays import NO_TIME, Floats, Ints, Mask
+from fieldkit.measure.captures.headers import UDP
+from fieldkit.measure.captures.packets import UDP_HEADER_BYTES
+from fieldkit.measure.transfers.delay import LARGEST_ERROR
+from fieldkit.measure.transfers.match import match
+from fieldkit.ros.streams.topic_checks import TopicPlan
+from fieldkit.ros.streams.topic_columns import first_arrivals
+from fieldkit.ros.streams.topic_samples import SampleFlow, SampleHeads, TopicLog, TopicSamples
+
+STAMP_NS: Final = 2_000
+"""tcpdump truncates times to microseconds, and the kernel may stamp a packet with a time read 1 us later."""
+
+MAX_LATENCY_NS: Final = 5_000_000
+MAX_LATENCY_FEW_NS: Final = 20_000_000
+MIN_SAMPLES: Final = 20
+"""Largest time between the packet of a sample and its record, for the fastest sample; the larger value is for fewer
+than `MIN_SAMPLES` samples. A program on a busy robot delays single samples for longer, but not all of them."""
+
+SLOW_S: Final = 0.02
+"""A delay of which the subscriber's program caused more than this, and more than a tenth, is withheld: such a program
+cannot be distinguished from a log with wrong times. On two idle hosts the largest of 100 was 0.3 to 13 ms."""
+
+SHARE_FIGURES: Final = {
+    "topic_delay_median_s": "median",
+    "topic_delay_mean_s": "mean",
+    "topic_delay_p95_s": "95th percentile",
+    "topic_delay_max_s": "largest",
+    "topic_delay_error_s": "mean",
+    "topic_delay_median_sent_s": "median of those sent",
+    "topic_delay_p95_sent_s": "95th percentile of those sent",
+    "topic_age_mean_s": "mean",
+    "topic_age_peak_s": "mean",
+    "topic_delay_variation_p95_s": "95th percentile",
+    "topic_jitter_s": "95th percentile",
+    "topic_deadline_misses": "largest",
+}
+"""Columns of time, and the statistic of the delay in the subscriber's program with which each is compared."""
+
+_GRACE_NS: Final = 300_000_000
+"""Around the match and the end of the subscriber's log, a captured sample may be missing in the log."""
+
+_GIVE_UP_NS: Final = 600_000_000
+"""After a sample was finally lost, the next ones may wait this long for the message that reports the loss."""
+
+_READ_BURST_NS: Final = 1_000_000
+"""Within this time a subscriber's program reads all samples in its queue."""
+
+_OVERHEAD_BYTES: Final = 200
+_OVERHEAD_ONCE_BYTES: Final = 20_000
+"""Largest overhead of a middleware over TCP: for each sample, and once for all of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedTopic:
+    """A topic in both captures.
+
+    Attributes:
+        publisher: Packets in the publisher's capture; None without an undamaged capture.
+        subscriber: Packets in the subscriber's capture; None without an undamaged capture.
+        complete: True if all packets of its data that were sent are in the subscriber's capture.
+    """
+
+    publisher: SampleFlow | None
+    subscriber: SampleFlow | None
+    complete: bool
+
+
+def is_complete(publisher: SampleFlow, subscriber: SampleFlow) -> bool:
+    """Return True if the subscriber's capture has every UDP packet of the topic that the publisher sent."""
+    sent_packets, received_packets = (
+        flow.packets.where(flow.packets.protocol == UDP) for flow in (publisher, subscriber)
+    )
+    return len(sent_packets) > 0 and bool(match(sent_packets, received_packets).arrived.all())
+
+
+def check_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured: CapturedTopic) -> Iterator[str]:
+    """Yield each contradiction between the logs and the captures as a sentence.
+
+    Args:
+        plan: Settings of the procedure.
+        sent: Complete log of the publisher.
+        received: Complete log of the subscriber.
+        captured: The topic in both captures.
+    """
+    if any(
+        flow is not None and (flow.packets.time_ns == NO_TIME).any()
+        for flow in (captured.publisher, captured.subscriber)
+    ):
+        return
+    if captured.publisher is not None:
+        yield from _content_contradictions(captured.publisher.heads, sent.samples, sent.samples.sequence, "publisher")
+        yield from _sending_contradictions(captured.publisher.heads)
+    if captured.subscriber is not None:
+        yield from _content_contradictions(captured.subscriber.heads, received.samples, None, "subscriber")
+        yield from _arrival_contradictions(plan, received, captured.subscriber, complete=captured.complete)
+
+
+def _arrival_contradictions(
+    plan: TopicPlan, received: TopicLog, subscriber: SampleFlow, *, complete: bool
+) -> Iterator[str]:
+    """Yield the contradictions between the subscriber's log and its capture."""
+    arrived = first_arrivals(received)
+    yield from _Arrivals.of(arrived, subscriber, complete=complete, reliable=plan.reliable).contradictions()
+    yield from _surplus_copies(received.samples, subscriber)
+    yield from _uncaptured_samples(plan, arrived, subscriber)
+    if missing := _missing_count(plan, received, subscriber, complete=complete):
+        missing_text = f"{format_count(missing, 'sample')} arrived by the subscriber's capture"
+        yield f"{missing_text}, but are not in the subscriber's log"
+
+
+def withheld(
+    values: Mapping[str, Value],
+    arrived: TopicSamples,
+    captured: CapturedTopic,
+    *,
+    reliable: bool,
+    deadline_s: float | None,
+) -> dict[str, str]:
+    """Return the time columns in which the subscriber's program has too large a share, with the reason.
+
+    Args:
+        values: Columns of the topic from the logs.
+        arrived: Samples that arrived, each once.
+        captured: The topic in both captures.
+        reliable: As in `TopicPlan`.
+        deadline_s: Deadline of the topic; None without one.
+    """
+    if captured.subscriber is None or not len(arrived):
+        return {}
+    latency_s = _Arrivals.of(arrived, captured.subscriber, complete=captured.complete, reliable=reliable).latency_s
+    if latency_s is None or not len(latency_s):
+        return {}
+    figures_s = {
+        "median": float(np.median(latency_s)),
+        "mean": float(latency_s.mean()),
+        "95th percentile": float(np.percentile(latency_s, 95)),
+        "largest": float(latency_s.max()),
+        "median of those sent": _quantile_of_sent(latency_s, values, 0.5),
+        "95th percentile of those sent": _quantile_of_sent(latency_s, values, 0.95),
+    }
+    reasons = {}
+    for name, figure in SHARE_FIGURES.items():
+        value = deadline_s if name == "topic_deadline_misses" else values.get(name)
+        if name in values and isinstance(value, float) and figures_s[figure] > max(SLOW_S, LARGEST_ERROR * value):
+            late_text = f"the subscriber's log is later than its capture by {figures_s[figure]:.3f} s"
+            reasons[name] = f"{late_text} ({figure}): its program was delayed, or the log is wrong"
+    return reasons
+
+
+def _quantile_of_sent(latency_s: Floats, values: Mapping[str, Value], share: float) -> float:
+    """Return the quantile of the received samples that corresponds to this quantile of the sent samples."""
+    sent, received = values.get("topic_sent"), values.get("topic_received")
+    sent_per_received = sent / received if isinstance(sent, int) and isinstance(received, int) and received else 1.0
+    return float(np.quantile(latency_s, min(share * sent_per_received, 1.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Arrivals:
+    """Samples in the subscriber's log that are also in its capture.
+
+    Attributes:
+        after_ns: Time of the record minus that of the first packet with the sample's head.
+        latency_s: Time of the record minus that of the packet that completed the sample and all earlier ones, for
+            samples for which that packet is known; None if it is known for none.
+    """
+
+    after_ns: Ints
+    latency_s: Floats | None
+
+    @classmethod
+    def of(cls, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool, reliable: bool) -> "_Arrivals":
+        """Return the arrivals of samples that occur once; arguments as in `CapturedTopic` and `TopicPlan`."""
+        heads = subscriber.heads.first()
+        _, logged, captured = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
+        at_ns, head_ns = samples.at_ns[logged], heads.at_ns[captured]
+        complete_ns = _complete_ns(subscriber, heads, complete=complete, reliable=reliable) if len(heads) else None
+        if complete_ns is None:
+            return cls(at_ns - head_ns, None)
+        latency_s = (at_ns - complete_ns[captured]) / 1e9
+        return cls(
+            at_ns - head_ns,
+            latency_s[~_may_have_waited(samples, heads)] if reliable and not subscriber.is_tcp else latency_s,
+        )
+
+    def contradictions(self) -> Iterator[str]:
+        """Yield contradictions between the times in the log and in the capture."""
+        early_ns = -int(self.after_ns.min(initial=0))
+        if early_ns > STAMP_NS:
+            early_count = int((self.after_ns < -STAMP_NS).sum())
+            early_text = f"{format_count(early_count, 'sample')} in the subscriber's log came up to"
+            yield f"{early_text} {early_ns / 1e9:.6f} s before their packets in its capture"
+        if self.latency_s is not None and len(self.latency_s) > 2:
+            least_s = float(self.latency_s.min())
+            if least_s > (MAX_LATENCY_NS if len(self.latency_s) >= MIN_SAMPLES else MAX_LATENCY_FEW_NS) / 1e9:
+                yield f"the subscriber's log is {least_s:.6f} s or more later than its capture for every sample"
+
+
+def _complete_ns(subscriber: SampleFlow, heads: SampleHeads, *, complete: bool, reliable: bool) -> Ints | None:
+    """Return the time at which each sample and all earlier ones had arrived, by number; None if it is unknown."""
+    if subscriber.is_tcp:
+        return _contiguous_ns(subscriber, heads.end)
+    if heads.whole.all():
+        delivered_ns: Ints = np.maximum.accumulate(heads.at_ns) if reliable else heads.at_ns
+        return delivered_ns
+    return _before_next_ns(subscriber, heads) if complete else None
+
+
+def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
+    """Return a mask of the captured samples, by number, that may have waited for a sample that was not captured.
+
+    A reliable middleware delays samples until the previous one has arrived or is known to be lost.
+    """
+    numbers, first = np.unique(samples.sequence, return_index=True)
+    at_ns = samples.at_ns[first]
+    rank = np.minimum(np.searchsorted(heads.sequence, numbers), len(heads) - 1)
+    is_captured = heads.sequence[rank] == numbers
+    known = np.concatenate((numbers, heads.sequence))
+    after_gap = (numbers > 0) & ~np.isin(numbers - 1, known)
+    released_ns = np.where(is_captured, 0, at_ns)
+    released_ns[after_gap & is_captured] = np.minimum(at_ns, heads.at_ns[rank] + _GIVE_UP_NS)[after_gap & is_captured]
+    released_ns = np.maximum.accumulate(released_ns)
+    mask: Mask = (after_gap | (np.append(0, released_ns[:-1]) > heads.at_ns[rank]))[is_captured]
+    return mask
+
+
+def _contiguous_ns(subscriber: SampleFlow, end: Ints) -> Ints | None:
+    """Return when a TCP connection had delivered every byte before `end`, from the first copy of each segment."""
+    if (connection := subscriber.connection()) is None:
+        return None
+    data, _ = connection
+    base = int(end[0])
+    starts, first = np.unique(_seq_difference(data.tcp_seq, base), return_index=True)
+    until_ns = np.maximum.accumulate(data.time_ns[first])
+    contiguous_ns: Ints = until_ns[
+        np.maximum(np.searchsorted(starts, _seq_difference(end, base), side="left") - 1, 0)
+    ]
+    return contiguous_ns
+
+
+def _seq_difference(number: Ints, base: int) -> Ints:
+    """Return the signed difference of sequence numbers from `base`, modulo 2**32 (RFC 9293, section 3.4)."""
+    return (number - base + (1 << 31)) % (1 << 32) - (1 << 31)
+
+
+def _before_next_ns(subscriber: SampleFlow, heads: SampleHeads) -> Ints:
+    """Return the time of the last packet before the next sample starts, for samples in several packets."""
+    times_ns, begins_ns = np.sort(subscriber.packets.time_ns), np.sort(heads.at_ns)
+    next_index = np.searchsorted(begins_ns, heads.at_ns, side="right")
+    next_ns = np.append(begins_ns, times_ns[-1] + 1)[next_index]
+    last: Ints = times_ns[np.maximum(np.searchsorted(times_ns, next_ns, side="left") - 1, 0)]
+    return last
+
+
+def _content_contradictions(
+    heads: SampleHeads, samples: TopicSamples, numbers: Ints | None, name: str
+) -> Iterator[str]:
+    """Yield differences in the time of sending between capture and log, and captured samples without a record."""
+    if numbers is not None and (unlogged := int((~np.isin(heads.sequence, numbers)).sum())):
+        yield f"{format_count(unlogged, 'sample')} in the {name}'s capture are not in its log"
+    first = heads.first()
+    _, logged, captured = np.intersect1d(samples.sequence, first.sequence, return_indices=True)
+    if different := int((samples.sent_ns[logged] != first.sent_ns[captured]).sum()):
+        what = f"{format_count(different, 'sample')} in the {name}'s log"
+        yield f"{what} have another time of sending than in its capture"
+
+
+def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
+    """Yield contradictions between the times of sending and the publisher's capture."""
+    first = publisher.first()
+    after_ns = first.at_ns - first.sent_ns
+    if len(after_ns) and int(after_ns.min()) < -STAMP_NS:
+        early_s = -int(after_ns.min()) / 1e9
+        yield f"a sample was sent {early_s:.6f} s before it was created, by the publisher's capture and log"
+    if len(after_ns) > 2 and after_ns.min() > (
+        MAX_LATENCY_NS if len(after_ns) >= MIN_SAMPLES else MAX_LATENCY_FEW_NS
+    ):
+        late_s = int(after_ns.min()) / 1e9
+        yield f"every sample was sent {late_s:.6f} s or more after it was created, by the publisher's capture and log"
+
+
+def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
+    """Yield a contradiction if a log has samples more often than the capture."""
+    numbers, copies = np.unique(samples.sequence, return_counts=True)
+    shown_numbers, shown_copies = np.unique(subscriber.heads.sequence, return_counts=True)
+    known = np.isin(numbers, shown_numbers)
+    max_copies = np.ones(len(numbers), dtype=np.int64)
+    if not subscriber.is_tcp:  # TCP delivers every byte once, even if it arrived several times
+        max_copies[known] = shown_copies[np.searchsorted(shown_numbers, numbers[known])]
+    if surplus := int(((copies > max_copies) & (known | subscriber.is_tcp)).sum()):
+        yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"
+
+
+def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
+    """Yield a contradiction if the capture has too few packets for the samples in a log, which has no duplicates."""
+    if not plan.on_ports and not len(subscriber.heads):
+        return
+    packets = subscriber.packets
+    size_bytes = plan.size_bytes + plan.envelope_bytes
+    without_head = int((~np.isin(arrived.sequence, subscriber.heads.sequence)).sum())
+    payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
+    if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
+        capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
+    else:
+        capacity = int((payload_bytes // size_bytes).sum()) - len(subscriber.heads)
+    if without_head > max(capacity, 0):
+        missing_text = f"{format_count(without_head - max(capacity, 0), 'sample')} in the subscriber's log"
+        yield f"{missing_text} are not in its capture"
+    if not len(subscriber.heads):
+        yield from _early_samples(arrived, packets.time_ns, payload_bytes, size_bytes)
+
+
+_DATAGRAM_BYTES: Final = 1_200
+"""A DDS sample larger than this may be divided into several messages, each smaller than the sample."""
+
+
+def _early_samples(samples: TopicSamples, times_ns: Ints, payload_bytes: Ints, size_bytes: int) -> Iterator[str]:
+    """Yield a contradiction if samples are logged before enough bytes had arrived; for captures without heads."""
+    order, arrival = np.argsort(times_ns, kind="stable"), np.sort(samples.at_ns)
+    bytes_until = np.concatenate(([0], np.cumsum(payload_bytes[order])))
+    captured_bytes = bytes_until[np.searchsorted(times_ns[order], arrival + STAMP_NS, side="right")]
+    needed_bytes = size_bytes * np.arange(1, len(arrival) + 1)
+    if early_count := int((captured_bytes < needed_bytes).sum()):
+        yield f"{format_count(early_count, 'sample')} in the subscriber's log came before their bytes in its capture"
+
+
+def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, complete: bool) -> int:
+    """Return the number of samples that arrived completely but are missing in the log without a known reason.
+
+    Known reasons: the subscriber had not discovered the publisher; its queue overflowed, because its program did not
+    read the samples in time; an earlier sample was missing, or a later one had arrived.
+    """
+    if not len(subscriber.heads):
+        return _missing_bytes(plan, log, subscriber)
+    heads = subscriber.heads.first()
+    begins_ns = int(log.times_ns[-1] if log.matched_ns is None else log.matched_ns)
+    settled = (heads.at_ns > begins_ns + _GRACE_NS) & (heads.at_ns < log.times_ns[-1] - _GRACE_NS)
+    received = _is_received(plan, heads, log.samples, subscriber, complete=complete)
+    is_missing = settled & received & ~np.isin(heads.sequence, log.samples.sequence)
+    if not is_missing.any():
+        return 0
+    return int((~_overflowed(plan, log.samples, heads, is_missing, int(log.times_ns[-1]))).sum())
+
+
+def _is_received(
+    plan: TopicPlan, heads: SampleHeads, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool
+) -> Mask:
+    """Return a mask of the samples, by number, that the subscriber's middleware must have delivered."""
+    if subscriber.is_tcp:
+        return _is_acknowledged(heads, subscriber)
+    has_all_bytes = heads.whole | complete
+    if plan.reliable:
+        # No sample is delivered after a gap; a sample that arrives before a later one is delivered precedes it.
+        gapless = np.logical_and.accumulate(heads.sequence == np.arange(len(heads)))
+        numbers, first = np.unique(samples.sequence, return_index=True)
+        next_index = np.searchsorted(numbers, heads.sequence, side="right")
+        next_ns = np.append(samples.at_ns[first], -1)[next_index]
+        return has_all_bytes & (gapless | (next_ns >= heads.at_ns))
+    received: Mask = has_all_bytes & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
+    return received
+
+
+def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
+    """Return a mask of the samples over TCP that the subscriber's kernel acknowledged completely."""
+    connection = subscriber.connection()
+    if connection is None or not len(connection[1]):
+        return np.zeros(len(heads), dtype=np.bool_)
+    base = int(heads.end[0])
+    acknowledged: Mask = _seq_difference(heads.end, base) <= _seq_difference(connection[1].tcp_ack, base).max()
+    return acknowledged
+
+
+def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_missing: Mask, end_ns: int) -> Mask:
+    """Return, for each sample that a log lacks, True if a queue of the subscriber may have dropped it."""
+    if plan.depth is None:
+        return np.zeros(int(is_missing.sum()), dtype=np.bool_)
+    arrived_ns, read_ns = np.sort(heads.at_ns), np.append(np.sort(samples.at_ns), end_ns)
+    lost_ns = heads.at_ns[is_missing]
+    next_ns = read_ns[np.minimum(np.searchsorted(read_ns, lost_ns), len(read_ns) - 1)]
+    queued = np.searchsorted(arrived_ns, next_ns, side="right") - np.searchsorted(arrived_ns, lost_ns, side="right")
+    # A missing sample that arrives releases all waiting samples together; the capture may lack heads of some of them.
+    read_together = np.searchsorted(read_ns[:-1], next_ns + _READ_BURST_NS, side="right") - np.searchsorted(
+        read_ns[:-1], next_ns
+    )
+    queued = np.maximum(queued, read_together)
+    newest_ns = arrived_ns[max(len(arrived_ns) - plan.depth, 0)]
+    overflowed: Mask = (queued >= plan.depth) & ((lost_ns < newest_ns) | (read_together >= plan.depth))
+    return overflowed
+
+
+def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:
+    """Return the number of samples missing in a log by the TCP bytes that arrived, if the capture has no heads."""
+    if not subscriber.is_tcp:
+        return 0
+    max_bytes = plan.size_bytes + plan.envelope_bytes + _OVERHEAD_BYTES
+    payload = subscriber.packets.where(subscriber.packets.tcp_payload_bytes > 0)
+    _, first = np.unique(payload.tcp_seq, return_index=True)
+    arrived_bytes = int(payload.tcp_payload_bytes[first].sum()) - _OVERHEAD_ONCE_BYTES
+    return max(arrived_bytes // max_bytes - len(log.samples), 0)

@@ -1,0 +1,219 @@
+"""Contradictions between the logs of a topic and the procedure, the time of the attempt, and each other.
+
+`topic_captures` compares the same logs with the captures.
+"""
+
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
+from fieldkit.core.model import Role
+from fieldkit.core.units import format_count
+from fieldkit.ros.streams import topic_samples
+from fieldkit.ros.streams.topic_samples import TopicLog
+
+MAX_SLEW_NS: Final = 1_000_000
+"""Largest difference by which two consecutive times of one program may be reversed by a slewed clock."""
+
+SETTLES_NS: Final = 500_000_000
+"""Minimum time between the record of the match and the first sample (`fieldkit.agent.stream.SETTLES_S`)."""
+
+PADDING_BYTES: Final = 3
+"""DDS pads a sample to a multiple of 4 bytes, and some implementations do not report this."""
+
+_NAMES: Final = {topic_samples.PUBLISHER: "publisher", topic_samples.SUBSCRIBER: "subscriber"}
+
+
+@dataclass(frozen=True)
+class TopicPlan:
+    """Settings of a topic in a procedure.
+
+    Attributes:
+        topic: Its name.
+        samples: Number of samples that the publisher offers, including skipped ones.
+        size_bytes: Data bytes of a sample.
+        envelope_bytes: Bytes that serialization adds to the data.
+        reliable: True if samples are retransmitted until they arrive.
+        depth: Number of samples that a subscriber queues until its program reads them; None for all.
+        in_order: True if one thread of the subscriber's program reads all samples.
+        on_ports: True if all packets of the topic use the ports that the procedure expects.
+    """
+
+    topic: str
+    samples: int
+    size_bytes: int
+    envelope_bytes: int
+    reliable: bool
+    depth: int | None
+    in_order: bool
+    on_ports: bool
+
+
+def check_logs(plan: TopicPlan, sent: TopicLog, received: TopicLog) -> Iterator[str]:
+    """Yield each contradiction in the two logs of one stream as a sentence.
+
+    Args:
+        plan: Settings of the procedure.
+        sent: Complete log of the publisher.
+        received: Complete log of the subscriber.
+    """
+    yield from _wrong_end(plan, sent, topic_samples.PUBLISHER)
+    yield from _wrong_end(plan, received, topic_samples.SUBSCRIBER)
+    yield from _publisher_problems(plan, sent)
+    yield from _wrong_sizes(plan, received, PADDING_BYTES, "subscriber")
+    if plan.in_order and (reversed_s := _reversed_s(received)):
+        yield f"a sample in the subscriber's log is {reversed_s:.3f} s earlier than the previous one"
+    samples, arrived = sent.samples, received.samples
+    if unsent := int((~np.isin(arrived.sequence, sent.numbers)).sum()):
+        yield f"{format_count(unsent, 'sample')} arrived with numbers that the publisher's log does not have"
+    _, sent_index, received_index = np.intersect1d(samples.sequence, arrived.sequence, return_indices=True)
+    if (samples.sent_ns[sent_index] != arrived.sent_ns[received_index]).any():
+        yield "samples arrived that the publisher did not send: another stream has the same topic and domain"
+    if len(sent_index) > 1 and (samples.at_ns[sent_index] == arrived.at_ns[received_index]).all():
+        yield "the subscriber's log is a copy of the publisher's"
+
+
+def check_times(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int, int] | None]) -> Iterator[str]:
+    """Yield the logs with records from before or after the attempt, by the clock of the robot.
+
+    Args:
+        logs: Logs by role.
+        windows: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+    """
+    for role, log in logs.items():
+        window = windows.get(role)
+        if window is None or not len(log.times_ns):
+            continue
+        early_s = (window[0] - int(log.times_ns.min())) / 1e9
+        late_s = (int(log.times_ns.max()) - window[1]) / 1e9
+        if early_s > 0:
+            yield f"the {role}'s topic log has a record from {early_s:.3f} s before the attempt, by the robot's clock"
+        if late_s > 0:
+            yield f"the {role}'s topic log has a record from {late_s:.3f} s after the attempt, by the robot's clock"
+
+
+def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
+    """Yield a contradiction if a log is from the other end of the topic, or from another topic."""
+    name = _NAMES[end]
+    if log.end is not None and log.end != end:
+        yield f"the {name}'s log was written by the {_NAMES.get(log.end, 'unknown end')} of the topic"
+    if log.topic_sum is not None and log.topic_sum != zlib.crc32(plan.topic.encode()):
+        yield f"the {name}'s log is of another topic than {plan.topic}"
+    has_valid_count = (log.kinds.get(topic_samples.BEGUN) == 1, log.kinds.get(topic_samples.MATCHED, 0) <= 1)
+    unexpected_kinds = (
+        (topic_samples.FOREIGN,) if end == topic_samples.PUBLISHER else (topic_samples.REFUSED, topic_samples.SKIPPED)
+    )
+    if not all(has_valid_count) or any(log.kinds.get(kind) for kind in unexpected_kinds):
+        yield f"the {name}'s log has records that no {name} writes"
+    times_ns = log.times_ns
+    if len(times_ns) and (times_ns.min() < times_ns[0] - MAX_SLEW_NS or times_ns.max() > times_ns[-1] + MAX_SLEW_NS):
+        yield f"the {name}'s log has records from before its start or after its end"
+    if len(log.samples) and log.matched_ns is None:
+        yield f"the {name}'s log has samples, but the other end was never discovered"
+
+
+def _publisher_problems(plan: TopicPlan, sent: TopicLog) -> Iterator[str]:
+    """Yield properties of a log that no publisher writes."""
+    samples, numbers = sent.samples, sent.numbers
+    if (numbers != np.arange(len(numbers))).any():
+        yield "the publisher's log does not number its samples from 0 on without a gap"
+    offered = len(numbers) + sent.skipped
+    if sent.matched_ns is not None and offered != plan.samples:
+        yield f"the publisher's log accounts for {offered} instead of {format_count(plan.samples, 'sample')}"
+    yield from _wrong_sizes(plan, sent, 0, "publisher")
+    if len(samples) and (samples.at_ns < samples.sent_ns - MAX_SLEW_NS).any():
+        yield "the publisher's log has a sample that the middleware accepted before it was created"
+    if (np.diff(sent.times_ns) < -MAX_SLEW_NS).any() or (np.diff(samples.sent_ns) < -MAX_SLEW_NS).any():
+        yield "the records of the publisher's log are not in the order of time"
+    if len(samples) and sent.matched_ns is not None:
+        early_ns = sent.matched_ns + SETTLES_NS - int(samples.sent_ns[0])
+        if early_ns > MAX_SLEW_NS:
+            yield f"the publisher's log has its first sample {early_ns / 1e9:.3f} s too early after the subscription"
+
+
+def _wrong_sizes(plan: TopicPlan, log: TopicLog, padding_bytes: int, name: str) -> Iterator[str]:
+    size_bytes = plan.size_bytes + plan.envelope_bytes
+    sizes = log.samples.size_bytes
+    if count := int(((sizes < size_bytes) | (sizes > size_bytes + padding_bytes)).sum()):
+        samples = f"{format_count(count, 'sample')} with a size other than {size_bytes} bytes"
+        yield f"the {name}'s log has {samples}"
+
+
+def _reversed_s(log: TopicLog) -> float:
+    """Return the largest time by which a sample is earlier than the previous one; 0 if none is."""
+    reversed_ns = -int(np.diff(log.samples.at_ns).min(initial=0))
+    return reversed_ns / 1e9 if reversed_ns > MAX_SLEW_NS else 0.0
+
+
+_SAME_FILE: Final = "the same file: checksum and count of samples"
+
+CROSS_CHECKS: Final = (
+    CrossCheck(
+        "samples sent",
+        ("topic_sent", "topic_refused", "topic_skipped", "topic_loss"),
+        "`ROLE-topic.bin` of the publisher: samples",
+        ("the rate and duration of the procedure", "the publisher's capture: heads of samples", _SAME_FILE),
+        "none: every number from 0 on is sent, refused or skipped; a sample in the capture is in the log",
+    ),
+    CrossCheck(
+        "samples received",
+        ("topic_received", "topic_loss", "topic_repeated"),
+        "`ROLE-topic.bin` of the subscriber: samples",
+        (
+            "the publisher's log: numbers, sizes and times of sending",
+            "the subscriber's capture: heads, packets and bytes of samples",
+            _SAME_FILE,
+        ),
+        "a sample that arrived may be missing if the subscriber's queue overflowed, if an earlier one is missing and "
+        "the middleware preserves the order, or within 0.3 s of the match or of the end",
+    ),
+    CrossCheck(
+        "time of sending of each sample",
+        ("topic_delay_*", "topic_age_*", "topic_jitter_s"),
+        "`ROLE-topic.bin` of both ends: time in the sample",
+        ("the publisher's capture: time in the sample, and time of its packet", "the subscriber's capture"),
+        "the packet of the fastest sample leaves within 5 ms (20 ms if there are fewer than 20 samples)",
+    ),
+    CrossCheck(
+        "time of arrival of each sample",
+        ("topic_delay_*", "topic_age_*", "topic_jitter_s"),
+        "`ROLE-topic.bin` of the subscriber: time of the record",
+        ("the subscriber's capture: time of the packet with the sample", "the robot's clock around the attempt"),
+        "no record is earlier than its packet; the fastest is at most 5 ms later (20 ms if there are fewer than 20)",
+    ),
+    CrossCheck(
+        "delay added by the subscriber's program",
+        ("topic_delay_*", "topic_age_*", "topic_jitter_s", "topic_deadline_misses"),
+        "`ROLE-topic.bin` of the subscriber: time of the record",
+        ("the subscriber's capture: time of the packet with the sample",),
+        "up to 20 ms, or a tenth of the figure: a busy robot delays single samples",
+        CheckOutcome.WITHHELD,
+    ),
+    CrossCheck(
+        "discovery",
+        ("topic_discovered", "topic_discovery_s"),
+        "`ROLE-topic.bin` of the publisher: start and match",
+        ("the robot's clock around the attempt", "the first sample, 0.5 s after the match"),
+        "a first sample that is up to 0.1 s late, as on a busy robot; if it is later, the discovery time is withheld",
+    ),
+    CrossCheck(
+        "completeness of a topic's captures",
+        ("topic_capture_withheld",),
+        "`ROLE-capture.log`: packets dropped before tcpdump",
+        ("`ROLE.pcap`: number of packets, which is in the log too",),
+        "none: if a packet was dropped, all columns that need the captures are empty; those of the logs remain",
+        CheckOutcome.WITHHELD,
+    ),
+    CrossCheck(
+        "packets and bytes of a topic",
+        ("topic_data_*", "topic_discovery_packets", "topic_discovery_bytes", "topic_packet_loss"),
+        "the captures: packets of its ports",
+        (),
+        "the logs give a lower bound of the data packets; only the captures contain discovery",
+        CheckOutcome.UNCHECKED,
+    ),
+)

@@ -1,0 +1,361 @@
+"""Columns of a topic from the logs of its ends and the captures: loss, delay, age of information, traffic.
+
+Age of information is the time since the newest sample that has arrived was sent. It increases with time and drops
+when a newer sample arrives. Mean over time: S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one
+update?", INFOCOM 2012. Mean just before each drop, the peak age: M. Costa, M. Codreanu, A. Ephremides, "On the age of
+information in status update systems with packet management", IEEE Trans. Information Theory 62, 2016.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
+from fieldkit.measure.captures.arrays import Floats, Ints
+from fieldkit.measure.captures.headers import UDP
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.evidence.delay_quantiles import quantile_of_sent
+from fieldkit.measure.transfers.clock_offset import Clocks
+from fieldkit.measure.transfers.delay import LARGEST_ERROR, clocks_between, jitter_s
+from fieldkit.measure.transfers.match import match
+from fieldkit.measure.transfers.udp import with_ports
+from fieldkit.ros.streams.topic_samples import TopicLog, TopicSamples
+
+_COUNTS: Final = columns(
+    100,
+    ("topic_sent", "count", "Samples that the publisher's middleware accepted."),
+    ("topic_received", "count", "Samples of topic_sent that the subscriber received, each counted once."),
+    (
+        "topic_loss",
+        "share",
+        "1 - topic_received/topic_sent. Empty if nothing was sent.",
+        Figure("topic loss", Kind.COUNTED, "topic_received", "topic_sent", rank=70),
+    ),
+    ("topic_repeated", "count", "Samples that the subscriber received more than once."),
+    ("topic_refused", "count", "Samples that the publisher's middleware did not accept in time."),
+    ("topic_skipped", "count", "Samples that were never sent: their time passed while an earlier one was written."),
+    (
+        "topic_discovered",
+        "bool",
+        "True if the publisher discovered the subscription before its timeout; if not, nothing was sent.",
+        Figure("topic discovered", Kind.FLAG, rank=71),
+    ),
+    (
+        "topic_discovery_s",
+        "s",
+        "Time from the start of the publisher's middleware until it discovered the subscription.",
+        Figure("topic discovery", Kind.MEDIAN, rank=72),
+    ),
+)
+_TIMES: Final = columns(
+    100,
+    (
+        "topic_delay_median_s",
+        "s",
+        (
+            "Median delay from just before a sample is passed to the middleware until the subscriber receives it. "
+            "Each delay and age of a topic is empty if topic_delay_error_s is unknown or above a tenth of it."
+        ),
+        Figure("topic delay", Kind.MEDIAN, rank=73, of_sent="topic_delay_median_sent_s"),
+    ),
+    ("topic_delay_mean_s", "s", "Mean delay of samples; empty as for topic_delay_median_s."),
+    (
+        "topic_delay_p95_s",
+        "s",
+        "95th percentile of the delay of samples; empty as for topic_delay_median_s.",
+        Figure("topic delay, 95 %", Kind.MEDIAN, rank=74, of_sent="topic_delay_p95_sent_s"),
+    ),
+    ("topic_delay_max_s", "s", "Largest delay of a sample; empty as for topic_delay_median_s."),
+    ("topic_delay_error_s", "s", "Maximum error of each delay that is caused by the clocks, from the captures."),
+    (
+        "topic_delay_variation_p95_s",
+        "s",
+        "95th percentile of the delay relative to the fastest sample, which needs no common clock (RFC 5481).",
+        Figure("topic delay variation, 95 %", Kind.MEDIAN, rank=75),
+    ),
+    (
+        "topic_jitter_s",
+        "s",
+        "Interarrival jitter of the samples, after the last one (RFC 3550, section 6.4.1).",
+        Figure("topic's last jitter value (RFC 3550)", Kind.MEDIAN, rank=76),
+    ),
+    (
+        "topic_age_mean_s",
+        "s",
+        "Age of information, mean from the first arrival to the last (Kaul, Yates and Gruteser 2012).",
+        Figure("age of information", Kind.MEDIAN, rank=77),
+    ),
+    (
+        "topic_age_peak_s",
+        "s",
+        "Mean age of information just before each newer sample arrived (Costa, Codreanu and Ephremides 2016).",
+        Figure("peak age of information", Kind.MEDIAN, rank=78),
+    ),
+    (
+        "topic_deadline_misses",
+        "count",
+        "Deadlines that passed between two arrivals without a sample, as in DDS. Empty without a deadline.",
+        Figure("topic deadline misses", Kind.MEAN, rank=79),
+    ),
+)
+_TRAFFIC: Final = columns(
+    100,
+    ("topic_data_packets", "count", "IP packets of the topic's data and its acknowledgements at the publisher."),
+    (
+        "topic_data_bytes",
+        "B",
+        "Bytes of topic_data_packets with the headers of their frames.",
+        Figure("topic data bytes", Kind.MEAN, rank=80),
+    ),
+    (
+        "topic_packet_loss",
+        "share",
+        (
+            "Share of the IP packets of the topic's data from publisher to subscriber over UDP, each fragment "
+            "separately, that are not in the subscriber's capture. Empty over TCP."
+        ),
+        Figure("topic packet loss", Kind.MEAN, rank=82),
+    ),
+    (
+        "topic_discovery_packets",
+        "count",
+        "IP packets of discovery between publisher and subscriber, at the publisher.",
+    ),
+    (
+        "topic_discovery_bytes",
+        "B",
+        "Bytes of topic_discovery_packets with the headers of their frames.",
+        Figure("topic discovery bytes", Kind.MEAN, rank=81),
+    ),
+)
+
+_OF_SENT: Final = columns(
+    110,
+    (
+        "topic_delay_median_sent_s",
+        "s",
+        (
+            "Median delay of all samples sent; a lost one counts as later than all others. Empty if half of "
+            "them or more were lost, and if topic_delay_error_s is above a tenth of it."
+        ),
+    ),
+    (
+        "topic_delay_p95_sent_s",
+        "s",
+        (
+            "95th percentile of the delay of all samples sent; a lost one counts as later than all others. Empty if "
+            "about 5 % or more were lost."
+        ),
+    ),
+)
+
+_WITHHELD: Final = columns(
+    120,
+    (
+        "topic_capture_withheld",
+        "text",
+        (
+            "Reason why columns that depend on the captures are empty although the repeat is valid: packets were "
+            "dropped before tcpdump. Samples, losses, delay variation and jitter are from the logs alone. Empty if "
+            "no packet was dropped."
+        ),
+    ),
+)
+
+COLUMNS: Final = (*_COUNTS, *_TIMES, *_TRAFFIC, *_OF_SENT, *_WITHHELD)
+
+
+@dataclass(frozen=True)
+class TopicTraffic:
+    """Properties that identify a topic's packets, and its deadline.
+
+    Attributes:
+        sender_address: Address of the publisher.
+        receiver_address: Address of the subscriber.
+        data_ports: Ports of samples and their acknowledgements.
+        discovery_ports: Ports of discovery.
+        deadline_s: Largest expected time between samples; None without a deadline.
+    """
+
+    sender_address: str
+    receiver_address: str
+    data_ports: frozenset[int]
+    discovery_ports: frozenset[int]
+    deadline_s: float | None
+
+
+def measure(
+    flow: TopicTraffic,
+    sent: TopicLog | None,
+    received: TopicLog | None,
+    sender: Packets | None,
+    receiver: Packets | None,
+) -> Measured:
+    """Return all columns of a topic.
+
+    Args:
+        flow: Identifies its packets.
+        sent: Log of the publisher; None if it is incomplete.
+        received: Log of the subscriber; None if it is incomplete.
+        sender: Packets that the publisher's robot captured; None without a complete capture.
+        receiver: Packets that the subscriber's robot captured; None without a complete capture.
+    """
+    traffic = _packet_loss(flow, sender, receiver) | _traffic(flow, sender)
+    if sent is None or received is None:
+        of_logs = (*_COUNTS, *_TIMES, *_OF_SENT)
+        return traffic | Measured.all_missing(of_logs, "there are no complete logs of both ends")
+    arrived = first_arrivals(received)
+    clocks = None
+    if sender is not None and receiver is not None:
+        clocks = clocks_between(sender, receiver, flow.sender_address, flow.receiver_address)
+    counts = _counts(sent, arrived, len(received.samples))
+    return traffic | counts | _times(arrived, clocks, flow.deadline_s, len(sent.samples))
+
+
+def withheld_reasons(measured: Measured, reason: str) -> dict[str, str]:
+    """Return the reason for each column of a topic that is missing because packets were dropped before tcpdump.
+
+    Args:
+        measured: Columns measured without the captures.
+        reason: Why the captures are not used; empty if they are.
+    """
+    if not reason:
+        return {}
+    by_clocks = {column.name for column in (*_TIMES, *_OF_SENT)} - {"topic_deadline_misses"}
+    names = by_clocks | {column.name for column in _TRAFFIC}
+    return {name: reason for name in sorted(names) if name not in measured.values}
+
+
+def withheld_mark(reason: str) -> Measured:
+    """Return the column that marks a topic that was measured without its captures.
+
+    Args:
+        reason: Why the captures are not used; empty if they are.
+    """
+    return Measured.from_optional({"topic_capture_withheld": reason or None}, "nothing is withheld")
+
+
+def first_arrivals(log: TopicLog) -> TopicSamples:
+    """Return the first arrival of each sample, in the order of the log."""
+    _, first = np.unique(log.samples.sequence, return_index=True)
+    return log.samples.where(np.sort(first))
+
+
+def _counts(sent: TopicLog, arrived: TopicSamples, arrivals: int) -> Measured:
+    was_sent = np.isin(arrived.sequence, sent.samples.sequence)
+    received_count, sent_count = int(was_sent.sum()), len(sent.samples)
+    discovery_s = None
+    if sent.begun_ns is not None and sent.matched_ns is not None:
+        discovery_s = (sent.matched_ns - sent.begun_ns) / 1e9
+    values: dict[str, Value | None] = {
+        "topic_sent": sent_count,
+        "topic_received": received_count,
+        "topic_loss": 1 - received_count / sent_count if sent_count else None,
+        "topic_repeated": arrivals - len(arrived),
+        "topic_refused": sent.refused,
+        "topic_skipped": sent.skipped,
+        "topic_discovered": sent.matched_ns is not None,
+        "topic_discovery_s": discovery_s,
+    }
+    return Measured.from_optional(values, "the publisher discovered no subscription, so nothing was sent")
+
+
+def _times(arrived: TopicSamples, clocks: Clocks | None, deadline_s: float | None, sent: int) -> Measured:
+    """Return the columns of time; each sample has arrived once, in the order of `arrived`."""
+    transit_ns = arrived.at_ns - arrived.sent_ns
+    values: dict[str, Value | None] = {"topic_jitter_s": jitter_s(transit_ns)}
+    if deadline_s is not None:
+        values["topic_deadline_misses"] = deadline_misses(arrived.at_ns, deadline_s)
+    if len(arrived):
+        variation_s = (transit_ns - transit_ns.min()) / 1e9
+        values["topic_delay_variation_p95_s"] = float(np.percentile(variation_s, 95))
+    if len(arrived) and clocks is not None and math.isfinite(clocks.error_s(arrived.at_ns)):
+        values |= _by_clocks(arrived, clocks, sent)
+    reason = "too few samples arrived, there is no deadline, or the captures do not give the clock offset well enough"
+    return Measured.from_optional(values, reason) | Measured.all_missing((*_TIMES, *_OF_SENT), reason)
+
+
+def _by_clocks(arrived: TopicSamples, clocks: Clocks, sent: int) -> dict[str, float]:
+    """Return delays and ages whose clock error is small enough."""
+    delay_s, error_s = clocks.delays_s(arrived.sent_ns, arrived.at_ns), clocks.error_s(arrived.at_ns)
+    mean_s, peak_s = age_s((arrived.at_ns - arrived.at_ns[0]) / 1e9, delay_s)
+    figures = {
+        "topic_delay_median_s": float(np.median(delay_s)),
+        "topic_delay_mean_s": float(delay_s.mean()),
+        "topic_delay_p95_s": float(np.percentile(delay_s, 95)),
+        "topic_delay_max_s": float(delay_s.max()),
+        "topic_age_mean_s": mean_s,
+        "topic_age_peak_s": peak_s,
+        "topic_delay_median_sent_s": quantile_of_sent(delay_s, sent, 0.5),
+        "topic_delay_p95_sent_s": quantile_of_sent(delay_s, sent, 0.95),
+    }
+    shown = {name: value for name, value in figures.items() if value is not None and error_s <= LARGEST_ERROR * value}
+    return {"topic_delay_error_s": error_s, **shown}
+
+
+def age_s(at_s: Floats, delay_s: Floats) -> tuple[float | None, float | None]:
+    """Return the mean age of information over time, and the mean of its peaks.
+
+    Args:
+        at_s: Time of arrival of each sample, ascending.
+        delay_s: Age of the sample on arrival.
+
+    Returns:
+        The mean from the first arrival to the last, None if they are the same; the mean peak, None without a drop.
+    """
+    sent_s = at_s - delay_s
+    newest_s = np.maximum.accumulate(sent_s)
+    fresh = np.concatenate(([True], sent_s[1:] > newest_s[:-1]))
+    at_s, newest_s = at_s[fresh], newest_s[fresh]
+    if len(at_s) < 2:
+        return None, None
+    # Between two arrivals the age increases linearly.
+    peaks = at_s[1:] - newest_s[:-1]
+    steps = np.diff(at_s)
+    mean = float(((peaks - steps / 2) * steps).sum() / steps.sum()) if steps.sum() > 0 else None
+    return mean, float(peaks.mean())
+
+
+def deadline_misses(at_ns: Ints, deadline_s: float) -> int:
+    """Return the number of missed deadlines: one per period without a sample (DDS 1.4, section 2.2.3)."""
+    gaps_s = np.diff(at_ns) / 1e9
+    # A sample that arrives exactly at its deadline is in time.
+    return int(np.maximum(np.ceil(gaps_s / deadline_s - 1e-9) - 1, 0).sum())
+
+
+def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
+    """Return the counts of the topic's data and discovery packets in a capture."""
+    if sender is None:
+        return Measured.all_missing(_TRAFFIC, "there is no complete capture of the publisher")
+    data, discovery = list(flow.data_ports), list(flow.discovery_ports)
+    packets = with_ports(sender)
+    to_data, to_discovery = np.isin(packets.dport, data), np.isin(packets.dport, discovery)
+    of_data, of_discovery = np.isin(packets.sport, data), np.isin(packets.sport, discovery)
+    kinds = {
+        "data": to_data | (of_data & ~to_discovery),
+        "discovery": to_discovery | (of_discovery & ~to_data),
+    }
+    values: dict[str, Value | None] = {}
+    for name, mask in kinds.items():
+        values[f"topic_{name}_packets"] = int(mask.sum())
+        values[f"topic_{name}_bytes"] = int(sender.wire_bytes[mask].sum())
+    return Measured.from_optional(values, "")
+
+
+def _packet_loss(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> Measured:
+    """Return the share of UDP data packets from publisher to subscriber that did not arrive."""
+    if sender is None or receiver is None:
+        return Measured.from_optional({"topic_packet_loss": None}, "there are no complete captures of both ends")
+
+    def forward(packets: Packets) -> Packets:
+        ends = packets.are_from(flow.sender_address) & packets.are_to(flow.receiver_address)
+        return packets.where(ends & (packets.protocol == UDP))
+
+    sent = forward(sender)
+    # At the subscriber a first fragment, and with it the port, may be missing. The sender's capture has all ports.
+    of_data = np.isin(with_ports(sent).dport, list(flow.data_ports))
+    arrived = match(sent, forward(receiver)).arrived[of_data]
+    lost = 1 - float(arrived.mean()) if len(arrived) else None
+    return Measured.from_optional({"topic_packet_loss": lost}, "none of its data was sent over UDP")

@@ -1,0 +1,131 @@
+"""Evidence of a topic: the logs of publisher and subscriber, the captures, and contradictions between them."""
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from fieldkit.core.columns import Measured
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Role
+from fieldkit.core.units import format_count
+from fieldkit.ros.interfaces.qos import History, Reliability
+from fieldkit.ros.middlewares.middleware import MiddlewareName
+from fieldkit.ros.streams import topic_captures, topic_checks, topic_samples
+from fieldkit.ros.streams.stream_options import StreamOptions
+from fieldkit.ros.streams.topic_captures import CapturedTopic
+from fieldkit.ros.streams.topic_checks import TopicPlan
+from fieldkit.ros.streams.topic_columns import first_arrivals
+from fieldkit.ros.streams.topic_samples import SampleFlow, TopicLog
+from fieldkit.steps.view import View, capture_around
+
+_ENVELOPE_BYTES: Final = 12
+_CDR_BYTES: Final = 16
+_ROS1_QUEUE: Final = 1000
+"""Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.ros1`)."""
+_LATE_S: Final = 0.1
+"""Permitted delay of the first sample after discovery and the publisher's wait; else discovery is withheld."""
+
+
+def plan(step: StreamOptions) -> TopicPlan:
+    """Return the plan of a step's topic, with which its logs are compared."""
+    quality = step.qos.resolved()
+    keeps_last = quality.history is not History.KEEP_ALL and quality.depth > 0
+    depth = quality.depth if keeps_last else _ROS1_QUEUE if step.over is MiddlewareName.ROS1 else None
+    return TopicPlan(
+        topic=step.topic,
+        samples=round(step.duration * step.rate),
+        size_bytes=round(step.bytes),
+        envelope_bytes=_ENVELOPE_BYTES if step.over is MiddlewareName.ROS1 else _CDR_BYTES,
+        reliable=step.over in {MiddlewareName.ROS1, MiddlewareName.ZENOH}
+        or quality.reliability is not Reliability.BEST_EFFORT,
+        # Zenoh passes samples to the callback without a queue.
+        depth=None if step.over is MiddlewareName.ZENOH else depth,
+        in_order=step.over in {MiddlewareName.DDS, MiddlewareName.ROS1},
+        on_ports=step.over is not MiddlewareName.ROS2,
+    )
+
+
+def problems(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog]) -> Iterator[str]:
+    """Yield the contradictions between the logs of both ends, the procedure, the attempt and the captures.
+
+    Args:
+        step: The topic.
+        view: The attempt.
+        logs: Complete logs by role.
+    """
+    yield from topic_checks.check_times(logs, {role: view.attempt_window(role) for role in logs})
+    if {step.sender, step.receiver} <= logs.keys():
+        sent, received = logs[step.sender], logs[step.receiver]
+        topic_plan = plan(step)
+        reasons = list(topic_checks.check_logs(topic_plan, sent, received))
+        yield from reasons
+        # The same cause would also lead to many contradictions with the captures.
+        if not reasons:
+            yield from topic_captures.check_captures(topic_plan, sent, received, captured(step, view))
+
+
+def captured(step: StreamOptions, view: View) -> CapturedTopic:
+    """Return the samples of the topic in the captures of sender and receiver."""
+    sent, received = (_flow(step, view, role) for role in (step.sender, step.receiver))
+    complete = sent is not None and received is not None and topic_captures.is_complete(sent, received)
+    return CapturedTopic(sent, received, complete)
+
+
+def dropped(step: StreamOptions, view: View) -> str:
+    """Return why columns that need captures are withheld; empty if the kernel dropped no packet before tcpdump."""
+    counts = {role: view.dropped(role) for role in (step.sender, step.receiver)}
+    return " and ".join(
+        f"the capture of {role} lacks {format_count(count, 'packet')} that its kernel dropped"
+        for role, count in counts.items()
+        if count
+    )
+
+
+def _flow(step: StreamOptions, view: View, role: Role) -> SampleFlow | None:
+    """Return the samples of the topic in the capture of a robot; None without a complete capture."""
+    name = capture_around(view.within, role)
+    capture = view.capture(role)
+    if name is None or capture is None:
+        return None
+    heads = view.evidence.read(topic_samples.find_heads, name, round(step.bytes))
+    address = view.scene.robot(role).address
+    publishes = role == step.sender
+    return topic_samples.sample_flow(
+        capture.packets,
+        heads,
+        step.wire_ports.data,
+        round(step.bytes),
+        lambda packets: packets.are_from(address) if publishes else ~packets.are_from(address),
+    )
+
+
+def checked(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog], measured: Measured) -> Measured:
+    """Return the measurements without the times that the captures contradict."""
+    if not {step.sender, step.receiver} <= logs.keys():
+        return measured
+    sent, arrived = logs[step.sender], first_arrivals(logs[step.receiver])
+    reasons = topic_captures.withheld(
+        measured.values, arrived, captured(step, view), reliable=plan(step).reliable, deadline_s=step.qos.deadline
+    )
+    if sent.matched_ns is not None and len(sent.samples):
+        late_s = (int(sent.samples.sent_ns[0]) - sent.matched_ns - topic_checks.SETTLES_NS) / 1e9
+        if late_s > _LATE_S:
+            reasons["topic_discovery_s"] = f"the first sample was sent {late_s:.3f} s too late after the discovery"
+    return measured.without(reasons)
+
+
+def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
+    """Return the complete logs by role, and a sentence for each other log on what is wrong."""
+    logs, errors = dict[Role, TopicLog](), list[str]()
+    for role, name in files.items():
+        try:
+            log = view.evidence.read(topic_samples.read_log, name)
+        except EvidenceError as error:
+            errors.append(f"{name}: {error.what}")
+            continue
+        if not log.whole:
+            errors.append(f"{name} is incomplete: the agent was stopped")
+        else:
+            logs[role] = log
+        if log.foreign:
+            errors.append(f"{name}: another program also publishes {step.topic}: use another topic or domain")
+    return logs, errors

@@ -1,0 +1,59 @@
+"""The delays and losses of a topic over time, as a panel of the time line of an attempt."""
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.report.attempt_timing import TIME_LABEL, Moments
+from fieldkit.report.charts import Panel, Series
+from fieldkit.report.theme import Style
+from fieldkit.ros.streams import topic_samples
+from fieldkit.steps.base import Step
+
+MOST_SAMPLES: Final = 1500
+"""Most samples of each kind in a panel; of more samples, every k-th is drawn."""
+_RECEIVED: Final = Style("green", "^", "none")
+_LOST: Final = Style("lost", "x", "none")
+
+
+def panels(step: Step, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+    """Yield the delays of received samples, and lost samples, by the time of sending; see `DrawsPanels.panels`."""
+    logs = {
+        role: evidence.read_or_none(topic_samples.read_log, step.prefixed_name(f"{role}-topic.bin"))
+        for verb in ("publish", "subscribe")
+        for role, job in times.jobs
+        if job == step.prefixed_name(verb)
+    }
+    complete = [log for log in logs.values() if log]
+    if len(complete) != 2:
+        return
+    publisher, _ = logs
+    sent, received = (log.samples for log in complete)
+    if not len(sent.sequence):
+        return
+    is_lost = ~np.isin(sent.sequence, received.sequence)
+    lost_s = (sent.at_ns[is_lost] - times.ahead_ns[publisher] - zero_ns) / 1e9
+    took_ms = (
+        received.at_ns - received.sent_ns
+    ) / 1e6  # measured with two clocks, so only differences are meaningful
+    excess_ms = took_ms - took_ms.min(initial=math.inf) if len(took_ms) else took_ms
+    received_s = (received.sent_ns - times.ahead_ns[publisher] - zero_ns) / 1e9
+    kinds = (
+        ("sample received", _RECEIVED, received_s, excess_ms),
+        ("sample lost", _LOST, lost_s, np.zeros(len(lost_s))),
+    )
+    series = []
+    for label, style, at_s, heights in kinds:
+        every_kth = slice(None, None, max(1, -(-len(at_s) // MOST_SAMPLES)))
+        series.append(Series(label, style, at_s[every_kth], heights[every_kth]))
+    yield Panel(
+        title=f"delay of {step.name or 'the topic'} beyond its fastest sample",
+        x_label=TIME_LABEL,
+        y_label="[ms]",
+        series=series,
+        words=f"{len(sent.sequence)} samples sent, {int(is_lost.sum())} lost, {len(received.sequence)} received",
+        top=None if len(excess_ms) else 1.0,
+    )

@@ -1,0 +1,89 @@
+"""Stalls of a topic: times during which a sample was overdue at its subscriber."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fieldkit.core.columns import Measured
+from fieldkit.core.errors import EvidenceError
+from fieldkit.measure.captures.packets import Packets
+from fieldkit.measure.transfers import delay, deliveries, stalls
+from fieldkit.measure.transfers.clock_offset import StampPairs
+from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
+from fieldkit.ros.streams.topic_columns import TopicTraffic
+from fieldkit.ros.streams.topic_samples import TopicLog
+
+COLUMNS = tuple(
+    replace(column, meaning=column.meaning.replace("complete captures", "complete logs"))
+    for column in stalls.declare_columns("topic", "the topic", 83)
+)
+
+
+def require_steady_clocks(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> None:
+    """Raise an error if the captures show that a robot's clock was set.
+
+    Raises:
+        EvidenceError: No clock offset fits both captures.
+    """
+    if sender is None or receiver is None:
+        return
+    ends = flow.sender_address, flow.receiver_address
+    has_packets = (packets.are_from(end).any() for packets in (sender, receiver) for end in ends)
+    if all(has_packets) and delay.clocks_between(sender, receiver, *ends) is None:
+        raise EvidenceError(delay.UNSTEADY)
+
+
+def delivery(sent: TopicLog | None, received: TopicLog | None, expected: FlowSchedule) -> Delivery:
+    """Return the deliveries of a topic.
+
+    Args:
+        sent: Log of the publisher; None if it is incomplete.
+        received: Log of the subscriber; None if it is incomplete.
+        expected: Known properties of the stream.
+
+    Raises:
+        EvidenceError: The deliveries cannot be determined from the logs.
+    """
+    if sent is None or received is None:
+        raise EvidenceError("there are no complete logs of both ends")
+    samples = sent.samples
+    if not len(samples):
+        raise EvidenceError("nothing was sent")
+    _, sent_index, received_index = np.intersect1d(samples.sequence, received.samples.sequence, return_indices=True)
+    at_ns = received.samples.at_ns[np.sort(received_index)]
+    if (np.diff(at_ns) < -deliveries.REORDERING_NS).any():
+        raise EvidenceError("a sample is earlier than the one before it: a clock was set back")
+    pairs = StampPairs(samples.sent_ns[sent_index], received.samples.at_ns[received_index])
+    first_ns, last_ns = int(samples.sent_ns.min()), int(samples.sent_ns.max())
+    return deliveries.stream_delivery(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, expected)
+
+
+def measure(
+    flow: TopicTraffic,
+    logs: tuple[TopicLog | None, TopicLog | None],
+    captured: tuple[Packets | None, Packets | None],
+    expected: FlowSchedule,
+) -> Measured:
+    """Return the columns of the stalls of a topic.
+
+    Args:
+        flow: Identifies its packets.
+        logs: Logs of publisher and subscriber as for `delivery`.
+        captured: Packets that their robots captured; None without a complete capture.
+        expected: Known properties of the stream.
+    """
+    return stalls.measure("topic", lambda: read_deliveries(flow, logs, captured, expected))
+
+
+def read_deliveries(
+    flow: TopicTraffic,
+    logs: tuple[TopicLog | None, TopicLog | None],
+    captured: tuple[Packets | None, Packets | None],
+    expected: FlowSchedule,
+) -> list[Delivery]:
+    """Return the deliveries of a topic.
+
+    Arguments as for `measure`; raises as `delivery` and `require_steady_clocks`.
+    """
+    require_steady_clocks(flow, *captured)
+    return [delivery(*logs, expected)]

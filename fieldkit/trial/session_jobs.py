@@ -1,0 +1,104 @@
+"""Jobs that run on robots during a whole session, such as a bridge of topics.
+
+They run from before the first check until the end of the session, so preflight, people and every trial of the
+session use the robot in the same state. They are normal jobs: `fieldkit abort` ends them, and a resumed session joins
+them. Packages add them by entry points (`plugins.SESSION_JOBS`).
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Final
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.core import plugins
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import FieldkitError, RobotError, TestbedLostError
+from fieldkit.core.events import Note, PhaseStarted, Sink
+from fieldkit.core.threads import run_parallel
+from fieldkit.remote import evidence, jobs
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+from fieldkit.steps.scene import Planned, Shells
+
+SessionJobs = Callable[[Cast, str], Iterable[Planned]]
+"""Returns the jobs of a session on the robots of a cast. The session is the second argument; the folder of each job
+must be named after it."""
+
+_INSTALLS_S: Final = 30.0
+_GRACE_S: Final = 5
+
+
+def planned(cast: Cast, session: str) -> list[Planned]:
+    """Return the jobs of a session.
+
+    Args:
+        cast: The robot in each role.
+        session: Identifies the run of fieldkit.
+    """
+    return [job for _, jobs_of_package in _by_package(cast, session) for job in jobs_of_package]
+
+
+def _by_package(cast: Cast, session: str) -> Iterator[tuple[str, Sequence[Planned]]]:
+    """Yield the name of each entry point with its jobs."""
+    for point in plugins.entry_points(plugins.SESSION_JOBS):
+        session_jobs: SessionJobs = plugins.load(point)
+        yield point.name, list(session_jobs(cast, session))
+
+
+@contextmanager
+def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator[None]:
+    """Run the jobs of a session while the body runs.
+
+    Args:
+        cast: The robot in each role.
+        shells: The robots.
+        session: Identifies the run of fieldkit.
+        sink: Receives the start of the jobs, and a note on each that did not exit successfully.
+
+    Raises:
+        LinkError: A robot did not answer.
+        RobotError: A job did not start; the message has the end of its log.
+    """
+    started: list[Planned] = []
+
+    def start(job: Planned) -> None:
+        _start(cast, shells[job.role], job)
+        started.append(job)
+
+    try:
+        for name, jobs_of_package in _by_package(cast, session):
+            if jobs_of_package:
+                sink(PhaseStarted(f"start {name}"))
+                run_parallel(start, jobs_of_package)
+        yield
+    finally:
+        errors = run_parallel(lambda job: _end(shells[job.role], job.job), started)
+        for job, error in zip(started, errors, strict=True):
+            if error:
+                sink(Note(f"the {job.job.name} on {cast[job.role].name} {error}"))
+
+
+def _start(cast: Cast, shell: Shell, planned_job: Planned) -> None:
+    robot, job = cast[planned_job.role], planned_job.job
+    jobs.install(shell, Deadline.after(_INSTALLS_S))
+    evidence.begin(shell, job.folder, planned_job.role, robot.profile.radio.interface)
+    try:
+        jobs.start(shell, job)
+    except RobotError as error:
+        raise RobotError(
+            f"its {job.name} does not start: {error.what}", where=robot.name, remedy=planned_job.remedy
+        ) from error
+
+
+def _end(shell: Shell, job: Job) -> str:
+    """Stop a job; return a description of what went wrong, empty if nothing did."""
+    try:
+        runs = any(f"{job.folder}/" in line for line in jobs.list_running(shell, Deadline.after(jobs.REPLY_S)))
+        code = jobs.stop(shell, job, grace_s=_GRACE_S)
+        evidence.discard(shell, job.folder.split("/")[-2])
+    except TestbedLostError:
+        return ""  # it exited with its robot
+    except FieldkitError as error:
+        return f"was not stopped: {error.what}"
+    early = "" if runs else "early, "
+    return f"exited {early}with exit code {code}" if code or early else ""

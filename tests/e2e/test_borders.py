@@ -1,0 +1,137 @@
+"""The harness works without `fieldkit.motion` and `fieldkit.ros`: its tests pass in a copy without them."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from tests.helpers.casts import PLAIN
+from tests.helpers.outside_packages import write_package
+from tests.helpers.paths import ROOT
+
+PACKAGES: Final = ("fieldkit.motion", "fieldkit.ros")
+LIMIT_S: Final = 300.0
+COPIED: Final = ("fieldkit", "sim_backends", "tests", "robots", "procedures", "pyproject.toml")
+REMOVED: Final = ("fieldkit/motion", "fieldkit/ros", "tests/motion", "tests/ros")
+HARNESS_TESTS: Final = (
+    "tests/analysis/test_analysis_compare.py",
+    "tests/analysis/test_expectations.py",
+    "tests/backends/test_backend_registry.py",
+    "tests/campaign/test_campaign_order.py",
+    "tests/campaign/test_campaign_plan.py",
+    "tests/config/test_misplaced.py",
+    "tests/config/test_site_file.py",
+    "tests/core/test_columns.py",
+    "tests/core/test_plugins.py",
+    "tests/export/test_export_table.py",
+    "tests/measure/evidence/test_measure_host.py",
+    "tests/measure/evidence/test_measure_ping.py",
+    "tests/measure/evidence/test_recordings.py",
+    "tests/measure/transfers/test_measure_udp.py",
+    "tests/remote/test_remote_programs.py",
+    "tests/report/test_report_headlines.py",
+    "tests/steps/kinds/test_step_capture.py",
+    "tests/steps/kinds/test_step_transfer.py",
+    "tests/steps/test_netcat_pairs.py",
+    "tests/steps/test_step_kinds.py",
+    "tests/trial/running/test_trial_ledger.py",
+    "tests/trial/running/test_trial_opening.py",
+    "tests/trial/test_session_jobs.py",
+    "tests/trial/test_trial_journal.py",
+    "tests/trial/test_trial_rows.py",
+    "tests/trial/test_trial_store.py",
+)
+"""A quick part of the tests of each package of the harness."""
+STEPS_OF_PRODUCTS: Final = {
+    "fly": "{robot: sender, height: 2m, during: [ping: {from: sender, to: receiver}]}",
+    "record": "{robot: sender, topics: [/scan], duration: 2s}",
+}
+PROCEDURE: Final = """\
+name: KIND
+summary: A procedure with a kind of step of a product
+scenario: los
+topology: masterless
+protocols: [udp]
+repeats: 1
+steps:
+  - KIND: STEP
+"""
+
+
+def entry_points() -> Iterator[str]:
+    """Yield the lines of the entry points of fieldkit without those of the removed packages."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for group, points in {"console_scripts": project["scripts"], **project["entry-points"]}.items():
+        yield f"[{group}]"
+        yield from (f"{name} = {target}" for name, target in points.items() if not target.startswith(PACKAGES))
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the repository without the packages, with metadata as after an installation."""
+    folder = tmp_path_factory.mktemp("border")
+    for name in COPIED:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, folder)
+    for name in REMOVED:
+        shutil.rmtree(folder / name)
+    write_package(folder, "fieldkit", "\n".join(entry_points()), version="0.1.0")
+    return folder
+
+
+def run(copy: Path, *words: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a module of Python with the copy's packages."""
+    return subprocess.run(
+        (sys.executable, "-m", *words),
+        cwd=folder or copy,
+        env=os.environ | {"PYTHONPATH": str(copy)},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT_S,
+        check=False,
+    )
+
+
+def test_tests_of_the_harness_pass_without_the_products(copy: Path) -> None:
+    chosen = "not motion and not ros and not emulated and not quiet and not nightly"
+    done = run(copy, "pytest", "-q", "-p", "no:cacheprovider", "-m", chosen, *HARNESS_TESTS)
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
+
+
+def test_a_trial_is_planned_without_the_products(copy: Path, tmp_path: Path) -> None:
+    write_procedure(tmp_path, "plain", PLAIN)
+    done = run(copy, "fieldkit", "trial", "plain", "30ft", "--dry-run", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    listed = run(copy, "fieldkit", "columns", folder=tmp_path)
+    assert listed.returncode == 0, listed.stderr
+    assert "rtt_sent" in listed.stdout
+
+
+@pytest.mark.parametrize(("kind", "step"), STEPS_OF_PRODUCTS.items())
+def test_a_kind_of_a_removed_package_is_reported(copy: Path, tmp_path: Path, kind: str, step: str) -> None:
+    write_procedure(tmp_path, kind, PROCEDURE.replace("KIND", kind).replace("STEP", step))
+    done = run(copy, "fieldkit", "trial", kind, "5m", "--dry-run", folder=tmp_path)
+    assert done.returncode == 2
+    assert f"unknown key {kind}" in done.stderr
+    assert "other kinds of step need a package that is not installed" in " ".join(done.stderr.split())
+
+
+def write_procedure(folder: Path, name: str, text: str) -> None:
+    (folder / "procedures").mkdir()
+    (folder / "procedures" / f"{name}.yaml").write_text(text.replace("name: los", f"name: {name}"), encoding="utf-8")
+
+
+def test_the_commands_of_the_removed_packages_are_not_listed(copy: Path, tmp_path: Path) -> None:
+    lines = run(copy, "fieldkit", "--help", folder=tmp_path).stdout.splitlines()
+    names = {line.split()[0] for line in lines if line.startswith("    ") and line.split()}
+    assert "abort" in names
+    assert not names & {"bag", "bridge", "middleware", "stop"}

@@ -1,0 +1,180 @@
+"""The rule of `fieldkit middleware recommend`, on repeats with known results."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fieldkit.analysis.quantities import parse_amount
+from fieldkit.analysis.repeats import SOURCE, Repeats
+from fieldkit.ros.recommendation import candidates, link_cells
+from fieldkit.ros.recommendation.candidates import Assessment, Candidate
+from fieldkit.ros.recommendation.link_cells import LinkCell, LinkCriterion
+
+DDS = Candidate("dds", "", "{}", "reliable keep_last 10")
+PLACE, SIZE = "masterless, 5m", 1000.0
+ONE_PERCENT = LinkCriterion(0.01)
+UNKNOWN = float("nan")
+
+
+def cell(
+    lost: Sequence[float],
+    *,
+    sent: float = 100,
+    never_sent: float = 0,
+    delay_s: Sequence[float] = (),
+    delay_sent_s: Sequence[float] | None = None,
+    status: Sequence[str] = (),
+    size_bytes: float = SIZE,
+) -> LinkCell:
+    """Return repeats that lost the given numbers of 100 samples."""
+    n = len(lost)
+    delay = np.array([*delay_s] or [0.01] * n)
+    numbers = {
+        "topic_sent": np.full(n, sent),
+        "topic_refused": np.full(n, never_sent),
+        "topic_skipped": np.zeros(n),
+        "topic_received": sent - np.array(lost, dtype=np.float64),
+        "topic_delay_p95_s": delay,
+        "topic_delay_p95_sent_s": delay if delay_sent_s is None else np.array(delay_sent_s),
+    }
+    texts = {
+        "status": np.array([*status] or ["valid"] * n, dtype=np.object_),
+        SOURCE: np.array(["trials/a"] * n, dtype=np.object_),
+    }
+    halves = [Repeats(numbers, texts, ()).where(np.array(part)) for part in (range(n // 2), range(n // 2, n))]
+    return link_cells.link_cell(PLACE, size_bytes, halves)
+
+
+def judge(*cells: LinkCell, criterion: LinkCriterion = ONE_PERCENT) -> Assessment:
+    return candidates.assess_candidate(DDS, cells, {(own.place, own.size_bytes) for own in cells}, criterion)
+
+
+def test_a_repeat_at_the_bound_passes_and_one_above_fails() -> None:
+    assert judge(cell([0, 1, 1, 0, 1])).passed
+    assessment = judge(cell([0, 1, 2, 0, 1]))
+    assert not assessment.passed
+    assert assessment.failed == (f"{PLACE}, 1000 B: loss <= 0.01 in 4 of 5 repeats, up to 0.02",)
+
+
+def test_a_bound_is_compared_as_a_decimal() -> None:
+    # In binary floating point, 2.9 times 0.01 is less than 29/1000.
+    bound = parse_amount("2.9%", "share", "bound")
+    assert judge(cell(5 * [29], sent=1000), criterion=LinkCriterion(bound)).passed
+    assert judge(cell(5 * [30], sent=1000), criterion=LinkCriterion(bound)).failed
+
+
+def test_one_bad_repeat_fails_although_the_mean_is_low() -> None:
+    # Bimodal: 1 of 200 repeats loses everything, 0.5 % on average.
+    assert judge(cell([100] + 199 * [0])).failed
+
+
+def test_samples_never_sent_are_lost() -> None:
+    assert judge(cell(5 * [0], sent=99, never_sent=1)).passed
+    assert judge(cell(5 * [0], sent=98, never_sent=2)).failed
+
+
+def test_too_few_repeats_never_pass() -> None:
+    assessment = judge(cell(4 * [0]))
+    assert assessment.lacking == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
+    assert judge(cell(4 * [0]), criterion=replace(ONE_PERCENT, repeats=4)).passed
+
+
+def test_void_and_failed_repeats_do_not_count() -> None:
+    own = cell(6 * [0], status=["valid", "void", "valid", "failed", "valid", "valid"])
+    assert own.attempts == 6
+    assert judge(own).lacking == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
+    # The loss of a void repeat proves nothing either.
+    assert judge(cell([0, 0, 0, 0, 0, 90], status=[*5 * ["valid"], "void"])).passed
+
+
+def test_a_valid_repeat_without_a_loss_never_passes() -> None:
+    assessment = judge(cell([*5 * [0], UNKNOWN]))
+    assert not assessment.passed
+    assert "1 of 6 repeats have no value" in assessment.lacking[0]
+    # Nothing was sent: there was no subscription.
+    assert judge(cell(5 * [0], sent=0)).lacking
+    assert not judge(cell(5 * [0], sent=0)).failed
+
+
+def test_no_valid_repeat_at_all_is_undecided() -> None:
+    assessment = judge(cell([0, 0], status=["void", "void"]))
+    assert not assessment.passed
+    assert not assessment.failed
+    assert f"{PLACE}, 1000 B: loss <= 0.01: no repeat is valid" in assessment.lacking
+
+
+@pytest.mark.parametrize(("largest_s", "passed"), [(0.2, True), (0.201, False)])
+def test_a_delay_limit_applies_to_every_repeat(largest_s: float, passed: bool) -> None:
+    own = cell(5 * [0], delay_s=[0.01, 0.02, largest_s, 0.01, 0.01])
+    assessment = judge(own, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
+    assert assessment.passed == passed
+    assert bool(assessment.failed) == (not passed)
+    assert judge(own).passed
+
+
+def test_a_missing_delay_never_passes() -> None:
+    own = cell(5 * [0], delay_s=[0.01, 0.02, UNKNOWN, 0.01, 0.01])
+    assessment = judge(own, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
+    assert not assessment.failed
+    assert "1 of 5 repeats have no value" in assessment.lacking[0]
+    assert judge(own).passed  # without a delay limit it is not needed
+
+
+def test_a_censored_delay_never_passes() -> None:
+    # More than 5 % were lost, so that the delay of 95 % of those sent is censored.
+    lenient = LinkCriterion(0.5, 0.2)
+    own = cell(5 * [10], delay_sent_s=[0.01, UNKNOWN, 0.01, 0.01, 0.01])
+    assessment = judge(own, criterion=lenient)
+    assert not assessment.failed
+    assert "in 1 of 5 repeats too much was lost for a value over all sent items" in assessment.lacking[0]
+    # The received samples were already late, so it fails whatever the lost ones would have been.
+    late = cell(5 * [10], delay_s=5 * [0.3], delay_sent_s=5 * [UNKNOWN])
+    assert judge(late, criterion=lenient).failed
+
+
+@pytest.mark.parametrize(
+    ("lost", "passed", "failed"),
+    # 95 %, one-sided (Clopper and Pearson 1934): of 29 all show 90 %, since 0.9^29 < 5 % < 0.9^28; of 46 all but one.
+    [
+        (29 * [0], True, False),
+        (28 * [0], False, False),
+        ([*45 * [0], 5], True, False),
+        ([*44 * [0], 5], False, False),
+        (29 * [5], False, True),
+    ],
+)
+def test_a_share_of_repeats_needs_confidence(lost: list[float], passed: bool, failed: bool) -> None:
+    assessment = judge(cell(lost), criterion=replace(ONE_PERCENT, share=0.9))
+    assert assessment.passed == passed
+    assert bool(assessment.failed) == failed
+
+
+def test_every_cell_must_pass_and_none_may_be_missing() -> None:
+    good, bad = cell(5 * [0]), cell(5 * [9], size_bytes=1e6)
+    assert judge(good, bad).failed == (f"{PLACE}, 1e+06 B: loss <= 0.01 in 0 of 5 repeats, up to 0.09",)
+    wanted = {(PLACE, SIZE), (PLACE, 1e6)}
+    assessment = candidates.assess_candidate(DDS, [good], wanted, ONE_PERCENT)
+    assert assessment.lacking == (f"{PLACE}, 1e+06 B: not measured, although other candidates were",)
+
+
+def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:
+    fast, slow = cell(5 * [0], delay_s=5 * [0.01]), cell(5 * [0], delay_s=[0.01, 0.01, 0.3, 0.01, 0.01])
+    lossy, unknown = cell([1, 1, 0, 0, 1]), cell(5 * [0], delay_s=[0.01, UNKNOWN, 0.01, 0.01, 0.01])
+    empty = cell([0, 0], status=["void", "void"])
+    assert judge(fast).rank == (0, 0.01)
+    assert judge(slow).rank == judge(fast, slow).rank == (0, 0.3)
+    assert judge(unknown).rank == (0, float("inf"))  # an unknown delay is not short
+    assert judge(lossy).rank == judge(fast, lossy).rank == (3 / 500, 0.01)
+    assert judge(fast, empty).rank == (float("inf"), float("inf"))
+
+
+def test_the_evidence_contains_every_repeat() -> None:
+    own = cell([0, 1, 0, 0, 1], delay_s=[0.01, 0.02, 0.03, UNKNOWN, 0.01])
+    text = "\n".join(candidates.evidence(judge(own), ONE_PERCENT))
+    assert "loss <= 0.01 in 5 of 5 repeats: at least 55 % of all repeats do, with 95 % confidence" in text
+    assert "by repeat 0.0, 1.0, 0.0, 0.0, 1.0" in text
+    assert "by repeat 10.0, 20.0, 30.0, 10.0, unknown in 1" in text
+    assert "Criterion: loss at most 1 %, in each repeat." in text
+    assert "trials: trials/a" in text

@@ -1,0 +1,334 @@
+"""Logs of a topic compared with each other and with the captures: every change in one of them is noticed."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from fieldkit.agent import records, stream
+from fieldkit.core.columns import Measured
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Role
+from fieldkit.ros.streams import topic_captures, topic_checks, topic_columns, topic_samples
+from tests.helpers import topic_attempts
+from tests.helpers.captures import Frame
+from tests.helpers.topic_attempts import MS, PERIOD, PLAN, SAMPLES, SECOND, Row, TopicAttempt, attempt, best_effort
+
+KINDS = {
+    "reliable over UDP": attempt(),
+    "best effort with losses": attempt(plan=best_effort(), lost=(3, 4, 17, 39)),
+    "reliable with samples given up": attempt(lost=(0, 20, 21)),
+    "over TCP": attempt(tcp=True),
+}
+ANY = st.sampled_from(sorted(KINDS))
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("topic")
+
+
+def is_sample(row: Row) -> bool:
+    return row[0] == records.SAMPLE
+
+
+def with_samples(rows: Sequence[Row], change: Callable[[int, Row], Row | None]) -> tuple[Row, ...]:
+    """Return rows in which each sample is replaced by `change(index, row)`, or removed if that is None."""
+    samples = [row for row in rows if is_sample(row)]
+    changed = [change(place, row) for place, row in enumerate(samples)]
+    return (*(row for row in rows if not is_sample(row)), *(row for row in changed if row is not None))
+
+
+def changed(made: TopicAttempt, end: str, rows: Sequence[Row]) -> TopicAttempt:
+    return replace(made, sent=tuple(rows)) if end == "sent" else replace(made, received=tuple(rows))
+
+
+def later(row: Row, by_ns: int) -> Row:
+    return (*row[:4], row[4] + by_ns)
+
+
+def require_noticed(reasons: list[str], measured: Measured, before: Measured) -> None:
+    """Require that an attempt is void, or that every column is as before or withheld."""
+    if reasons:
+        return
+    for name, value in before.values.items():
+        now = measured.values.get(name)
+        if now is None or now == value:
+            continue
+        assert isinstance(now, float), f"{name} is {now}, not {value}"
+        assert isinstance(value, float), f"{name} is {now}, not {value}"
+        most = max(topic_captures.SLOW_S, 0.1 * now) if name.endswith("_s") else 0.0
+        assert now == pytest.approx(value, abs=most + 1e-4), f"{name} is {now}, not {value}"
+
+
+@pytest.mark.parametrize("signed", [True, False], ids=["signed", "unsigned"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_valid_attempt_has_no_contradiction(kind: str, signed: bool, tmp_path: Path) -> None:
+    reasons, measured = topic_attempts.judge_attempt(KINDS[kind], tmp_path, signed=signed)
+    assert reasons == []
+    # The fastest packet took 1 ms and its record 0.2 ms; the slowest took 84 us more.
+    assert measured.values["topic_delay_median_s"] == pytest.approx(1.24e-3, abs=6e-5)
+
+
+HOUR = 3600 * SECOND
+SHIFTS = (HOUR, -HOUR, 50 * MS, -50 * MS, 10 * MS, -2 * MS, SECOND)
+
+
+@pytest.mark.parametrize("shift_ns", SHIFTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_path: Path) -> None:
+    made = KINDS[kind]
+    received = with_samples(made.received, lambda _, row: later(row, shift_ns))
+    reasons, _ = topic_attempts.judge_attempt(replace(made, received=received), tmp_path)
+    assert reasons
+    which = "before their packets" if shift_ns < 0 else "later than its capture for every sample"
+    which = "from before its start or after its end" if abs(shift_ns) == HOUR else which
+    assert which in reasons[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_log_without_half_of_the_arrivals_is_noticed(kind: str, tmp_path: Path) -> None:
+    made = KINDS[kind]
+    received = with_samples(made.received, lambda place, row: row if place % 2 else None)
+    reasons, _ = topic_attempts.judge_attempt(replace(made, received=received), tmp_path)
+    if kind == "reliable with samples given up":  # nothing behind a gap need ever be handed over
+        assert reasons
+        return
+    assert "arrived by the subscriber's capture, but are not in the subscriber's log" in reasons[0]
+
+
+def other_numbers(_: int, row: Row) -> Row:
+    return (*row[:2], row[2] + 1000, *row[3:])
+
+
+def other_sizes(place: int, row: Row) -> Row:
+    return (row[0], row[1] - 500 if place == 7 else row[1], *row[2:])
+
+
+def other_sending(place: int, row: Row) -> Row:
+    return (*row[:3], row[3] - (40 * MS if place == 7 else 0), row[4])
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (other_numbers, "numbers that the publisher's log does not have"),
+        (other_sizes, "with a size other than 1016 bytes"),
+        (other_sending, "the publisher did not send"),
+    ],
+)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_subscribers_log_with_one_wrong_field_is_noticed(
+    kind: str, change: Callable[[int, Row], Row], why: str, tmp_path: Path
+) -> None:
+    made = replace(KINDS[kind], received=with_samples(KINDS[kind].received, change))
+    reasons, _ = topic_attempts.judge_attempt(made, tmp_path)
+    assert any(why in reason for reason in reasons)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (other_numbers, "does not number its samples from 0 on"),
+        (other_sizes, "the publisher's log has 1 sample with a size other"),
+        (lambda place, row: None if place % 2 else row, "does not number its samples from 0 on"),
+        (lambda place, row: row if place < 30 else None, "accounts for 30 instead of 40 samples"),
+    ],
+)
+def test_a_publishers_log_with_one_wrong_field_is_noticed(
+    change: Callable[[int, Row], Row | None], why: str, tmp_path: Path
+) -> None:
+    made = KINDS["best effort with losses"]
+    reasons, _ = topic_attempts.judge_attempt(replace(made, sent=with_samples(made.sent, change)), tmp_path)
+    assert any(why in reason for reason in reasons)
+
+
+def test_the_same_change_in_both_logs_is_noticed_by_the_captures(tmp_path: Path) -> None:
+    made = KINDS["reliable over UDP"]
+
+    def earlier(_: int, row: Row) -> Row:
+        return (*row[:3], row[3] - 30 * MS, row[4])
+
+    both = replace(made, sent=with_samples(made.sent, earlier), received=with_samples(made.received, earlier))
+    reasons, _ = topic_attempts.judge_attempt(both, tmp_path)
+    assert any("another time of sending than in its capture" in reason for reason in reasons)
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp_path: Path) -> None:
+    made = KINDS["reliable over UDP"]
+    topic_attempts.write(made, tmp_path, signed=signed)
+    sent = (tmp_path / "sender-topic.bin").read_bytes()
+    (tmp_path / "receiver-topic.bin").write_bytes(sent)
+    log = topic_samples.read_log(tmp_path / "receiver-topic.bin")
+    reasons = list(topic_checks.check_logs(PLAN, log, log))
+    assert "the subscriber's log is a copy of the publisher's" in reasons
+    assert ("the subscriber's log was written by the publisher of the topic" in reasons) is signed
+
+
+def test_the_log_of_another_topic_is_noticed(tmp_path: Path) -> None:
+    topic_attempts.write(KINDS["over TCP"], tmp_path)
+    sent, came = (topic_samples.read_log(tmp_path / f"{role}-topic.bin") for role in ("sender", "receiver"))
+    (publisher, subscriber) = topic_checks.check_logs(replace(PLAN, topic="/other"), sent, came)
+    assert "publisher's log is of another topic" in publisher
+    assert "subscriber's log is of another topic" in subscriber
+
+
+def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
+    topic_attempts.write(KINDS["over TCP"], tmp_path)
+    log = topic_samples.read_log(tmp_path / "sender-topic.bin")
+    role = Role.SENDER
+    first, last = int(log.times_ns.min()), int(log.times_ns.max())
+    assert not list(topic_checks.check_times({role: log}, {role: (first, last)}))
+    assert not list(topic_checks.check_times({role: log}, {}))
+    (early,) = topic_checks.check_times({role: log}, {role: (first + SECOND, last)})
+    assert "a record from 1.000 s before the attempt" in early
+    (late,) = topic_checks.check_times({role: log}, {role: (first, last - SECOND)})
+    assert "a record from 1.000 s after the attempt" in late
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_samples_in_the_log_that_never_arrived_are_noticed(kind: str, tmp_path: Path) -> None:
+    """The subscriber's capture lacks ten samples that are in its log."""
+    made = KINDS[kind]
+    few = replace(
+        made,
+        receiver_frames=tuple(frame for frame in made.receiver_frames if not is_data(frame) or frame.time_ns % 4),
+    )
+    sent_again = [row for row in made.sent if is_sample(row)]
+    there = {row[2] for row in made.received if is_sample(row)}
+    extra = [later(row, topic_attempts.AHEAD + 2 * MS) for row in sent_again if row[2] not in there]
+    received = tuple(sorted((*made.received, *extra), key=lambda row: row[4]))
+    if extra:
+        reasons, _ = topic_attempts.judge_attempt(replace(few, received=received), tmp_path)
+        assert any("are not in its capture" in reason for reason in reasons)
+
+
+def is_data(frame: Frame) -> bool:
+    return len(frame.data) > 200
+
+
+def test_an_overflowed_queue_is_no_contradiction(tmp_path: Path) -> None:
+    """The program stopped for 15 samples; its queue of 10 has the newest."""
+    made = KINDS["reliable over UDP"]
+    resumed = next(row for place, row in enumerate(filter(is_sample, made.received)) if place == 30)[4]
+
+    def held(place: int, row: Row) -> Row | None:
+        if not 15 <= place < 30:
+            return row
+        return None if place < 20 else (*row[:4], resumed - MS)
+
+    reasons, measured = topic_attempts.judge_attempt(
+        replace(made, received=with_samples(made.received, held)), tmp_path
+    )
+    assert reasons == []
+    assert measured.values["topic_received"] == SAMPLES - 5
+    assert "its program was delayed" in measured.missing["topic_delay_max_s"]
+
+
+def test_a_capture_without_heads_limits_the_number_of_arrivals(tmp_path: Path) -> None:
+    """As with the shorter snap length of older captures: Zenoh's heads were not captured."""
+    made = KINDS["over TCP"]
+    cut = replace(made, sender_frames=shorter(made.sender_frames), receiver_frames=shorter(made.receiver_frames))
+    assert topic_attempts.judge_attempt(cut, tmp_path)[0] == []
+    early = with_samples(made.received, lambda _, row: later(row, -20 * MS))
+    assert (
+        "before their bytes in its capture"
+        in topic_attempts.judge_attempt(replace(cut, received=early), tmp_path)[0][0]
+    )
+    few = with_samples(made.received, lambda place, row: row if place < 8 else None)
+    assert (
+        "are not in the subscriber's log" in topic_attempts.judge_attempt(replace(cut, received=few), tmp_path)[0][0]
+    )
+
+
+def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+    return tuple(
+        replace(frame, data=frame.data[:100], wire_bytes=frame.wire_bytes or len(frame.data)) for frame in frames
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    kind=ANY,
+    end=st.sampled_from(["sent", "received"]),
+    field=st.integers(0, 4),
+    some=st.tuples(st.integers(0, SAMPLES + 1), st.integers(1, SAMPLES + 2)),
+    by=st.sampled_from(
+        [1, -1, 7, 1000, -500, 3 * MS, -3 * MS, 15 * MS, 35 * MS, -35 * MS, PERIOD, SECOND, HOUR, -HOUR]
+    ),
+)
+@example(kind="over TCP", end="received", field=4, some=(0, 5), by=35 * MS)
+def test_a_change_in_any_range_of_a_field_is_noticed(
+    kind: str, end: str, field: int, some: tuple[int, int], by: int, *, folder: Path
+) -> None:
+    made, (first, count) = KINDS[kind], some
+    rows: list[Row] = list(getattr(made, end))
+    before = topic_attempts.judge_attempt(made, folder)[1]
+    for place in range(first, min(first + count, len(rows))):
+        row = list(rows[place])
+        row[field] = row[field] + by if field else by % 7 + 1
+        rows[place] = (row[0], abs(row[1]) % 2**32, row[2], row[3], row[4])
+    try:
+        reasons, measured = topic_attempts.judge_attempt(changed(made, end, rows), folder)
+    except EvidenceError:
+        return
+    require_noticed(reasons, measured, before)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    kind=ANY,
+    end=st.sampled_from(["sent", "received"]),
+    chosen=st.sets(st.integers(0, SAMPLES + 1), min_size=1),
+    twice=st.booleans(),
+)
+def test_missing_or_duplicated_records_are_noticed(
+    kind: str, end: str, chosen: set[int], twice: bool, folder: Path
+) -> None:
+    made = KINDS[kind]
+    before = topic_attempts.judge_attempt(made, folder)[1]
+    rows: Sequence[Row] = getattr(made, end)
+    times = [1 + twice if place in chosen else 1 if twice or place not in chosen else 0 for place in range(len(rows))]
+    if not twice:
+        times = [int(place not in chosen) for place in range(len(rows))]
+    kept = tuple(row for row, count in zip(rows, times, strict=True) for _ in range(count))
+    if not kept:
+        return
+    reasons, measured = topic_attempts.judge_attempt(changed(made, end, kept), folder)
+    if kind == "reliable with samples given up" and end == "received" and not twice:
+        return  # behind a gap nothing shows whether the middleware handed a sample over
+    require_noticed(reasons, measured, before)
+
+
+@settings(max_examples=100, deadline=None)
+@given(end=st.sampled_from(["sender", "receiver"]), place=st.integers(0), bit=st.integers(0, 7))
+def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int, bit: int, folder: Path) -> None:
+    made = KINDS["over TCP"]
+    topic_attempts.write(made, folder)
+    path = folder / f"{end}-topic.bin"
+    content = bytearray(path.read_bytes())
+    content[place % len(content)] ^= 1 << bit
+    path.write_bytes(content)
+    try:
+        log = topic_samples.read_log(path)
+    except EvidenceError:
+        return
+    assert not log.whole, "a changed log passes for whole"
+
+
+def test_constants_equal_those_of_the_agent() -> None:
+    assert int(stream.SETTLES_S * 1e9) == topic_checks.SETTLES_NS
+    assert (stream.MAGIC, stream.MIN_BYTES) == (
+        topic_samples.MAGIC,
+        topic_samples.HEAD_BYTES,
+    )
+
+
+def test_every_time_of_a_topic_is_compared_with_the_capture() -> None:
+    """Columns added later are included."""
+    times = {column.name for column in topic_columns.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
+    assert times | {"topic_deadline_misses"} == topic_captures.SHARE_FIGURES.keys()
