@@ -13,8 +13,8 @@ from fieldkit.report.theme import Style
 from fieldkit.ros.streams import topic_samples
 from fieldkit.steps.base import Step
 
-MOST_SAMPLES: Final = 1500
-"""Most samples of each kind in a panel; of more samples, every k-th is drawn."""
+MAX_SAMPLES: Final = 1500
+"""Maximum number of samples of each kind in a panel; of more samples, every k-th is drawn."""
 _RECEIVED: Final = Style("green", "^", "none")
 _LOST: Final = Style("lost", "x", "none")
 
@@ -47,7 +47,7 @@ def panels(step: Step, evidence: AttemptEvidence, times: Moments, zero_ns: int) 
     )
     series = []
     for label, style, at_s, heights in kinds:
-        every_kth = slice(None, None, max(1, -(-len(at_s) // MOST_SAMPLES)))
+        every_kth = slice(None, None, max(1, -(-len(at_s) // MAX_SAMPLES)))
         series.append(Series(label, style, at_s[every_kth], heights[every_kth]))
     yield Panel(
         title=f"delay of {step.name or 'the topic'} beyond its fastest sample",
