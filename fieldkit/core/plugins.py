@@ -1,7 +1,10 @@
 """Installed packages: their versions, and the backends, steps and commands that they add through entry points."""
 
+import sys
+from functools import lru_cache
 from importlib import metadata
 from importlib.metadata import EntryPoint
+from types import MappingProxyType
 from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError
@@ -17,13 +20,41 @@ POSITIONS: Final = "fieldkit.positions"
 `fieldkit.measure.positions.recorded`."""
 COMMANDS: Final = "fieldkit.commands"
 """Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.parser`."""
+PROFILE_SECTIONS: Final = "fieldkit.profile_sections"
+"""Entry point group of sections of robot profiles: `KEY = "package.module:Class"`, a
+`fieldkit.config.profiles.ProfileSection`."""
+PROCEDURE_SECTIONS: Final = "fieldkit.procedure_sections"
+"""Entry point group of sections of procedures: `KEY = "package.module:Class"`, a
+`fieldkit.trial.procedure_section.ProcedureSection`."""
+PERMISSIONS: Final = "fieldkit.permissions"
+"""Entry point group of permissions: `NAME = "package.module:OBJECT"`, a `fieldkit.core.permissions.Permission`."""
+
+_OWNERS: Final = MappingProxyType(
+    {
+        (PROFILE_SECTIONS, "drive"): "fieldkit.motion",
+        (PROFILE_SECTIONS, "mavlink"): "fieldkit.motion",
+        (PROCEDURE_SECTIONS, "on_abort"): "fieldkit.motion",
+    }
+)
+"""Package of each section that fieldkit documents, for the error message in a distribution without the package."""
 
 REMEDY: Final = "fix or uninstall its package"
 
 
 def entry_points(group: str) -> list[EntryPoint]:
     """Return the entry points of a group sorted by name, without importing their targets."""
-    return sorted(metadata.entry_points(group=group), key=lambda point: (point.name, point.value))
+    return sorted(_installed(tuple(sys.path)).select(group=group), key=lambda point: (point.name, point.value))
+
+
+@lru_cache(maxsize=1)
+def _installed(path: tuple[str, ...]) -> Any:  # noqa: ANN401, ARG001 (versions of Python differ; the cache's key)
+    """Return the entry points of all packages; reading them takes about 15 ms."""
+    return metadata.entry_points()
+
+
+def owner(group: str, name: str) -> str:
+    """Return the package of fieldkit that has an entry point, even if it is not installed; empty if it is unknown."""
+    return _OWNERS.get((group, name), "")
 
 
 def versions() -> dict[str, str]:

@@ -122,7 +122,7 @@ class Plan(Strict):
     def _without_autopilot(self) -> Iterator[Refusal]:
         """Yield a refusal for each role of `on_abort` whose robot has no autopilot link to land it."""
         for role in self.procedure.on_abort:
-            if self.cast[role].profile.mavlink is None:
+            if "mavlink" not in self.cast[role].profile.sections:
                 why = "on_abort must bring it down, but its profile has no mavlink"
                 yield Refusal(role, why, f"leave {role} out of on_abort, or use a drone")
 

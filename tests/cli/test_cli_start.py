@@ -55,6 +55,8 @@ def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) 
 MOST_LINES = {"--dry-run": 25_000, "--repeats 1 --record 1s --yes": 40_500}
 """Maximum of own lines that a trial of the paper's procedure imports, by its options."""
 
+MOTION = {"fieldkit.motion", "fieldkit.motion.permissions", "fieldkit.motion.profile_sections"}
+
 COUNT_LINES = """
 import sys
 from pathlib import Path
@@ -82,7 +84,7 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
     count, *names = done.stdout.splitlines()[-1].split()
     kinds = {name for name in names if name.startswith("fieldkit.steps.kinds.")}
     assert kinds == {f"fieldkit.steps.kinds.{kind}" for kind in ("capture", "ping", "record", "transfer")}
-    assert not any(name.startswith("fieldkit.motion") for name in names)
+    assert {name for name in names if name.startswith("fieldkit.motion")} == MOTION, "sections of the profiles"
     assert int(count) <= MOST_LINES[options]
 
 

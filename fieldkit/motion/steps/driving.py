@@ -11,15 +11,14 @@ from typing_extensions import override
 
 from fieldkit.agent import drive_plan
 from fieldkit.agent.drive_plan import DriveTask
-from fieldkit.backends.driven import topic_conflict
 from fieldkit.backends.protocols import Robot, Testbed
-from fieldkit.config.profiles import Drive
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError
 from fieldkit.core.model import MotionOrigin, Move
 from fieldkit.core.text import JSON_ERRORS, shorten
 from fieldkit.motion.logs import drive_log
+from fieldkit.motion.profile_sections import Drive, drive_of
 from fieldkit.motion.steps import lease
 from fieldkit.motion.steps.lease import LeaseKeeper, orders_file
 from fieldkit.motion.steps.robot_mover import RobotMover
@@ -120,7 +119,8 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
             f"its fence is {limits.fence_m:g} m from its place, but its path leads {farthest_m:g} m away",
             "shorten the path in the procedure, or increase limits.fence_m in its profile if the area allows it",
         )
-    if why := topic_conflict(robot, scene.cast.values()):
+    drive = drive_of(robot.profile)
+    if drive is not None and (why := drive.topic_conflict(robot, scene.cast.values())):
         remedy = "give each robot its own topics, ROS domain or master; or move it by hand: without --allow-motion"
         yield Refusal(move.role, why, remedy)
 
@@ -136,11 +136,11 @@ def _drive(robot: Robot) -> Drive:
     Raises:
         RobotError: The profile has no such section.
     """
-    if robot.profile.drive is None:
+    if (drive := drive_of(robot.profile)) is None:
         raise RobotError(
             "it cannot be driven", where=robot.name, remedy="add drive: and limits.fence_m to its profile"
         )
-    return robot.profile.drive
+    return drive
 
 
 def _origin(scene: Scene, move: Move) -> dict[str, Any]:
@@ -322,7 +322,7 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
         OSError: The journal of motions cannot be written; the robot does not start.
     """
     shell, robot = testbed.shells[move.role], scene.robot(move.role)
-    lease_s = robot.profile.drive.lease if robot.profile.drive else 0.0
+    lease_s = _drive(robot).lease
     mover = RobotMover(robot.name, shell, scene.folder, f"it stops automatically within {lease_s:g} s")
     drive_lease = DriveLease(shell, plan.job, name, lease_s)
     with scene.motions.moving(mover), lease.start_program(shell, plan.job), drive_lease, ExitStack() as stack:

@@ -17,6 +17,7 @@ from fieldkit.core.model import Control, OnAbort, Protocol, Role
 from fieldkit.core.units import format_duration
 from fieldkit.measure.evidence import reading
 from fieldkit.motion.logs import fly_checks, fly_log, motion_sources
+from fieldkit.motion.profile_sections import flies, mavlink_of
 from fieldkit.motion.steps import piloting
 from fieldkit.motion.steps.arming_need import arming_need
 from fieldkit.motion.steps.flight_alarm import alarmed
@@ -145,7 +146,8 @@ class FlyStep(Nest):
         return self._farthest_m / self.speed + self._highest_m / _SLOWEST_M_S
 
     def _plan(self, scene: Scene) -> FlightPlan:
-        limits, mavlink = scene.robot(self.robot).profile.limits, scene.robot(self.robot).profile.mavlink
+        profile = scene.robot(self.robot).profile
+        limits, mavlink = profile.limits, mavlink_of(profile)
         origin = scene.origins.get(self.robot)
         return FlightPlan(
             connection=piloting.connection(scene.robot(self.robot)),
@@ -183,7 +185,7 @@ class FlyStep(Nest):
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        if scene.robot(self.robot).profile.mavlink is not None:  # otherwise `refusals` reports it
+        if mavlink_of(scene.robot(self.robot).profile) is not None:  # otherwise `refusals` reports it
             yield self._guard(scene)
             yield self._pilot(scene)
         yield from self.inside(scene)
@@ -211,9 +213,9 @@ class FlyStep(Nest):
         """Yield a reason for each limit of the profile that the flight exceeds or that is missing."""
         profile, name = scene.robot(self.robot).profile, scene.robot(self.robot).profile.name
         limits = profile.limits
-        if profile.mavlink is None:
+        if mavlink_of(profile) is None:
             yield Refusal(self.robot, "it cannot fly: its profile has no mavlink", "use a drone in this role")
-        elif not scene.robot(self.robot).flies:
+        elif not flies(scene.robot(self.robot)):
             remedy = "--allow-motion, if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
             yield Refusal(self.robot, "it is a real drone, and flights are not allowed", remedy)
         for quantity, planned_m, limit_m, key in (
@@ -246,7 +248,7 @@ class FlyStep(Nest):
         """Yield the checks of the connection to the autopilot, and that it can be armed for this flight."""
         robot = scene.robot(self.robot)
         if (
-            robot.profile.mavlink is not None and robot.profile.limits.max_height_m is not None
+            mavlink_of(robot.profile) is not None and robot.profile.limits.max_height_m is not None
         ):  # otherwise `refusals` reports it
             plan = self._plan(scene)
             yield link_need(robot, self.robot, plan.connection, ("pilot", "guard"))
