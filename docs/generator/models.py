@@ -44,7 +44,7 @@ def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]
         for mark, inner in _models_in(field.annotation):
             yield from rows(inner, f"{prefix}{key}{mark}.")
     for key, section in model.section_types().items():
-        yield f"`{prefix}{key}`", "none", describe(section).partition("\n\n")[0]
+        yield f"`{prefix}{key}`", "none", " ".join(describe(section).split())
         if issubclass(section, Strict):
             yield from rows(section, f"{prefix}{key}.")
 

@@ -27,7 +27,7 @@ class Sectioned(Strict):
     model_config = ConfigDict(extra="allow")
 
     section_group: ClassVar[str]
-    section_base: ClassVar[type[BaseModel]]
+    section_base: ClassVar[type]
 
     @classmethod
     @override
@@ -60,7 +60,7 @@ class SectionTypes(Mapping[str, type[BaseModel]]):
         base: Class from which the models derive.
     """
 
-    def __init__(self, points: Mapping[str, EntryPoint], base: type[BaseModel]) -> None:
+    def __init__(self, points: Mapping[str, EntryPoint], base: type) -> None:
         self._points = points
         self._base = base
 
@@ -68,7 +68,7 @@ class SectionTypes(Mapping[str, type[BaseModel]]):
     def __getitem__(self, key: str) -> type[BaseModel]:
         point = self._points[key]
         model = plugins.load(point)
-        if not (isinstance(model, type) and issubclass(model, self._base)):
+        if not (isinstance(model, type) and issubclass(model, self._base) and issubclass(model, BaseModel)):
             raise ConfigurationError(
                 f"a section must be a subclass of {self._base.__name__}",
                 where=plugins.location(point),
@@ -90,5 +90,5 @@ class SectionTypes(Mapping[str, type[BaseModel]]):
 
 
 @cache
-def _section_types(group: str, base: type[BaseModel]) -> SectionTypes:
+def _section_types(group: str, base: type) -> SectionTypes:
     return SectionTypes({point.name: point for point in plugins.entry_points(group)}, base)

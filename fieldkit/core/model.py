@@ -179,13 +179,6 @@ class Fault:
     process: str = ""
 
 
-class OnAbort(StrEnum):
-    """Action of a drone whose trial is aborted: land at its position, or return to its take-off position and land."""
-
-    LAND = "land"
-    RETURN = "return"
-
-
 @dataclass(frozen=True)
 class Leg:
     """A straight segment of a path, relative to the end of the previous segment.

@@ -13,9 +13,10 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
-from fieldkit.core.model import Control, OnAbort, Protocol, Role
+from fieldkit.core.model import Control, Protocol, Role
 from fieldkit.core.units import format_duration
 from fieldkit.measure.evidence import reading
+from fieldkit.motion.abort_actions import OnAbort, abort_of
 from fieldkit.motion.logs import fly_checks, fly_log, motion_sources
 from fieldkit.motion.profile_sections import flies, mavlink_of
 from fieldkit.motion.steps import piloting
@@ -152,7 +153,7 @@ class FlyStep(Nest):
         return FlightPlan(
             connection=piloting.connection(scene.robot(self.robot)),
             orders=orders_file(self.prefixed_name("fly")),
-            abort=piloting.abort_of(scene, self.robot).value,
+            abort=abort_of(scene, self.robot).value,
             lease_s=self.lease,
             end=self.then.value,
             height_m=self.height,
@@ -199,7 +200,7 @@ class FlyStep(Nest):
         yield from super().dry_run_notes(scene)
 
     def _abort_action(self, scene: Scene) -> str:
-        return {"return": "returns automatically", "land": "lands"}[piloting.abort_of(scene, self.robot)]
+        return {"return": "returns automatically", "land": "lands"}[abort_of(scene, self.robot)]
 
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:

@@ -18,8 +18,9 @@ from fieldkit.agent.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Control, MotionOrigin, OnAbort, Role
+from fieldkit.core.model import Control, MotionOrigin, Role
 from fieldkit.core.text import JSON_ERRORS, shorten
+from fieldkit.motion.abort_actions import abort_of
 from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps import lease
 from fieldkit.motion.steps.lease import LeaseKeeper, orders_file
@@ -299,8 +300,3 @@ def leased_program(
         if code != 0:
             flight.renew()
             raise flight.failure(flight.end_reason or f"{program.job.name} ended with exit code {code}")
-
-
-def abort_of(scene: Scene, role: Role) -> OnAbort:
-    """Return the action of a drone if the attempt is aborted."""
-    return scene.on_abort.get(role, OnAbort.LAND)

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from fieldkit.config import schema
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
+from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.motion.abort_actions import ON_ABORT, AbortActions, OnAbort
 from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps import arming_need
 from fieldkit.motion.steps.fly import FlyStep
@@ -174,6 +175,6 @@ def test_abort_notes_describe_the_action() -> None:
     assert list(flight.abort_notes(SCENE)) == [
         f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, also after fieldkit has exited"
     ]
-    returns = Scene(Protocol.TCP, PERMITTED, "f", on_abort={DRONE: OnAbort.RETURN})
+    returns = Scene(Protocol.TCP, PERMITTED, "f", sections={ON_ABORT: AbortActions({DRONE: OnAbort.RETURN})})
     (note,) = flight.abort_notes(returns)
     assert "returns automatically" in note

@@ -17,7 +17,8 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
-from fieldkit.core.model import OnAbort, Protocol, Role
+from fieldkit.core.model import Protocol, Role
+from fieldkit.motion.abort_actions import ON_ABORT, AbortActions, OnAbort
 from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps.fly import FlyStep
 from fieldkit.remote import evidence, jobs
@@ -80,7 +81,9 @@ def fly(
     }
     profile = DUCKIEDRONE.model_copy(update=update)
     robot = Robot(name="drone", address="127.0.0.1", profile=profile, abilities=frozenset({"mavlink"}))
-    scene = Scene(Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, on_abort={Role.RECEIVER: abort})
+    scene = Scene(
+        Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, sections={ON_ABORT: AbortActions({Role.RECEIVER: abort})}
+    )
     step = f"{{{FLIGHT}, during: [{{wait: {{duration: {waits}}}}}, {{wait: {{duration: {waits}}}}}]}}"
 
     def announce(name: str, _: float | None) -> None:
