@@ -18,7 +18,6 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
 from fieldkit.steps.motions import Motions
-from fieldkit.steps.origins import MemoryOrigins, Origins
 from fieldkit.steps.variants import Tool, Variants
 
 Shells = Mapping[Role, Shell]
@@ -75,7 +74,8 @@ class Scene:
         sections: The sections of the procedure that installed packages added, by key.
         halt: Interrupts waits when the steps must not continue.
         motions: The robots that move automatically, which the operator may stop.
-        origins: Origins of the robots that move automatically, and the record of each motion.
+        origins: Where the robots that move automatically started, an object of the package that moves them; None if
+            no attempt is made.
     """
 
     protocol: Protocol
@@ -90,7 +90,7 @@ class Scene:
     sections: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     halt: StopSignal = field(default_factory=StopSignal, compare=False, repr=False)
     motions: Motions = field(default_factory=Motions, compare=False, repr=False)
-    origins: Origins = field(default_factory=MemoryOrigins, compare=False, repr=False)
+    origins: object = field(default=None, compare=False, repr=False)
 
     def robot(self, role: Role) -> Robot:
         """Return the robot in `role`."""

@@ -13,10 +13,10 @@ from fieldkit.core.model import Role
 from fieldkit.core.permissions import option
 from fieldkit.core.prompts import Operator, Question, Unattended
 from fieldkit.motion import permissions
+from fieldkit.motion.origins import MemoryOrigins, Origins
 from fieldkit.motion.profile_sections import drives, flies
 from fieldkit.motion.running import motion_journal
 from fieldkit.motion.running.motion_journal import KeptOrigins, MotionJournal
-from fieldkit.steps.origins import MemoryOrigins, Origins
 from fieldkit.trial.plan import Plan
 
 CONFIRM: Final = "confirm"

@@ -18,6 +18,7 @@ from fieldkit.core.units import format_duration
 from fieldkit.measure.evidence import reading
 from fieldkit.motion.abort_actions import OnAbort, abort_of
 from fieldkit.motion.logs import fly_checks, fly_log, motion_sources
+from fieldkit.motion.origins import origins_of
 from fieldkit.motion.profile_sections import flies, mavlink_of
 from fieldkit.motion.steps import piloting
 from fieldkit.motion.steps.arming_need import arming_need
@@ -149,7 +150,7 @@ class FlyStep(Nest):
     def _plan(self, scene: Scene) -> FlightPlan:
         profile = scene.robot(self.robot).profile
         limits, mavlink = profile.limits, mavlink_of(profile)
-        origin = scene.origins.get(self.robot)
+        origin = origins_of(scene).get(self.robot)
         return FlightPlan(
             connection=piloting.connection(scene.robot(self.robot)),
             orders=orders_file(self.prefixed_name("fly")),
@@ -285,7 +286,7 @@ class FlyStep(Nest):
         """Give the orders of the flight; the origin is stored before the first one that moves the drone."""
         name = scene.robot(self.robot).name
         self._wait_for_start(scene, flight)
-        with scene.origins.moving(self.robot) as motion:
+        with origins_of(scene).moving(self.robot) as motion:
             announce(f"take off with {name}", self._climb_s)
             flight.give_order(CLIMB)
             flight.wait_for("up", self._climb_s + _SLACK_S)
@@ -303,10 +304,10 @@ class FlyStep(Nest):
             flight.wait_for("standing", STANDS_S)
         except RobotError as error:
             if flight.is_misplaced:
-                scene.origins.refuse(self.robot, error.what)
+                origins_of(scene).refuse(self.robot, error.what)
             raise
-        if scene.origins.get(self.robot) is None:
-            scene.origins.record(self.robot, flight.origin())
+        if origins_of(scene).get(self.robot) is None:
+            origins_of(scene).record(self.robot, flight.origin())
 
     @override
     def moves(self) -> frozenset[Role]:

@@ -18,9 +18,10 @@ from fieldkit.agent.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Control, MotionOrigin, Role
+from fieldkit.core.model import Control, Role
 from fieldkit.core.text import JSON_ERRORS, shorten
 from fieldkit.motion.abort_actions import abort_of
+from fieldkit.motion.origins import MotionOrigin
 from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps import lease
 from fieldkit.motion.steps.lease import LeaseKeeper, orders_file

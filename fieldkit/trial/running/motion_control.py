@@ -7,14 +7,13 @@ which robots move.
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from fieldkit.backends.protocols import Backend, Testbed
 from fieldkit.core import laptop_files, plugins
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Sink
 from fieldkit.core.prompts import Operator
-from fieldkit.steps.origins import MemoryOrigins, Origins
 from fieldkit.trial.plan import Plan
 
 
@@ -22,8 +21,8 @@ class MotionClearance(Protocol):
     """Permission of the robots of a trial to move, checked before each attempt."""
 
     @property
-    def origins(self) -> Origins:
-        """Origins of the robots, for the steps."""
+    def origins(self) -> object:
+        """The object that the steps get as `Scene.origins`."""
         ...
 
     def demand(self) -> None:
@@ -64,8 +63,7 @@ class MotionSupport(Protocol):
 class _Unmoved:
     """Permission of a trial in which no robot moves."""
 
-    def __init__(self) -> None:
-        self.origins: Origins = MemoryOrigins()
+    origins: Final = None
 
     def demand(self) -> None:
         """Allow the attempt."""
