@@ -1,4 +1,4 @@
-"""Installed packages: their versions, and the backends, steps and commands that they add through entry points."""
+"""Installed packages: their versions, and what they add through entry points, for example kinds of step."""
 
 import sys
 from functools import lru_cache
@@ -58,8 +58,9 @@ def owner(group: str, name: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the version of each package that adds backends or steps, fieldkit included."""
-    packages = (point.dist for group in (BACKENDS, STEPS) for point in entry_points(group))
+    """Return the version of each package that adds backends, steps or sections, fieldkit included."""
+    groups = (BACKENDS, STEPS, PROFILE_SECTIONS, PROCEDURE_SECTIONS)
+    packages = (point.dist for group in groups for point in entry_points(group))
     return {package.name: package.version for package in packages if package is not None}
 
 

@@ -6,7 +6,8 @@ import pytest
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import RobotProfile
-from fieldkit.motion.profile_sections import Drive, drive_of
+from fieldkit.motion.profile_sections import Drive, drive_of, mavlink_of
+from sim_backends.emulated import motion_sections
 from tests.helpers.casts import DUCKIEDRONE, TURTLEBOT, ros_of
 
 MASTER = "10.42.0.3"
@@ -62,6 +63,15 @@ def test_conflicts_of_robots_with_ros2_domains(domain: str, alone: bool) -> None
     reason = conflict(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
     assert (reason is None) is alone
     assert alone or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
+
+
+def test_emulated_robots_implement_the_sections() -> None:
+    drive: motion_sections.DriveSection | None = drive_of(TURTLEBOT)
+    mavlink: motion_sections.MavlinkSection | None = mavlink_of(DUCKIEDRONE)
+    assert drive is not None
+    assert motion_sections.drive_of(TURTLEBOT) is drive
+    assert mavlink is not None
+    assert motion_sections.mavlink_of(DUCKIEDRONE) is mavlink
 
 
 def test_robots_with_separate_masters_have_no_conflict() -> None:
