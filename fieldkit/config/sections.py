@@ -1,7 +1,7 @@
 """Sections: keys of profiles and procedures that installed packages add, each with a model of its value."""
 
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Mapping
+from functools import cache, partial
 from importlib.metadata import EntryPoint
 from typing import ClassVar, TypeVar
 
@@ -10,6 +10,7 @@ from typing_extensions import override
 from fieldkit.config.schema import BaseModel, ConfigDict, Strict
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.lazy_mapping import LazyMapping
 
 Section = TypeVar("Section")
 
@@ -31,7 +32,7 @@ class Sectioned(Strict):
 
     @classmethod
     @override
-    def section_types(cls) -> "SectionTypes":
+    def section_types(cls) -> Mapping[str, type[BaseModel]]:
         return _section_types(cls.section_group, cls.section_base)
 
     @classmethod
@@ -50,45 +51,20 @@ class Sectioned(Strict):
         return section if isinstance(section, model) else None
 
 
-class SectionTypes(Mapping[str, type[BaseModel]]):
-    """The model of each section by key. A package is imported when its model is looked up.
-
-    A look-up raises a `ConfigurationError` if the entry point cannot be loaded, or names another object.
-
-    Args:
-        points: The entry point of each section.
-        base: Class from which the models derive.
-    """
-
-    def __init__(self, points: Mapping[str, EntryPoint], base: type) -> None:
-        self._points = points
-        self._base = base
-
-    @override
-    def __getitem__(self, key: str) -> type[BaseModel]:
-        point = self._points[key]
-        model = plugins.load(point)
-        if not (isinstance(model, type) and issubclass(model, self._base) and issubclass(model, BaseModel)):
-            raise ConfigurationError(
-                f"a section must be a subclass of {self._base.__name__}",
-                where=plugins.location(point),
-                remedy=plugins.REMEDY,
-            )
-        return model
-
-    @override
-    def __contains__(self, key: object) -> bool:
-        return key in self._points
-
-    @override
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._points)
-
-    @override
-    def __len__(self) -> int:
-        return len(self._points)
-
-
 @cache
-def _section_types(group: str, base: type) -> SectionTypes:
-    return SectionTypes({point.name: point for point in plugins.entry_points(group)}, base)
+def _section_types(group: str, base: type) -> LazyMapping[type[BaseModel]]:
+    points = {point.name: point for point in plugins.entry_points(group)}
+    return LazyMapping(points, partial(load_model, base))
+
+
+def load_model(base: type, point: EntryPoint) -> type[BaseModel]:
+    """Return the model of a section.
+
+    Raises:
+        ConfigurationError: The entry point cannot be loaded, or its object does not derive from `base`.
+    """
+    loaded, location = plugins.load(point), plugins.location(point)
+    if not (isinstance(loaded, type) and issubclass(loaded, base) and issubclass(loaded, BaseModel)):
+        name = base.__name__
+        raise ConfigurationError(f"a section must be a subclass of {name}", where=location, remedy=plugins.REMEDY)
+    return loaded

@@ -1,9 +1,10 @@
 """Installed packages: their versions, and what they add through entry points, for example kinds of step."""
 
 import sys
-from functools import lru_cache
+from collections.abc import Callable
+from functools import cache
 from importlib import metadata
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -29,38 +30,30 @@ PROCEDURE_SECTIONS: Final = "fieldkit.procedure_sections"
 PERMISSIONS: Final = "fieldkit.permissions"
 """Entry point group of permissions: `NAME = "package.module:OBJECT"`, a `fieldkit.core.permissions.Permission`."""
 
-_OWNERS: Final = MappingProxyType(
-    {
-        (PROFILE_SECTIONS, "drive"): "fieldkit.motion",
-        (PROFILE_SECTIONS, "mavlink"): "fieldkit.motion",
-        (PROCEDURE_SECTIONS, "on_abort"): "fieldkit.motion",
-    }
-)
-"""Package of each section that fieldkit documents, for the error message in a distribution without the package."""
+_OF_MOTION: Final = MappingProxyType({PROFILE_SECTIONS: {"drive", "mavlink"}, PROCEDURE_SECTIONS: {"on_abort"}})
+"""Sections of `fieldkit.motion` by group, for the error message in a distribution without this package."""
 
 REMEDY: Final = "fix or uninstall its package"
 
 
 def entry_points(group: str) -> list[EntryPoint]:
-    """Return the entry points of a group sorted by name, without importing their targets."""
-    return sorted(_installed(tuple(sys.path)).select(group=group), key=lambda point: (point.name, point.value))
+    """Return the entry points of a group sorted by name, without importing their targets.
+
+    They are read once: a package that is installed in a folder of `sys.path` later is not found.
+    """
+    points = _selector(tuple(sys.path))(group=group)
+    return sorted(points, key=lambda point: (point.name, point.value))
 
 
-@lru_cache(maxsize=1)
-def _installed(path: tuple[str, ...]) -> Any:  # noqa: ANN401, ARG001 (versions of Python differ; the cache's key)
-    """Return the entry points of all packages; reading them takes about 15 ms."""
-    return metadata.entry_points()
-
-
-def owner(group: str, name: str) -> str:
-    """Return the package of fieldkit that has an entry point, even if it is not installed; empty if it is unknown."""
-    return _OWNERS.get((group, name), "")
+def owner(group: str, section: str) -> str:
+    """Return the package of fieldkit that has a section, even if it is not installed; empty if it is unknown."""
+    return "fieldkit.motion" if section in _OF_MOTION.get(group, ()) else ""
 
 
 def versions() -> dict[str, str]:
     """Return the version of each package that adds backends, steps or sections, fieldkit included."""
     groups = (BACKENDS, STEPS, PROFILE_SECTIONS, PROCEDURE_SECTIONS)
-    packages = (point.dist for group in groups for point in entry_points(group))
+    packages = dict.fromkeys(point.dist for group in groups for point in entry_points(group))
     return {package.name: package.version for package in packages if package is not None}
 
 
@@ -84,6 +77,12 @@ def load(point: EntryPoint) -> Any:  # noqa: ANN401 (any object of another packa
         raise ConfigurationError(
             f"it cannot be loaded: {type(error).__name__}: {error}", where=location(point), remedy=REMEDY
         ) from error
+
+
+@cache
+def _selector(search_path: tuple[str, ...]) -> Callable[..., EntryPoints]:  # noqa: ARG001 (the key of the cache)
+    """Return the function that selects entry points of the installed packages, whose metadata takes 10 ms to read."""
+    return metadata.entry_points().select
 
 
 def location(point: EntryPoint) -> str:

@@ -14,22 +14,11 @@ MAVLINK: Final = "mavlink"
 
 
 class DriveSection(Protocol):
-    """How a ground robot is driven by velocities on a topic."""
+    """How a ground robot is driven by velocities on a topic; its keys are in docs/reference/robot-profile.md."""
 
-    @property
-    def topic(self) -> str:
-        """Topic of velocities."""
-        ...
-
-    @property
-    def turn_rad_s(self) -> float:
-        """Maximum turn rate."""
-        ...
-
-    @property
-    def acceleration_m_s2(self) -> float:
-        """Maximum acceleration."""
-        ...
+    topic: str
+    turn_rad_s: float
+    acceleration_m_s2: float
 
     def topic_conflict(self, robot: Robot, others: Iterable[Robot]) -> str | None:
         """Return why a robot cannot be driven by this section next to other robots; None if it can."""
@@ -39,25 +28,10 @@ class DriveSection(Protocol):
 class MavlinkSection(Protocol):
     """The autopilot of a drone."""
 
-    @property
-    def port(self) -> int:
-        """UDP port on the radio."""
-        ...
-
-    @property
-    def autopilot(self) -> str:
-        """Its firmware: `px4` or `ardupilot`."""
-        ...
-
-    @property
-    def system(self) -> int:
-        """Its MAVLink system id after power-on."""
-        ...
-
-    @property
-    def boot_s(self) -> float:
-        """Time from power-on until its position estimate has an origin, in seconds."""
-        ...
+    port: int
+    autopilot: str
+    system: int
+    boot_s: float
 
 
 def drive_of(profile: RobotProfile) -> DriveSection | None:

@@ -1,7 +1,8 @@
 """Sections that installed packages add to profiles: read, written, absent, and of the wrong class."""
 
+from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import EntryPoint
-from typing import ClassVar
 
 import pytest
 
@@ -9,8 +10,9 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config import documents, schema
 from fieldkit.config.profiles import ProfileSection, RobotProfile
 from fieldkit.config.schema import Int
-from fieldkit.config.sections import SectionTypes
+from fieldkit.config.sections import load_model
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.lazy_mapping import LazyMapping
 from tests.helpers.paths import ROOT
 
 SHIPPED = documents.read(ROOT / "robots" / "iris.yaml").data
@@ -28,18 +30,16 @@ class Winch(ProfileSection):
         return None if self.metres else f"the winch of {profile.name} has no rope"
 
 
-def section_types(target: str = "Winch") -> SectionTypes:
-    return SectionTypes({"winch": EntryPoint("winch", f"{__name__}:{target}", "bench")}, ProfileSection)
+def point(target: str) -> EntryPoint:
+    return EntryPoint("winch", f"{__name__}:{target}", "bench")
 
 
 class BenchProfile(RobotProfile):
     """A profile where the package of `Winch` is installed."""
 
-    target: ClassVar[str] = "Winch"
-
     @classmethod
-    def section_types(cls) -> SectionTypes:
-        return section_types(cls.target)
+    def section_types(cls) -> Mapping[str, type[schema.BaseModel]]:
+        return LazyMapping({"winch": point("Winch")}, partial(load_model, ProfileSection))
 
 
 def read(winch: object) -> BenchProfile:
@@ -86,7 +86,7 @@ def test_a_key_of_no_package_is_unknown() -> None:
 
 def test_an_entry_point_must_name_a_section() -> None:
     with pytest.raises(ConfigurationError, match="a section must be a subclass of ProfileSection") as caught:
-        section_types("RobotProfile")["winch"]
+        load_model(ProfileSection, point("RobotProfile"))
     assert caught.value.where == f"entry point winch = {__name__}:RobotProfile"
 
 
