@@ -202,6 +202,26 @@ def test_only_entry_points_lead_to_a_product(package: str, importers: tuple[str,
 ROS_SEAMS = ("fieldkit.ros.interfaces", "fieldkit.ros.middlewares.ports")
 """The modules of `fieldkit.ros` that `sim_backends` imports: message types, names, quality of service, ports."""
 
+NAMES_OF_MOTION: Final = re.compile(r"""["'.](mavlink|drives?|flies)\b(?!\.|_)|on_abort|allow.motion""")
+NAMING_MOTION: Final = {
+    "core/plugins.py": "the package of each section, for an error message without it",
+    "backends/protocols.py": "keys in plans of earlier versions",
+    "trial/request.py": "hashes equal to those of earlier versions",
+}
+
+
+def test_the_harness_does_not_name_what_motion_adds() -> None:
+    """Neither its sections of profiles and procedures nor its permissions."""
+    harness = [path.relative_to(ROOT / "fieldkit") for path in modules("fieldkit")]
+    naming = {
+        str(path)
+        for path in harness
+        if path.parts[0] not in {"motion", "agent"}
+        and NAMES_OF_MOTION.search((ROOT / "fieldkit" / path).read_text(encoding="utf-8"))
+    }
+    assert naming == NAMING_MOTION.keys()
+
+
 # Commands of other packages declare arguments, display and draw like fieldkit's commands (docs/add-a-command.md).
 COMMAND_SEAMS = (
     "fieldkit.cli.shared_arguments",

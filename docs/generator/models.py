@@ -44,6 +44,10 @@ def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]
             continue  # each kind has a separate table
         for mark, inner in _models_in(field.annotation):
             yield from rows(inner, f"{prefix}{key}{mark}.")
+    for key, section in model.section_types().items():
+        yield f"`{prefix}{key}`", "none", " ".join(describe(section).split())
+        if issubclass(section, Strict):
+            yield from rows(section, f"{prefix}{key}.")
 
 
 def _models_in(annotation: object) -> Iterator[tuple[str, type[Strict]]]:

@@ -31,8 +31,8 @@ class FieldBackend:
         ask: Prompts the operator for a password without echo.
 
     Attributes:
-        allow_motion: Whether fieldkit may drive robots; otherwise the operator is asked to move them.
-        allow_motion_after_fault: Whether robots may move again without a confirmation after a fault stopped one.
+        permissions: Names of the permissions that the operator gave. Without permission to move robots, the operator
+            is asked to move them.
     """
 
     by_hand: Final = True
@@ -57,8 +57,7 @@ class FieldBackend:
         self._site = site
         self._document = document
         self._ask = ask
-        self.allow_motion = False
-        self.allow_motion_after_fault = False
+        self.permissions: frozenset[str] = frozenset()
         self._passwords: dict[str, str | None] = {}
 
     def cast(self, topology: Topology) -> Cast:
@@ -79,12 +78,15 @@ class FieldBackend:
                     where=self._document.where(("robots", robot.name)),
                     remedy="correct address: of one of them",
                 )
-        return {role: robot.model_copy(update=self._permissions(robot.profile)) for role, robot in cast.items()}
+        return {
+            role: robot.model_copy(update={"abilities": self._abilities(robot.profile)})
+            for role, robot in cast.items()
+        }
 
-    def _permissions(self, profile: RobotProfile) -> dict[str, bool]:
-        """Return the values of `Robot.drives` and `Robot.flies`, which are false without `allow_motion`."""
-        abilities = {"drives": profile.drive is not None, "flies": profile.mavlink is not None}
-        return {name: self.allow_motion and is_able for name, is_able in abilities.items()}
+    def _abilities(self, profile: RobotProfile) -> frozenset[str]:
+        """Return the sections of a profile by which steps may move the robot with the given permissions."""
+        sections = profile.sections.items()
+        return frozenset(key for key, section in sections if section.permission in self.permissions)
 
     @contextmanager
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (starts nothing)
@@ -93,7 +95,7 @@ class FieldBackend:
         try:
             for role, robot in cast.items():
                 shells[role] = self._shell(robot.name, sink)
-            yield FieldTestbed(cast, shells, operator, allow_motion_after_fault=self.allow_motion_after_fault)
+            yield FieldTestbed(cast, shells, operator, permissions=self.permissions)
         finally:
             for shell in shells.values():
                 shell.close()
@@ -140,7 +142,7 @@ class FieldTestbed:
         cast: The robot in each role.
         shells: Control connection of each robot.
         operator: The operator.
-        allow_motion_after_fault: See `Attended`.
+        permissions: See `Attended`.
     """
 
     oracle: Final = None
@@ -151,9 +153,9 @@ class FieldTestbed:
         shells: Mapping[Role, Shell],
         operator: Operator,
         *,
-        allow_motion_after_fault: bool = False,
+        permissions: frozenset[str] = frozenset(),
     ) -> None:
-        self.allow_motion_after_fault = allow_motion_after_fault
+        self.permissions = permissions
         self._cast = cast
         self._shells = shells
         self.operator = operator
@@ -165,11 +167,11 @@ class FieldTestbed:
 
     def place(self, placement: Placement) -> Answer:
         """Ask the operator to place the robots; see `Testbed.place`."""
-        names = {role: robot.name for role, robot in self._cast.items()}
+        names, topology = {role: robot.name for role, robot in self._cast.items()}, placement.topology
         sender, receiver = names[Role.SENDER], names[Role.RECEIVER]
         distance = format_distance(placement.distance)
         behind = placement.scenario is Scenario.NLOS
-        if placement.topology is Topology.MASTER:
+        if topology is Topology.MASTER:
             text = f"move {sender} and {receiver} to {distance} from {names[Role.RELAY]}, on opposite sides of it"
             wall = f"{sender} behind the wall"
         else:
@@ -177,17 +179,17 @@ class FieldTestbed:
             wall = "behind the wall"
         posts = "".join(
             f"; put {names[post.role]} {geometry.describe_leg(post.leg)} of {names[post.near]}, as seen from "
-            + names[geometry.other_end(post.near, placement.topology)]
+            + names[geometry.other_end(post.near, topology)]
             for post in placement.posts
         )
-        facing = "".join(
-            f"; let {robot.name} face away from {names[geometry.other_end(role, placement.topology)]} with a clear "
-            "path: it drives automatically"
+        directions = "".join(
+            "; " + section.placement.format(robot=robot.name, other=names[geometry.other_end(role, topology)])
             for role, robot in self._cast.items()
-            if robot.drives
+            for key, section in robot.profile.sections.items()
+            if key in robot.abilities and section.placement
         )
         return self.operator.ask(
-            f"{text}, {wall if behind else 'nothing between them'}{posts}{facing}", may_skip=True
+            f"{text}, {wall if behind else 'nothing between them'}{posts}{directions}", may_skip=True
         )
 
     def inject(self, fault: Fault) -> float | None:

@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from types import MappingProxyType
+from typing import Final, Protocol, runtime_checkable
 
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
-from fieldkit.config.schema import Bool, Document, Field, Strict
+from fieldkit.config.schema import Document, Field, Strict
 from fieldkit.config.site import Site
 from fieldkit.core import model
 from fieldkit.core.errors import FieldkitError
@@ -28,6 +29,9 @@ from fieldkit.core.model import (
 from fieldkit.core.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
 
+_FORMER_KEYS: Final = MappingProxyType({"drives": "drive", "flies": "mavlink"})
+"""Section by the key of the ability in plans of earlier versions."""
+
 
 class Robot(Strict):
     """A robot in a role, as it is written into the plan of a trial.
@@ -38,8 +42,7 @@ class Robot(Strict):
         profile: Its profile.
         control: The network that SSH uses to reach it, from the site file.
         ros_master: Address on the radio of the robot that runs its ROS master; empty if its setup files define it.
-        drives: Whether steps that move it drive it by the velocity topic of its profile.
-        flies: Whether a step may fly it.
+        abilities: Sections of its profile by which steps may move it, for example `drive`.
     """
 
     name: str
@@ -47,8 +50,16 @@ class Robot(Strict):
     profile: RobotProfile
     control: Control = Control.SEPARATE
     ros_master: str = Field(default="", exclude_if=schema.is_empty)
-    drives: Bool = Field(default=False, exclude_if=schema.is_empty)
-    flies: Bool = Field(default=False, exclude_if=schema.is_empty)
+    abilities: schema.Names = Field(default=frozenset(), exclude_if=schema.is_empty)
+
+    @schema.model_validator(mode="before")
+    @classmethod
+    def _read_former_keys(cls, data: object) -> object:
+        """Read plans of earlier versions, which have a boolean for each ability."""
+        if not isinstance(data, dict) or not data.keys() & _FORMER_KEYS.keys():
+            return data
+        abilities = [section for key, section in _FORMER_KEYS.items() if data.get(key)]
+        return {key: value for key, value in data.items() if key not in _FORMER_KEYS} | {"abilities": abilities}
 
     @property
     def ros_graph(self) -> str:
@@ -235,8 +246,8 @@ class Attended(Protocol):
         ...
 
     @property
-    def allow_motion_after_fault(self) -> bool:
-        """Whether robots may move from where a fault stopped them (`--allow-motion-after-fault`)."""
+    def permissions(self) -> frozenset[str]:
+        """Names of the permissions that the operator gave; see `fieldkit.core.permissions`."""
         ...
 
 
@@ -246,8 +257,8 @@ class Backend(Protocol):
     The constructor only checks the site file; it raises `ConfigurationError` if an entry is missing there.
     """
 
-    allow_motion: bool
-    """Whether fieldkit may drive real robots (`--allow-motion`); false in a new backend."""
+    permissions: frozenset[str]
+    """Names of the permissions that the operator gave by options `--allow-NAME`; empty in a new backend."""
 
     @property
     def by_hand(self) -> bool:
@@ -262,7 +273,7 @@ class Backend(Protocol):
     def cast(self, topology: Topology) -> Cast:
         """Return the robot in each role without contacting any robot (`--dry-run` uses nothing else).
 
-        Steps drive robots with `Robot.drives` themselves; `Testbed.moving` moves the others.
+        Steps move robots with `Robot.abilities`; `Testbed.moving` moves the others.
 
         Raises:
             ConfigurationError: The site file gives no roles for this topology.

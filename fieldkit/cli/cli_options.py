@@ -12,6 +12,7 @@ from fieldkit.backends.registry import load_backend
 from fieldkit.cli.sites import backend_name, lab_site
 from fieldkit.cli.terminal import Terminal
 from fieldkit.config.locations import SITE_FILE
+from fieldkit.core import permissions
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Distance, Protocol, Topology
@@ -82,7 +83,5 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
         sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
     name = backend_name(arguments, site)
     chosen = load_backend(name, site, document)
-    chosen.allow_motion = getattr(arguments, "allow_motion", False)  # only commands that run trials have this option
-    if hasattr(chosen, "allow_motion_after_fault"):  # an optional attribute of a backend with real robots
-        chosen.allow_motion_after_fault = getattr(arguments, "allow_motion_after_fault", False)
+    chosen.permissions = permissions.given(arguments)
     return name, chosen

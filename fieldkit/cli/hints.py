@@ -12,11 +12,10 @@ from contextvars import ContextVar
 from typing import Final
 
 from fieldkit.cli.parser import Parser
+from fieldkit.core import permissions
 
 _CARRIED: Final = ("site", "backend", "topology", "protocol", "repeats", "record")
 """Options that select robots and what is measured on them, by their names in the namespace of argparse."""
-_CARRIED_FLAGS: Final = ("allow_motion",)
-"""Flags that a trial needs again when it is resumed."""
 
 # Words in lower case: a command of fieldkit, and perhaps its subcommand, such as `lab up`.
 _COMMAND: Final = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;\n`]*)")
@@ -39,9 +38,8 @@ class CliOptions:
             value = getattr(arguments, name, None)
             values = value if isinstance(value, list) else [] if value is None else [value]
             self._options += [(f"--{name}", str(item)) for item in values]
-        for name in _CARRIED_FLAGS:
-            if getattr(arguments, name, False):
-                self._options.append((f"--{name.replace('_', '-')}", ""))
+        if given := permissions.given(arguments):
+            self._options += [(permissions.option(name), "") for name in permissions.repeated(given)]
 
     def completed(self, match: re.Match[str]) -> str:
         """Return the matched command with those of the given options that it accepts."""

@@ -6,7 +6,7 @@ from typing import Final
 
 from fieldkit.cli.parser import Parser
 from fieldkit.config.locations import SITE_FILE
-from fieldkit.core import plugins
+from fieldkit.core import permissions, plugins
 from fieldkit.core.model import MAX_REPEATS, Protocol, Topology
 from fieldkit.core.text import sanitized
 
@@ -35,20 +35,12 @@ def add_site(parser: Parser) -> None:
 
 
 def add_operator(parser: Parser) -> None:
-    """Add the options for questions to the operator and for motion of robots."""
+    """Add the options for questions to the operator, and one for each permission."""
     answers = parser.add_mutually_exclusive_group()
     answers.add_argument("--yes", action="store_true", help="ask nothing: the robots are at their positions")
     answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: from standard input")
-    parser.add_argument(
-        "--allow-motion",
-        action="store_true",
-        help="allow fieldkit to drive real robots in steps that move them (safety: `fieldkit docs motion`)",
-    )
-    parser.add_argument(
-        "--allow-motion-after-fault",
-        action="store_true",
-        help="after a fault stopped a robot, let robots move again from their positions without a question",
-    )
+    for name, permission in permissions.installed().items():
+        parser.add_argument(permissions.option(name), action="store_true", help=permission.help_line)
 
 
 def add_junit(parser: Parser) -> None:

@@ -2,21 +2,13 @@
 
 import posixpath
 import string
-from typing import Annotated, Final
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Final
 
 from fieldkit.config import catalog, schema
-from fieldkit.config.schema import (
-    AfterValidator,
-    Bytes,
-    Duration,
-    Field,
-    Fraction,
-    Hertz,
-    Int,
-    Number,
-    Strict,
-    pattern_field,
-)
+from fieldkit.config.schema import AfterValidator, Bytes, Field, Hertz, Int, Number, Strict, pattern_field
+from fieldkit.config.sections import Sectioned
+from fieldkit.core import plugins
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
@@ -258,66 +250,6 @@ class Radio(Strict):
     sensitivity_dbm: Number | Int
 
 
-MIN_CHARGE: Final = 0.2
-"""No drone starts a flight below this charge. Battery makers recommend to keep 20 %."""
-
-_CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
-
-
-BOOT_S: Final = 2.0
-"""Boot time of an emulated autopilot; a real one takes about 30 s."""
-
-
-class Mavlink(Strict):
-    """The MAVLink endpoint of an autopilot.
-
-    Attributes:
-        port: UDP port on which it listens on the radio.
-        connection: Connection from the robot's computer, for the step `mavlink`: `udpout:HOST:PORT` (sends first),
-            `udpin:HOST:PORT`, `tcp:HOST:PORT` or `/dev/ttyAMA0:921600`; without it, `port` on the robot itself.
-        autopilot: Firmware of an emulated autopilot: `px4` or `ardupilot`. A real one reports its own.
-        system: System id of an emulated autopilot after power-on, 1 to 250.
-        boot_s: Time from power-on until the position estimate of an emulated autopilot has an origin, 0 to 120 s; a
-            real one takes about 30 s.
-        least_charge: Minimum battery charge before a step flies it.
-    """
-
-    port: Annotated[Int, Field(gt=0, lt=65536)]
-    connection: (
-        Annotated[
-            str, pattern_field(_CONNECTION, "a connection, such as udpout:127.0.0.1:14550 or /dev/ttyAMA0:921600")
-        ]
-        | None
-    ) = None
-    autopilot: Annotated[str, Field(pattern="^(px4|ardupilot)$", exclude_if=lambda name: name == "px4")] = "px4"
-    system: Annotated[Int, Field(gt=0, le=250, exclude_if=lambda number: number == 1)] = 1
-    boot_s: Annotated[Number | Int, Field(ge=0, le=120, exclude_if=lambda time_s: time_s == BOOT_S)] = BOOT_S
-    least_charge: Annotated[Fraction, Field(exclude_if=lambda share: share == MIN_CHARGE)] = MIN_CHARGE
-
-    @property
-    def onboard_connection(self) -> str:
-        """The connection from the robot's computer."""
-        return self.connection or f"udpout:127.0.0.1:{self.port}"
-
-
-class Drive(Strict):
-    """Settings for driving a ground robot by velocities on a topic, `geometry_msgs/Twist`.
-
-    Attributes:
-        topic: Topic of velocities (`geometry_msgs/Twist`) that its base subscribes to.
-        odometry: Topic of its odometry (`nav_msgs/Odometry`).
-        turn_rad_s: Maximum turn rate, in radians per second.
-        acceleration_m_s2: Maximum acceleration, in m/s^2.
-        lease: The robot stops if it has received nothing from the laptop for this time, 0.5 to 30 s.
-    """
-
-    topic: TopicName = "/cmd_vel"
-    odometry: TopicName = "/odom"
-    turn_rad_s: Annotated[Number | Int, Field(gt=0, le=10)] = 1.0
-    acceleration_m_s2: Annotated[Number | Int, Field(gt=0, le=10)] = 0.5
-    lease: Annotated[Duration, Field(ge=0.5, le=30)] = 2.0
-
-
 class Limits(Strict):
     """Limits of the robot.
 
@@ -336,7 +268,25 @@ class Limits(Strict):
     battery_min: Number | Int | None = None
 
 
-class RobotProfile(catalog.Named):
+class ProfileSection(Strict):
+    """Base of the sections of a robot profile that installed packages add.
+
+    Attributes:
+        permission: Permission (`fieldkit.core.permissions`) that steps need to move a real robot by this section;
+            empty if they do not move it.
+        placement: What the operator must observe when a robot is placed that steps move by this section. `{robot}`
+            and `{other}`, the robot at the other end of its link, are filled in. Empty if there is nothing.
+    """
+
+    permission: ClassVar[str] = ""
+    placement: ClassVar[str] = ""
+
+    def contradiction(self, profile: "RobotProfile") -> str | None:  # noqa: ARG002 (most fit every profile)
+        """Return why the section contradicts the rest of the profile; None if it does not."""
+        return None
+
+
+class RobotProfile(catalog.Named, Sectioned):
     """A robot model: one YAML file in `robots/`.
 
     How to write one: [add a robot](add-a-robot.md). A key described as "for information only" has no effect in this
@@ -357,9 +307,10 @@ class RobotProfile(catalog.Named):
         tools: Programs on the robot, each a name or a path.
         ros: Its ROS side; a robot without one records nothing.
         limits: Limits of the robot.
-        mavlink: Its autopilot, if it has one; an emulated robot has an [emulated autopilot](emulated-autopilot.md).
-        drive: How a ground robot is [driven](motion.md); without it, a person moves the robot.
     """
+
+    section_group = plugins.PROFILE_SECTIONS
+    section_base = ProfileSection
 
     kind: Annotated[str, Field(pattern="^(ugv|uav|usv)$")]
     computer: str
@@ -367,13 +318,18 @@ class RobotProfile(catalog.Named):
     tools: Tools = Tools.defaults()
     ros: Ros | None = None
     limits: Limits
-    mavlink: Mavlink | None = None
-    drive: Drive | None = Field(default=None, exclude_if=schema.is_empty)
+
+    @property
+    def sections(self) -> Mapping[str, ProfileSection]:
+        """Its sections of installed packages, by key."""
+        extra = self.model_extra or {}
+        return {key: section for key, section in extra.items() if isinstance(section, ProfileSection)}
 
     @schema.model_validator(mode="after")
-    def _has_a_fence(self) -> "RobotProfile":
-        if self.drive is not None and self.limits.fence_m is None:
-            raise schema.validation_error("a robot with drive needs a fence; set limits.fence_m")
+    def _has_consistent_sections(self) -> "RobotProfile":
+        for section in self.sections.values():
+            if why := section.contradiction(self):
+                raise schema.validation_error(why)
         return self
 
 

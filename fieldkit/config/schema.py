@@ -21,6 +21,7 @@ from pydantic import (
     Field,
     ModelWrapValidatorHandler,
     PlainSerializer,
+    RootModel,
     SerializationInfo,
     SerializerFunctionWrapHandler,
     StrictBool,
@@ -42,11 +43,13 @@ from fieldkit.core.model import Distance
 
 __all__ = [
     "AfterValidator",
+    "BaseModel",
     "BeforeValidator",
     "Bits",
     "Bool",
     "Bytes",
     "Codec",
+    "ConfigDict",
     "CoreSchema",
     "Document",
     "Duration",
@@ -56,7 +59,9 @@ __all__ = [
     "Int",
     "Length",
     "Location",
+    "Names",
     "Number",
+    "RootModel",
     "SerializerFunctionWrapHandler",
     "Span",
     "Speed",
@@ -149,6 +154,8 @@ Length = Annotated[float, *_quantity(_unit(units.METRES_PER_UNIT, "length"), "m"
 """Metres, written with a unit."""
 Speed = Annotated[float, *_quantity(_unit(units.METRES_PER_S_PER_UNIT, "speed"), "m/s")]
 """Metres per second, written with a unit."""
+Names = Annotated[frozenset[str], PlainSerializer(sorted, return_type=list[str])]
+"""A set of names, written in alphabetical order."""
 Span = Annotated[
     Distance, _converter(units.parse_distance, "ft"), PlainSerializer(lambda value: value.label, return_type=str)
 ]
@@ -178,18 +185,40 @@ class Strict(BaseModel):
         """Return the object of an empty mapping without building a validator, for the default of a field."""
         return cls.model_construct()
 
+    @classmethod
+    def section_types(cls) -> Mapping[str, type[BaseModel]]:
+        """Return the models of further keys, which installed packages add; most mappings have none."""
+        return {}
+
+    @classmethod
+    def missing_package(cls, key: str) -> str:  # noqa: ARG003 (most mappings have no keys of packages)
+        """Return the package without which a key is unknown; empty if no package is known."""
+        return ""
+
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
-        fields = _types(cls)
+        names, sections = _names(cls), cls.section_types()
         for key in data:
-            if key not in fields:
-                outer = [_types(model) for model in _ENCLOSING.get()[:-1]]
-                hint, index = yaml_errors.misplaced_hint(key, data, fields, outer)
-                raise _unknown(str(key), hint, outer[index] if index >= 0 else ())
-        return data
+            if key not in names and key not in sections:
+                raise cls._unknown_key(key, data)
+        if not sections:
+            return data
+        return {
+            key: value if key in names else _validated_under(key, sections[key], value)
+            for key, value in data.items()
+            if key in names or value is not None
+        }
+
+    @classmethod
+    def _unknown_key(cls, key: Any, data: Mapping[Any, Any]) -> Exception:  # noqa: ANN401 (any YAML value)
+        if package := cls.missing_package(str(key)):
+            return _unknown(str(key), f"it needs the package {package}, which is not installed")
+        outer = [_types(model) for model in _ENCLOSING.get()[:-1]]
+        hint, index = yaml_errors.misplaced_hint(key, data, _types(cls), outer)
+        return _unknown(str(key), hint, outer[index] if index >= 0 else ())
 
     @model_validator(mode="wrap")
     @classmethod
@@ -201,9 +230,15 @@ class Strict(BaseModel):
             _ENCLOSING.reset(token)
 
 
+def _names(model: type[Strict]) -> frozenset[str]:
+    """Return the keys of a model, without those of sections."""
+    return frozenset(field.alias or name for name, field in model.model_fields.items())
+
+
 def _types(model: type[Strict]) -> dict[str, Any]:
     """Return the type of each key of a model."""
-    return {field.alias or name: field.annotation for name, field in model.model_fields.items()}
+    fields = {field.alias or name: field.annotation for name, field in model.model_fields.items()}
+    return {**fields, **model.section_types()}
 
 
 def _unknown(key: str, hint: str, outer: Iterable[str] = ()) -> Exception:
@@ -224,6 +259,7 @@ def is_empty(value: object) -> bool:
 
 
 Model = TypeVar("Model", bound=Strict)
+AnyModel = TypeVar("AnyModel", bound=BaseModel)
 Item = TypeVar("Item")
 
 
@@ -257,9 +293,7 @@ def by_kind(
         if len(data) != 1:
             raise validation_error(f"a {what} has one kind, one of: {', '.join(models)}")
         ((kind, value),) = data.items()
-        # Validated under its key, so that the location of an error includes the key.
-        located = SchemaValidator(core_schema.typed_dict_schema({kind: _field_of(models[kind])}))
-        return make(kind, located.validate_python({kind: value})[kind])
+        return make(kind, _validated_under(kind, models[kind], value))
 
     def _require_made(data: Any) -> Item:  # noqa: ANN401 (as above)
         try:
@@ -284,8 +318,12 @@ def by_kind(
     )
 
 
-def _field_of(model: type[Strict]) -> core_schema.TypedDictField:
-    return core_schema.typed_dict_field(core_schema.no_info_plain_validator_function(model.model_validate))
+def _validated_under(key: str, model: type[AnyModel], value: object) -> AnyModel:
+    """Return the object of a value; the locations of its errors begin with `key`."""
+    validator = core_schema.no_info_plain_validator_function(model.model_validate)
+    located = SchemaValidator(core_schema.typed_dict_schema({key: core_schema.typed_dict_field(validator)}))
+    validated: AnyModel = located.validate_python({key: value})[key]
+    return validated
 
 
 def load(path: Path, model: type[Model]) -> Model:

@@ -179,13 +179,6 @@ class Fault:
     process: str = ""
 
 
-class OnAbort(StrEnum):
-    """Action of a drone whose trial is aborted: land at its position, or return to its take-off position and land."""
-
-    LAND = "land"
-    RETURN = "return"
-
-
 @dataclass(frozen=True)
 class Leg:
     """A straight segment of a path, relative to the end of the previous segment.
@@ -227,30 +220,6 @@ class Move:
     role: Role
     legs: tuple[Leg, ...]
     speed_m_s: float
-
-
-@dataclass(frozen=True)
-class MotionOrigin:
-    """Position and heading of a robot at its first start in a trial: centre of its fence, reference of directions.
-
-    Attributes:
-        frame: Frame of the coordinates: `odometry`, or `local` for MAVLink's LOCAL_POSITION_NED.
-        frame_id: Identifies one instance of that frame, for example by the boot ID of the robot. A frame that was
-            lost and created again has another one.
-        x_m: x of `nav_msgs/Odometry`, or metres north.
-        y_m: y of `nav_msgs/Odometry`, or metres east.
-        heading_rad: Heading from x towards y: counterclockwise in `odometry`, clockwise in `local`.
-        latitude_deg: Latitude (WGS 84); None if unknown.
-        longitude_deg: Longitude (WGS 84); None if unknown.
-    """
-
-    frame: str
-    frame_id: str
-    x_m: float
-    y_m: float
-    heading_rad: float
-    latitude_deg: float | None = None
-    longitude_deg: float | None = None
 
 
 Vector = tuple[float, float, float]

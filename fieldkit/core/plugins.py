@@ -1,10 +1,11 @@
-"""Installed packages: their versions, and what they add through entry points: backends, steps, policies, commands."""
+"""Installed packages: their versions, and what they add through entry points, for example kinds of step."""
 
 import sys
 from collections.abc import Callable
 from functools import cache
 from importlib import metadata
 from importlib.metadata import EntryPoint, EntryPoints
+from types import MappingProxyType
 from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError
@@ -32,6 +33,17 @@ POLICIES: Final = "fieldkit.policies"
 `sim_backends.cosim.policies.registry`."""
 COMMANDS: Final = "fieldkit.commands"
 """Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.parser`."""
+PROFILE_SECTIONS: Final = "fieldkit.profile_sections"
+"""Entry point group of sections of robot profiles: `KEY = "package.module:Class"`, a
+`fieldkit.config.profiles.ProfileSection`."""
+PROCEDURE_SECTIONS: Final = "fieldkit.procedure_sections"
+"""Entry point group of sections of procedures: `KEY = "package.module:Class"`, a
+`fieldkit.trial.procedure_section.ProcedureSection`."""
+PERMISSIONS: Final = "fieldkit.permissions"
+"""Entry point group of permissions: `NAME = "package.module:OBJECT"`, a `fieldkit.core.permissions.Permission`."""
+
+_OF_MOTION: Final = MappingProxyType({PROFILE_SECTIONS: {"drive", "mavlink"}, PROCEDURE_SECTIONS: {"on_abort"}})
+"""Sections of `fieldkit.motion` by group, for the error message in a distribution without this package."""
 
 REMEDY: Final = "fix or uninstall its package"
 
@@ -45,9 +57,15 @@ def entry_points(group: str) -> list[EntryPoint]:
     return sorted(points, key=lambda point: (point.name, point.value))
 
 
+def owner(group: str, section: str) -> str:
+    """Return the package of fieldkit that has a section, even if it is not installed; empty if it is unknown."""
+    return "fieldkit.motion" if section in _OF_MOTION.get(group, ()) else ""
+
+
 def versions() -> dict[str, str]:
-    """Return the version of each package that adds backends or steps, fieldkit included."""
-    packages = dict.fromkeys(point.dist for group in (BACKENDS, STEPS) for point in entry_points(group))
+    """Return the version of each package that adds backends, steps or sections, fieldkit included."""
+    groups = (BACKENDS, STEPS, PROFILE_SECTIONS, PROCEDURE_SECTIONS)
+    packages = dict.fromkeys(point.dist for group in groups for point in entry_points(group))
     return {package.name: package.version for package in packages if package is not None}
 
 

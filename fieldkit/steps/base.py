@@ -8,8 +8,6 @@ from importlib.metadata import EntryPoint
 from inspect import isabstract
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
-from typing_extensions import override
-
 from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import CoreSchema, Field, Strict
@@ -17,6 +15,7 @@ from fieldkit.core import plugins
 from fieldkit.core.columns import Column, Measured, Value, step_prefixed
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.lazy_mapping import LazyMapping
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.remote import jobs
@@ -278,40 +277,12 @@ def _roles_in(value: object) -> Iterator[Role]:
             yield from _roles_in(item)
 
 
-class StepTypes(Mapping[str, type[Step]]):
-    """The class of every kind of step by name, built-in kinds first. A kind is imported when its class is looked up.
-
-    A look-up of a kind whose entry point cannot be loaded, or names an object that is not a complete subclass of
-    `Step`, raises a `ConfigurationError`.
-
-    Args:
-        points: The entry point of each kind.
-    """
-
-    def __init__(self, points: Mapping[str, EntryPoint]) -> None:
-        self._points = points
-        self._types: dict[str, type[Step]] = {}
-
-    @override
-    def __getitem__(self, kind: str) -> type[Step]:
-        if kind not in self._types:
-            self._types[kind] = _load(self._points[kind])
-        return self._types[kind]
-
-    @override
-    def __contains__(self, kind: object) -> bool:
-        return kind in self._points
-
-    @override
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._points)
-
-    @override
-    def __len__(self) -> int:
-        return len(self._points)
-
-
 def _load(point: EntryPoint) -> type[Step]:
+    """Return the class of a kind.
+
+    Raises:
+        ConfigurationError: It cannot be loaded, or is not a complete subclass of `Step`.
+    """
     loaded, location, remedy = plugins.load(point), plugins.location(point), plugins.REMEDY
     if not (isinstance(loaded, type) and issubclass(loaded, Step)):
         raise ConfigurationError("a kind of step must be a subclass of Step", where=location, remedy=remedy)
@@ -322,13 +293,13 @@ def _load(point: EntryPoint) -> type[Step]:
 
 
 @cache
-def step_types() -> StepTypes:
-    """Return the class of every kind of step by name.
+def step_types() -> LazyMapping[type[Step]]:
+    """Return the class of every kind of step by name, built-in kinds first.
 
     Raises:
         ConfigurationError: As `kinds.find`.
     """
-    return StepTypes(kinds.find())
+    return LazyMapping(kinds.find(), _load)
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,13 @@ from fieldkit.backends.protocols import Cast, Robot
 from fieldkit.config.program_files import LabProgram
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import OnAbort, Placement, Protocol, Role, Vector, Verdict
+from fieldkit.core.model import Placement, Protocol, Role, Vector, Verdict
 from fieldkit.core.threads import StopSignal
 from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
 from fieldkit.steps.motions import Motions
-from fieldkit.steps.origins import MemoryOrigins, Origins
 from fieldkit.steps.variants import Tool, Variants
 
 Shells = Mapping[Role, Shell]
@@ -72,10 +71,11 @@ class Scene:
         placement: The placement of the robots; None if they were not placed.
         repeat: Number of the repeat of its protocol, from 1; None if the scene is valid for all repeats.
         flows: The traffic of all steps of the procedure on the radio.
-        on_abort: The action of each drone if the attempt is aborted; drones without an entry land.
+        sections: The sections of the procedure that installed packages added, by key.
         halt: Interrupts waits when the steps must not continue.
         motions: The robots that move automatically, which the operator may stop.
-        origins: Origins of the robots that move automatically, and the record of each motion.
+        origins: Where the robots that move automatically started, an object of the package that moves them; None if
+            no attempt is made.
     """
 
     protocol: Protocol
@@ -87,10 +87,10 @@ class Scene:
     placement: Placement | None = None
     repeat: int | None = None
     flows: "tuple[Flow, ...]" = ()
-    on_abort: Mapping[Role, OnAbort] = field(default_factory=lambda: MappingProxyType({}))
+    sections: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     halt: StopSignal = field(default_factory=StopSignal, compare=False, repr=False)
     motions: Motions = field(default_factory=Motions, compare=False, repr=False)
-    origins: Origins = field(default_factory=MemoryOrigins, compare=False, repr=False)
+    origins: object = field(default=None, compare=False, repr=False)
 
     def robot(self, role: Role) -> Robot:
         """Return the robot in `role`."""

@@ -1,6 +1,6 @@
 """The frozen inputs of a trial: the content of `trial.yaml`, and the columns of its table."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
@@ -21,6 +21,7 @@ from fieldkit.steps.variants import Variants
 from fieldkit.trial.columns import of_steps, trial_columns
 from fieldkit.trial.frozen import Columns
 from fieldkit.trial.procedure import Procedure, Repeats
+from fieldkit.trial.procedure_section import ProcedureSection
 from fieldkit.trial.step_packages import StepPackage
 
 PLAN_FILE: Final = laptop_files.PLAN
@@ -126,14 +127,11 @@ class Plan(Strict):
         """Return the parts of the procedure that cannot work with the robots' tools, without duplicates."""
         scenes, steps = self.scenes(variants), self.procedure.steps
         step_refusals = (refusal for scene in scenes for entry in steps for refusal in entry.step.refusals(scene))
-        return tuple(dict.fromkeys((*step_refusals, *self._without_autopilot())))
+        section_refusals = (refusal for section in self._sections() for refusal in section.refusals(self))
+        return tuple(dict.fromkeys((*step_refusals, *section_refusals)))
 
-    def _without_autopilot(self) -> Iterator[Refusal]:
-        """Yield a refusal for each role of `on_abort` whose robot has no autopilot link to land it."""
-        for role in self.procedure.on_abort:
-            if self.cast[role].profile.mavlink is None:
-                why = "on_abort must bring it down, but its profile has no mavlink"
-                yield Refusal(role, why, f"leave {role} out of on_abort, or use a drone")
+    def _sections(self) -> Iterable[ProcedureSection]:
+        return self.procedure.sections.values()
 
     def shortfalls(self) -> Iterator[str]:
         """Yield a sentence for each expectation that the plan cannot decide, for example with too few repeats."""
@@ -141,15 +139,13 @@ class Plan(Strict):
 
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
         """Return descriptions of what the testbed does in one repeat besides running the commands."""
-        on_abort = self.procedure.on_abort.items()
-        drones = (f"if it is aborted: {self.cast[role].name} is commanded to {action}" for role, action in on_abort)
-        return (*drones, *(line for entry in self.procedure.steps for line in entry.step.dry_run_notes(scene)))
+        section_notes = (line for section in self._sections() for line in section.dry_run_notes(self))
+        return (*section_notes, *(line for entry in self.procedure.steps for line in entry.step.dry_run_notes(scene)))
 
     def abort_notes(self, scene: Scene) -> tuple[str, ...]:
         """Return descriptions of what each robot that moves without a person does if a repeat is aborted."""
-        watched = (role for role in self.procedure.on_abort if role not in self.procedure.moved())
-        commands = (f"{self.cast[role].name} is commanded to {self.procedure.on_abort[role]}" for role in watched)
-        return (*commands, *(line for entry in self.procedure.steps for line in entry.step.abort_notes(scene)))
+        section_notes = (line for section in self._sections() for line in section.abort_notes(self))
+        return (*section_notes, *(line for entry in self.procedure.steps for line in entry.step.abort_notes(scene)))
 
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
         """Return the packet filter of each transfer, in the order of their starts."""

@@ -15,12 +15,12 @@ from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.backends.protocols import Cast
 from fieldkit.config import catalog, loops, schema
 from fieldkit.config.schema import Bool, Field, Int
-from fieldkit.core import laptop_files
+from fieldkit.config.sections import Sectioned
+from fieldkit.core import laptop_files, plugins
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import (
     FIXED_ROLES,
     MAX_REPEATS,
-    OnAbort,
     Post,
     Protocol,
     Role,
@@ -35,6 +35,7 @@ from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import columns
+from fieldkit.trial.procedure_section import ProcedureSection
 
 Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
 """Number of repeats per protocol."""
@@ -57,7 +58,7 @@ class Place(PathLeg):
         return self
 
 
-class Procedure(catalog.Named):
+class Procedure(catalog.Named, Sectioned):
     """The steps of a repeat, by role: one YAML file in `procedures/`.
 
     Roles are `sender`, `receiver`, `relay`, and others that the procedure places. How to write one: [add a
@@ -80,11 +81,12 @@ class Procedure(catalog.Named):
         needs_ros_master: Whether it needs one ROS master for all robots; a site file without `ros_master` is then
             rejected.
         places: Positions of robots in additional roles, by role.
-        on_abort: What a drone does when a repeat is aborted, by role: `land` where it is, or `return`; see
-            [MAVLink](mavlink.md#when-a-trial-is-cut-short).
         expect: List of [expectations](values.md#expectations).
         steps: The steps of a repeat, in order; each entry has one key, the kind of step.
     """
+
+    section_group = plugins.PROCEDURE_SECTIONS
+    section_base = ProcedureSection
 
     scenario: Scenario
     topology: Topology
@@ -93,7 +95,6 @@ class Procedure(catalog.Named):
     attempts: Annotated[Int, Field(gt=0, le=1000)] = 3
     needs_ros_master: Bool = Field(default=False, exclude_if=schema.is_empty)
     places: dict[Role, Place] = Field(default_factory=dict, exclude_if=schema.is_empty)
-    on_abort: dict[Role, OnAbort] = Field(default_factory=dict, exclude_if=schema.is_empty)
     expect: tuple[str, ...] = Field(default=(), exclude_if=schema.is_empty)
     steps: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
@@ -113,9 +114,9 @@ class Procedure(catalog.Named):
                 raise schema.validation_error(
                     f"there is no role {role}; {did_you_mean(role, known_roles, remedy)}", *placed.at
                 )
-        for role in self.on_abort:
-            if role not in self.roles():
-                raise schema.validation_error(f"no step has the role {role}", "on_abort", role)
+        for key, section in self.sections.items():
+            for role in sort_roles(section.roles() - self.roles()):
+                raise schema.validation_error(f"no step has the role {role}", key, role)
         for role in self.places:
             if role in FIXED_ROLES:
                 raise schema.validation_error(f"the place of the {role} follows from the distance", "places", role)
@@ -161,6 +162,12 @@ class Procedure(catalog.Named):
         return self
 
     @property
+    def sections(self) -> Mapping[str, ProcedureSection]:
+        """Its sections of installed packages, by key."""
+        extra = self.model_extra or {}
+        return {key: section for key, section in extra.items() if isinstance(section, ProcedureSection)}
+
+    @property
     def expectations(self) -> tuple[Expectation, ...]:
         """The expectations of its figures."""
         return tuple(map(self._expectation, range(len(self.expect))))
@@ -192,7 +199,7 @@ class Procedure(catalog.Named):
         for placed in self.walk():
             for file in placed.step.recorded(cast):
                 recorded[file.role] = (*recorded.get(file.role, ()), file)
-        scene = Scene(protocol, cast, folder, recorded, variants, on_abort=self.on_abort)
+        scene = Scene(protocol, cast, folder, recorded, variants, sections=self.sections)
         return replace(scene, flows=tuple(flow for placed in self.walk() for flow in placed.step.flows(scene)))
 
     def roles(self) -> frozenset[Role]:

@@ -117,7 +117,10 @@ def make_plan(
 
 def _robot_data(cast: Cast) -> dict[str, object]:
     """Return the data that distinguishes the robots of this trial from those of other trials."""
-    data: dict[str, object] = {role: robot.profile.model_dump(mode="json") for role, robot in cast.items()}
+    # Earlier versions hashed the key also for a robot without this section; equal robots must have equal hashes.
+    data: dict[str, object] = {
+        role: {"mavlink": None, **robot.profile.model_dump(mode="json")} for role, robot in cast.items()
+    }
     # The role of the ROS master is used, because addresses differ between labs without effect on the measurement.
     data |= {"ros_master": role for role, robot in cast.items() if robot.address == robot.ros_master}  # noqa: B035
     return data

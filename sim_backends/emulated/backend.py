@@ -5,7 +5,6 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from fieldkit.backends.driven import topic_conflict
 from fieldkit.backends.protocols import Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import Ros
@@ -17,6 +16,7 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated.emulated_options import EmulatedOptions, Ros2Options, RosChoice, load_options
+from sim_backends.emulated.motion_sections import DRIVE, MAVLINK, drive_of, mavlink_of
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
     LAPTOP_NAME,
@@ -51,7 +51,7 @@ class EmulatedBackend:
     """
 
     by_hand: Final = False
-    allow_motion = False
+    permissions: frozenset[str] = frozenset()
     """Without effect: emulated robots endanger no person."""
 
     def __init__(self, site: Site | None, document: Document | None) -> None:
@@ -105,18 +105,22 @@ class EmulatedBackend:
         cast = cast_of(self._site, self._document, topology, self._addresses)
         self._check_profiles(cast)
         return {
-            role: robot.model_copy(
-                update={"drives": self._drives(robot, cast), "flies": robot.profile.mavlink is not None}
-            )
-            for role, robot in cast.items()
+            role: robot.model_copy(update={"abilities": self._abilities(robot, cast)}) for role, robot in cast.items()
         }
 
-    def _drives(self, robot: Robot, cast: Cast) -> bool:
-        """Return True if the robot drives by its topic.
+    def _abilities(self, robot: Robot, cast: Cast) -> frozenset[str]:
+        """Return the sections of the robot's profile by which steps may move it.
 
-        If other robots of the cast would receive its velocities too, the lab moves the robot instead.
+        If other robots of the cast would receive the velocities of a driven robot too, the lab moves it instead.
         """
-        return drives_by_topic(robot.profile, self._options) and topic_conflict(robot, cast.values()) is None
+        drive = drive_of(robot.profile)
+        is_driven = (
+            drive is not None
+            and drives_by_topic(robot.profile, self._options)
+            and drive.topic_conflict(robot, cast.values()) is None
+        )
+        is_flown = mavlink_of(robot.profile) is not None
+        return frozenset({DRIVE} if is_driven else ()) | frozenset({MAVLINK} if is_flown else ())
 
     @contextmanager
     def open(

@@ -18,6 +18,7 @@ from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline
 from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered
+from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.ros.own_motion import AssignedPath
@@ -97,7 +98,7 @@ class EmulatedLab:
         with self._lock:
             states = {
                 name: motion.state
-                if self.members[name].profile.mavlink is not None
+                if mavlink_of(self.members[name].profile) is not None
                 else placement.on_ground(motion.state, self._world)
                 for name, motion in self_steered(self._up.robots, self._path_starts_ns).items()
             }

@@ -14,6 +14,7 @@ from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Move, Placement, Role, TrackPoint, Vector
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.medium.medium_client import MediumClient
+from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
 from sim_backends.emulated.provisioning import RobotKey
 from sim_backends.emulated.ros.steered import Steered
@@ -269,7 +270,7 @@ class Mobility:
 
     def _steered_state(self, role: Role, steered: Steered) -> State:
         """Return the state of a robot that steers itself; a ground robot is at the height of the ground."""
-        flies = self._cast[role].profile.mavlink is not None
+        flies = mavlink_of(self._cast[role].profile) is not None
         return steered.state if flies else places.on_ground(steered.state, self._world)
 
     def _next_update_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:

@@ -14,6 +14,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.emulated_options import AS_THIS_MACHINE, EmulatedOptions, RosChoice, uses_debian_ros
+from sim_backends.emulated.motion_sections import drive_of, mavlink_of
 from sim_backends.emulated.robot.spec import ANTENNA_M, LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros import static_frames
 from sim_backends.emulated.ros.laser import LaserTarget, Neighbour
@@ -159,7 +160,7 @@ def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
     Not with a Zenoh router on another robot, because the driver discovers only the base on its own robot.
     """
     ros = profile.ros
-    if profile.drive is None or ros is None:
+    if drive_of(profile) is None or ros is None:
         return False
     if ros.variant == "ros1":
         return uses_debian_ros(options.ros)
@@ -179,7 +180,7 @@ def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
 
 
 def _base(profile: RobotProfile) -> Base | None:
-    drive = profile.drive
+    drive = drive_of(profile)
     if drive is None:
         return None
     return Base(drive.topic, profile.limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s)
@@ -240,7 +241,7 @@ def robot_spec(
     is_ros2 = profile_ros is not None and profile_ros.variant == "ros2"
     ros2_over_radio = _ros2_spec(robots, robot, options)
     has_debian_ros1 = ros is RosChoice.DEBIAN and profile_ros is not None and not is_ros2
-    mavlink, limits = robot.profile.mavlink, robot.profile.limits
+    mavlink, limits = mavlink_of(robot.profile), robot.profile.limits
     has_laser = any(topic.type == LASER_SCAN for topic in _topics(robot))
     return RobotSpec(
         name=robot.name,

@@ -113,10 +113,13 @@ def test_unreadable_key_file_is_named(tmp_path: Path, access: str) -> None:
 
 def test_robots_drive_automatically_only_if_allowed(tmp_path: Path, access: str) -> None:
     field = backend(tmp_path, access)
-    assert not any(robot.drives for robot in field.cast(Topology.MASTERLESS).values())
-    field.allow_motion = True
+    for permissions in ((), ("motion-after-fault",), ("another",)):
+        field.permissions = frozenset(permissions)
+        assert not any(robot.abilities for robot in field.cast(Topology.MASTERLESS).values())
+    field.permissions = frozenset({"motion"})
     cast = field.cast(Topology.MASTERLESS)
-    assert {role for role, robot in cast.items() if robot.drives} == {Role.SENDER}, "a drone does not drive"
+    abilities = {role: set(robot.abilities) for role, robot in cast.items()}
+    assert abilities == {Role.SENDER: {"drive"}, Role.RECEIVER: {"mavlink"}}, "a drone does not drive"
     operator = RecordingOperator()
     with field.open(cast, seed=1, sink=lambda event: None, operator=operator) as lab:
         lab.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("5m")))

@@ -1,6 +1,7 @@
 """The harness works without `fieldkit.motion` and `fieldkit.ros`: its tests pass in a copy without them."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,8 @@ from typing import Final
 
 import pytest
 
-from tests.helpers.casts import PLAIN
+from fieldkit.config import schema
+from tests.helpers.casts import PLAIN, los_plan
 from tests.helpers.outside_packages import write_package
 from tests.helpers.paths import ROOT
 
@@ -19,6 +21,8 @@ PACKAGES: Final = ("fieldkit.motion", "fieldkit.ros")
 LIMIT_S: Final = 300.0
 COPIED: Final = ("fieldkit", "sim_backends", "tests", "robots", "procedures", "pyproject.toml")
 REMOVED: Final = ("fieldkit/motion", "fieldkit/ros", "tests/motion", "tests/ros")
+SECTIONS: Final = re.compile(r"^(drive|mavlink):.*\n(?:[ \t].*\n)*", re.MULTILINE)
+"""Sections of shipped profiles that the package defines, with the lines below them."""
 HARNESS_TESTS: Final = (
     "tests/analysis/test_analysis_compare.py",
     "tests/analysis/test_expectations.py",
@@ -74,7 +78,7 @@ def entry_points() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the repository without the packages, with metadata as after an installation."""
+    """A copy of the repository without the packages and its sections, with metadata as after an installation."""
     folder = tmp_path_factory.mktemp("border")
     for name in COPIED:
         if (ROOT / name).is_dir():
@@ -83,6 +87,8 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copy(ROOT / name, folder)
     for name in REMOVED:
         shutil.rmtree(folder / name)
+    for path in (folder / "robots").glob("*.yaml"):
+        path.write_text(SECTIONS.sub("", path.read_text(encoding="utf-8")), encoding="utf-8")
     write_package(folder, "fieldkit", "\n".join(entry_points()), version="0.1.0")
     return folder
 
@@ -123,6 +129,47 @@ def test_a_kind_of_a_removed_package_is_reported(copy: Path, tmp_path: Path, kin
     assert done.returncode == 2
     assert f"unknown key {kind}" in done.stderr
     assert "other kinds of step need a package that is not installed" in " ".join(done.stderr.split())
+
+
+# The robots of the default lab.
+@pytest.mark.parametrize(("profile", "key"), [("turtlebot3_burger", "drive"), ("duckiedrone", "mavlink")])
+def test_a_profile_with_a_section_of_the_removed_package_is_refused(
+    copy: Path, tmp_path: Path, profile: str, key: str
+) -> None:
+    (tmp_path / "robots").mkdir()
+    shutil.copy(ROOT / "robots" / f"{profile}.yaml", tmp_path / "robots")
+    done = run(copy, "fieldkit", "trial", "los", "30ft", "--dry-run", folder=tmp_path)
+    assert done.returncode == 2, done.stdout
+    message = f"unknown key {key}; it needs the package fieldkit.motion, which is not installed"
+    assert message in " ".join(done.stderr.split())
+
+
+def test_a_stored_trial_with_such_a_profile_is_refused(copy: Path, tmp_path: Path) -> None:
+    plan = los_plan()
+    trial = tmp_path / plan.trial
+    trial.mkdir()
+    (trial / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
+    for words in (("resume",), ("rebuild",)):
+        done = run(copy, "fieldkit", *words, str(trial), folder=tmp_path)
+        assert done.returncode == 2, done.stdout
+        assert "it needs the package fieldkit.motion" in " ".join(done.stderr.split())
+
+
+def test_a_procedure_with_a_section_of_the_removed_package_is_refused(copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "procedures").mkdir()
+    text = (ROOT / "procedures" / "los.yaml").read_text(encoding="utf-8").replace("name: los", "name: guarded")
+    (tmp_path / "procedures" / "guarded.yaml").write_text(f"{text}on_abort: {{receiver: land}}\n", encoding="utf-8")
+    done = run(copy, "fieldkit", "trial", "guarded", "5m", "--dry-run", folder=tmp_path)
+    assert done.returncode == 2, done.stdout
+    message = "unknown key on_abort; it needs the package fieldkit.motion, which is not installed"
+    assert message in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize("command", ["trial", "resume", "campaign"])
+def test_the_permissions_of_the_removed_package_are_not_options(copy: Path, tmp_path: Path, command: str) -> None:
+    shown = run(copy, "fieldkit", command, "--help", folder=tmp_path).stdout
+    assert "--yes" in shown
+    assert "--allow-" not in shown
 
 
 def write_procedure(folder: Path, name: str, text: str) -> None:

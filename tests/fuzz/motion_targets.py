@@ -24,6 +24,7 @@ from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import drive_log
+from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps.driving import DriveLease
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
@@ -99,13 +100,13 @@ def _read_answer(data: bytes, place: Path) -> None:
 @cache
 def _demanding_procedure() -> Procedure:
     """Return a procedure whose steps have requirements of every kind."""
-    drone = next(role for role, robot in CAST.items() if robot.profile.mavlink is not None)
+    drone = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) is not None)
     return schema.validate(schema.parse(_DEMANDING_PROCEDURE.replace("ROLE", drone), source="needy.yaml"), Procedure)
 
 
 def _judge_needs(data: bytes, _: Path) -> None:
     """Judge every preflight query by the same input as its response."""
-    overrides = {"flies": True, "ros_master": CAST[Role.RELAY].address}
+    overrides = {"abilities": frozenset({"mavlink"}), "ros_master": CAST[Role.RELAY].address}
     demanding_cast = {role: robot.model_copy(update=overrides) for role, robot in CAST.items()}
     scene = replace(los_plan().scenes()[0], cast=demanding_cast)
     report, text = Report("robot"), data.decode(errors="replace")

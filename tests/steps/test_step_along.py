@@ -14,6 +14,7 @@ from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.kinds.wait import WaitStep
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST
+from tests.helpers.movers import driving_cast
 
 ENDS = "from: sender, to: receiver"
 TEXT = """\
@@ -64,10 +65,7 @@ def test_each_kind_lasts_as_long_as_the_path() -> None:
 def test_driving_robot_needs_time_for_turns() -> None:
     text = TEXT.replace("AWAY", "1m}, {left: 1m").replace("KIND: {KEYS}", "wait: {along: true}")
     turning = schema.validate(schema.parse(text, source="x.yaml"), Procedure)
-    drives = {
-        role: robot.model_copy(update={"drives": robot.profile.drive is not None}) for role, robot in CAST.items()
-    }
-    moved, driven = (list(turning.resolved(cast).walk())[-1].step for cast in (CAST, drives))
+    moved, driven = (list(turning.resolved(cast).walk())[-1].step for cast in (CAST, driving_cast(CAST)))
     assert isinstance(moved, WaitStep)
     assert isinstance(driven, WaitStep)
     assert moved.duration == 10.0

@@ -16,7 +16,7 @@ import pytest
 from fieldkit.backends.protocols import Robot
 from fieldkit.cli import main
 from fieldkit.config import schema
-from fieldkit.config.profiles import Limits, Mavlink, RobotProfile
+from fieldkit.config.profiles import Limits, RobotProfile
 from fieldkit.config.site import load_site
 from fieldkit.core import runtime
 from fieldkit.core.columns import step_prefixed
@@ -26,6 +26,7 @@ from fieldkit.core.model import Role, Topology, Verdict
 from fieldkit.core.prompts import UNATTENDED
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.motion.profile_sections import Mavlink
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import kinds
@@ -217,7 +218,7 @@ def cast_of(backend: EmulatedBackend) -> dict[Role, Robot]:
     cast = backend.cast(Topology.MASTERLESS)
     return {
         role: robot.model_copy(
-            update={"flies": True, "drives": False, "profile": robot.profile.model_copy(update=FLYING)}
+            update={"abilities": frozenset({"mavlink"}), "profile": robot.profile.model_copy(update=FLYING)}
         )
         for role, robot in cast.items()
     }
@@ -339,7 +340,7 @@ def every_job() -> list[tuple[str, str]]:
     """Return each kind with each of its own jobs."""
     # As the robots of the bench, which use the built-in ROS.
     cast = {
-        role: robot.model_copy(update={"drives": False})
+        role: robot.model_copy(update={"abilities": robot.abilities - {"drive"}})
         for role, robot in cast_of(EmulatedBackend(None, None)).items()
     }
     pairs = []

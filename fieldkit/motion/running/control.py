@@ -2,7 +2,6 @@
 
 from typing import Final
 
-from fieldkit.motion.running.guards import guarded
 from fieldkit.motion.running.permission import MotionPermission, demand_one_place
 from fieldkit.trial.running.motion_control import MotionSupport
 
@@ -12,7 +11,6 @@ class MotionControl:
 
     demand_one_place = staticmethod(demand_one_place)
     permission = MotionPermission
-    guarded = staticmethod(guarded)
 
 
 CONTROL: Final[MotionSupport] = MotionControl()

@@ -10,13 +10,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 from fieldkit.core.model import sort_roles
+from fieldkit.motion.abort_actions import AbortActions
 from fieldkit.motion.steps import piloting
 from fieldkit.steps.scene import Scene, Shells
 from fieldkit.trial.plan import Plan
 
 
 @contextmanager
-def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
+def guarded(actions: AbortActions, plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
     """Guard every drone of `on_abort` that no step flies while the body runs.
 
     Raises:
@@ -24,7 +25,7 @@ def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
         RobotError: A guard did not start, for example because the autopilot does not answer.
     """
     with ExitStack() as stack:
-        for role in sort_roles(set(plan.procedure.on_abort) - plan.procedure.moved()):
+        for role in sort_roles(actions.guarded_roles(plan)):
             job = piloting.guard(scene, role, f"{role}-guard")
             body_s = plan.procedure.expected_s(scene.protocol)
             stack.enter_context(piloting.guarding(scene, shells[role], job, body_s=body_s))

@@ -15,10 +15,10 @@ from typing import Annotated, Final
 from fieldkit.config.schema import Codec, Field
 from fieldkit.core import jsonl, laptop_files
 from fieldkit.core.errors import FieldkitError, MotionHeldError, shell_command
-from fieldkit.core.model import MotionOrigin, Placement, Role, Topology
+from fieldkit.core.model import Placement, Role, Topology
 from fieldkit.core.text import shorten
+from fieldkit.motion.origins import MotionOrigin, RobotMotion
 from fieldkit.steps.motions import STOPPED
-from fieldkit.steps.origins import RobotMotion
 
 MOTION_FILE: Final = laptop_files.MOTION
 

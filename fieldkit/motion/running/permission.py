@@ -10,10 +10,13 @@ from fieldkit.backends.protocols import Attended, Backend, Testbed, Transient
 from fieldkit.core.errors import ConfigurationError, MotionHeldError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Role
+from fieldkit.core.permissions import option
 from fieldkit.core.prompts import Operator, Question, Unattended
+from fieldkit.motion import permissions
+from fieldkit.motion.origins import MemoryOrigins, Origins
+from fieldkit.motion.profile_sections import drives, flies
 from fieldkit.motion.running import motion_journal
 from fieldkit.motion.running.motion_journal import KeptOrigins, MotionJournal
-from fieldkit.steps.origins import MemoryOrigins, Origins
 from fieldkit.trial.plan import Plan
 
 CONFIRM: Final = "confirm"
@@ -40,7 +43,7 @@ def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator
 
 def _self_moving(plan: Plan) -> tuple[Role, ...]:
     moved = plan.procedure.moved()
-    return tuple(role for role, robot in plan.cast.items() if role in moved and (robot.drives or robot.flies))
+    return tuple(role for role, robot in plan.cast.items() if role in moved and (drives(robot) or flies(robot)))
 
 
 class MotionPermission:
@@ -67,7 +70,7 @@ class MotionPermission:
             self.origins = MemoryOrigins()
             return
         self._journal = MotionJournal(motion_journal.journal_of(folder))
-        allowed = isinstance(testbed, Attended) and testbed.allow_motion_after_fault
+        allowed = isinstance(testbed, Attended) and permissions.MOVE_AFTER_FAULT in testbed.permissions
         robots = {role: robot.name for role, robot in plan.cast.items()}
         self.origins = self._kept = KeptOrigins(self._journal, folder, robots, plan.placement, may_return=allowed)
 
@@ -111,8 +114,8 @@ class MotionPermission:
     def _demand_confirmed(self, kept: KeptOrigins) -> None:
         testbed = self._testbed
         if isinstance(testbed, Attended):
-            if testbed.allow_motion_after_fault:
-                self._journal.confirm("--allow-motion-after-fault", at_place=False)
+            if permissions.MOVE_AFTER_FAULT in testbed.permissions:
+                self._journal.confirm(option(permissions.MOVE_AFTER_FAULT), at_place=False)
                 return
             stopped = "; ".join(f"{hold.robot}: {hold.reason}" for hold in self._journal.holds)
             names = " and ".join(hold.robot for hold in self._journal.holds)

@@ -11,15 +11,15 @@ from typing_extensions import override
 
 from fieldkit.agent import drive_plan
 from fieldkit.agent.drive_plan import DriveTask
-from fieldkit.backends.driven import topic_conflict
 from fieldkit.backends.protocols import Robot, Testbed
-from fieldkit.config.profiles import Drive
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError
-from fieldkit.core.model import MotionOrigin, Move
+from fieldkit.core.model import Move
 from fieldkit.core.text import JSON_ERRORS, shorten
 from fieldkit.motion.logs import drive_log
+from fieldkit.motion.origins import MotionOrigin, RobotMotion, origins_of
+from fieldkit.motion.profile_sections import Drive, drive_of
 from fieldkit.motion.steps import lease
 from fieldkit.motion.steps.lease import LeaseKeeper, orders_file
 from fieldkit.motion.steps.robot_mover import RobotMover
@@ -29,7 +29,6 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.ros.middlewares.middleware import MiddlewareName
 from fieldkit.steps import agent_commands
-from fieldkit.steps.origins import RobotMotion
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
 
 ODOMETRY_S: Final = 0.5
@@ -120,7 +119,8 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
             f"its fence is {limits.fence_m:g} m from its place, but its path leads {farthest_m:g} m away",
             "shorten the path in the procedure, or increase limits.fence_m in its profile if the area allows it",
         )
-    if why := topic_conflict(robot, scene.cast.values()):
+    drive = drive_of(robot.profile)
+    if drive is not None and (why := drive.topic_conflict(robot, scene.cast.values())):
         remedy = "give each robot its own topics, ROS domain or master; or move it by hand: without --allow-motion"
         yield Refusal(move.role, why, remedy)
 
@@ -136,22 +136,23 @@ def _drive(robot: Robot) -> Drive:
     Raises:
         RobotError: The profile has no such section.
     """
-    if robot.profile.drive is None:
+    if (drive := drive_of(robot.profile)) is None:
         raise RobotError(
             "it cannot be driven", where=robot.name, remedy="add drive: and limits.fence_m to its profile"
         )
-    return robot.profile.drive
+    return drive
 
 
 def _origin(scene: Scene, move: Move) -> dict[str, Any]:
     """Return the keys of a drive task that depend on the origin of the robot in this trial."""
-    origin, last = scene.origins.get(move.role), scene.origins.last(move.role)
-    if origin is None or not scene.origins.robots_stay:
+    origins = origins_of(scene)
+    origin, last = origins.get(move.role), origins.last(move.role)
+    if origin is None or not origins.robots_stay:
         return {}
     places = {"origin": (origin.x_m, origin.y_m, origin.heading_rad)}
     if last is not None:
         places["last"] = (last.x_m, last.y_m, last.heading_rad)
-    return {**places, "frame_id": origin.frame_id, "may_return": scene.origins.may_return}
+    return {**places, "frame_id": origin.frame_id, "may_return": origins.may_return}
 
 
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
@@ -325,13 +326,13 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
         OSError: The journal of motions cannot be written; the robot does not start.
     """
     shell, robot = testbed.shells[move.role], scene.robot(move.role)
-    lease_s = robot.profile.drive.lease if robot.profile.drive else 0.0
+    lease_s = _drive(robot).lease
     mover = RobotMover(robot.name, shell, scene.folder, f"it stops automatically within {lease_s:g} s")
     drive_lease = DriveLease(shell, plan.job, name, lease_s)
     with scene.motions.moving(mover), lease.start_program(shell, plan.job), drive_lease, ExitStack() as stack:
         try:
             _commit(scene, drive_lease, move)
-            motion = stack.enter_context(scene.origins.moving(move.role))
+            motion = stack.enter_context(origins_of(scene).moving(move.role))
         except BaseException:
             _end(shell, plan.job)
             raise
@@ -342,7 +343,7 @@ def _commit(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
     """Wait until a robot is stationary at its place, and record its origin before its first start there."""
     drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.end_state, Deadline.after(_START_S))
     if drive_lease.is_refused:
-        scene.origins.refuse(move.role, drive_lease.end_state)
+        origins_of(scene).refuse(move.role, drive_lease.end_state)
         raise MotionHeldError(
             f"it does not start: {drive_lease.end_state}",
             where=scene.robot(move.role).name,
@@ -351,11 +352,11 @@ def _commit(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
     drive_lease.check_running()
     if not drive_lease.is_ready:
         raise drive_lease.failure(f"it was not stationary for {_START_S:g} s")
-    if scene.origins.robots_stay and scene.origins.get(move.role) is None:
+    if origins_of(scene).robots_stay and origins_of(scene).get(move.role) is None:
         pose = drive_lease.pose
         if pose is None:
             raise drive_lease.failure("its driver does not report its position")
-        scene.origins.record(move.role, pose)
+        origins_of(scene).record(move.role, pose)
 
 
 def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
@@ -364,7 +365,7 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
     """Drive a robot out while the body runs, and back; see `driven`."""
 
     def bring_back() -> str:
-        why_ended = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not scene.origins.robots_stay)
+        why_ended = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not origins_of(scene).robots_stay)
         if why_ended == drive_log.HOME:
             motion.mark_ended(drive_lease.pose)
         elif drive_lease.status.get("ended"):

@@ -13,10 +13,13 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
-from fieldkit.core.model import Control, OnAbort, Protocol, Role
+from fieldkit.core.model import Control, Protocol, Role
 from fieldkit.core.units import format_duration
 from fieldkit.measure.evidence import reading
+from fieldkit.motion.abort_actions import OnAbort, abort_of
 from fieldkit.motion.logs import fly_checks, fly_log, motion_sources
+from fieldkit.motion.origins import origins_of
+from fieldkit.motion.profile_sections import flies, mavlink_of
 from fieldkit.motion.steps import piloting
 from fieldkit.motion.steps.arming_need import arming_need
 from fieldkit.motion.steps.flight_alarm import alarmed
@@ -145,12 +148,13 @@ class FlyStep(Nest):
         return self._farthest_m / self.speed + self._highest_m / _SLOWEST_M_S
 
     def _plan(self, scene: Scene) -> FlightPlan:
-        limits, mavlink = scene.robot(self.robot).profile.limits, scene.robot(self.robot).profile.mavlink
-        origin = scene.origins.get(self.robot)
+        profile = scene.robot(self.robot).profile
+        limits, mavlink = profile.limits, mavlink_of(profile)
+        origin = origins_of(scene).get(self.robot)
         return FlightPlan(
             connection=piloting.connection(scene.robot(self.robot)),
             orders=orders_file(self.prefixed_name("fly")),
-            abort=piloting.abort_of(scene, self.robot).value,
+            abort=abort_of(scene, self.robot).value,
             lease_s=self.lease,
             end=self.then.value,
             height_m=self.height,
@@ -183,7 +187,7 @@ class FlyStep(Nest):
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        if scene.robot(self.robot).profile.mavlink is not None:  # otherwise `refusals` reports it
+        if mavlink_of(scene.robot(self.robot).profile) is not None:  # otherwise `refusals` reports it
             yield self._guard(scene)
             yield self._pilot(scene)
         yield from self.inside(scene)
@@ -197,7 +201,7 @@ class FlyStep(Nest):
         yield from super().dry_run_notes(scene)
 
     def _abort_action(self, scene: Scene) -> str:
-        return {"return": "returns automatically", "land": "lands"}[piloting.abort_of(scene, self.robot)]
+        return {"return": "returns automatically", "land": "lands"}[abort_of(scene, self.robot)]
 
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:
@@ -211,9 +215,9 @@ class FlyStep(Nest):
         """Yield a reason for each limit of the profile that the flight exceeds or that is missing."""
         profile, name = scene.robot(self.robot).profile, scene.robot(self.robot).profile.name
         limits = profile.limits
-        if profile.mavlink is None:
+        if mavlink_of(profile) is None:
             yield Refusal(self.robot, "it cannot fly: its profile has no mavlink", "use a drone in this role")
-        elif not scene.robot(self.robot).flies:
+        elif not flies(scene.robot(self.robot)):
             remedy = "--allow-motion, if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
             yield Refusal(self.robot, "it is a real drone, and flights are not allowed", remedy)
         for quantity, planned_m, limit_m, key in (
@@ -246,7 +250,7 @@ class FlyStep(Nest):
         """Yield the checks of the connection to the autopilot, and that it can be armed for this flight."""
         robot = scene.robot(self.robot)
         if (
-            robot.profile.mavlink is not None and robot.profile.limits.max_height_m is not None
+            mavlink_of(robot.profile) is not None and robot.profile.limits.max_height_m is not None
         ):  # otherwise `refusals` reports it
             plan = self._plan(scene)
             yield link_need(robot, self.robot, plan.connection, ("pilot", "guard"))
@@ -282,7 +286,7 @@ class FlyStep(Nest):
         """Give the orders of the flight; the origin is stored before the first one that moves the drone."""
         name = scene.robot(self.robot).name
         self._wait_for_start(scene, flight)
-        with scene.origins.moving(self.robot) as motion:
+        with origins_of(scene).moving(self.robot) as motion:
             announce(f"take off with {name}", self._climb_s)
             flight.give_order(CLIMB)
             flight.wait_for("up", self._climb_s + _SLACK_S)
@@ -300,10 +304,10 @@ class FlyStep(Nest):
             flight.wait_for("standing", STANDS_S)
         except RobotError as error:
             if flight.is_misplaced:
-                scene.origins.refuse(self.robot, error.what)
+                origins_of(scene).refuse(self.robot, error.what)
             raise
-        if scene.origins.get(self.robot) is None:
-            scene.origins.record(self.robot, flight.origin())
+        if origins_of(scene).get(self.robot) is None:
+            origins_of(scene).record(self.robot, flight.origin())
 
     @override
     def moves(self) -> frozenset[Role]:

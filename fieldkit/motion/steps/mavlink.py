@@ -21,6 +21,7 @@ from fieldkit.measure.positions.position_sources import GAP_S, Account, Accounts
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import motion_sources, tlog
 from fieldkit.motion.logs.tlog import GLOBAL, LOCAL, Tlog
+from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps.link_need import link_need
 from fieldkit.remote import agent
 from fieldkit.remote.jobs import Job
@@ -150,7 +151,7 @@ class MavlinkStep(Nest):
             ConfigurationError: The profile of the robot has no `mavlink`.
         """
         robot = scene.robot(self.robot)
-        if (mavlink := robot.profile.mavlink) is None:
+        if (mavlink := mavlink_of(robot.profile)) is None:
             raise ConfigurationError(
                 f"telemetry of {robot.name} cannot be recorded: its profile {robot.profile.name} has no mavlink",
                 remedy="write mavlink: {port: 14550} in the profile, or name another robot in the step mavlink",
@@ -227,7 +228,7 @@ class MavlinkStep(Nest):
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
         """Yield the telemetry, if another robot records it over the radio."""
-        mavlink = scene.robot(self.robot).profile.mavlink
+        mavlink = mavlink_of(scene.robot(self.robot).profile)
         if self.recorder != self.robot and mavlink is not None:
             frames = self._messages(scene)
             yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, served=True)

@@ -15,6 +15,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.positions import position_columns
 from fieldkit.motion.logs import drive_checks, drive_log, motion_sources
+from fieldkit.motion.profile_sections import drive_of, drives
 from fieldkit.motion.steps import driving
 from fieldkit.motion.steps.lease import run_inside
 from fieldkit.ros.streams import stream_options
@@ -76,7 +77,7 @@ class MoveStep(Nest):
             if fence_m is not None and geometry.farthest_m(legs) > fence_m:
                 margin_m = min(_FENCE_MARGIN_M, fence_m / 2)
                 path = tuple(filter(None, map(PathLeg.of, geometry.clip_path(legs, fence_m - margin_m)))) or path
-        update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or robot.drives}
+        update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or drives(robot)}
         step = self.model_copy(update=update)
         return super(MoveStep, step).resolved(cast, step.path_s(robot))
 
@@ -109,12 +110,12 @@ class MoveStep(Nest):
 
     def path_s(self, robot: Robot) -> float:
         """Return the duration of the path in seconds, including turns if the robot drives automatically."""
-        return driving.path_duration_s(robot, self.motion) if robot.drives else self.straight_s
+        return driving.path_duration_s(robot, self.motion) if drives(robot) else self.straight_s
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         """Yield the job that drives the robot, unless the testbed moves it, and the jobs of the steps inside."""
-        if scene.robot(self.robot).drives:
+        if drives(scene.robot(self.robot)):
             yield self._driving(scene)
         yield from self.inside(scene)
 
@@ -136,8 +137,7 @@ class MoveStep(Nest):
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         robot = scene.robot(self.robot)
         driving_note = ""
-        if robot.drives and robot.profile.drive is not None:
-            drive = robot.profile.drive
+        if (drive := drive_of(robot.profile)) is not None and drives(robot):
             driving_note = (
                 f", and back, automatically: velocities on {drive.topic}, odometry of {drive.odometry}; it stops if "
                 f"the laptop is silent for {drive.lease:g} s, and {robot.profile.limits.fence_m:g} m from its place"
@@ -148,7 +148,7 @@ class MoveStep(Nest):
 
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:
-        if scene.robot(self.robot).drives:
+        if drives(scene.robot(self.robot)):
             yield f"{scene.robot(self.robot).name} stops where it is"
         yield from super().abort_notes(scene)
 
@@ -164,7 +164,7 @@ class MoveStep(Nest):
                 "reduce the speed in the procedure, or write within_limits: true; the limit is "
                 "limits.max_speed_m_s in its profile",
             )
-        if robot.drives:
+        if drives(robot):
             yield from driving.refusals(scene, self.motion)
         yield from super().refusals(scene)
 
@@ -172,7 +172,7 @@ class MoveStep(Nest):
     def bytes_left(self, scene: Scene, role: Role) -> float:
         """Return the size of the log of a driving robot, which covers path, steps inside and the return."""
         robot = scene.robot(role)
-        if role != self.robot or not robot.drives or robot.profile.drive is None:
+        if role != self.robot or not drives(robot) or drive_of(robot.profile) is None:
             return 0.0
         return _LOG_BYTES_PER_S * (2 * self.path_s(robot) + self.inside_s(scene.protocol))
 
@@ -180,14 +180,14 @@ class MoveStep(Nest):
     def needs(self, scene: Scene) -> Iterator[Need]:
         """Yield the check of the middleware's Python package for a robot that drives automatically."""
         robot = scene.robot(self.robot)
-        if robot.drives:
+        if drives(robot):
             yield stream_options.need(self.robot, robot, driving.middleware_of(robot))
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         robot = scene.robot(self.robot)
         announce(f"move {robot.name}", None)
-        if robot.drives:
+        if drives(robot):
             with driving.driven(scene, testbed, self._driving(scene), self.motion, self._name_pattern) as drive_lease:
                 run_inside(self, drive_lease, scene, testbed, announce)
                 announce(f"drive {robot.name} back", self.path_s(robot))
@@ -213,7 +213,7 @@ class MoveStep(Nest):
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the log of the drive is damaged or contradicts the plan."""
-        if not (self.driven and view.scene.robot(self.robot).drives):
+        if not (self.driven and drives(view.scene.robot(self.robot))):
             return
         try:
             log = view.evidence.read(drive_log.read, self._log)

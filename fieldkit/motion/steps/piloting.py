@@ -18,8 +18,11 @@ from fieldkit.agent.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Control, MotionOrigin, OnAbort, Role
+from fieldkit.core.model import Control, Role
 from fieldkit.core.text import JSON_ERRORS, shorten
+from fieldkit.motion.abort_actions import abort_of
+from fieldkit.motion.origins import MotionOrigin
+from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps import lease
 from fieldkit.motion.steps.lease import LeaseKeeper, orders_file
 from fieldkit.motion.steps.robot_mover import RobotMover
@@ -54,11 +57,11 @@ def connection(robot: Robot) -> str:
     Raises:
         ConfigurationError: Its profile has no `mavlink`.
     """
-    if robot.profile.mavlink is None:
+    if (mavlink := mavlink_of(robot.profile)) is None:
         raise ConfigurationError(
             "it cannot fly: its profile has no mavlink", where=robot.name, remedy="use a drone in this role"
         )
-    return robot.profile.mavlink.onboard_connection
+    return mavlink.onboard_connection
 
 
 def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: float) -> Planned:
@@ -298,8 +301,3 @@ def leased_program(
         if code != 0:
             flight.renew()
             raise flight.failure(flight.end_reason or f"{program.job.name} ended with exit code {code}")
-
-
-def abort_of(scene: Scene, role: Role) -> OnAbort:
-    """Return the action of a drone if the attempt is aborted."""
-    return scene.on_abort.get(role, OnAbort.LAND)

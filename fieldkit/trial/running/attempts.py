@@ -18,7 +18,6 @@ from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.motions import STOPPED, Motions
-from fieldkit.steps.origins import Origins
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import gates, hosts, size, store
 from fieldkit.trial.gates import EvidenceVerdict
@@ -40,7 +39,7 @@ class Attempts:
         variants: The tools of each robot.
         sink: Receives the start of each phase.
         motions: The robots that move without a person.
-        origins: Origins of these robots.
+        origins: See `Scene.origins`.
     """
 
     def __init__(
@@ -53,7 +52,7 @@ class Attempts:
         variants: Mapping[Role, Variants],
         sink: Sink,
         motions: Motions,
-        origins: Origins,
+        origins: object,
     ) -> None:
         self._plan = plan
         self._folder = folder

@@ -1,30 +1,28 @@
 """What surrounds trials in which robots move by themselves: the interface of the package that moves them.
 
 The package is found by the entry point `control` of the group `fieldkit.motion`, and imported only for trials in
-which robots move or a drone has an action on abort.
+which robots move.
 """
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from fieldkit.backends.protocols import Backend, Testbed
 from fieldkit.core import laptop_files, plugins
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Sink
 from fieldkit.core.prompts import Operator
-from fieldkit.steps.origins import MemoryOrigins, Origins
-from fieldkit.steps.scene import Scene, Shells
 from fieldkit.trial.plan import Plan
 
 
-class Permission(Protocol):
-    """Permission of the robots of a trial to move."""
+class MotionClearance(Protocol):
+    """Permission of the robots of a trial to move, checked before each attempt."""
 
     @property
-    def origins(self) -> Origins:
-        """Origins of the robots, for the steps."""
+    def origins(self) -> object:
+        """The object that the steps get as `Scene.origins`."""
         ...
 
     def demand(self) -> None:
@@ -53,7 +51,7 @@ class MotionSupport(Protocol):
         """
         ...
 
-    def permission(self, plan: Plan, testbed: Testbed, folder: Path) -> Permission:
+    def permission(self, plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
         """Return the permission of the robots of a trial to move.
 
         Raises:
@@ -61,21 +59,11 @@ class MotionSupport(Protocol):
         """
         ...
 
-    def guarded(self, plan: Plan, scene: Scene, shells: Shells) -> AbstractContextManager[None]:
-        """Guard every drone of `on_abort` that no step flies while the body runs.
-
-        Raises:
-            LinkError: A robot did not answer.
-            RobotError: A guard did not start.
-        """
-        ...
-
 
 class _Unmoved:
     """Permission of a trial in which no robot moves."""
 
-    def __init__(self) -> None:
-        self.origins: Origins = MemoryOrigins()
+    origins: Final = None
 
     def demand(self) -> None:
         """Allow the attempt."""
@@ -92,21 +80,11 @@ def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator
         _control().demand_one_place(plans, backend, operator)
 
 
-def permission(plan: Plan, testbed: Testbed, folder: Path) -> Permission:
+def permission(plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
     """Return the permission of a trial; raises as `MotionSupport.permission`."""
     # A campaign without moves in this trial may have a robot that a fault stopped in another one.
     has_journal = any((place / laptop_files.MOTION).exists() for place in (folder, folder.parent))
     return _control().permission(plan, testbed, folder) if plan.procedure.moved() or has_journal else _Unmoved()
-
-
-@contextmanager
-def guarded(plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
-    """Run the body within `MotionSupport.guarded` if the procedure has actions on abort."""
-    if not plan.procedure.on_abort:
-        yield
-        return
-    with _control().guarded(plan, scene, shells):
-        yield
 
 
 def _control() -> MotionSupport:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.core import plugins
+from fieldkit.core import permissions, plugins
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.trial import store
 from fieldkit.trial.hashes import code_hash
@@ -64,14 +64,15 @@ def demand_cast(plan: Plan, cast: Cast) -> None:
     for role, robot in plan.cast.items():
         current = cast.get(role)
         is_moved = role in plan.procedure.moved()
-        if current and is_moved and (robot.drives > current.drives or robot.flies > current.flies):
+        if current and is_moved and robot.abilities - current.abilities:
+            options = " ".join(map(permissions.option, permissions.repeated(permissions.installed())))
             raise ConfigurationError(
                 f"{robot.name} moved without a person in this trial, and may not now",
                 where=plan.trial,
-                remedy="give --allow-motion again, or start a new trial in which a person moves it",
+                remedy=f"give {options} again, or start a new trial in which a person moves it",
             )
         # Permission to move does not matter in a trial that does not move the robot.
-        if current is None or current.model_copy(update={"drives": robot.drives, "flies": robot.flies}) != robot:
+        if current is None or current.model_copy(update={"abilities": robot.abilities}) != robot:
             raise ConfigurationError(
                 f"{role} was {robot.name} ({robot.address}, {robot.profile.name}); the site file now differs",
                 where=plan.trial,

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
@@ -31,7 +31,7 @@ from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.owners import FileOwners
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import locks, motion_control, step_errors
+from fieldkit.trial.running import locks, step_errors
 
 T = TypeVar("T")
 
@@ -120,7 +120,9 @@ class Robots:
             )
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
-        with self._watched(), motion_control.guarded(self._plan, scene, self.shells):
+        with self._watched(), ExitStack() as stack:
+            for section in self._plan.procedure.sections.values():
+                stack.enter_context(section.around_steps(self._plan, scene, self.shells))
             for entry in self._plan.procedure.steps:
                 with step_errors.reported(entry.kind, scene.laptop_folder):
                     entry.step.run(scene, self._testbed, announce)

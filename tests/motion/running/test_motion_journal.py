@@ -13,8 +13,9 @@ from fieldkit.agent.drive_plan import BACK, OUT, START_M, DriveTask
 from fieldkit.agent.steering import Driver, DriveVelocity, OdometryPose
 from fieldkit.core import laptop_files
 from fieldkit.core.errors import MotionHeldError
-from fieldkit.core.model import Distance, MotionOrigin, Placement, Role, Scenario, Topology
+from fieldkit.core.model import Distance, Placement, Role, Scenario, Topology
 from fieldkit.motion.logs import drive_checks
+from fieldkit.motion.origins import MotionOrigin
 from fieldkit.motion.running.motion_journal import MOTION_FILE, KeptOrigins, MotionEvent, MotionJournal, journal_of
 
 ORIGIN = MotionOrigin("odometry", "boot", 1.0, 2.0, 0.5)

@@ -18,6 +18,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.motion.profile_sections import drive_of
 from fieldkit.motion.steps import driving
 from fieldkit.motion.steps.driving import DriveLease
 from fieldkit.motion.steps.move import MoveStep
@@ -28,8 +29,9 @@ from fieldkit.steps.scene import Scene
 from fieldkit.steps.view import View
 from tests.helpers.casts import CAST, TURTLEBOT, ros_of
 from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.movers import driving_cast
 
-DRIVES = {role: robot.model_copy(update={"drives": robot.profile.drive is not None}) for role, robot in CAST.items()}
+DRIVES = driving_cast(CAST)
 SCENE = Scene(Protocol.TCP, DRIVES, "f")
 LEASE_S = 0.05
 PING = "during: [{ping: {from: sender, to: receiver}}]"
@@ -258,11 +260,11 @@ def stopped(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def quick_scene() -> Scene:
     """Return the scene with a short lease."""
-    profile = TURTLEBOT.model_copy(
-        update={"drive": TURTLEBOT.drive and TURTLEBOT.drive.model_copy(update={"lease": LEASE_S})}
-    )
-    cast_of = {**DRIVES, Role.RECEIVER: Robot(name="r", address="10.0.0.1", profile=profile, drives=True)}
-    return replace(SCENE, cast=cast_of)
+    drive = drive_of(TURTLEBOT)
+    assert drive is not None
+    profile = TURTLEBOT.model_copy(update={"drive": drive.model_copy(update={"lease": LEASE_S})})
+    robot = Robot(name="r", address="10.0.0.1", profile=profile, abilities=frozenset({"drive"}))
+    return replace(SCENE, cast={**DRIVES, Role.RECEIVER: robot})
 
 
 def driven(field: Field, body: Any) -> None:  # noqa: ANN401

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from fieldkit.config import schema
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import OnAbort, Protocol, Role, Verdict
+from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.motion.abort_actions import ON_ABORT, AbortActions, OnAbort
+from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps import arming_need
 from fieldkit.motion.steps.fly import FlyStep
 from fieldkit.steps.scene import CommandResult, Scene
@@ -19,8 +21,8 @@ from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST, los_plan
 
 DURING = "during: [{wait: {duration: 1s}}]"
-DRONE = next(role for role, robot in CAST.items() if robot.profile.mavlink is not None)
-PERMITTED = {role: robot.model_copy(update={"flies": True}) for role, robot in CAST.items()}
+DRONE = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) is not None)
+PERMITTED = {role: robot.model_copy(update={"abilities": frozenset({"mavlink"})}) for role, robot in CAST.items()}
 SCENE = Scene(Protocol.TCP, PERMITTED, "f")
 LOW = '{"what": "its battery has 10%", "remedy": "charge it", "grave": true}'
 MODE = '{"what": "PX4 refuses to be armed", "remedy": "remove the cause", "grave": false}'
@@ -74,7 +76,7 @@ def test_flight_is_refused_exactly_if_it_exceeds_a_limit(
 
 
 def test_robot_without_autopilot_is_refused() -> None:
-    ground = next(role for role, robot in CAST.items() if robot.profile.mavlink is None)
+    ground = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) is None)
     reasons = refused(f"robot: {ground}, height: 1m")
     assert reasons[0] == "it cannot fly: its profile has no mavlink"
     assert "its profile has no limit for the height" in reasons
@@ -163,7 +165,7 @@ steps: [{ping: {from: sender, to: receiver}}]
     assert caught.value.where == "x.yaml:7"
     procedure = schema.validate(schema.parse(text.replace("ROLE", "sender"), source="x.yaml"), Procedure)
     plan = los_plan().model_copy(update={"procedure": procedure})
-    assert plan.cast[Role.SENDER].profile.mavlink is None
+    assert mavlink_of(plan.cast[Role.SENDER].profile) is None
     (refusal,) = plan.refusals({})
     assert re.search("no mavlink", refusal.what)
 
@@ -173,6 +175,6 @@ def test_abort_notes_describe_the_action() -> None:
     assert list(flight.abort_notes(SCENE)) == [
         f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, also after fieldkit has exited"
     ]
-    returns = Scene(Protocol.TCP, PERMITTED, "f", on_abort={DRONE: OnAbort.RETURN})
+    returns = Scene(Protocol.TCP, PERMITTED, "f", sections={ON_ABORT: AbortActions({DRONE: OnAbort.RETURN})})
     (note,) = flight.abort_notes(returns)
     assert "returns automatically" in note

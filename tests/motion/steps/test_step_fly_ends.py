@@ -17,7 +17,9 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
-from fieldkit.core.model import OnAbort, Protocol, Role
+from fieldkit.core.model import Protocol, Role
+from fieldkit.motion.abort_actions import ON_ABORT, AbortActions, OnAbort
+from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps.fly import FlyStep
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.shell import Completed
@@ -70,14 +72,18 @@ def fly(
 ) -> None:
     """Fly a drone at a UDP port or a connection; call `begun` when a step inside starts."""
     connection = where if isinstance(where, str) else f"udpout:127.0.0.1:{where}"
-    assert DUCKIEDRONE.mavlink is not None
+    mavlink = mavlink_of(DUCKIEDRONE)
+    assert mavlink is not None
     update = {
         "ros": None,
         "tools": DUCKIEDRONE.tools.model_copy(update={"python": sys.executable}),
-        "mavlink": DUCKIEDRONE.mavlink.model_copy(update={"connection": connection}),
+        "mavlink": mavlink.model_copy(update={"connection": connection}),
     }
-    robot = Robot(name="drone", address="127.0.0.1", profile=DUCKIEDRONE.model_copy(update=update), flies=True)
-    scene = Scene(Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, on_abort={Role.RECEIVER: abort})
+    profile = DUCKIEDRONE.model_copy(update=update)
+    robot = Robot(name="drone", address="127.0.0.1", profile=profile, abilities=frozenset({"mavlink"}))
+    scene = Scene(
+        Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, sections={ON_ABORT: AbortActions({Role.RECEIVER: abort})}
+    )
     step = f"{{{FLIGHT}, during: [{{wait: {{duration: {waits}}}}}, {{wait: {{duration: {waits}}}}}]}}"
 
     def announce(name: str, _: float | None) -> None:

@@ -10,7 +10,6 @@ import pytest
 from pymavlink.dialects.v20 import common as d
 
 from fieldkit.config import schema
-from fieldkit.config.profiles import Mavlink
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
@@ -21,6 +20,7 @@ from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.positions.samples import WGS84
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import tlog_reader
+from fieldkit.motion.profile_sections import Mavlink
 from fieldkit.motion.steps.mavlink import MavlinkStep
 from fieldkit.steps.scene import Flow, Scene
 from fieldkit.steps.view import View

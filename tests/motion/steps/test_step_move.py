@@ -183,7 +183,7 @@ def test_shipped_procedure_with_shipped_profiles(
     profile: str, note: str, pings: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     loaded = load_profile(profile)
-    update = {"profile": loaded, "drives": loaded.drive is not None}
+    update = {"profile": loaded, "abilities": frozenset(loaded.sections) & {"drive"}}
     cast = {role: robot.model_copy(update=update) for role, robot in CAST.items()}
     request = TrialRequest(load_procedure("driveaway"), parse_distance("5m"))
     plan = make_plan(request, backend="field", cast=cast, now=datetime(2026, 11, 20, tzinfo=UTC))
@@ -192,7 +192,7 @@ def test_shipped_procedure_with_shipped_profiles(
     assert note in out
     assert f"-c {pings} -i 0.2" in out
     assert "refused" not in out
-    assert bool(plan.columns) == (loaded.drive is not None), "columns of the drive"
+    assert bool(plan.columns) == ("drive" in loaded.sections), "columns of the drive"
 
 
 def test_top_speed_is_the_default() -> None:
@@ -253,7 +253,7 @@ def test_shortened_path_is_valid_in_a_procedure(path: list[Leg], fence_m: float)
 
 def test_driving_robot_has_columns_and_time_for_the_return() -> None:
     text = f"robot: receiver, path: [{{away: 2m}}], speed: 0.2m/s, {PING}"
-    drives = {role: robot.model_copy(update={"drives": True}) for role, robot in CAST.items()}
+    drives = {role: robot.model_copy(update={"abilities": frozenset({"drive"})}) for role, robot in CAST.items()}
     driving, moved = resolved_move(text, drives), resolved_move(text)
     assert {column.name for column in driving.output_columns()} >= {
         "drive_out_m",

@@ -77,4 +77,4 @@ def driving(folder: Path, profiles: tuple[dict[str, str], dict[str, str]], site:
         write_profile(folder / "robots", name, changes)
     (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")
     cast = EmulatedBackend(*load_site(folder / "fieldkit.yaml")).cast(Topology.MASTER)
-    return {robot.name for robot in cast.values() if robot.drives}
+    return {robot.name for robot in cast.values() if "drive" in robot.abilities}

@@ -46,7 +46,7 @@ class Recorder:
 
     by_hand = False
     lab_bytes = 0
-    allow_motion = False
+    permissions: frozenset[str] = frozenset()
 
     def __init__(self, failing: Mapping[str, BaseException]) -> None:
         self.failing = dict(failing)

@@ -48,8 +48,10 @@ def test_other_robots_are_rejected(change: dict[str, str] | None) -> None:
 @pytest.mark.motion
 def test_a_self_moving_robot_needs_permission_again() -> None:
     shipped = load_procedure("driveaway")
-    driving = {role: robot.model_copy(update={"drives": True}) for role, robot in PLAN.cast.items()}
-    by_hand = {role: robot.model_copy(update={"drives": False}) for role, robot in PLAN.cast.items()}
+    driving = {
+        role: robot.model_copy(update={"abilities": frozenset({"drive"})}) for role, robot in PLAN.cast.items()
+    }
+    by_hand = {role: robot.model_copy(update={"abilities": frozenset()}) for role, robot in PLAN.cast.items()}
     plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
     resumption.demand_cast(plan, driving)
     with pytest.raises(ConfigurationError, match="moved without a person in this trial, and may not now") as caught:

@@ -1,10 +1,13 @@
 """Conflicts of ROS topics between robots that share a ROS master or a domain, and between those that do not."""
 
+from collections.abc import Iterable
+
 import pytest
 
-from fieldkit.backends.driven import topic_conflict
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import RobotProfile
+from fieldkit.motion.profile_sections import Drive, drive_of, mavlink_of
+from sim_backends.emulated import motion_sections
 from tests.helpers.casts import DUCKIEDRONE, TURTLEBOT, ros_of
 
 MASTER = "10.42.0.3"
@@ -12,6 +15,16 @@ MASTER = "10.42.0.3"
 
 def robot(name: str, profile: RobotProfile = TURTLEBOT, master: str = "") -> Robot:
     return Robot(name=name, address="10.42.0.9", profile=profile, ros_master=master)
+
+
+def drive_section(profile: RobotProfile) -> Drive:
+    drive = drive_of(profile)
+    assert drive is not None
+    return drive
+
+
+def conflict(one: Robot, others: Iterable[Robot]) -> str | None:
+    return drive_section(one.profile).topic_conflict(one, others)
 
 
 def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str | None = None) -> RobotProfile:
@@ -23,8 +36,7 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
     update: dict[str, object] = {"topics": topics}
     if domain is not None:
         update |= {"variant": "ros2", "environment": {"ROS_DOMAIN_ID": domain} if domain else {}}
-    assert TURTLEBOT.drive is not None
-    drive = TURTLEBOT.drive.model_copy(update={"topic": topic, "odometry": odometry})
+    drive = drive_section(TURTLEBOT).model_copy(update={"topic": topic, "odometry": odometry})
     return TURTLEBOT.model_copy(update={"drive": drive, "ros": ros.model_copy(update=update)})
 
 
@@ -42,16 +54,25 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
     ],
 )
 def test_conflicts_of_robots_with_one_master(other: Robot, why: str | None) -> None:
-    reason = topic_conflict(robot("one", master=MASTER), [other])
+    reason = conflict(robot("one", master=MASTER), [other])
     assert reason == why if why is None else reason is not None and reason.startswith(why)
 
 
 @pytest.mark.parametrize(("domain", "alone"), [("", False), ("0", False), ("7", True)])
 def test_conflicts_of_robots_with_ros2_domains(domain: str, alone: bool) -> None:
-    reason = topic_conflict(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
+    reason = conflict(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
     assert (reason is None) is alone
     assert alone or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
 
 
+def test_emulated_robots_implement_the_sections() -> None:
+    drive: motion_sections.DriveSection | None = drive_of(TURTLEBOT)
+    mavlink: motion_sections.MavlinkSection | None = mavlink_of(DUCKIEDRONE)
+    assert drive is not None
+    assert motion_sections.drive_of(TURTLEBOT) is drive
+    assert mavlink is not None
+    assert motion_sections.mavlink_of(DUCKIEDRONE) is mavlink
+
+
 def test_robots_with_separate_masters_have_no_conflict() -> None:
-    assert topic_conflict(robot("one"), [robot("other")]) is None
+    assert conflict(robot("one"), [robot("other")]) is None

@@ -1,10 +1,36 @@
-"""Origins of robots that move automatically, and the record of their motions: the interface for steps."""
+"""Origins of robots that move by themselves, and the record of their motions: the interface for steps."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Protocol, cast
 
-from fieldkit.core.model import MotionOrigin, Role
+from fieldkit.core.model import Role
+from fieldkit.steps.scene import Scene
+
+
+@dataclass(frozen=True)
+class MotionOrigin:
+    """Position and heading of a robot at its first start in a trial: centre of its fence, reference of directions.
+
+    Attributes:
+        frame: Frame of the coordinates: `odometry`, or `local` for MAVLink's LOCAL_POSITION_NED.
+        frame_id: Identifies one instance of that frame, for example by the boot ID of the robot. A frame that was
+            lost and created again has another one.
+        x_m: x of `nav_msgs/Odometry`, or metres north.
+        y_m: y of `nav_msgs/Odometry`, or metres east.
+        heading_rad: Heading from x towards y: counterclockwise in `odometry`, clockwise in `local`.
+        latitude_deg: Latitude (WGS 84); None if unknown.
+        longitude_deg: Longitude (WGS 84); None if unknown.
+    """
+
+    frame: str
+    frame_id: str
+    x_m: float
+    y_m: float
+    heading_rad: float
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
 
 
 class RobotMotion:
@@ -110,3 +136,8 @@ class MemoryOrigins:
     def moving(self, role: Role) -> Iterator[RobotMotion]:  # noqa: ARG002 (nothing is recorded)
         """Yield a motion that is not recorded."""
         yield RobotMotion()
+
+
+def origins_of(scene: Scene) -> Origins:
+    """Return the origins of the robots of an attempt; there are none without an attempt, as in a dry run."""
+    return MemoryOrigins() if scene.origins is None else cast("Origins", scene.origins)

@@ -1,0 +1,74 @@
+"""The section `on_abort` of a procedure: the action of each drone if a repeat is aborted."""
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from typing_extensions import override
+
+from fieldkit.config.schema import ConfigDict, RootModel
+from fieldkit.core.model import Role
+from fieldkit.motion.profile_sections import mavlink_of
+from fieldkit.steps.scene import Refusal, Scene, Shells
+from fieldkit.trial.procedure_section import ProcedureSection
+
+if TYPE_CHECKING:
+    from fieldkit.trial.plan import Plan
+
+ON_ABORT: Final = "on_abort"
+
+
+class OnAbort(StrEnum):
+    """Action of a drone whose trial is aborted: land at its position, or return to its take-off position and land."""
+
+    LAND = "land"
+    RETURN = "return"
+
+
+class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
+    """What a drone does when a repeat is aborted, by role: `land` where it is, or `return`.
+
+    See [MAVLink](mavlink.md#when-a-trial-is-cut-short).
+    """
+
+    model_config = ConfigDict(frozen=True, hide_input_in_errors=True, defer_build=True)
+
+    @override
+    def roles(self) -> frozenset[Role]:
+        return frozenset(self.root)
+
+    @override
+    def refusals(self, plan: "Plan") -> Iterator[Refusal]:
+        """Yield a refusal for each robot without an autopilot link to land it."""
+        for role in self.root:
+            if mavlink_of(plan.cast[role].profile) is None:
+                why = "on_abort must bring it down, but its profile has no mavlink"
+                yield Refusal(role, why, f"leave {role} out of on_abort, or use a drone")
+
+    @override
+    def dry_run_notes(self, plan: "Plan") -> Iterator[str]:
+        for role, action in self.root.items():
+            yield f"if it is aborted: {plan.cast[role].name} is commanded to {action}"
+
+    @override
+    def abort_notes(self, plan: "Plan") -> Iterator[str]:
+        for role in self.guarded_roles(plan):
+            yield f"{plan.cast[role].name} is commanded to {self.root[role]}"
+
+    @override
+    def around_steps(self, plan: "Plan", scene: Scene, shells: Shells) -> AbstractContextManager[None]:
+        from fieldkit.motion.running.guards import guarded  # noqa: PLC0415 (it imports what flies a drone)
+
+        return guarded(self, plan, scene, shells)
+
+    def guarded_roles(self, plan: "Plan") -> tuple[Role, ...]:
+        """Return the roles whose drones no step flies, so that a guard must watch them."""
+        moved = plan.procedure.moved()
+        return tuple(role for role in self.root if role not in moved)
+
+
+def abort_of(scene: Scene, role: Role) -> OnAbort:
+    """Return the action of a drone if the attempt is aborted; without an entry in `on_abort` it lands."""
+    actions = scene.sections.get(ON_ABORT)
+    return actions.root.get(role, OnAbort.LAND) if isinstance(actions, AbortActions) else OnAbort.LAND
