@@ -40,6 +40,12 @@ def _run(commands: Commands) -> None:
     _add_policy(parser, "sync policy (default: the scenario's)")
     _add_window(parser, "window of the sync policy")
     _add_seeds(parser)
+    for role in ("physics", "network"):
+        parser.add_argument(
+            f"--{role}",
+            metavar="FEDERATE",
+            help=f"external {role}: a command, tcp:HOST:PORT or tcp-listen:HOST:PORT (default: the scenario's)",
+        )
     parser.add_argument(
         "--out",
         type=Path,

@@ -18,6 +18,7 @@ from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.registry import POLICIES, make_policy
 from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
 from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.local_errors import (
     MEASURES,
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     windows_s = settings.windows_s(arguments, scenario) if arguments.windows else list(WINDOWS_S)
     policies = [name for name in settings.policies(arguments) if not getattr(POLICIES[name], "exact", False)]
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
-    build(scenario)  # raises before any run if the scenario is invalid
+    build(without_federates(scenario))  # raises before any run if the scenario is invalid
     with working() as sink:
         by_policy, failures = _measure(scenario, policies, seeds, windows_s, sink)
     title = f"{scenario.name}, {scenario.topology}, {format_count(len(seeds), 'seed')}"

@@ -108,7 +108,8 @@ def _outcome(make: Make, task: Task) -> RunOutcome | PolicyError:
     sampled = SampledPhysics(simulated.agents.physics, SAMPLING_NS)
     simulated.agents.physics = sampled
     try:
-        return RunOutcome(simulated.run(), sampled.tracks)
+        with simulated:
+            return RunOutcome(simulated.run(), sampled.tracks)
     except PolicyError as error:
         return error
 
