@@ -206,6 +206,21 @@ class Session:
             self._child.kill()
         self._channel.close()
 
+    def say_bye(self, limit_s: float) -> None:
+        """End the session, and wait until the federate closes the connection.
+
+        Args:
+            limit_s: Longest wait, in seconds of wall time.
+
+        Raises:
+            ClosedError: It has closed the connection.
+            DeadlineError: It has not.
+        """
+        deadline_s = time.monotonic() + limit_s
+        self._channel.send(encode(Kind.BYE, 0, 0), deadline_s)
+        while True:
+            self._channel.receive(deadline_s)
+
     def close(self) -> None:
         """End the session, and the process that it has started; nothing happens if it has ended."""
         if self._is_closed:

@@ -107,8 +107,10 @@ def build(
         if network is None and (remote_network := open_network(*details)) is not None:
             federates.callback(remote_network.close)
             network = remote_network
-        physics = physics or Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
-        network = network or radio_network(scenario, world, seed, recorder)
+        if physics is None:
+            physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
+        if network is None:
+            network = radio_network(scenario, world, seed, recorder)
         for fault in scenario.faults:
             if isinstance(fault, StalledFederateFault):
                 stall = Stall(fault.begin_ns, fault.stall, deadline_s)

@@ -1,0 +1,74 @@
+"""Federates served by a thread of the test, over a pair of sockets; the frames that they send can be changed."""
+
+import socket
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sim_backends.federates.answering import Service, serve_channel
+from sim_backends.federates.channels import StreamChannel
+from sim_backends.federates.frames import PHYSICS
+from sim_backends.federates.handshake import AgentStart, Hello, Welcome
+from sim_backends.federates.session import Session
+from sim_backends.world.motion import State
+
+Alter = Callable[[bytes], bytes | None]
+
+HELLO = Hello(
+    PHYSICS,
+    [
+        AgentStart("ann", "husky", State((0.0, 0.0, 0.0), heading_rad=0.0), limit_m_s2=3.0),
+        AgentStart("bob", "husky", State((5.0, 3.0, 0.0), heading_rad=1.0), limit_m_s2=3.0),
+        AgentStart("cy", "iris", State((9.0, 0.0, 4.0), heading_rad=0.0), flies=True, limit_m_s2=9.0),
+    ],
+    end_ns=10_000_000_000,
+    name="three robots",
+)
+
+
+class AlteredChannel(StreamChannel):
+    """A channel that changes what a federate sends, or sends nothing."""
+
+    alter: Alter | None = None
+
+    def send(self, frame: bytes, deadline_s: float | None) -> None:
+        altered = frame if self.alter is None else self.alter(frame)
+        if altered is not None:
+            super().send(altered, deadline_s)
+
+
+@dataclass
+class Pair:
+    """Opens sessions with a federate that a thread serves.
+
+    Attributes:
+        service: The federate.
+        deadline_s: Longest wait for a frame.
+        alter: Changes its frames; None removes a frame.
+        stays: True if it does not close the connection at the end.
+    """
+
+    service: Service
+    deadline_s: float = 20.0
+    alter: Alter | None = None
+    stays: bool = False
+
+    def __call__(self, hello: Hello) -> tuple[Session, Hello, Welcome]:
+        """Return a session with a fresh federate."""
+        own, other = (channel_of(side) for side in socket.socketpair())
+        other.alter = self.alter
+        threading.Thread(target=self._serve, args=(other,), daemon=True).start()
+        session = Session(hello.role, "test", own, deadline_s=self.deadline_s)
+        return session, hello, session.welcome(hello)
+
+    def _serve(self, channel: StreamChannel) -> None:
+        serve_channel(channel, self.service)
+        if self.stays:
+            threading.Event().wait(60)
+        channel.close()
+
+
+def channel_of(side: socket.socket) -> AlteredChannel:
+    """Return a channel over a socket, which it owns."""
+    fd = side.detach()
+    return AlteredChannel(fd, fd)
