@@ -226,7 +226,7 @@ class _Run:
         if header.kind is Kind.ADVANCE_PHYSICS and hasattr(current.federate, "step_ns"):
             return Kind.STATES, self._advance_physics(current, body)
         if header.kind is Kind.ADVANCE_NETWORK and not hasattr(current.federate, "step_ns"):
-            return Kind.OUTCOMES, _advance_network(current, body)
+            return Kind.OUTCOMES, self._advance_network(current, body)
         if header.kind is Kind.FORK and self.service.forks:
             return Kind.DONE, self._fork(current, decode_fork(body))
         raise MalformedFrameError(4, f"the request {header.kind.name.lower()} is not supported")
@@ -253,21 +253,23 @@ class _Run:
         current.last_ns = to_ns
         return encode_states(to_ns - to_ns % federate.step_ns, states, current.agents, federate.limits_m_s2)
 
+    def _advance_network(self, current: _FederateCopy, body: bytes) -> bytes:
+        request = AdvanceNetwork.decode(body, current.agents)
+        for packet in request.packets:
+            if self.service.transports and packet.protocol not in self.service.transports:
+                raise ValueError(f"the transport {packet.protocol} is not supported")
+        states = request.states
+        if request.reckoning_ns:
+            states = DeadReckoned(states, request.since_ns, request.reckoning_ns)
+        arrivals, drops = current.federate.advance(request.to_ns, request.packets, states)
+        current.last_ns = request.to_ns
+        return Outcomes(request.to_ns, _next_event_ns(current.federate), arrivals, drops).encode(current.agents)
+
     def _fork(self, current: _FederateCopy, number: int) -> bytes:
         if number in self.copies or len(self.copies) > _MAX_COPIES:
             raise MalformedFrameError(16, f"copy {number} exists already, or there are too many")
         self.copies[number] = _FederateCopy(copy.deepcopy(current.federate), current.agents.copy(), current.last_ns)
         return b""
-
-
-def _advance_network(current: _FederateCopy, body: bytes) -> bytes:
-    request = AdvanceNetwork.decode(body, current.agents)
-    states = request.states
-    if request.reckoning_ns:
-        states = DeadReckoned(states, request.since_ns, request.reckoning_ns)
-    arrivals, drops = current.federate.advance(request.to_ns, request.packets, states)
-    current.last_ns = request.to_ns
-    return Outcomes(request.to_ns, _next_event_ns(current.federate), arrivals, drops).encode(current.agents)
 
 
 def serve_channel(channel: Channel, service: Service, token: str = "") -> bool:

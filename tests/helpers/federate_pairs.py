@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_backends.federates.answering import Service, serve_channel
+from sim_backends.federates.answering import Service, _Run
 from sim_backends.federates.channels import StreamChannel
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello, Welcome
@@ -45,6 +45,7 @@ class Pair:
         service: The federate.
         deadline_s: Longest wait for a frame.
         alter: Changes its frames; None removes a frame.
+        run_class: The class that answers requests.
         stays: True if it does not close the connection at the end.
     """
 
@@ -52,6 +53,7 @@ class Pair:
     deadline_s: float = 20.0
     alter: Alter | None = None
     stays: bool = False
+    run_class: type[_Run] = _Run
 
     def __call__(self, hello: Hello) -> tuple[Session, Hello, Welcome]:
         """Return a session with a fresh federate."""
@@ -62,7 +64,7 @@ class Pair:
         return session, hello, session.welcome(hello)
 
     def _serve(self, channel: StreamChannel) -> None:
-        serve_channel(channel, self.service)
+        self.run_class(self.service, channel, "").serve()
         if self.stays:
             threading.Event().wait(60)
         channel.close()

@@ -47,6 +47,7 @@ class _Account:
     def __init__(self, probe: Probe) -> None:
         self._probe = probe
         self._packets: dict[int, Packet] = {}
+        self._decided: set[int] = set()
         self._next_event_ns = probe.welcome.next_event_ns
         self.arrivals: list[Arrival] = []
         self.reasons: dict[int, str] = {}
@@ -65,7 +66,7 @@ class _Account:
         for arrival in outcomes.arrivals:
             self._check_arrival(arrival, from_ns, to_ns)
         for drop in outcomes.drops:
-            self._check_under_way(drop.packet_id)
+            self._decide(drop.packet_id)
             if not drop.reason:
                 raise CheckError(f"packet {drop.packet_id} was dropped without a reason")
             self.reasons[drop.packet_id] = drop.reason
@@ -77,17 +78,17 @@ class _Account:
 
     def undecided(self) -> list[int]:
         """Return the numbers of packets that neither arrived nor were dropped."""
-        decided = {arrival.packet_id for arrival in self.arrivals} | self.reasons.keys()
-        return sorted(self._packets.keys() - decided)
+        return sorted(self._packets.keys() - self._decided)
 
-    def _check_under_way(self, packet_id: int) -> None:
+    def _decide(self, packet_id: int) -> None:
         if packet_id not in self._packets:
             raise CheckError(f"the fate of packet {packet_id} was reported, which it never got")
-        if packet_id in self.reasons or packet_id in {arrival.packet_id for arrival in self.arrivals}:
+        if packet_id in self._decided:
             raise CheckError(f"the fate of packet {packet_id} was reported twice")
+        self._decided.add(packet_id)
 
     def _check_arrival(self, arrival: Arrival, from_ns: int, to_ns: int) -> None:
-        self._check_under_way(arrival.packet_id)
+        self._decide(arrival.packet_id)
         packet = self._packets[arrival.packet_id]
         if arrival.receiver != packet.destination:
             raise CheckError(f"packet {packet.packet_id} for {packet.destination} arrived at {arrival.receiver}")

@@ -22,7 +22,7 @@ HELLO = make_hello(SCENARIO, WORLD, bodies(SCENARIO, WORLD), 1, PHYSICS)
 CASES = [(role, name) for role in (PHYSICS, NETWORK) for name in checks(is_physics=role == PHYSICS)]
 
 
-@pytest.mark.parametrize(("role", "name"), CASES, ids=lambda value: str(value))
+@pytest.mark.parametrize(("role", "name"), CASES, ids=str)
 def test_the_built_in_federates_conform(role: int, name: str) -> None:
     target = Target(Pair(Service(partial(make_federate, role))), replace(HELLO, role=role), windows=500)
     result = run_check(target, name, checks(is_physics=role == PHYSICS)[name])
