@@ -86,7 +86,8 @@ class RemotePhysics(_Remote):
     def __init__(self, session: Session, hello: Hello, welcome: Welcome) -> None:
         super().__init__(session, hello, welcome)
         self.step_ns = welcome.step_ns
-        self.limits_m_s2: dict[str, float] = {agent.name: agent.limit_m_s2 for agent in hello.agents}
+        self._limits_m_s2 = {agent.name: agent.limit_m_s2 for agent in hello.agents}
+        self.limits_m_s2: Mapping[str, float] = self._limits_m_s2
         self._states: dict[str, State] = {}
         self._states_ns: int | None = None
         self._last_ns = 0
@@ -116,7 +117,7 @@ class RemotePhysics(_Remote):
                 f"{seconds_text(states_ns)} instead of {seconds_text(at_ns)}, its last step until then"
             )
         self._states, self._states_ns = states, at_ns
-        self.limits_m_s2.update(limits_m_s2)
+        self._limits_m_s2.update(limits_m_s2)
         self.session.reached_ns = to_ns
         return states
 

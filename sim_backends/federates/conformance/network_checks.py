@@ -29,10 +29,13 @@ def _packets(probe: Probe, times_ns: Sequence[int]) -> list[Packet]:
     if len(ends) < 2:
         raise NotDeclaredError("the scenario has only one agent")
     protocol = (probe.welcome.transports or ("udp",))[0]
-    return [
-        Packet(number + 1, *ends[:: -1 if number % 2 else 1], _SIZE_BYTES, ("check", number), at_ns, at_ns, protocol)
-        for number, at_ns in enumerate(times_ns)
-    ]
+    packets = []
+    for number, at_ns in enumerate(times_ns):
+        source, destination = ends[::-1] if number % 2 else ends
+        packets.append(
+            Packet(number + 1, source, destination, _SIZE_BYTES, ("check", number), at_ns, at_ns, protocol)
+        )
+    return packets
 
 
 def _times_ns() -> list[int]:

@@ -18,8 +18,9 @@ import pytest
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates import tcp
 from sim_backends.federates.answering import Service, serve_channel
-from sim_backends.federates.channels import ClosedError, DeadlineError
+from sim_backends.federates.channels import ClosedError, DeadlineError, StreamChannel
 from sim_backends.federates.frames import HEADER_BYTES, NETWORK, PHYSICS, Kind, encode
+from sim_backends.federates.handshake import encode_join
 from sim_backends.federates.protocols import FederateError, UnansweredError
 from sim_backends.federates.remote import RemotePhysics, open_network, open_physics
 from sim_backends.federates.serving import serve
@@ -72,8 +73,7 @@ def from_second(alter: Callable[[bytes], bytes | None]) -> Alter:
         (
             lambda frame: b"garbage" * 9,
             FederateError,
-            "answered request 3, to advance from 0 s to 0.0011 s, with a "
-            "malformed frame: byte 4: there is no kind of message 24930",
+            "to advance from 0 s to 0.0011 s, with a malformed frame: byte 4: there is no kind of message 26465",
         ),
         (lambda frame: struct.pack("<I", 1 << 31) + frame[4:], FederateError, "byte 0: a size of 2147483648 bytes"),
         (lambda frame: frame[:8] + b"\7\0\0\0" + frame[12:], FederateError, "byte 8: it is for request 7 and copy 0"),
@@ -262,7 +262,7 @@ def test_other_programs_are_rejected_and_the_wait_continues(monkeypatch: pytest.
     def connect_all() -> None:
         for data in (
             b"GET / HTTP/1.1\r\n\r\n",
-            encode(Kind.JOIN, 0, 0, tcp.encode_join("wrong")),
+            encode(Kind.JOIN, 0, 0, encode_join("wrong")),
             encode(Kind.BYE, 0, 0),
         ):
             with socket.create_connection(("127.0.0.1", port)) as connection:
@@ -295,7 +295,7 @@ def test_a_federate_of_the_other_role_is_named() -> None:
 
 def test_a_full_channel_reaches_the_deadline_of_its_writer() -> None:
     own, other = socket.socketpair()
-    with closing(tcp.StreamChannel(own.fileno(), own.fileno())) as channel, other:
+    with closing(StreamChannel(own.fileno(), own.fileno())) as channel, other:
         with pytest.raises(DeadlineError):
             channel.send(bytes(1 << 24), time.monotonic() + 0.1)
         own.detach()
