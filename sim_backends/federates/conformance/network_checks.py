@@ -1,6 +1,5 @@
 """Checks of a network: times, fates of packets, window borders, reasons, determinism, forks."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Final
 
@@ -156,12 +155,11 @@ def check_window_borders(target: Target) -> None:
 
 def check_window_length(target: Target) -> None:
     """Agents that do not move get the same arrivals in short and in long windows."""
-    short = target.open()
-    short.require(Capability.DETERMINISTIC)
-    arrivals = [
-        sorted(_run(probe, window_ns).arrivals, key=lambda arrival: arrival.packet_id)
-        for probe, window_ns in ((short, _WINDOW_NS), (target.open(), 13 * _WINDOW_NS))
-    ]
+    arrivals = []
+    for window_ns in (_WINDOW_NS, 13 * _WINDOW_NS):
+        probe = target.open()
+        probe.require(Capability.DETERMINISTIC)
+        arrivals.append(sorted(_run(probe, window_ns).arrivals, key=lambda arrival: arrival.packet_id))
     for one, other in zip(*arrivals, strict=False):
         if one != other:
             raise CheckError(f"windows of another length changed an arrival: {one} and {other}")
@@ -194,9 +192,12 @@ def check_unknown_transport(target: Target) -> None:
 
 def check_determinism(target: Target) -> None:
     """Equal requests give equal answers, if the federate declares this."""
-    first, second = target.open(), target.open()
-    first.require(Capability.DETERMINISTIC)
-    one, other = (_run(probe, _WINDOW_NS) for probe in (first, second))
+    accounts = []
+    for _ in range(2):
+        probe = target.open()
+        probe.require(Capability.DETERMINISTIC)
+        accounts.append(_run(probe, _WINDOW_NS))
+    one, other = accounts
     if one.arrivals != other.arrivals or one.reasons != other.reasons:
         raise CheckError("equal requests gave different arrivals or drops")
 
@@ -219,17 +220,17 @@ def check_new_agent(target: Target) -> None:
 
 def check_dead_reckoning(target: Target) -> None:
     """Extrapolation at a velocity of 0 changes nothing, if the federate declares that it extrapolates."""
-    probes = target.open(), target.open()
-    probes[0].require(Capability.EXTRAPOLATES)
-    first, second = (
-        Counter(
-            arrival
+    arrivals = []
+    for reckoning_ns in (0, _MS):
+        probe = target.open()
+        probe.require(Capability.EXTRAPOLATES)
+        states = _states(probe)
+        outcomes = [
+            probe.network(to_ns, states, packets, reckoning_ns=reckoning_ns)
             for to_ns, packets in ((10 * _MS, _packets(probe, [5 * _MS])), (_END_NS, []))
-            for arrival in probe.network(to_ns, _states(probe), packets, reckoning_ns=reckoning_ns).arrivals
-        )
-        for probe, reckoning_ns in zip(probes, (0, _MS), strict=True)
-    )
-    if first != second:
+        ]
+        arrivals.append([outcome.arrivals for outcome in outcomes])
+    if arrivals[0] != arrivals[1]:
         raise CheckError("extrapolation at a velocity of 0 changed the arrivals")
 
 

@@ -83,19 +83,20 @@ def check_remainders(target: Target) -> None:
 
 def check_drift(target: Target) -> None:
     """Many windows of 1.1 steps give the same motion as one window; 10^6 of them with --windows 1000000."""
-    probe, once = target.open(), target.open()
+    probe = target.open()
     step_ns = probe.welcome.step_ns
     window_ns = step_ns + max(step_ns // 10, 1)
     commands = _commands(probe)
-    probe.physics(0)
-    once.physics(0)
+    advanced = probe.physics(0)
     for window in range(1, target.windows + 1):
         to_ns = window * window_ns
         advanced = probe.physics(to_ns, commands if window == 1 else None)
         _check_time(probe, to_ns, advanced)
-    at_once = once.physics(target.windows * window_ns, commands)
     if not probe.has(Capability.DETERMINISTIC):
         raise NotDeclaredError("it does not declare DETERMINISTIC; only the times were compared")
+    once = target.open()
+    once.physics(0)
+    at_once = once.physics(target.windows * window_ns, commands)
     _check_same(advanced.states, at_once.states, f"{target.windows} windows instead of one")
 
 
@@ -152,14 +153,15 @@ def check_limits(target: Target) -> None:
 
 def check_command_time(target: Target) -> None:
     """A command applies from `from_ns` on, even if the federate was not asked to advance to it before."""
-    late, exact = target.open(), target.open()
-    step_ns, commands = late.welcome.step_ns, _commands(late)
-    late.require(Capability.DETERMINISTIC)
+    exact = target.open()
+    exact.require(Capability.DETERMINISTIC)
+    step_ns, commands = exact.welcome.step_ns, _commands(exact)
     middle_ns, end_ns = 100 * step_ns, 300 * step_ns
-    late.physics(0)
     exact.physics(0)
     exact.physics(middle_ns)
     expected = exact.physics(end_ns, commands)
+    late = target.open()
+    late.physics(0)
     _check_same(
         expected.states,
         late.physics(end_ns, commands, from_ns=middle_ns).states,
@@ -179,15 +181,17 @@ def check_unknown_command(target: Target) -> None:
 
 def check_determinism(target: Target) -> None:
     """Equal requests give equal answers, byte by byte, if the federate declares this."""
-    probes = target.open(), target.open()
-    probes[0].require(Capability.DETERMINISTIC)
-    step_ns, commands = probes[0].welcome.step_ns, _commands(probes[0])
-    for window in range(100):
-        first, second = (
-            probe.physics(window * 7 * step_ns, commands if window == 3 else None).body for probe in probes
+    answers = []
+    for _ in range(2):
+        probe = target.open()
+        probe.require(Capability.DETERMINISTIC)
+        window_ns, commands = 7 * probe.welcome.step_ns, _commands(probe)
+        answers.append(
+            [probe.physics(number * window_ns, commands if number == 3 else None).body for number in range(100)]
         )
+    for number, (first, second) in enumerate(zip(*answers, strict=True)):
         if first != second:
-            raise CheckError(f"equal requests up to {window * 7 * step_ns} ns gave different answers")
+            raise CheckError(f"equal requests up to {number * window_ns} ns gave different answers")
 
 
 def check_fork(target: Target) -> None:

@@ -208,7 +208,7 @@ class Target:
 
     def __post_init__(self) -> None:
         self.exchange: dict[str, str] = {}
-        self._probes: list[Probe] = []
+        self._probe: Probe | None = None
 
     @property
     def is_physics(self) -> bool:
@@ -216,13 +216,14 @@ class Target:
         return self.hello.role == PHYSICS
 
     def open(self) -> Probe:
-        """Return a fresh federate."""
+        """Return a fresh federate, after the previous one has ended: one that listens may serve one at a time."""
+        self.close()
         self.exchange |= {"request": "hello", "answer": "none"}
-        probe = Probe(self.opener, self.hello, self.exchange)
-        self._probes.append(probe)
-        return probe
+        self._probe = Probe(self.opener, self.hello, self.exchange)
+        return self._probe
 
     def close(self) -> None:
-        """End all federates."""
-        while self._probes:
-            self._probes.pop().close()
+        """End the last federate."""
+        if self._probe is not None:
+            self._probe.close()
+            self._probe = None
