@@ -3,6 +3,7 @@
 import copy
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -10,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from sim_backends.federates import tcp
-from sim_backends.federates.channels import Channel, ClosedError
+from sim_backends.federates.channels import Channel, ClosedError, DeadlineError
 from sim_backends.federates.exchanges import (
     AdvanceNetwork,
     Outcomes,
@@ -165,21 +166,23 @@ class _Run:
     service: Service
     channel: Channel
     token: str
+    hello_s: float | None = None
     copies: dict[int, _FederateCopy] = field(default_factory=dict)
     heartbeat: _Heartbeat | None = None
 
     def serve(self) -> bool:
         """Answer requests until the coordinator ends the run; return True if it did so without an error."""
         try:
-            frame = self.channel.receive(None, MAX_HELLO_BYTES)
+            deadline_s = None if self.hello_s is None else time.monotonic() + self.hello_s
+            frame = self.channel.receive(deadline_s, MAX_HELLO_BYTES)
             while frame.header.kind is not Kind.BYE:
                 if not self._handle(frame):
                     return False
                 frame = self.channel.receive(None)
         except ClosedError:
             pass
-        except MalformedFrameError as error:
-            print(f"the coordinator sent a malformed frame: {error}", file=sys.stderr)  # noqa: T201 (stderr is its log)
+        except (DeadlineError, MalformedFrameError) as error:
+            print(f"a connection was closed: {error}", file=sys.stderr)  # noqa: T201 (stderr is its log)
             return False
         finally:
             if self.heartbeat is not None:
@@ -272,12 +275,13 @@ class _Run:
         return b""
 
 
-def serve_channel(channel: Channel, service: Service, token: str = "") -> bool:
+def serve_channel(channel: Channel, service: Service, token: str = "", hello_s: float | None = None) -> bool:
     """Serve one run over a channel; return True if it ended without an error.
 
     Args:
         channel: The channel.
         service: The federate.
         token: Token that the coordinator must send.
+        hello_s: Longest wait for its first message; None for no limit.
     """
-    return _Run(service, channel, token).serve()
+    return _Run(service, channel, token, hello_s).serve()

@@ -16,6 +16,8 @@ from sim_backends.federates.answering import Make, Service, serve_channel
 from sim_backends.federates.channels import DeadlineError, StreamChannel
 
 _CONNECT_S: Final = 60.0
+_HELLO_S: Final = 10.0
+"""Longest wait for the first message of a program that has connected; others wait for their turn meanwhile."""
 
 
 def serve(make: Make, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `Service`)
@@ -53,7 +55,7 @@ def _listen(address: tcp.Address, service: Service, runs: int | None) -> bool:
     with tcp.listening(address) as server:
         while runs is None or served < runs:
             with closing(tcp.accept(server, None)) as channel:
-                succeeded = serve_channel(channel, service, token)
+                succeeded = serve_channel(channel, service, token, _HELLO_S)
             served += 1
     return succeeded
 

@@ -1,6 +1,7 @@
 """A federate that fails, is silent, or sends garbage is named with its last time and the pending request."""
 
 import os
+import random
 import signal
 import socket
 import struct
@@ -20,16 +21,19 @@ from sim_backends.federates import tcp
 from sim_backends.federates.answering import Service, serve_channel
 from sim_backends.federates.channels import ClosedError, DeadlineError, StreamChannel
 from sim_backends.federates.frames import HEADER_BYTES, NETWORK, PHYSICS, Kind, encode
-from sim_backends.federates.handshake import encode_join
+from sim_backends.federates.handshake import Hello, encode_join
 from sim_backends.federates.protocols import FederateError, UnansweredError
 from sim_backends.federates.remote import RemotePhysics, open_network, open_physics
 from sim_backends.federates.serving import serve
 from sim_backends.federates.session import Session
 from sim_backends.physics.body import Twist
+from sim_backends.world.motion import State
 from tests.helpers.federate_examples import EXAMPLES, carts
-from tests.helpers.federate_pairs import HELLO, Alter, Pair
+from tests.helpers.federate_frames import example_frames
+from tests.helpers.federate_pairs import HELLO, Alter, Pair, channel_of
 
 MS = 1_000_000
+REQUESTS = ("advance physics", "ping", "fork", "release", "advance physics", "bye")
 CARTS = f"{sys.executable} {EXAMPLES / 'carts.py'}"
 
 
@@ -291,6 +295,57 @@ def test_a_federate_of_the_other_role_is_named() -> None:
     with pytest.raises(FederateError, match="it is a physics, and a network was requested"):
         open_network(CARTS, replace(HELLO, role=NETWORK), 20.0)
     assert HELLO.role == PHYSICS
+
+
+class Still:
+    """A physics whose robots do not move."""
+
+    step_ns = MS
+    limits_m_s2: Mapping[str, float] = MappingProxyType({})
+
+    def __init__(self, hello: Hello) -> None:
+        self._states = {agent.name: agent.start for agent in hello.agents}
+
+    def advance(self, to_ns: int, commands: object) -> dict[str, State]:
+        return self._states
+
+
+def mutated(frame: bytes, draws: random.Random) -> bytes:
+    data = bytearray(frame)
+    for _ in range(draws.randint(1, 4)):
+        data[draws.randrange(len(data))] = draws.choice((0, 1, 0x7F, 0xFF, draws.randrange(256)))
+    return bytes(data[: draws.choice((len(data), len(data), draws.randrange(len(data) + 1)))])
+
+
+def test_mutated_requests_end_the_session_of_a_federate_or_are_answered() -> None:
+    frames = [encode(Kind.HELLO, 1, 0, HELLO.encode()), *(example_frames()[name] for name in REQUESTS)]
+    for seed in range(80):
+        draws = random.Random(seed)
+        own, other = socket.socketpair()
+        channel = channel_of(other)
+        thread = threading.Thread(target=serve_channel, args=(channel, Service(Still)), daemon=True)
+        thread.start()
+        wrong = draws.randrange(len(frames))
+        with own, suppress(BrokenPipeError, ConnectionResetError):
+            for number, frame in enumerate(frames):
+                own.sendall(mutated(frame, draws) if number == wrong else frame)
+            own.shutdown(socket.SHUT_WR)
+        thread.join(10)
+        assert not thread.is_alive(), seed
+        channel.close()
+
+
+def test_mutated_answers_raise_only_errors_that_name_the_federate() -> None:
+    for seed in range(80):
+        draws = random.Random(seed)
+        alter = from_second(lambda frame, draws=draws: mutated(frame, draws))  # type: ignore[misc]
+        physics = RemotePhysics(*Pair(Service(Still, name="still"), alter=alter, deadline_s=0.05)(HELLO))
+        try:
+            for step in range(4):
+                physics.advance(step * MS, {})
+        except FederateError as error:
+            assert "physics still (test)" in error.what  # noqa: PT017 (a mutation may also be valid)
+        physics.close()
 
 
 def test_a_full_channel_reaches_the_deadline_of_its_writer() -> None:
