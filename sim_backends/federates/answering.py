@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from sim_backends.federates import tcp
-from sim_backends.federates.channels import Channel, ClosedError, DeadlineError
+from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
 from sim_backends.federates.exchanges import (
     AdvanceNetwork,
-    Outcomes,
+    NetworkOutcomes,
     decode_advance_physics,
     decode_fork,
     decode_number,
@@ -27,9 +27,9 @@ from sim_backends.federates.frames import (
     NETWORK,
     PHYSICS,
     ROLES,
-    Frame,
-    Kind,
     MalformedFrameError,
+    MessageKind,
+    ProtocolFrame,
     encode,
     text_bytes,
 )
@@ -43,7 +43,7 @@ Make = Callable[[Hello], Any]
 
 
 @dataclass(frozen=True)
-class Service:
+class FederateService:
     """A federate and its properties.
 
     Attributes:
@@ -125,7 +125,7 @@ class _Heartbeat:
         interval_s: Interval between two of these messages.
     """
 
-    def __init__(self, channel: Channel, interval_s: float) -> None:
+    def __init__(self, channel: FrameChannel, interval_s: float) -> None:
         self._channel = channel
         self._interval_s = interval_s
         self._lock = threading.Lock()
@@ -155,7 +155,7 @@ class _Heartbeat:
                 current = self._request
                 if current is not None and current is previous and not self._stopped.is_set():
                     request, copy_number, at_ns = current
-                    self._channel.send(encode(Kind.BUSY, request, copy_number, encode_number(at_ns)), None)
+                    self._channel.send(encode(MessageKind.BUSY, request, copy_number, encode_number(at_ns)), None)
                 previous = current
 
 
@@ -163,8 +163,8 @@ class _Heartbeat:
 class _Run:
     """One run of a coordinator with a federate."""
 
-    service: Service
-    channel: Channel
+    service: FederateService
+    channel: FrameChannel
     token: str
     hello_s: float | None = None
     copies: dict[int, _FederateCopy] = field(default_factory=dict)
@@ -175,7 +175,7 @@ class _Run:
         try:
             deadline_s = None if self.hello_s is None else time.monotonic() + self.hello_s
             frame = self.channel.receive(deadline_s, MAX_HELLO_BYTES)
-            while frame.header.kind is not Kind.BYE:
+            while frame.header.kind is not MessageKind.BYE:
                 if not self._handle(frame):
                     return False
                 frame = self.channel.receive(None)
@@ -189,9 +189,9 @@ class _Run:
                 self.heartbeat.stop()
         return True
 
-    def _handle(self, frame: Frame) -> bool:
+    def _handle(self, frame: ProtocolFrame) -> bool:
         _, kind, request, copy_number = frame.header
-        if kind is Kind.RELEASE:
+        if kind is MessageKind.RELEASE:
             self.copies.pop(copy_number, None)
             return True
         try:
@@ -199,7 +199,7 @@ class _Run:
         except Exception as error:  # noqa: BLE001 (every error is reported to the coordinator)
             traceback.print_exc()
             text = f"{type(error).__name__}: {error}".encode(errors="replace")[:MAX_TEXT_BYTES]
-            self._send(encode(Kind.ERROR, request, copy_number, text_bytes(text.decode(errors="ignore"))))
+            self._send(encode(MessageKind.ERROR, request, copy_number, text_bytes(text.decode(errors="ignore"))))
             return False
         self._send(encode(answer, request, copy_number, body))
         return True
@@ -210,28 +210,28 @@ class _Run:
         else:
             self.heartbeat.answer(frame)
 
-    def _answer(self, frame: Frame) -> tuple[Kind, bytes]:
+    def _answer(self, frame: ProtocolFrame) -> tuple[MessageKind, bytes]:
         """Return kind and body of the answer to a request.
 
         Raises:
             Exception: The request is malformed, or the federate failed.
         """
         header, body = frame
-        if header.kind is Kind.HELLO and not self.copies:
-            return Kind.WELCOME, self._begin(Hello.decode(body), header.request)
-        if header.kind is Kind.PING:
-            return Kind.PONG, encode_number(decode_number(body))
+        if header.kind is MessageKind.HELLO and not self.copies:
+            return MessageKind.WELCOME, self._begin(Hello.decode(body), header.request)
+        if header.kind is MessageKind.PING:
+            return MessageKind.PONG, encode_number(decode_number(body))
         current = self.copies.get(header.copy)
         if current is None:
             raise MalformedFrameError(12, f"there is no copy {header.copy}, or hello is missing")
         if self.heartbeat is not None:
             self.heartbeat.begin(header.request, header.copy, current.last_ns)
-        if header.kind is Kind.ADVANCE_PHYSICS and hasattr(current.federate, "step_ns"):
-            return Kind.STATES, self._advance_physics(current, body)
-        if header.kind is Kind.ADVANCE_NETWORK and not hasattr(current.federate, "step_ns"):
-            return Kind.OUTCOMES, self._advance_network(current, body)
-        if header.kind is Kind.FORK and self.service.forks:
-            return Kind.DONE, self._fork(current, decode_fork(body))
+        if header.kind is MessageKind.ADVANCE_PHYSICS and hasattr(current.federate, "step_ns"):
+            return MessageKind.STATES, self._advance_physics(current, body)
+        if header.kind is MessageKind.ADVANCE_NETWORK and not hasattr(current.federate, "step_ns"):
+            return MessageKind.OUTCOMES, self._advance_network(current, body)
+        if header.kind is MessageKind.FORK and self.service.forks:
+            return MessageKind.DONE, self._fork(current, decode_fork(body))
         raise MalformedFrameError(4, f"the request {header.kind.name.lower()} is not supported")
 
     def _begin(self, hello: Hello, request: int) -> bytes:
@@ -266,7 +266,9 @@ class _Run:
             states = DeadReckoned(states, request.since_ns, request.reckoning_ns)
         arrivals, drops = current.federate.advance(request.to_ns, request.packets, states)
         current.last_ns = request.to_ns
-        return Outcomes(request.to_ns, _next_event_ns(current.federate), arrivals, drops).encode(current.agents)
+        return NetworkOutcomes(request.to_ns, _next_event_ns(current.federate), arrivals, drops).encode(
+            current.agents
+        )
 
     def _fork(self, current: _FederateCopy, number: int) -> bytes:
         if number in self.copies or len(self.copies) > _MAX_COPIES:
@@ -275,7 +277,9 @@ class _Run:
         return b""
 
 
-def serve_channel(channel: Channel, service: Service, token: str = "", hello_s: float | None = None) -> bool:
+def serve_channel(
+    channel: FrameChannel, service: FederateService, token: str = "", hello_s: float | None = None
+) -> bool:
     """Serve one run over a channel; return True if it ended without an error.
 
     Args:

@@ -6,7 +6,7 @@ import socket
 import time
 from typing import Final, Protocol
 
-from sim_backends.federates.frames import HEADER_BYTES, MAX_FRAME_BYTES, Frame, read_header
+from sim_backends.federates.frames import HEADER_BYTES, MAX_FRAME_BYTES, ProtocolFrame, read_header
 
 _CHUNK_BYTES: Final = 1 << 16
 
@@ -19,7 +19,7 @@ class DeadlineError(TimeoutError):
     """A wait reached its deadline."""
 
 
-class Channel(Protocol):
+class FrameChannel(Protocol):
     """Carries frames."""
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
@@ -35,7 +35,7 @@ class Channel(Protocol):
         """
         ...
 
-    def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> Frame:
+    def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> ProtocolFrame:
         """Return the next frame.
 
         Args:
@@ -76,7 +76,7 @@ class StreamChannel:
         self._data = bytearray()
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
-        """Implement `Channel.send`."""
+        """Implement `FrameChannel.send`."""
         rest = memoryview(frame)
         while rest:
             try:
@@ -86,8 +86,8 @@ class StreamChannel:
             except OSError as error:
                 raise ClosedError("the connection was closed") from error
 
-    def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> Frame:
-        """Implement `Channel.receive`."""
+    def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> ProtocolFrame:
+        """Implement `FrameChannel.receive`."""
         data = self._data
         while len(data) < HEADER_BYTES:
             self._read(deadline_s)
@@ -97,10 +97,10 @@ class StreamChannel:
             self._read(deadline_s)
         body = bytes(memoryview(data)[HEADER_BYTES:end])
         del data[:end]
-        return Frame(header, body)
+        return ProtocolFrame(header, body)
 
     def close(self) -> None:
-        """Implement `Channel.close`."""
+        """Implement `FrameChannel.close`."""
         for fd in self._fds:
             os.close(fd)
         self._fds = set()

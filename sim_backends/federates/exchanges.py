@@ -125,7 +125,7 @@ class AdvanceNetwork:
 
 
 @dataclass(frozen=True)
-class Outcomes:
+class NetworkOutcomes:
     """A network's answer.
 
     Attributes:
@@ -149,7 +149,7 @@ class Outcomes:
         )
 
     @staticmethod
-    def decode(body: bytes, agents: AgentTable) -> "Outcomes":
+    def decode(body: bytes, agents: AgentTable) -> "NetworkOutcomes":
         """Return the message of a body.
 
         Raises:
@@ -159,7 +159,7 @@ class Outcomes:
         at_ns, next_event_ns = reader.unpack(_TWO_TIMES)
         arrivals, drops = read_arrivals(reader, agents), read_drops(reader)
         reader.end()
-        return Outcomes(at_ns, next_event_ns, arrivals, drops)
+        return NetworkOutcomes(at_ns, next_event_ns, arrivals, drops)
 
 
 def encode_number(number: int) -> bytes:

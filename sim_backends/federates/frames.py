@@ -24,7 +24,7 @@ _HEADER: Final = struct.Struct("<IHHII")
 HEADER_BYTES: Final = _HEADER.size
 
 
-class Kind(IntEnum):
+class MessageKind(IntEnum):
     """Kind of a message."""
 
     JOIN = 1
@@ -44,7 +44,7 @@ class Kind(IntEnum):
     BYE = 15
 
 
-_KINDS: Final = {int(kind): kind for kind in Kind}
+_KINDS: Final = {int(kind): kind for kind in MessageKind}
 
 
 class MalformedFrameError(ValueError):
@@ -71,12 +71,12 @@ class Header(NamedTuple):
     """
 
     size: int
-    kind: Kind
+    kind: MessageKind
     request: int
     copy: int
 
 
-class Frame(NamedTuple):
+class ProtocolFrame(NamedTuple):
     """A received frame.
 
     Attributes:
@@ -88,7 +88,7 @@ class Frame(NamedTuple):
     body: bytes
 
 
-def encode(kind: Kind, request: int, copy: int, body: bytes = b"") -> bytes:
+def encode(kind: MessageKind, request: int, copy: int, body: bytes = b"") -> bytes:
     """Return a frame.
 
     Raises:

@@ -8,22 +8,22 @@ from typing import Any
 
 from sim_backends.federates.exchanges import (
     AdvanceNetwork,
-    Outcomes,
+    NetworkOutcomes,
     decode_states,
     encode_advance_physics,
     encode_fork,
 )
-from sim_backends.federates.frames import NETWORK, PHYSICS, Kind
+from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
 from sim_backends.federates.handshake import NO_EVENT, Capability, Hello, Welcome
 from sim_backends.federates.protocols import FederateError, seconds_text
 from sim_backends.federates.records import AgentTable, command_type
-from sim_backends.federates.session import Session, open_session
+from sim_backends.federates.session import FederateSession, open_session
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.dead_reckoning import DeadReckoned
 from sim_backends.world.motion import State
 
 
-class _Remote:
+class _RemoteFederate:
     """What both roles have in common.
 
     Attributes:
@@ -31,7 +31,7 @@ class _Remote:
         welcome: The federate's answer to the handshake.
     """
 
-    def __init__(self, session: Session, hello: Hello, welcome: Welcome) -> None:
+    def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
         self.session = session
         self.welcome = welcome
         self._agents = AgentTable(agent.name for agent in hello.agents)
@@ -54,10 +54,10 @@ class _Remote:
             )
         number = self.session.next_copy()
         self.session.request(
-            Kind.FORK,
+            MessageKind.FORK,
             self._copy,
             encode_fork(number),
-            Kind.DONE,
+            MessageKind.DONE,
             decode=bytes,
             what=lambda: f"copy itself as copy {number}",
         )
@@ -68,7 +68,7 @@ class _Remote:
         return other
 
 
-class RemotePhysics(_Remote):
+class RemotePhysics(_RemoteFederate):
     """A physics in another process.
 
     A request that changes nothing is not sent: the states between two steps are those at the first.
@@ -83,7 +83,7 @@ class RemotePhysics(_Remote):
         limits_m_s2: See `PhysicsFederate`.
     """
 
-    def __init__(self, session: Session, hello: Hello, welcome: Welcome) -> None:
+    def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
         super().__init__(session, hello, welcome)
         self.step_ns = welcome.step_ns
         self._limits_m_s2 = {agent.name: agent.limit_m_s2 for agent in hello.agents}
@@ -104,10 +104,10 @@ class RemotePhysics(_Remote):
                     f"{self.session.name} does not support the command {type(command).__name__} to {name}"
                 )
         states_ns, states, limits_m_s2 = self.session.request(
-            Kind.ADVANCE_PHYSICS,
+            MessageKind.ADVANCE_PHYSICS,
             self._copy,
             encode_advance_physics(to_ns, from_ns, commands, self._agents),
-            Kind.STATES,
+            MessageKind.STATES,
             decode=partial(decode_states, agents=self._agents),
             what=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
         )
@@ -122,7 +122,7 @@ class RemotePhysics(_Remote):
         return states
 
 
-class RemoteNetwork(_Remote):
+class RemoteNetwork(_RemoteFederate):
     """A network in another process.
 
     Args:
@@ -136,7 +136,7 @@ class RemoteNetwork(_Remote):
         fixed_emitters_m: See `NetworkFederate`.
     """
 
-    def __init__(self, session: Session, hello: Hello, welcome: Welcome) -> None:
+    def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
         super().__init__(session, hello, welcome)
         self.extrapolates = bool(welcome.capabilities & Capability.EXTRAPOLATES)
         if any(index >= len(hello.agents) for index in welcome.transmitters):
@@ -162,11 +162,11 @@ class RemoteNetwork(_Remote):
             since_ns, reckoning_ns = states.since_ns, states.step_ns
         from_ns, self._last_ns = self._last_ns, to_ns
         outcomes = self.session.request(
-            Kind.ADVANCE_NETWORK,
+            MessageKind.ADVANCE_NETWORK,
             self._copy,
             AdvanceNetwork(to_ns, states, packets, since_ns, reckoning_ns).encode(self._agents),
-            Kind.OUTCOMES,
-            decode=partial(Outcomes.decode, agents=self._agents),
+            MessageKind.OUTCOMES,
+            decode=partial(NetworkOutcomes.decode, agents=self._agents),
             what=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
         )
         if outcomes.at_ns != to_ns:

@@ -12,7 +12,7 @@ from contextlib import closing
 from typing import Any, Final
 
 from sim_backends.federates import tcp
-from sim_backends.federates.answering import Make, Service, serve_channel
+from sim_backends.federates.answering import FederateService, Make, serve_channel
 from sim_backends.federates.channels import DeadlineError, StreamChannel
 
 _CONNECT_S: Final = 60.0
@@ -28,13 +28,13 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
         address: None for standard input and output, which then belong to the protocol: what the federate prints goes
             to standard error. `tcp-listen:HOST:PORT` listens, `tcp:HOST:PORT` connects to a listening coordinator.
         runs: Number of runs after which to return; None for one run if this side does not listen, else no limit.
-        **properties: Other attributes of `Service`.
+        **properties: Other attributes of `FederateService`.
 
     Raises:
         ConfigurationError: The address is invalid or cannot be used, or the token is missing.
         SystemExit: The last run failed.
     """
-    service = Service(make, **properties)
+    service = FederateService(make, **properties)
     parsed = None if address is None else tcp.parse_address(address)
     if address is not None and parsed is None:
         raise ValueError(f"{address!r} is neither tcp:HOST:PORT nor tcp-listen:HOST:PORT")
@@ -49,7 +49,7 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
         raise SystemExit(1)
 
 
-def _listen(address: tcp.Address, service: Service, runs: int | None) -> bool:
+def _listen(address: tcp.TcpAddress, service: FederateService, runs: int | None) -> bool:
     token = tcp.token(address)
     succeeded, served = True, 0
     with tcp.listening(address) as server:
@@ -60,7 +60,7 @@ def _listen(address: tcp.Address, service: Service, runs: int | None) -> bool:
     return succeeded
 
 
-def _connect(address: tcp.Address, service: Service, runs: int) -> bool:
+def _connect(address: tcp.TcpAddress, service: FederateService, runs: int) -> bool:
     token = tcp.token(address)
     succeeded = True
     for _ in range(runs):

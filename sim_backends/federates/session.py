@@ -8,10 +8,10 @@ from typing import Final, NoReturn, TypeVar
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates import tcp
-from sim_backends.federates.channels import Channel, ClosedError, DeadlineError
+from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
 from sim_backends.federates.children import Child
 from sim_backends.federates.exchanges import decode_number, decode_text
-from sim_backends.federates.frames import ROLES, Frame, Header, Kind, MalformedFrameError, encode
+from sim_backends.federates.frames import ROLES, Header, MalformedFrameError, MessageKind, ProtocolFrame, encode
 from sim_backends.federates.handshake import Hello, Welcome
 from sim_backends.federates.protocols import FederateError, UnansweredError, seconds_text
 
@@ -31,7 +31,7 @@ def printable(text: str) -> str:
     return line if len(line) <= _MAX_SHOWN else f"{line[:_MAX_SHOWN]}..."
 
 
-class Session:
+class FederateSession:
     """A connection to an external federate. After an error it is closed, and its child process has ended.
 
     Args:
@@ -48,7 +48,7 @@ class Session:
     """
 
     def __init__(
-        self, role: int, where: str, channel: Channel, *, deadline_s: float | None, child: Child | None = None
+        self, role: int, where: str, channel: FrameChannel, *, deadline_s: float | None, child: Child | None = None
     ) -> None:
         self._role = role
         self._where = where
@@ -62,9 +62,9 @@ class Session:
         self._is_closed = False
         self.name = f"{ROLES[role]} ({where})"
         self.reached_ns: int | None = None
-        self.observer: Callable[[bytes, Frame | None], None] | None = None
+        self.observer: Callable[[bytes, ProtocolFrame | None], None] | None = None
 
-    def __deepcopy__(self, memo: dict[int, object]) -> "Session":
+    def __deepcopy__(self, memo: dict[int, object]) -> "FederateSession":
         return self  # copies of a federate share the connection
 
     def next_copy(self) -> int:
@@ -83,7 +83,9 @@ class Session:
             FederateError: It failed, does not answer, or does not suit; the message names it.
         """
         what = f"begin a run as {ROLES[self._role]}"
-        welcome = self.request(Kind.HELLO, 0, hello.encode(), Kind.WELCOME, decode=Welcome.decode, what=lambda: what)
+        welcome = self.request(
+            MessageKind.HELLO, 0, hello.encode(), MessageKind.WELCOME, decode=Welcome.decode, what=lambda: what
+        )
         if welcome.name:
             self.name = f"{ROLES[self._role]} {printable(welcome.name)} ({self._where})"
         if welcome.role != self._role:
@@ -94,10 +96,10 @@ class Session:
 
     def request(
         self,
-        kind: Kind,
+        kind: MessageKind,
         copy: int,
         body: bytes,
-        answer: Kind,
+        answer: MessageKind,
         *,
         decode: Callable[[bytes], Answer],
         what: Callable[[], str],
@@ -120,11 +122,11 @@ class Session:
             raise FederateError(f"the connection to {self.name} is closed")
         try:
             for number in self._released:
-                self._channel.send(encode(Kind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
+                self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
             self._released.clear()
             self._requests = (self._requests + 1) % _REQUESTS
             frame = self._exchange(encode(kind, self._requests, copy, body), Header(0, answer, self._requests, copy))
-            if frame.header.kind is Kind.ERROR:
+            if frame.header.kind is MessageKind.ERROR:
                 text = printable(decode_text(frame.body))
                 self.fail(f"{self.name} failed when it was asked to {what()}: {text}")
             return decode(frame.body)
@@ -140,7 +142,7 @@ class Session:
                 f"{self.name} failed when it was asked to {what()}: {error}{self._progress()}{self._exit_text()}"
             )
 
-    def _exchange(self, request: bytes, expected: Header) -> Frame:
+    def _exchange(self, request: bytes, expected: Header) -> ProtocolFrame:
         """Send a request, and return its answer or the error; the federate may report before that it computes."""
         started_s = time.monotonic()
         limit_s, last_s = started_s + self._deadline_s, started_s + PATIENCE * self._deadline_s
@@ -151,7 +153,7 @@ class Session:
         while True:
             frame = self._channel.receive(limit_s)
             _, kind, number, copy = frame.header
-            if kind is Kind.BUSY:
+            if kind is MessageKind.BUSY:
                 if number == expected.request:  # otherwise it is late
                     self._busy_ns = decode_number(frame.body)
                     limit_s = min(time.monotonic() + self._deadline_s, last_s)
@@ -162,7 +164,7 @@ class Session:
                 raise MalformedFrameError(
                     8, f"it is for request {number} and copy {copy}, not {expected.request} and {expected.copy}"
                 )
-            if kind is not expected.kind and kind is not Kind.ERROR:
+            if kind is not expected.kind and kind is not MessageKind.ERROR:
                 raise MalformedFrameError(4, f"it is {kind.name.lower()}, not {expected.kind.name.lower()}")
             return frame
 
@@ -217,7 +219,7 @@ class Session:
             DeadlineError: It has not.
         """
         deadline_s = time.monotonic() + limit_s
-        self._channel.send(encode(Kind.BYE, 0, 0), deadline_s)
+        self._channel.send(encode(MessageKind.BYE, 0, 0), deadline_s)
         while True:
             self._channel.receive(deadline_s)
 
@@ -227,13 +229,15 @@ class Session:
             return
         self._is_closed = True
         with suppress(ClosedError, DeadlineError):
-            self._channel.send(encode(Kind.BYE, 0, 0), time.monotonic() + _BYE_S)
+            self._channel.send(encode(MessageKind.BYE, 0, 0), time.monotonic() + _BYE_S)
         if self._child is not None:
             self._child.close()
         self._channel.close()
 
 
-def open_session(role: int, where: str, hello: Hello, deadline_s: float | None) -> tuple[Session, Hello, Welcome]:
+def open_session(
+    role: int, where: str, hello: Hello, deadline_s: float | None
+) -> tuple[FederateSession, Hello, Welcome]:
     """Start or connect a federate, and return its session with both messages of the handshake.
 
     Args:
@@ -249,7 +253,7 @@ def open_session(role: int, where: str, hello: Hello, deadline_s: float | None) 
     address = tcp.parse_address(where)
     if address is None:
         child = Child(where)
-        session = Session(role, printable(where), child.channel, deadline_s=deadline_s, child=child)
+        session = FederateSession(role, printable(where), child.channel, deadline_s=deadline_s, child=child)
     else:
         token = tcp.token(address)
         hello = replace(hello, token=token)
@@ -263,7 +267,7 @@ def open_session(role: int, where: str, hello: Hello, deadline_s: float | None) 
                 f"{ROLES[role]} ({address}): {error} within {deadline_s:g} s",
                 remedy="start the federate, or check its address and token",
             ) from error
-        session = Session(role, str(address), channel, deadline_s=deadline_s)
+        session = FederateSession(role, str(address), channel, deadline_s=deadline_s)
     try:
         return session, hello, session.welcome(hello)
     except ValueError as error:

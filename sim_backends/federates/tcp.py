@@ -12,7 +12,7 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.channels import ClosedError, DeadlineError, StreamChannel, socket_channel
-from sim_backends.federates.frames import MAX_JOIN_BYTES, Kind, MalformedFrameError, encode
+from sim_backends.federates.frames import MAX_JOIN_BYTES, MalformedFrameError, MessageKind, encode
 from sim_backends.federates.handshake import decode_join, encode_join
 
 TOKEN_VARIABLE: Final = "FIELDKIT_FEDERATE_TOKEN"  # noqa: S105 (the variable's name)
@@ -22,7 +22,7 @@ _JOIN_S: Final = 5.0
 
 
 @dataclass(frozen=True)
-class Address:
+class TcpAddress:
     """A TCP address.
 
     Attributes:
@@ -39,7 +39,7 @@ class Address:
         return f"{'tcp-listen' if self.listens else 'tcp'}:{self.host}:{self.port}"
 
 
-def parse_address(text: str) -> Address | None:
+def parse_address(text: str) -> TcpAddress | None:
     """Return the address of `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`; None if the text begins with neither.
 
     Raises:
@@ -53,10 +53,10 @@ def parse_address(text: str) -> Address | None:
         raise ConfigurationError(
             f"{text!r} is not an address", remedy="write for example tcp:127.0.0.1:7000 or tcp-listen:0.0.0.0:7000"
         )
-    return Address(host.strip("[]"), int(port), listens=scheme == "tcp-listen")
+    return TcpAddress(host.strip("[]"), int(port), listens=scheme == "tcp-listen")
 
 
-def token(address: Address) -> str:
+def token(address: TcpAddress) -> str:
     """Return the token of a connection: the value of `TOKEN_VARIABLE`.
 
     Raises:
@@ -85,7 +85,7 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-def connect(address: Address, deadline_s: float) -> StreamChannel:
+def connect(address: TcpAddress, deadline_s: float) -> StreamChannel:
     """Return a connection to a listening program; refused attempts are repeated.
 
     Args:
@@ -108,7 +108,7 @@ def connect(address: Address, deadline_s: float) -> StreamChannel:
 
 
 @contextmanager
-def listening(address: Address) -> Iterator[socket.socket]:
+def listening(address: TcpAddress) -> Iterator[socket.socket]:
     """Listen at an address.
 
     Raises:
@@ -138,7 +138,7 @@ def accept(server: socket.socket, deadline_s: float | None) -> StreamChannel:
     return socket_channel(connection)
 
 
-def accept_federate(address: Address, expected_token: str, deadline_s: float) -> StreamChannel:
+def accept_federate(address: TcpAddress, expected_token: str, deadline_s: float) -> StreamChannel:
     """Return the connection of a federate, which begins with `join` and the token; others are closed.
 
     Args:
@@ -158,7 +158,7 @@ def accept_federate(address: Address, expected_token: str, deadline_s: float) ->
                 raise DeadlineError(f"no federate has connected to {address}{rejection}") from error
             try:
                 frame = channel.receive(min(deadline_s, time.monotonic() + _JOIN_S), MAX_JOIN_BYTES)
-                if frame.header.kind is Kind.JOIN and is_same_token(decode_join(frame.body), expected_token):
+                if frame.header.kind is MessageKind.JOIN and is_same_token(decode_join(frame.body), expected_token):
                     return channel
                 rejection = "; a program with a wrong token was rejected"
             except (ClosedError, DeadlineError, MalformedFrameError) as error:
@@ -168,4 +168,4 @@ def accept_federate(address: Address, expected_token: str, deadline_s: float) ->
 
 def join(channel: StreamChannel, own_token: str, deadline_s: float) -> None:
     """Send the first message of a federate that has connected."""
-    channel.send(encode(Kind.JOIN, 0, 0, encode_join(own_token)), deadline_s)
+    channel.send(encode(MessageKind.JOIN, 0, 0, encode_join(own_token)), deadline_s)

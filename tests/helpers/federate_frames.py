@@ -1,8 +1,8 @@
 """An example of each message of the protocol of external federates: those of docs/federates.md."""
 
 from sim_backends.federates import exchanges
-from sim_backends.federates.exchanges import AdvanceNetwork, Outcomes
-from sim_backends.federates.frames import PHYSICS, Kind, encode, text_bytes
+from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
+from sim_backends.federates.frames import PHYSICS, MessageKind, encode, text_bytes
 from sim_backends.federates.handshake import AgentStart, Capability, Hello, Welcome, encode_join
 from sim_backends.federates.records import COMMAND_TYPES, AgentTable
 from sim_backends.network.packets import Arrival, Drop, Packet
@@ -37,7 +37,7 @@ def agents() -> AgentTable:
     return AgentTable(["ugv", "uav"])
 
 
-def _name(kind: Kind) -> str:
+def _name(kind: MessageKind) -> str:
     return kind.name.lower().replace("_", " ")
 
 
@@ -45,32 +45,32 @@ def example_frames() -> dict[str, bytes]:
     """Return a frame of each kind, by its name."""
     packet = Packet(9, "ugv", "uav", 300, ("pose", 4), 10_000_000, 10_500_000, "udp")
     bodies = {
-        Kind.JOIN: encode_join("s3cret"),
-        Kind.HELLO: HELLO.encode(),
-        Kind.WELCOME: WELCOME.encode(),
-        Kind.ADVANCE_PHYSICS: exchanges.encode_advance_physics(
+        MessageKind.JOIN: encode_join("s3cret"),
+        MessageKind.HELLO: HELLO.encode(),
+        MessageKind.WELCOME: WELCOME.encode(),
+        MessageKind.ADVANCE_PHYSICS: exchanges.encode_advance_physics(
             11_100_000, 10_000_000, {"ugv": Twist(0.5, -0.125), "uav": Velocity((1.0, 0.0, 0.25))}, agents()
         ),
-        Kind.STATES: exchanges.encode_states(
+        MessageKind.STATES: exchanges.encode_states(
             11_000_000, {"ugv": START, "uav": DRONE}, AgentTable(["ugv"]), {"ugv": 3.0}
         ),
-        Kind.ADVANCE_NETWORK: AdvanceNetwork(
+        MessageKind.ADVANCE_NETWORK: AdvanceNetwork(
             11_099_999, {"ugv": START}, [packet], since_ns=10_000_000, reckoning_ns=1_000_000
         ).encode(agents()),
-        Kind.OUTCOMES: Outcomes(
+        MessageKind.OUTCOMES: NetworkOutcomes(
             11_099_999, 12_000_000, [Arrival(9, "uav", 11_000_250)], [Drop(8, "out of range")]
         ).encode(agents()),
-        Kind.PING: exchanges.encode_number(42),
-        Kind.PONG: exchanges.encode_number(42),
-        Kind.BUSY: exchanges.encode_number(10_000_000),
-        Kind.FORK: exchanges.encode_fork(2),
-        Kind.DONE: b"",
-        Kind.RELEASE: b"",
-        Kind.ERROR: text_bytes("ValueError: no wheels"),
-        Kind.BYE: b"",
+        MessageKind.PING: exchanges.encode_number(42),
+        MessageKind.PONG: exchanges.encode_number(42),
+        MessageKind.BUSY: exchanges.encode_number(10_000_000),
+        MessageKind.FORK: exchanges.encode_fork(2),
+        MessageKind.DONE: b"",
+        MessageKind.RELEASE: b"",
+        MessageKind.ERROR: text_bytes("ValueError: no wheels"),
+        MessageKind.BYE: b"",
     }
-    copies = {Kind.RELEASE: 2}
-    without_number = {Kind.JOIN, Kind.RELEASE, Kind.BYE}
+    copies = {MessageKind.RELEASE: 2}
+    without_number = {MessageKind.JOIN, MessageKind.RELEASE, MessageKind.BYE}
     return {
         _name(kind): encode(kind, 0 if kind in without_number else 3, copies.get(kind, 0), body)
         for kind, body in bodies.items()

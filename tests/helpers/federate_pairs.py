@@ -5,11 +5,11 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim_backends.federates.answering import Service, _Run
+from sim_backends.federates.answering import FederateService, _Run
 from sim_backends.federates.channels import StreamChannel
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello, Welcome
-from sim_backends.federates.session import Session
+from sim_backends.federates.session import FederateSession
 from sim_backends.world.motion import State
 
 Alter = Callable[[bytes], bytes | None]
@@ -49,18 +49,18 @@ class Pair:
         stays: True if it does not close the connection at the end.
     """
 
-    service: Service
+    service: FederateService
     deadline_s: float = 20.0
     alter: Alter | None = None
     stays: bool = False
     run_class: type[_Run] = _Run
 
-    def __call__(self, hello: Hello) -> tuple[Session, Hello, Welcome]:
+    def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
         """Return a session with a fresh federate."""
         own, other = (channel_of(side) for side in socket.socketpair())
         other.alter = self.alter
         threading.Thread(target=self._serve, args=(other,), daemon=True).start()
-        session = Session(hello.role, "test", own, deadline_s=self.deadline_s)
+        session = FederateSession(hello.role, "test", own, deadline_s=self.deadline_s)
         return session, hello, session.welcome(hello)
 
     def _serve(self, channel: StreamChannel) -> None:

@@ -2,7 +2,7 @@
 
 from sim_backends.federates.conformance.probe import CheckError, NotDeclaredError, Target
 from sim_backends.federates.exchanges import encode_fork
-from sim_backends.federates.frames import Kind
+from sim_backends.federates.frames import MessageKind
 from sim_backends.federates.handshake import Capability
 from sim_backends.federates.records import COMMAND_TYPES
 
@@ -29,14 +29,20 @@ def check_ping(target: Target) -> None:
 
 def check_malformed(target: Target) -> None:
     """A frame that ends too early is refused with an error."""
-    kind, answer = (Kind.ADVANCE_PHYSICS, Kind.STATES) if target.is_physics else (Kind.ADVANCE_NETWORK, Kind.OUTCOMES)
+    kind, answer = (
+        (MessageKind.ADVANCE_PHYSICS, MessageKind.STATES)
+        if target.is_physics
+        else (MessageKind.ADVANCE_NETWORK, MessageKind.OUTCOMES)
+    )
     target.open().expect_error(kind, bytes(9), answer, "a frame that ends too early")
 
 
 def check_counts(target: Target) -> None:
     """A count that is larger than the frame is refused with an error."""
     times, kind, answer = (
-        (16, Kind.ADVANCE_PHYSICS, Kind.STATES) if target.is_physics else (24, Kind.ADVANCE_NETWORK, Kind.OUTCOMES)
+        (16, MessageKind.ADVANCE_PHYSICS, MessageKind.STATES)
+        if target.is_physics
+        else (24, MessageKind.ADVANCE_NETWORK, MessageKind.OUTCOMES)
     )
     target.open().expect_error(kind, bytes(times) + b"\xff" * 4, answer, "a count that is larger than the frame")
 
@@ -46,7 +52,7 @@ def check_fork_absence(target: Target) -> None:
     probe = target.open()
     if probe.has(Capability.FORK):
         raise NotDeclaredError("it declares FORK")
-    probe.expect_error(Kind.FORK, encode_fork(1), Kind.DONE, "fork, which it does not declare")
+    probe.expect_error(MessageKind.FORK, encode_fork(1), MessageKind.DONE, "fork, which it does not declare")
 
 
 def check_bye(target: Target) -> None:

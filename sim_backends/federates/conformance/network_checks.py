@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from sim_backends.federates.conformance.probe import CheckError, NotDeclaredError, Probe, Target
-from sim_backends.federates.exchanges import AdvanceNetwork, Outcomes
-from sim_backends.federates.frames import Kind
+from sim_backends.federates.conformance.probe import CheckError, FederateProbe, NotDeclaredError, Target
+from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
+from sim_backends.federates.frames import MessageKind
 from sim_backends.federates.handshake import NO_EVENT, Capability
 from sim_backends.network.packets import Arrival, Packet
 from sim_backends.world.motion import State
@@ -18,11 +18,11 @@ _FAR_M: Final = 1e6
 _SIZE_BYTES: Final = 200
 
 
-def _states(probe: Probe) -> dict[str, State]:
+def _states(probe: FederateProbe) -> dict[str, State]:
     return {agent.name: State(agent.start.position_m) for agent in probe.hello.agents}
 
 
-def _packets(probe: Probe, times_ns: Sequence[int]) -> list[Packet]:
+def _packets(probe: FederateProbe, times_ns: Sequence[int]) -> list[Packet]:
     """Return packets between the first two agents, in both directions in turns."""
     ends = [agent.name for agent in probe.hello.agents[:2]]
     if len(ends) < 2:
@@ -46,7 +46,7 @@ def _times_ns() -> list[int]:
 class _Account:
     """Follows the fates of packets, and checks what the network reports."""
 
-    def __init__(self, probe: Probe) -> None:
+    def __init__(self, probe: FederateProbe) -> None:
         self._probe = probe
         self._packets: dict[int, Packet] = {}
         self._decided: set[int] = set()
@@ -56,7 +56,7 @@ class _Account:
 
     def advance(
         self, to_ns: int, states: Mapping[str, State], packets: Sequence[Packet] = (), *, copy: int = 0
-    ) -> Outcomes:
+    ) -> NetworkOutcomes:
         """Advance the network, and check its answer."""
         from_ns = self._probe.last_ns
         outcomes = self._probe.network(to_ns, states, packets, copy=copy)
@@ -100,7 +100,7 @@ class _Account:
                 f"packet {packet.packet_id} arrived at {arrival.at_ns} ns, not between {earliest_ns} and {to_ns} ns"
             )
 
-    def _check_next_event(self, outcomes: Outcomes, to_ns: int, *, has_packets: bool) -> None:
+    def _check_next_event(self, outcomes: NetworkOutcomes, to_ns: int, *, has_packets: bool) -> None:
         announced_ns, self._next_event_ns = self._next_event_ns, outcomes.next_event_ns
         if outcomes.next_event_ns != NO_EVENT and outcomes.next_event_ns <= to_ns:
             raise CheckError(f"after advancing to {to_ns} ns, its next event is at {outcomes.next_event_ns} ns")
@@ -112,7 +112,7 @@ class _Account:
                 )
 
 
-def _run(probe: Probe, window_ns: int, until_ns: int = _END_NS) -> _Account:
+def _run(probe: FederateProbe, window_ns: int, until_ns: int = _END_NS) -> _Account:
     """Carry packets in windows of equal length; after all have entered, windows are 100 times as long."""
     account, states = _Account(probe), _states(probe)
     waiting = _packets(probe, _times_ns())
@@ -187,7 +187,9 @@ def check_unknown_transport(target: Target) -> None:
     (packet,) = _packets(probe, [_MS])
     wrong = Packet(1, packet.source, packet.destination, 1, packet.identity, _MS, _MS, "no-such-transport")
     body = AdvanceNetwork(2 * _MS, _states(probe), [wrong]).encode(probe.agents)
-    probe.expect_error(Kind.ADVANCE_NETWORK, body, Kind.OUTCOMES, "a packet of a transport that is not listed")
+    probe.expect_error(
+        MessageKind.ADVANCE_NETWORK, body, MessageKind.OUTCOMES, "a packet of a transport that is not listed"
+    )
 
 
 def check_determinism(target: Target) -> None:

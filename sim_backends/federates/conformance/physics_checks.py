@@ -4,9 +4,9 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from sim_backends.federates.conformance.probe import Advanced, CheckError, NotDeclaredError, Probe, Target
+from sim_backends.federates.conformance.probe import Advanced, CheckError, FederateProbe, NotDeclaredError, Target
 from sim_backends.federates.exchanges import encode_number
-from sim_backends.federates.frames import Kind
+from sim_backends.federates.frames import MessageKind
 from sim_backends.federates.handshake import AgentStart, Capability
 from sim_backends.federates.records import TWIST, VELOCITY
 from sim_backends.physics.body import Twist, Velocity
@@ -33,7 +33,7 @@ def _command(agent: AgentStart) -> Twist | Velocity:
     return Twist(_SPEED_M_S)
 
 
-def _commands(probe: Probe) -> Mapping[str, Twist | Velocity]:
+def _commands(probe: FederateProbe) -> Mapping[str, Twist | Velocity]:
     """Return commands to all agents that the federate can command."""
     supported = {TWIST: False, VELOCITY: True}
     flying = {flies for number, flies in supported.items() if number in probe.welcome.commands}
@@ -50,7 +50,7 @@ def _check_same(first: Mapping[str, State], second: Mapping[str, State], what: s
             raise CheckError(f"{what}: the positions of {name} differ by {distance_m:.3g} m")
 
 
-def _check_time(probe: Probe, to_ns: int, advanced: Advanced) -> None:
+def _check_time(probe: FederateProbe, to_ns: int, advanced: Advanced) -> None:
     step_ns = probe.welcome.step_ns
     expected_ns = to_ns - to_ns % step_ns
     if advanced.at_ns != expected_ns:
@@ -176,7 +176,7 @@ def check_unknown_command(target: Target) -> None:
     body = (
         encode_number(probe.welcome.step_ns) + encode_number(0) + b"\1\0\0\0" + b"\0\0\0\0\xff\x7f\x08\0" + bytes(8)
     )
-    probe.expect_error(Kind.ADVANCE_PHYSICS, body, Kind.STATES, "a command of an unknown type")
+    probe.expect_error(MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, "a command of an unknown type")
 
 
 def check_determinism(target: Target) -> None:

@@ -9,18 +9,18 @@ from typing import Any, Final, Protocol
 from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.exchanges import (
     AdvanceNetwork,
-    Outcomes,
+    NetworkOutcomes,
     decode_number,
     decode_states,
     encode_advance_physics,
     encode_fork,
     encode_number,
 )
-from sim_backends.federates.frames import HEADER_BYTES, PHYSICS, Frame, Kind
+from sim_backends.federates.frames import HEADER_BYTES, PHYSICS, MessageKind, ProtocolFrame
 from sim_backends.federates.handshake import Capability, Hello, Welcome
 from sim_backends.federates.protocols import FederateError
 from sim_backends.federates.records import AgentTable
-from sim_backends.federates.session import Session
+from sim_backends.federates.session import FederateSession
 from sim_backends.network.packets import Packet
 from sim_backends.world.motion import State
 
@@ -39,7 +39,7 @@ class NotDeclaredError(Exception):
 class Opener(Protocol):
     """Starts or connects a fresh federate."""
 
-    def __call__(self, hello: Hello) -> tuple[Session, Hello, Welcome]:
+    def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
         """Return its session, as `open_session`."""
         ...
 
@@ -67,7 +67,7 @@ def frame_text(frame: bytes) -> str:
     return f"{len(frame)} bytes: {frame[:_SHOWN_BYTES].hex(' ', 4)}{rest}"
 
 
-class Probe:
+class FederateProbe:
     """A fresh federate, which is used without the coordinator's safeguards.
 
     Args:
@@ -88,8 +88,8 @@ class Probe:
         self._session.observer = self._observe
         self.last_ns = 0
 
-    def _observe(self, request: bytes, answer: Frame | None) -> None:
-        self._exchange["request"] = f"{Kind(request[4]).name.lower()}, {frame_text(request)}"
+    def _observe(self, request: bytes, answer: ProtocolFrame | None) -> None:
+        self._exchange["request"] = f"{MessageKind(request[4]).name.lower()}, {frame_text(request)}"
         self._exchange["answer"] = "none"
         if answer is not None:
             header = answer.header
@@ -108,8 +108,10 @@ class Probe:
         if not self.has(capability):
             raise NotDeclaredError(f"it does not declare {capability.name}")
 
-    def request(self, kind: Kind, body: bytes, answer: Kind, decode: Callable[[bytes], Any], *, copy: int = 0) -> Any:  # noqa: ANN401 (of `decode`)
-        """Send a request, and return the decoded answer; errors as `Session.request`."""
+    def request(
+        self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
+    ) -> Any:  # noqa: ANN401 (of `decode`)
+        """Send a request, and return the decoded answer; errors as `FederateSession.request`."""
         what = kind.name.lower().replace("_", " ")
         return self._session.request(kind, copy, body, answer, decode=decode, what=lambda: what)
 
@@ -121,7 +123,7 @@ class Probe:
         body = encode_advance_physics(to_ns, begin_ns, commands or {}, self.agents)
         known = set(self.agents.names)
         decode = partial(_decode_advanced, agents=self.agents)
-        advanced: Advanced = self.request(Kind.ADVANCE_PHYSICS, body, Kind.STATES, decode, copy=copy)
+        advanced: Advanced = self.request(MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, decode, copy=copy)
         self.last_ns = to_ns
         if set(self.agents.names) - known and not self.has(Capability.AGENTS_APPEAR):
             raise CheckError(f"an agent appeared, {self.agents.names[-1]}, which it does not declare")
@@ -138,24 +140,26 @@ class Probe:
         *,
         reckoning_ns: int = 0,
         copy: int = 0,
-    ) -> Outcomes:
+    ) -> NetworkOutcomes:
         """Advance a network."""
         body = AdvanceNetwork(to_ns, states, packets, self.last_ns, reckoning_ns).encode(self.agents)
-        decode = partial(Outcomes.decode, agents=self.agents)
-        outcomes: Outcomes = self.request(Kind.ADVANCE_NETWORK, body, Kind.OUTCOMES, decode, copy=copy)
+        decode = partial(NetworkOutcomes.decode, agents=self.agents)
+        outcomes: NetworkOutcomes = self.request(
+            MessageKind.ADVANCE_NETWORK, body, MessageKind.OUTCOMES, decode, copy=copy
+        )
         self.last_ns = to_ns
         return outcomes
 
     def fork(self, copy: int) -> None:
         """Let the federate copy itself."""
-        self.request(Kind.FORK, encode_fork(copy), Kind.DONE, bytes)
+        self.request(MessageKind.FORK, encode_fork(copy), MessageKind.DONE, bytes)
 
     def ping(self, value: int) -> int:
         """Return the value of the answer to a ping."""
-        number: int = self.request(Kind.PING, encode_number(value), Kind.PONG, decode_number)
+        number: int = self.request(MessageKind.PING, encode_number(value), MessageKind.PONG, decode_number)
         return number
 
-    def expect_error(self, kind: Kind, body: bytes, answer: Kind, why: str) -> None:
+    def expect_error(self, kind: MessageKind, body: bytes, answer: MessageKind, why: str) -> None:
         """Send a request that the federate must refuse.
 
         Raises:
@@ -208,18 +212,18 @@ class Target:
 
     def __post_init__(self) -> None:
         self.exchange: dict[str, str] = {}
-        self._probe: Probe | None = None
+        self._probe: FederateProbe | None = None
 
     @property
     def is_physics(self) -> bool:
         """True if a physics is tested."""
         return self.hello.role == PHYSICS
 
-    def open(self) -> Probe:
+    def open(self) -> FederateProbe:
         """Return a fresh federate, after the previous one has ended: one that listens may serve one at a time."""
         self.close()
         self.exchange |= {"request": "hello", "answer": "none"}
-        self._probe = Probe(self.opener, self.hello, self.exchange)
+        self._probe = FederateProbe(self.opener, self.hello, self.exchange)
         return self._probe
 
     def close(self) -> None:

@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import pytest
 
-from sim_backends.federates.answering import Service, _FederateCopy, _Run
+from sim_backends.federates.answering import FederateService, _FederateCopy, _Run
 from sim_backends.federates.conformance import probe
 from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import CheckResult, checks, run_check
-from sim_backends.federates.frames import NETWORK, PHYSICS, Kind
+from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.dead_reckoning import DeadReckoned
@@ -185,16 +185,16 @@ def random_delay(self: Net, arrivals: list[Arrival], drops: list[Drop], to_ns: i
     return kept, [Drop(arrival.packet_id, "bad luck") for arrival in lost]
 
 
-def as_answer(kind: Kind) -> Alter:
+def as_answer(kind: MessageKind) -> Alter:
     """Return a function that turns an error into an empty answer."""
 
     def alter(frame: bytes) -> bytes:
-        return frame if frame[4] != Kind.ERROR else struct.pack("<IHH", 0, kind, 0) + frame[8:16]
+        return frame if frame[4] != MessageKind.ERROR else struct.pack("<IHH", 0, kind, 0) + frame[8:16]
 
     return alter
 
 
-def later(kind: Kind, by: int) -> Alter:
+def later(kind: MessageKind, by: int) -> Alter:
     """Return a function that changes the first integer in the body of messages."""
 
     def alter(frame: bytes) -> bytes:
@@ -206,7 +206,7 @@ def later(kind: Kind, by: int) -> Alter:
 
 
 def silent(frame: bytes) -> bytes | None:
-    return None if frame[4] in {Kind.STATES, Kind.OUTCOMES} else frame
+    return None if frame[4] in {MessageKind.STATES, MessageKind.OUTCOMES} else frame
 
 
 @dataclass(frozen=True)
@@ -217,18 +217,22 @@ class Broken:
 
 
 def physics(make: Any, **settings: Any) -> Pair:  # noqa: ANN401
-    return Pair(Service(make, **settings))
+    return Pair(FederateService(make, **settings))
 
 
 PHYSICS_CASES = [
     Broken("handshake", physics(Carts, commands=(1, 2, 9)), "unknown types of commands: [9]"),
-    Broken("ping", replace(physics(Carts), alter=later(Kind.PONG, 1)), "the ping 0 was answered with 1"),
-    Broken("malformed", replace(physics(Carts), alter=as_answer(Kind.STATES)), "it must refuse a frame that ends"),
-    Broken("counts", replace(physics(Carts), alter=as_answer(Kind.STATES)), "it must refuse a count"),
-    Broken("fork_absence", replace(physics(Carts, forks=False), alter=as_answer(Kind.DONE)), "it must refuse fork"),
+    Broken("ping", replace(physics(Carts), alter=later(MessageKind.PONG, 1)), "the ping 0 was answered with 1"),
+    Broken(
+        "malformed", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a frame that ends"
+    ),
+    Broken("counts", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a count"),
+    Broken(
+        "fork_absence", replace(physics(Carts, forks=False), alter=as_answer(MessageKind.DONE)), "it must refuse fork"
+    ),
     Broken("bye", replace(physics(Carts), stays=True), "it has not closed the connection"),
     Broken("start", physics(StartsElsewhere), "ann starts 1 m away"),
-    Broken("remainders", replace(physics(Carts), alter=later(Kind.STATES, 1)), "instead of 0 ns"),
+    Broken("remainders", replace(physics(Carts), alter=later(MessageKind.STATES, 1)), "instead of 0 ns"),
     Broken("remainders", physics(LosesAnAgent), "there is no state of bob"),
     Broken("remainders", physics(AddsAnAgent), "an agent appeared, dan"),
     Broken("remainders", replace(physics(Carts), alter=silent, deadline_s=0.2), "has not answered for 0.2 s"),
@@ -239,19 +243,25 @@ PHYSICS_CASES = [
     Broken("motion", physics(IgnoresCommands), "moved by 0 m in 1000 steps"),
     Broken("limits", physics(HasWrongLimits), "its limit of 0.1 m/s^2 allows"),
     Broken("command_time", replace(physics(Carts), run_class=IgnoresFrom), "a command from 100000000 ns on"),
-    Broken("unknown_command", replace(physics(Carts), alter=as_answer(Kind.STATES)), "it must refuse a command"),
+    Broken(
+        "unknown_command", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a command"
+    ),
     Broken("determinism", physics(Trembles), "gave different answers"),
     Broken("fork", physics(IsShared), "the original"),
 ]
 NETWORK_CASES = [
     Broken("handshake", physics(Transmits), "KeyError: 'nobody'"),
-    Broken("ping", replace(physics(Net), alter=later(Kind.PONG, 1)), "the ping 0 was answered with 1"),
-    Broken("malformed", replace(physics(Net), alter=as_answer(Kind.OUTCOMES)), "it must refuse a frame that ends"),
-    Broken("counts", replace(physics(Net), alter=as_answer(Kind.OUTCOMES)), "it must refuse a count"),
-    Broken("fork_absence", replace(physics(Net, forks=False), alter=as_answer(Kind.DONE)), "it must refuse fork"),
+    Broken("ping", replace(physics(Net), alter=later(MessageKind.PONG, 1)), "the ping 0 was answered with 1"),
+    Broken(
+        "malformed", replace(physics(Net), alter=as_answer(MessageKind.OUTCOMES)), "it must refuse a frame that ends"
+    ),
+    Broken("counts", replace(physics(Net), alter=as_answer(MessageKind.OUTCOMES)), "it must refuse a count"),
+    Broken(
+        "fork_absence", replace(physics(Net, forks=False), alter=as_answer(MessageKind.DONE)), "it must refuse fork"
+    ),
     Broken("bye", replace(physics(Net), stays=True), "it has not closed the connection"),
     Broken("first_request", physics(RefusesNegativeTimes), "ValueError: negative"),
-    Broken("exactly_once", replace(physics(Net), alter=later(Kind.OUTCOMES, 1)), "it advanced to"),
+    Broken("exactly_once", replace(physics(Net), alter=later(MessageKind.OUTCOMES, 1)), "it advanced to"),
     Broken("exactly_once", physics(net(lambda _, arrived, drops, to_ns: ([], drops))), "neither arrived nor"),
     Broken(
         "exactly_once",
@@ -290,7 +300,7 @@ NETWORK_CASES = [
     Broken("far_away", physics(ForgetsFarAway), "1,000 km away neither arrived nor"),
     Broken(
         "unknown_transport",
-        replace(physics(Net, transports=("udp",)), alter=as_answer(Kind.OUTCOMES)),
+        replace(physics(Net, transports=("udp",)), alter=as_answer(MessageKind.OUTCOMES)),
         "it must refuse a packet of a transport",
     ),
     Broken("determinism", physics(net(random_delay)), "gave different arrivals or drops"),

@@ -9,7 +9,7 @@ from sim_backends.cosim import load_scenario
 from sim_backends.cosim.scenario.agent_setup import bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.served import make_federate
-from sim_backends.federates.answering import Service
+from sim_backends.federates.answering import FederateService
 from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import checks, run_check
 from sim_backends.federates.frames import NETWORK, PHYSICS
@@ -24,7 +24,7 @@ CASES = [(role, name) for role in (PHYSICS, NETWORK) for name in checks(is_physi
 
 @pytest.mark.parametrize(("role", "name"), CASES, ids=str)
 def test_the_built_in_federates_conform(role: int, name: str) -> None:
-    target = Target(Pair(Service(partial(make_federate, role))), replace(HELLO, role=role), windows=500)
+    target = Target(Pair(FederateService(partial(make_federate, role))), replace(HELLO, role=role), windows=500)
     result = run_check(target, name, checks(is_physics=role == PHYSICS)[name])
     assert not result.failure, result
     assert bool(result.skipped) == (name in {"fork_absence", "unknown_transport", "new_agent"})

@@ -9,13 +9,13 @@ from contextlib import suppress
 import pytest
 
 from sim_backends.federates import exchanges
-from sim_backends.federates.exchanges import AdvanceNetwork, Outcomes
+from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import (
     HEADER_BYTES,
     MAX_FRAME_BYTES,
     FrameReader,
-    Kind,
     MalformedFrameError,
+    MessageKind,
     encode,
     read_header,
     text_bytes,
@@ -30,7 +30,7 @@ DECODERS: dict[str, Callable[[bytes], object]] = {
     "advance physics": lambda body: exchanges.decode_advance_physics(body, agents()),
     "states": lambda body: exchanges.decode_states(body, agents()),
     "advance network": lambda body: AdvanceNetwork.decode(body, agents()),
-    "outcomes": lambda body: Outcomes.decode(body, agents()),
+    "outcomes": lambda body: NetworkOutcomes.decode(body, agents()),
     "ping": exchanges.decode_number,
     "fork": exchanges.decode_fork,
     "error": exchanges.decode_text,
@@ -118,7 +118,7 @@ def test_two_states_of_one_agent_are_refused() -> None:
 
 def test_our_own_limits() -> None:
     with pytest.raises(ValueError, match="longer than"):
-        encode(Kind.STATES, 1, 0, bytes(17 << 20))
+        encode(MessageKind.STATES, 1, 0, bytes(17 << 20))
     with pytest.raises(ValueError, match="a text of 1001 bytes is longer than 1000"):
         text_bytes("x" * 1001)
     assert FrameReader(text_bytes("ä\ud800")).text() == "ä?"

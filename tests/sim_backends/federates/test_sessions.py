@@ -18,14 +18,14 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates import tcp
-from sim_backends.federates.answering import Service, serve_channel
+from sim_backends.federates.answering import FederateService, serve_channel
 from sim_backends.federates.channels import ClosedError, DeadlineError, StreamChannel
-from sim_backends.federates.frames import HEADER_BYTES, NETWORK, PHYSICS, Kind, encode
+from sim_backends.federates.frames import HEADER_BYTES, NETWORK, PHYSICS, MessageKind, encode
 from sim_backends.federates.handshake import Hello, encode_join
 from sim_backends.federates.protocols import FederateError, UnansweredError
 from sim_backends.federates.remote import RemotePhysics, open_network, open_physics
 from sim_backends.federates.serving import serve
-from sim_backends.federates.session import Session
+from sim_backends.federates.session import FederateSession
 from sim_backends.physics.body import Twist
 from sim_backends.world.motion import State
 from tests.helpers.federate_examples import EXAMPLES, carts
@@ -38,7 +38,7 @@ CARTS = f"{sys.executable} {EXAMPLES / 'carts.py'}"
 
 
 def remote(alter: Alter | None = None, deadline_s: float = 20.0) -> RemotePhysics:
-    return RemotePhysics(*Pair(Service(carts(), name="carts"), alter=alter, deadline_s=deadline_s)(HELLO))
+    return RemotePhysics(*Pair(FederateService(carts(), name="carts"), alter=alter, deadline_s=deadline_s)(HELLO))
 
 
 def children() -> set[int]:
@@ -64,7 +64,7 @@ def from_second(alter: Callable[[bytes], bytes | None]) -> Alter:
 
     def altered(frame: bytes) -> bytes | None:
         nonlocal count
-        count += frame[4] == Kind.STATES
+        count += frame[4] == MessageKind.STATES
         return alter(frame) if count > 1 else frame
 
     return altered
@@ -81,14 +81,14 @@ def from_second(alter: Callable[[bytes], bytes | None]) -> Alter:
         ),
         (lambda frame: struct.pack("<I", 1 << 31) + frame[4:], FederateError, "byte 0: a size of 2147483648 bytes"),
         (lambda frame: frame[:8] + b"\7\0\0\0" + frame[12:], FederateError, "byte 8: it is for request 7 and copy 0"),
-        (lambda frame: encode(Kind.DONE, 3, 0), FederateError, "byte 4: it is done, not states"),
+        (lambda frame: encode(MessageKind.DONE, 3, 0), FederateError, "byte 4: it is done, not states"),
         (
-            lambda frame: encode(Kind.STATES, 3, 0, frame[HEADER_BYTES:-1]),
+            lambda frame: encode(MessageKind.STATES, 3, 0, frame[HEADER_BYTES:-1]),
             FederateError,
             "byte 28: 3 items of at least",
         ),
         (
-            lambda frame: encode(Kind.ERROR, 3, 0, b"\3\0a\nb"),
+            lambda frame: encode(MessageKind.ERROR, 3, 0, b"\3\0a\nb"),
             FederateError,
             "asked to advance from 0 s to 0.0011 s: a b",
         ),
@@ -134,12 +134,12 @@ class Slow:
 
 def test_a_federate_that_reports_that_it_computes_may_take_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     hello = replace(HELLO, heartbeat_ms=50)
-    physics = RemotePhysics(*Pair(Service(Slow), deadline_s=0.3)(hello))
+    physics = RemotePhysics(*Pair(FederateService(Slow), deadline_s=0.3)(hello))
     physics.advance(0, {})
     physics.advance(2 * MS, {})
     physics.advance(3 * MS, {})
     monkeypatch.setattr("sim_backends.federates.session.PATIENCE", 1)
-    impatient = RemotePhysics(*Pair(Service(Slow), deadline_s=0.3)(hello))
+    impatient = RemotePhysics(*Pair(FederateService(Slow), deadline_s=0.3)(hello))
     impatient.advance(0, {})
     impatient.advance(2 * MS, {})
     with pytest.raises(UnansweredError, match=r"its last time is 0.002 s; it last reported 0.002 s"):
@@ -243,11 +243,11 @@ def test_a_federate_refuses_a_wrong_token(monkeypatch: pytest.MonkeyPatch) -> No
     port = free_port()
     monkeypatch.setenv(tcp.TOKEN_VARIABLE, "right")
     thread = threading.Thread(target=_serve_once, args=(port,), daemon=True)
-    with tcp.listening(tcp.Address("127.0.0.1", port)) as server:
+    with tcp.listening(tcp.TcpAddress("127.0.0.1", port)) as server:
         thread.start()
         with closing(tcp.accept(server, time.monotonic() + 5)) as channel:
             channel.receive(time.monotonic() + 5)  # join
-            session = Session(PHYSICS, "test", channel, deadline_s=5.0)
+            session = FederateSession(PHYSICS, "test", channel, deadline_s=5.0)
             with pytest.raises(FederateError, match="PermissionError: the token is wrong"):
                 session.welcome(replace(HELLO, token="wrong"))
     thread.join(5)
@@ -261,20 +261,20 @@ def _serve_once(port: int) -> None:
 def test_other_programs_are_rejected_and_the_wait_continues(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(tcp.TOKEN_VARIABLE, "right")
     port = free_port()
-    address = tcp.Address("127.0.0.1", port, listens=True)
+    address = tcp.TcpAddress("127.0.0.1", port, listens=True)
 
     def connect_all() -> None:
         for data in (
             b"GET / HTTP/1.1\r\n\r\n",
-            encode(Kind.JOIN, 0, 0, encode_join("wrong")),
-            encode(Kind.BYE, 0, 0),
+            encode(MessageKind.JOIN, 0, 0, encode_join("wrong")),
+            encode(MessageKind.BYE, 0, 0),
         ):
             with socket.create_connection(("127.0.0.1", port)) as connection:
                 connection.sendall(data)
                 assert connection.recv(1) == b""  # nothing is sent to it, not even the token
-        channel = tcp.connect(tcp.Address("127.0.0.1", port), time.monotonic() + 5)
+        channel = tcp.connect(tcp.TcpAddress("127.0.0.1", port), time.monotonic() + 5)
         tcp.join(channel, "right", time.monotonic() + 5)
-        serve_channel(channel, Service(carts()), "right")
+        serve_channel(channel, FederateService(carts()), "right")
 
     threading.Timer(0.1, connect_all).start()
     with closing(open_physics(str(address), HELLO, 20.0)) as physics:
@@ -318,12 +318,12 @@ def mutated(frame: bytes, draws: random.Random) -> bytes:
 
 
 def test_mutated_requests_end_the_session_of_a_federate_or_are_answered() -> None:
-    frames = [encode(Kind.HELLO, 1, 0, HELLO.encode()), *(example_frames()[name] for name in REQUESTS)]
+    frames = [encode(MessageKind.HELLO, 1, 0, HELLO.encode()), *(example_frames()[name] for name in REQUESTS)]
     for seed in range(80):
         draws = random.Random(seed)
         own, other = socket.socketpair()
         channel = channel_of(other)
-        thread = threading.Thread(target=serve_channel, args=(channel, Service(Still)), daemon=True)
+        thread = threading.Thread(target=serve_channel, args=(channel, FederateService(Still)), daemon=True)
         thread.start()
         wrong = draws.randrange(len(frames))
         with own, suppress(BrokenPipeError, ConnectionResetError):
@@ -339,7 +339,7 @@ def test_mutated_answers_raise_only_errors_that_name_the_federate() -> None:
     for seed in range(80):
         draws = random.Random(seed)
         alter = from_second(lambda frame, draws=draws: mutated(frame, draws))  # type: ignore[misc]
-        physics = RemotePhysics(*Pair(Service(Still, name="still"), alter=alter, deadline_s=0.05)(HELLO))
+        physics = RemotePhysics(*Pair(FederateService(Still, name="still"), alter=alter, deadline_s=0.05)(HELLO))
         try:
             for step in range(4):
                 physics.advance(step * MS, {})

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from sim_backends.federates import exchanges
-from sim_backends.federates.exchanges import AdvanceNetwork, Outcomes
-from sim_backends.federates.frames import HEADER_BYTES, Kind, read_header
+from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
+from sim_backends.federates.frames import HEADER_BYTES, MessageKind, read_header
 from sim_backends.federates.handshake import Hello, Welcome, decode_join
 from sim_backends.federates.records import AgentTable
 from tests.helpers.federate_frames import DRONE, HELLO, START, WELCOME, agents, example_frames
@@ -43,7 +43,7 @@ class ByHand:
 
 def test_the_page_has_a_vector_of_each_message() -> None:
     assert example_frames() == VECTORS
-    assert len(VECTORS) == len(Kind)
+    assert len(VECTORS) == len(MessageKind)
 
 
 def test_the_handshake_by_hand() -> None:
@@ -122,12 +122,12 @@ def test_our_decoder_reads_the_vectors() -> None:
     assert table.names == ["ugv", "uav"]
     network = AdvanceNetwork.decode(body("advance network"), agents())
     assert network.encode(agents()) == body("advance network")
-    outcomes = Outcomes.decode(body("outcomes"), agents())
+    outcomes = NetworkOutcomes.decode(body("outcomes"), agents())
     assert outcomes.encode(agents()) == body("outcomes")
     assert exchanges.decode_text(body("error")) == "ValueError: no wheels"
 
 
 @pytest.mark.parametrize("name", sorted(VECTORS))
 def test_the_size_in_the_header_is_that_of_the_body(name: str) -> None:
-    assert read_header(VECTORS[name]).kind is Kind[name.upper().replace(" ", "_")]
+    assert read_header(VECTORS[name]).kind is MessageKind[name.upper().replace(" ", "_")]
     assert body(name) == VECTORS[name][16:]
