@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from sim_backends.federates import tcp
+from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
 from sim_backends.federates.exchanges import (
     AdvanceNetwork,
@@ -34,7 +35,7 @@ from sim_backends.federates.frames import (
     text_bytes,
 )
 from sim_backends.federates.handshake import NO_EVENT, Capability, Hello, Welcome
-from sim_backends.federates.records import COMMAND_TYPES, AgentTable, command_type
+from sim_backends.federates.records import COMMAND_TYPES, command_type
 from sim_backends.world.dead_reckoning import DeadReckoned
 
 _MAX_COPIES: Final = 1000

@@ -5,21 +5,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from sim_backends.federates.agent_states import (
+    AgentTable,
+    ReceivedStates,
+    announcements_bytes,
+    read_announcements,
+    read_states,
+    states_bytes,
+)
 from sim_backends.federates.frames import FrameReader, MalformedFrameError
 from sim_backends.federates.records import (
-    AgentTable,
-    announcements_bytes,
     arrivals_bytes,
     commands_bytes,
     drops_bytes,
     packets_bytes,
-    read_announcements,
     read_arrivals,
     read_commands,
     read_drops,
     read_packets,
-    read_states,
-    states_bytes,
 )
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.body import Twist, Velocity
@@ -63,8 +66,8 @@ def encode_states(
     return _TIME.pack(at_ns) + announcements_bytes(states, agents) + states_bytes(states, agents, limits_m_s2)
 
 
-def decode_states(body: bytes, agents: AgentTable) -> tuple[int, dict[str, State], dict[str, float]]:
-    """Return time, states and limits of a physics' answer.
+def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]:
+    """Return time and states of a physics' answer; the states have the limits.
 
     Raises:
         MalformedFrameError: It is malformed.
@@ -72,9 +75,9 @@ def decode_states(body: bytes, agents: AgentTable) -> tuple[int, dict[str, State
     reader = FrameReader(body)
     (at_ns,) = reader.unpack(_TIME)
     read_announcements(reader, agents)
-    states, limits_m_s2 = read_states(reader, agents)
+    states = read_states(reader, agents)
     reader.end()
-    return at_ns, states, limits_m_s2
+    return at_ns, states
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,7 @@ class AdvanceNetwork:
         if reckoning_ns < 0:
             raise MalformedFrameError(reader.position - 8, f"a step of {reckoning_ns} ns is negative")
         read_announcements(reader, agents)
-        states, _ = read_states(reader, agents)
+        states = read_states(reader, agents)
         packets = read_packets(reader, agents)
         reader.end()
         return AdvanceNetwork(to_ns, states, packets, since_ns, reckoning_ns)

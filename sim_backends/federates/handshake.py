@@ -9,6 +9,7 @@ from enum import IntFlag
 from typing import Any, Final
 
 from fieldkit.core.model import Vector
+from sim_backends.federates.agent_states import STATE, AgentTable, read_states, states_bytes
 from sim_backends.federates.frames import (
     MAGIC,
     MAX_AGENTS,
@@ -22,7 +23,6 @@ from sim_backends.federates.frames import (
     short_count_bytes,
     text_bytes,
 )
-from sim_backends.federates.records import STATE, AgentTable, read_states, states_bytes
 from sim_backends.world.motion import State
 
 NO_EVENT: Final = -1
@@ -187,11 +187,11 @@ def _read_agent(reader: FrameReader, table: AgentTable) -> AgentStart:
         raise MalformedFrameError(
             position, f"the agent's name {name!r} is empty or not unique, or there are too many"
         )
-    table.add(name)
-    (states, limits_m_s2) = read_states(FrameReader(count_bytes(1) + reader.take(STATE.size)), table)
+    table.add([name])
+    states = read_states(FrameReader(count_bytes(1) + reader.take(STATE.size)), table)
     if name not in states:
         raise MalformedFrameError(position, f"the start of {name} has the index of another agent")
-    return AgentStart(name, profile, states[name], bool(flies), antenna_m, limits_m_s2[name])
+    return AgentStart(name, profile, states[name], bool(flies), antenna_m, states.limits_m_s2[name])
 
 
 @dataclass(frozen=True)

@@ -1,23 +1,15 @@
-"""Records inside messages: agents, states, commands, packets, arrivals and drops."""
+"""Records inside messages: commands, packets, arrivals and drops."""
 
 import math
 import struct
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from sim_backends.federates.frames import (
-    MAX_AGENTS,
-    FrameReader,
-    MalformedFrameError,
-    count_bytes,
-    text_bytes,
-)
+from sim_backends.federates.agent_states import AgentTable
+from sim_backends.federates.frames import FrameReader, MalformedFrameError, count_bytes, text_bytes
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.world.motion import State
 
-_INDEX: Final = struct.Struct("<I")
-STATE: Final = struct.Struct("<II8d")
 _PACKET: Final = struct.Struct("<QqQqqII")
 _ARRIVAL: Final = struct.Struct("<QqII")
 _DROP: Final = struct.Struct("<Q")
@@ -27,134 +19,6 @@ _VELOCITY: Final = struct.Struct("<4d")
 TWIST, VELOCITY = 1, 2
 COMMAND_TYPES: Final = (TWIST, VELOCITY)
 _MAX_BYTES: Final = 1 << 62
-_NEW_AGENT_BYTES: Final = _INDEX.size + 2
-
-
-class AgentTable:
-    """The agents that both sides know, by index.
-
-    Args:
-        names: Their names, in order.
-    """
-
-    def __init__(self, names: Iterable[str] = ()) -> None:
-        self.names = list(names)
-        self.indices = {name: index for index, name in enumerate(self.names)}
-
-    def copy(self) -> "AgentTable":
-        """Return an independent copy."""
-        return AgentTable(self.names)
-
-    def add(self, name: str) -> int:
-        """Add an agent, and return its index."""
-        index = self.indices[name] = len(self.names)
-        self.names.append(name)
-        return index
-
-    def name(self, index: int, position: int) -> str:
-        """Return the name of an agent.
-
-        Args:
-            index: Its index.
-            position: Position of the index in the frame, for the error.
-
-        Raises:
-            MalformedFrameError: There is no such agent.
-        """
-        if index >= len(self.names):
-            raise MalformedFrameError(position, f"agent {index} was not announced")
-        return self.names[index]
-
-
-def announcements_bytes(names: Iterable[str], agents: AgentTable) -> bytes:
-    """Return the announcement of those names that are not in the table yet, which adds them to it.
-
-    Raises:
-        ValueError: There are too many agents.
-    """
-    new = [name for name in names if name not in agents.indices]
-    if len(agents.names) + len(new) > MAX_AGENTS:
-        raise ValueError(f"there are more than {MAX_AGENTS} agents")
-    return count_bytes(len(new)) + b"".join(_INDEX.pack(agents.add(name)) + text_bytes(name) for name in new)
-
-
-def read_announcements(reader: FrameReader, agents: AgentTable) -> None:
-    """Add announced agents to the table.
-
-    Raises:
-        MalformedFrameError: An index is not the next one, or a name is known already.
-    """
-    for _ in range(reader.count(_NEW_AGENT_BYTES)):
-        position = reader.position
-        (index,) = reader.unpack(_INDEX)
-        if index != len(agents.names) or index >= MAX_AGENTS:
-            raise MalformedFrameError(position, f"the new agent has index {index}, not {len(agents.names)}")
-        position = reader.position
-        name = reader.text()
-        if not name or name in agents.indices:
-            raise MalformedFrameError(position, f"the new agent's name {name!r} is empty or known already")
-        agents.add(name)
-
-
-def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: Mapping[str, float] | None) -> bytes:
-    """Return the states of announced agents.
-
-    Args:
-        states: The states.
-        agents: The agents.
-        limits_m_s2: Limits of their accelerations; None for unknown.
-    """
-    indices, pack = agents.indices, STATE.pack
-    parts = [count_bytes(len(states))]
-    for name, state in states.items():
-        heading_rad = state.heading_rad
-        parts.append(
-            pack(
-                indices[name],
-                0,
-                *state.position_m,
-                *state.velocity_m_s,
-                math.nan if heading_rad is None else heading_rad,
-                math.inf if limits_m_s2 is None else limits_m_s2.get(name, math.inf),
-            )
-        )
-    return b"".join(parts)
-
-
-def read_states(reader: FrameReader, agents: AgentTable) -> tuple[dict[str, State], dict[str, float]]:
-    """Return states and limits of agents, by name.
-
-    Raises:
-        MalformedFrameError: A state is invalid, or an agent has two.
-    """
-    count = reader.count(STATE.size)
-    begin = reader.position
-    names, known, isfinite, isinf = agents.names, len(agents.names), math.isfinite, math.isinf
-    states: dict[str, State] = {}
-    limits_m_s2: dict[str, float] = {}
-    for index, reserved, e, n, u, v_e, v_n, v_u, heading_rad, limit_m_s2 in STATE.iter_unpack(
-        reader.take(count * STATE.size)
-    ):
-        if (
-            index >= known
-            or reserved
-            or not isfinite(e + n + u + v_e + v_n + v_u)
-            or isinf(heading_rad)
-            or not limit_m_s2 >= 0
-        ):
-            position = begin + len(states) * STATE.size
-            raise MalformedFrameError(position, f"the state of agent {index} is invalid, or it was not announced")
-        name = names[index]
-        if name in states:
-            raise MalformedFrameError(begin + len(states) * STATE.size, f"agent {name} has two states")
-        # NaN, which means no heading, is the only number that is not equal to itself.
-        states[name] = State(
-            (e, n, u),
-            (v_e, v_n, v_u),
-            heading_rad if heading_rad == heading_rad else None,  # noqa: PLR0124 (see above)
-        )
-        limits_m_s2[name] = limit_m_s2
-    return states, limits_m_s2
 
 
 def commands_bytes(commands: Mapping[str, Any], agents: AgentTable) -> bytes:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import (
     AdvanceNetwork,
     NetworkOutcomes,
@@ -16,7 +17,7 @@ from sim_backends.federates.exchanges import (
 from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
 from sim_backends.federates.handshake import NO_EVENT, Capability, Hello, Welcome
 from sim_backends.federates.protocols import FederateError, seconds_text
-from sim_backends.federates.records import AgentTable, command_type
+from sim_backends.federates.records import command_type
 from sim_backends.federates.session import FederateSession, open_session
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.dead_reckoning import DeadReckoned
@@ -88,7 +89,7 @@ class RemotePhysics(_RemoteFederate):
         self.step_ns = welcome.step_ns
         self._limits_m_s2 = {agent.name: agent.limit_m_s2 for agent in hello.agents}
         self.limits_m_s2: Mapping[str, float] = self._limits_m_s2
-        self._states: dict[str, State] = {}
+        self._states: Mapping[str, State] = {}
         self._states_ns: int | None = None
         self._last_ns = 0
 
@@ -103,7 +104,7 @@ class RemotePhysics(_RemoteFederate):
                 raise FederateError(
                     f"{self.session.name} does not support the command {type(command).__name__} to {name}"
                 )
-        states_ns, states, limits_m_s2 = self.session.request(
+        states_ns, states = self.session.request(
             MessageKind.ADVANCE_PHYSICS,
             self._copy,
             encode_advance_physics(to_ns, from_ns, commands, self._agents),
@@ -117,7 +118,7 @@ class RemotePhysics(_RemoteFederate):
                 f"{seconds_text(states_ns)} instead of {seconds_text(at_ns)}, its last step until then"
             )
         self._states, self._states_ns = states, at_ns
-        self._limits_m_s2.update(limits_m_s2)
+        self._limits_m_s2.update(states.limits_m_s2)
         self.session.reached_ns = to_ns
         return states
 

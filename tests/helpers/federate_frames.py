@@ -1,10 +1,11 @@
 """An example of each message of the protocol of external federates: those of docs/federates.md."""
 
 from sim_backends.federates import exchanges
+from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import PHYSICS, MessageKind, encode, text_bytes
 from sim_backends.federates.handshake import AgentStart, Capability, Hello, Welcome, encode_join
-from sim_backends.federates.records import COMMAND_TYPES, AgentTable
+from sim_backends.federates.records import COMMAND_TYPES
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State

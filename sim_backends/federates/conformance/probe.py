@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Protocol
 
+from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.exchanges import (
     AdvanceNetwork,
@@ -19,7 +20,6 @@ from sim_backends.federates.exchanges import (
 from sim_backends.federates.frames import HEADER_BYTES, PHYSICS, MessageKind, ProtocolFrame
 from sim_backends.federates.handshake import Capability, Hello, Welcome
 from sim_backends.federates.protocols import FederateError
-from sim_backends.federates.records import AgentTable
 from sim_backends.federates.session import FederateSession
 from sim_backends.network.packets import Packet
 from sim_backends.world.motion import State
@@ -193,7 +193,8 @@ class FederateProbe:
 
 
 def _decode_advanced(body: bytes, agents: AgentTable) -> Advanced:
-    return Advanced(*decode_states(body, agents), body)
+    at_ns, states = decode_states(body, agents)
+    return Advanced(at_ns, states, states.limits_m_s2, body)
 
 
 @dataclass

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from sim_backends.federates import exchanges
+from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import HEADER_BYTES, MessageKind, read_header
 from sim_backends.federates.handshake import Hello, Welcome, decode_join
-from sim_backends.federates.records import AgentTable
 from tests.helpers.federate_frames import DRONE, HELLO, START, WELCOME, agents, example_frames
 from tests.helpers.paths import ROOT
 
@@ -117,8 +117,12 @@ def test_our_decoder_reads_the_vectors() -> None:
     to_ns, from_ns, commands = exchanges.decode_advance_physics(body("advance physics"), agents())
     assert (to_ns, from_ns, set(commands)) == (11_100_000, 10_000_000, {"ugv", "uav"})
     table = AgentTable(["ugv"])
-    at_ns, states, limits_m_s2 = exchanges.decode_states(body("states"), table)
-    assert (at_ns, states, limits_m_s2) == (11_000_000, {"ugv": START, "uav": DRONE}, {"ugv": 3.0, "uav": math.inf})
+    at_ns, states = exchanges.decode_states(body("states"), table)
+    assert (at_ns, dict(states), states.limits_m_s2) == (
+        11_000_000,
+        {"ugv": START, "uav": DRONE},
+        {"ugv": 3.0, "uav": math.inf},
+    )
     assert table.names == ["ugv", "uav"]
     network = AdvanceNetwork.decode(body("advance network"), agents())
     assert network.encode(agents()) == body("advance network")
