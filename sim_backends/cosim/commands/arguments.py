@@ -187,7 +187,7 @@ def _conform(commands: Commands) -> None:
         "--scenario", default="convoy", metavar="SCENARIO", help="scenario that it receives (default convoy)"
     )
     parser.add_argument(
-        "--windows", type=repeats, default=2000, metavar="N", help="windows of the check for drift (default 2000)"
+        "--windows", type=natural, default=2000, metavar="N", help="windows of the check for drift (default 2000)"
     )
     parser.add_argument("--deadline", metavar="TIME", help="longest wait for an answer, in wall time (default 30s)")
     parser.add_choice("--format", ("table", "json"), default="table", help="output format (default table)")

@@ -3,13 +3,11 @@
 import random
 import struct
 import tracemalloc
-from collections.abc import Callable
 from contextlib import suppress
 
 import pytest
 
 from sim_backends.federates import exchanges
-from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import (
     HEADER_BYTES,
     MAX_FRAME_BYTES,
@@ -20,21 +18,9 @@ from sim_backends.federates.frames import (
     read_header,
     text_bytes,
 )
-from sim_backends.federates.handshake import Hello, Welcome, decode_join
+from tests.helpers.federate_decoders import DECODERS
 from tests.helpers.federate_frames import agents, example_frames
 
-DECODERS: dict[str, Callable[[bytes], object]] = {
-    "join": decode_join,
-    "hello": Hello.decode,
-    "welcome": Welcome.decode,
-    "advance physics": lambda body: exchanges.decode_advance_physics(body, agents()),
-    "states": lambda body: exchanges.decode_states(body, agents()),
-    "advance network": lambda body: AdvanceNetwork.decode(body, agents()),
-    "outcomes": lambda body: NetworkOutcomes.decode(body, agents()),
-    "ping": exchanges.decode_number,
-    "fork": exchanges.decode_fork,
-    "error": exchanges.decode_text,
-}
 BODIES = {name: frame[HEADER_BYTES:] for name, frame in example_frames().items() if name in DECODERS}
 
 

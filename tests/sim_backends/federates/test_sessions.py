@@ -5,6 +5,7 @@ import random
 import signal
 import socket
 import struct
+import subprocess
 import sys
 import threading
 import time
@@ -171,6 +172,30 @@ def test_a_child_that_is_killed_or_suspended_is_named_and_ended(
     with pytest.raises(FederateError, match=r"^physics carts \(.*carts.py\) ") as raised:
         physics.advance(3 * MS, {})
     assert message in str(raised.value)
+
+
+def test_a_federate_that_fieldkit_has_not_started_is_named_and_left_alone() -> None:
+    port = free_port()
+    process = subprocess.Popen([*CARTS.split(), f"tcp-listen:127.0.0.1:{port}"])
+    try:
+        with closing(open_physics(f"tcp:127.0.0.1:{port}", HELLO, 20.0)) as physics:
+            physics.advance(0, {})
+        physics = open_physics(f"tcp:127.0.0.1:{port}", HELLO, 20.0)
+        physics.session._deadline_s = 1.0
+        physics.advance(0, {})
+        process.send_signal(signal.SIGSTOP)
+        with pytest.raises(
+            UnansweredError, match=rf"physics carts \(tcp:127.0.0.1:{port}\) has not answered for 1 s"
+        ):
+            physics.advance(MS, {})
+        process.send_signal(signal.SIGCONT)
+        physics = open_physics(f"tcp:127.0.0.1:{port}", HELLO, 20.0)
+        process.kill()
+        with pytest.raises(FederateError, match="the connection was closed"):
+            physics.advance(MS, {})
+    finally:
+        process.kill()
+        process.wait()
 
 
 def test_a_child_that_fails_shows_its_last_output(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from fieldkit.cli import main
 from tests.helpers.federate_examples import EXAMPLES
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import Run
 
@@ -43,8 +44,9 @@ def carts_in_python() -> Iterator[str]:
     process.wait()
 
 
-def test_the_example_in_c_conforms(carts_in_c: Path) -> None:
-    run = conform(str(carts_in_c))
+@pytest.mark.parametrize("windows", mark_nightly([2000, 1_000_000]))
+def test_the_example_in_c_conforms(windows: int, carts_in_c: Path) -> None:
+    run = conform(str(carts_in_c), "--windows", str(windows))
     assert run.code == 0, run.out
     assert "carts in C" in run.err
     assert "15 checks passed, 1 not applicable, 0 failed" in run.err
