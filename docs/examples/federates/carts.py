@@ -40,11 +40,8 @@ class Carts:
             velocity_m_s = command.velocity_m_s
         else:
             heading_rad += command.turn_rad_s * step_s
-            velocity_m_s = (
-                command.forward_m_s * math.cos(heading_rad),
-                command.forward_m_s * math.sin(heading_rad),
-                0.0,
-            )
+            forward_m_s = command.forward_m_s
+            velocity_m_s = forward_m_s * math.cos(heading_rad), forward_m_s * math.sin(heading_rad), 0.0
         position_m = tuple(at + v * step_s for at, v in zip(state.position_m, velocity_m_s, strict=True))
         return State(position_m, velocity_m_s, heading_rad)
 
