@@ -3,9 +3,11 @@
 import io
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
@@ -19,7 +21,7 @@ from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.protocols import FederateError
 from tests.helpers.federate_examples import EXAMPLES
-from tests.helpers.runs import Run
+from tests.helpers.runs import Run, finish, start, wait_during
 
 SERVED = f"{sys.executable} -m sim_backends.cosim.scenario.served"
 DURATION = {"duration": "400ms"}
@@ -169,3 +171,31 @@ def test_a_network_without_next_events_suits_policies_with_windows(tmp_path: Pat
     assert digest(scenario, "sliding_window")
     with pytest.raises(FederateError, match="does not report the time of its next event"):
         digest(scenario, "event_driven")
+
+
+def processes_of(program: Path) -> list[int]:
+    """Return the process ids of the processes that run a program."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            if os.fsencode(program) in path.read_bytes().split(b"\0")[:3]:
+                found.append(int(path.parent.name))
+    return found
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_no_federate_is_left_if_the_run_is_interrupted_or_killed(
+    number: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    command = faulty(tmp_path, "physics", "pass")
+    program = tmp_path / "physics.py"
+    words = ("cosim", "run", "convoy", "--physics", command, "--duration", "10000s", "--out", "run")
+    process = start(tmp_path, *words)
+    wait_during(process, lambda: any((tmp_path / "run").rglob("*.parquet")))
+    assert processes_of(program)
+    process.send_signal(number)
+    assert finish(process).code == code
+    deadline_s = time.monotonic() + 30
+    while processes_of(program):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
