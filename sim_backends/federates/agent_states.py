@@ -29,7 +29,7 @@ def _layout(count: int) -> struct.Struct:
 
 
 class AgentTable:
-    """The agents that both sides know, by index.
+    """The announced agents, by index.
 
     Args:
         names: Their names, in order.

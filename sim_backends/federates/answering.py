@@ -197,12 +197,13 @@ class _Run:
             return True
         try:
             answer, body = self._answer(frame)
+            answer_frame = encode(answer, request, copy_number, body)
         except Exception as error:  # noqa: BLE001 (every error is reported to the coordinator)
             traceback.print_exc()
             text = f"{type(error).__name__}: {error}".encode(errors="replace")[:MAX_TEXT_BYTES]
             self._send(encode(MessageKind.ERROR, request, copy_number, text_bytes(text.decode(errors="ignore"))))
             return False
-        self._send(encode(answer, request, copy_number, body))
+        self._send(answer_frame)
         return True
 
     def _send(self, frame: bytes) -> None:

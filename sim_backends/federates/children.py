@@ -20,7 +20,7 @@ _TAIL_BYTES: Final = 4096
 
 
 class Child:
-    """A federate that is a child process, in a session of its own, so that Ctrl-C does not end it during a request.
+    """A federate that is a child process. Its session is separate, so that Ctrl-C does not end it during a request.
 
     It is ended when `close` is called, when this object is collected, or when this process exits.
 
@@ -72,13 +72,16 @@ class Child:
         return next((line for line in reversed(tail.splitlines()) if line.strip()), "").strip()
 
     def exit_text(self, wait_s: float = 0.5) -> str:
-        """Return how it has ended, if it does so within a time: `exit code 1`; empty if it still runs."""
+        """Return a text about its end, such as `it has exited with code 1`; empty if it still runs after a time."""
         deadline_s = time.monotonic() + wait_s
         while not _has_exited(self._process.pid):
             if time.monotonic() > deadline_s:
                 return ""
             time.sleep(_POLL_S)
-        info = os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
+        try:
+            info = os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
+        except ChildProcessError:
+            info = None
         if info is None or info.si_code == os.CLD_EXITED:
             return "it has exited" if info is None else f"it has exited with code {info.si_status}"
         return f"it was ended by {signal.Signals(info.si_status).name}"
@@ -95,8 +98,14 @@ class Child:
 
 
 def _has_exited(pid: int) -> bool:
-    """Return True if a child has exited; it stays a zombie, so that its process id is not used again."""
-    return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
+    """Return True if a child has exited; it stays a zombie, so that its process id is not used again.
+
+    If this process ignores SIGCHLD, the kernel has removed the zombie.
+    """
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
+    except ChildProcessError:
+        return True
 
 
 def _end(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[bytes]) -> None:

@@ -100,7 +100,7 @@ class AgentStart:
 
 @dataclass(frozen=True)
 class Hello:
-    """What a federate receives before a run.
+    """The first message to a federate: the run, its agents and its configuration.
 
     Attributes:
         role: `PHYSICS` or `NETWORK`.

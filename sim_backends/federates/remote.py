@@ -25,7 +25,7 @@ from sim_backends.world.motion import State
 
 
 class _RemoteFederate:
-    """What both roles have in common.
+    """Common part of both roles.
 
     Attributes:
         session: The session.
@@ -76,7 +76,7 @@ class RemotePhysics(_RemoteFederate):
 
     Args:
         session: The session.
-        hello: What the federate received.
+        hello: The hello that the federate received.
         welcome: Its answer.
 
     Attributes:
@@ -128,7 +128,7 @@ class RemoteNetwork(_RemoteFederate):
 
     Args:
         session: The session.
-        hello: What the federate received.
+        hello: The hello that the federate received.
         welcome: Its answer.
 
     Attributes:

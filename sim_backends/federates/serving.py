@@ -1,10 +1,4 @@
-"""The federate's side of the protocol: serves a physics or network class to a coordinator.
-
-from sim_backends.federates.serving import serve
-
-if __name__ == "__main__":
-    serve(MyPhysics)  # called with the Hello of each run
-"""
+"""The federate's side of the protocol: `serve(MyPhysics)` serves a physics or network class to a coordinator."""
 
 import os
 import time
@@ -20,7 +14,7 @@ _HELLO_S: Final = 10.0
 """Longest wait for the first message of a program that has connected; others wait for their turn meanwhile."""
 
 
-def serve(make: Make, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `Service`)
+def serve(make: Make, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `FederateService`)
     """Serve a physics or a network class.
 
     Args:

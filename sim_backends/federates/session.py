@@ -73,7 +73,7 @@ class FederateSession:
         return self._copies
 
     def release(self, copy: int) -> None:
-        """Tell the federate before the next request that a copy is not used again."""
+        """Release a copy of the federate, by a message before the next request."""
         self._released.append(copy)
 
     def welcome(self, hello: Hello) -> Welcome:
@@ -243,7 +243,7 @@ def open_session(
     Args:
         role: `PHYSICS` or `NETWORK`.
         where: A command, `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`.
-        hello: What it receives; the token is added.
+        hello: The hello that it receives; the token is added.
         deadline_s: Longest wait for the connection and for each frame; None for no deadline.
 
     Raises:

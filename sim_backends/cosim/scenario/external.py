@@ -27,7 +27,7 @@ def without_federates(scenario: CosimScenario) -> CosimScenario:
 
 
 def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, role: int) -> Hello:
-    """Return what an external federate receives before a run.
+    """Return the first message to an external federate.
 
     Args:
         scenario: The scenario.

@@ -23,7 +23,7 @@ def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or
 
     Args:
         role: `PHYSICS` or `NETWORK`.
-        hello: What a coordinator has sent.
+        hello: The first message of a coordinator.
 
     Raises:
         ValidationError: The configuration is invalid.

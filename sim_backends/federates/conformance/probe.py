@@ -1,4 +1,4 @@
-"""What checks use: connections to fresh federates, and the last request and answer of each."""
+"""Means of the checks: connections to fresh federates, and the last request and answer of each."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -72,11 +72,11 @@ class FederateProbe:
 
     Args:
         opener: Starts or connects it.
-        hello: What it receives.
+        hello: The hello that it receives.
         exchange: Receives the last request and answer.
 
     Attributes:
-        hello: What it received.
+        hello: The hello that it received.
         welcome: Its answer.
         agents: The agents that were announced.
     """
@@ -203,7 +203,7 @@ class Target:
 
     Attributes:
         opener: Starts or connects it.
-        hello: What it receives.
+        hello: The hello that it receives.
         windows: Number of windows of the check for drift.
     """
 
