@@ -1,9 +1,12 @@
 """Federates served by a thread of the test, over a pair of sockets; the frames that they send can be changed."""
 
+import os
 import socket
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 from sim_backends.federates.answering import FederateService, _Run
 from sim_backends.federates.channels import StreamChannel
@@ -11,6 +14,17 @@ from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello, Welcome
 from sim_backends.federates.session import FederateSession
 from sim_backends.world.motion import State
+
+
+def children() -> set[int]:
+    """Return the process ids of this process's children."""
+    pids = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(path.read_text(encoding="utf-8").rpartition(")")[2].split()[1]) == os.getpid():
+                pids.add(int(path.parent.name))
+    return pids
+
 
 Alter = Callable[[bytes], bytes | None]
 
@@ -43,7 +57,7 @@ class Pair:
 
     Attributes:
         service: The federate.
-        deadline_s: Longest wait for a frame.
+        deadline_s: Longest wait for a frame after the handshake.
         alter: Changes its frames; None removes a frame.
         run_class: The class that answers requests.
         stays: True if it does not close the connection at the end.
@@ -60,8 +74,10 @@ class Pair:
         own, other = (channel_of(side) for side in socket.socketpair())
         other.alter = self.alter
         threading.Thread(target=self._serve, args=(other,), daemon=True).start()
-        session = FederateSession(hello.role, "test", own, deadline_s=self.deadline_s)
-        return session, hello, session.welcome(hello)
+        session = FederateSession(hello.role, "test", own, deadline_s=20.0)
+        welcome = session.welcome(hello)
+        session._deadline_s = self.deadline_s  # later, because a busy machine may need longer for the handshake
+        return session, hello, welcome
 
     def _serve(self, channel: StreamChannel) -> None:
         self.run_class(self.service, channel, "").serve()
