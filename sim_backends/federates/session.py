@@ -243,7 +243,8 @@ def open_session(
     Args:
         role: `PHYSICS` or `NETWORK`.
         where: A command, `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`.
-        hello: The hello that it receives; the token is added.
+        hello: The hello that it receives; the token is added, and the interval of heartbeats
+            suits the deadline.
         deadline_s: Longest wait for the connection and for each frame; None for no deadline.
 
     Raises:
@@ -251,6 +252,9 @@ def open_session(
         FederateError: The federate failed, or has not connected or answered in time.
     """
     address = tcp.parse_address(where)
+    if deadline_s is not None:
+        # Several heartbeats per deadline, as the federate's machine may be busy.
+        hello = replace(hello, heartbeat_ms=max(min(hello.heartbeat_ms, round(deadline_s * 250)), 1))
     if address is None:
         child = Child(where)
         session = FederateSession(role, printable(where), child.channel, deadline_s=deadline_s, child=child)

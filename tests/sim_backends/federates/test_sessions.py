@@ -248,6 +248,20 @@ def test_either_side_may_listen_and_be_first(*, federate_listens: bool, coordina
         assert physics.advance(0, {})["ann"] == HELLO.agents[0].start
 
 
+def test_heartbeats_are_shorter_than_the_deadline() -> None:
+    port = free_port()
+    hellos: list[Hello] = []
+
+    def make(hello: Hello) -> object:
+        hellos.append(hello)
+        return Still(hello)
+
+    threading.Thread(target=lambda: serve(make, address=f"tcp-listen:127.0.0.1:{port}", runs=2), daemon=True).start()
+    for deadline_s in (2.0, 20.0):
+        open_physics(f"tcp:127.0.0.1:{port}", HELLO, deadline_s).close()
+    assert [hello.heartbeat_ms for hello in hellos] == [500, 1000]
+
+
 def test_a_token_is_needed_beyond_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(tcp.TOKEN_VARIABLE, raising=False)
     for where in ("tcp:192.0.2.1:7000", "tcp-listen:0.0.0.0:7000"):
