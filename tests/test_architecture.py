@@ -365,6 +365,25 @@ def test_the_walk_names_each_method_of_a_step() -> None:
     }
 
 
+# External federates are used by these modules of the co-simulation only.
+FEDERATE_SEAMS = {
+    "sim_backends/cosim/federates.py": {"protocols"},
+    "sim_backends/cosim/scenario/external.py": {"frames", "handshake", "remote"},
+    "sim_backends/cosim/scenario/served.py": {"frames", "handshake", "serving"},
+    "sim_backends/cosim/commands/conform.py": {"conformance", "frames", "handshake", "protocols", "session"},
+}
+
+
+def test_the_co_simulation_has_one_seam_to_external_federates() -> None:
+    prefix = "sim_backends.federates."
+    for path in modules("sim_backends/cosim"):
+        targets = {
+            name.removeprefix(prefix).split(".")[0] for name in imported_names(path) if name.startswith(prefix)
+        }
+        allowed = FEDERATE_SEAMS.get(str(path.relative_to(ROOT)), set())
+        assert targets <= allowed, f"{path} imports {targets - allowed}"
+
+
 def test_class_names_are_unique() -> None:
     """Each class name is unique, private classes included, so that a search finds one class."""
     places_by_name: dict[str, list[str]] = {}

@@ -164,21 +164,25 @@ class DeadReckoned(Mapping[str, State]):
         states: The states.
         since_ns: Their time.
         step_ns: The extrapolation moves in whole steps of this length, counted from `since_ns`.
+
+    Attributes:
+        since_ns: Time of the states.
+        step_ns: Length of a step.
     """
 
     def __init__(self, states: Mapping[str, State], since_ns: int, step_ns: int) -> None:
         self._states = states
-        self._since_ns = since_ns
-        self._step_ns = step_ns
+        self.since_ns = since_ns
+        self.step_ns = step_ns
         self._steps = 0
         self._now = states
 
     def at(self, now_ns: int) -> Mapping[str, State]:
         """Return the states at a time that is not before theirs; the same object for a whole step."""
-        steps = (now_ns - self._since_ns) // self._step_ns
+        steps = (now_ns - self.since_ns) // self.step_ns
         if steps != self._steps:
             self._steps = steps
-            self._now = _Extrapolated(self._states, steps * self._step_ns / 1e9) if steps else self._states
+            self._now = _Extrapolated(self._states, steps * self.step_ns / 1e9) if steps else self._states
         return self._now
 
     def __getitem__(self, name: str) -> State:

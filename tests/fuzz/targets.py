@@ -54,6 +54,7 @@ from fieldkit.trial.check import probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.running import locks
+from tests.fuzz.federate_targets import federate_targets
 from tests.fuzz.harness import Target
 from tests.fuzz.motion_targets import motion_targets
 from tests.fuzz.mutate import MAX_BYTES
@@ -400,6 +401,7 @@ def _all_targets() -> Iterator[Target]:
     yield Target("iw", (*_stored("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe_seeds()), _judge_sections, 2)
     yield from radio_targets()
     yield from motion_targets()
+    yield from federate_targets()
     yield Target("tools", _tool_seeds(), _parse_tools)
     yield Target("tar", _tar_seeds(), _fetch_tar, 2)
     yield Target("replies", _SCRIPT_REPLIES, _read_replies)

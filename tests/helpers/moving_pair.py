@@ -69,3 +69,6 @@ class MovingPair:
         return Coordinator(
             self.agents, Disc(RANGE_M, DELAY_NS, extrapolates=True), policy, [("a", "b"), ("b", "a")]
         ).advance(PAIR_END_NS)
+
+    def close(self) -> None:
+        """Do nothing: there are no external federates."""

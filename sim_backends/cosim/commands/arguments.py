@@ -25,6 +25,7 @@ def add(parser: Parser) -> None:
     _satisfy(commands)
     _plot(commands)
     _replay(commands)
+    _conform(commands)
     _list(commands)
     _schema(commands)
 
@@ -40,6 +41,12 @@ def _run(commands: Commands) -> None:
     _add_policy(parser, "sync policy (default: the scenario's)")
     _add_window(parser, "window of the sync policy")
     _add_seeds(parser)
+    for role in ("physics", "network"):
+        parser.add_argument(
+            f"--{role}",
+            metavar="FEDERATE",
+            help=f"external {role}: a command, tcp:HOST:PORT or tcp-listen:HOST:PORT (default: the scenario's)",
+        )
     parser.add_argument(
         "--out",
         type=Path,
@@ -159,6 +166,32 @@ def _replay(commands: Commands) -> None:
     parser.add_argument("--mcap", type=Path, metavar="FILE", help="also write it as MCAP, for Foxglove")
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.replay:run")
+
+
+def _conform(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "conform",
+        help="check an external federate",
+        description="Start an external physics or network, check that it follows the protocol, and print each "
+        "failure with the request and the answer. Exit code 1 if a check failed.",
+        epilog="example: fieldkit cosim conform 'python3 carts.py'",
+    )
+    parser.add_argument(
+        "federate",
+        nargs="+",
+        metavar="COMMAND",
+        help="its command, in one word or after --; tcp:HOST:PORT or tcp-listen:HOST:PORT",
+    )
+    parser.add_choice("--role", ("physics", "network"), help="its role (default: the first that it accepts)")
+    parser.add_argument(
+        "--scenario", default="convoy", metavar="SCENARIO", help="scenario that it receives (default convoy)"
+    )
+    parser.add_argument(
+        "--windows", type=natural, default=2000, metavar="N", help="windows of the check for drift (default 2000)"
+    )
+    parser.add_argument("--deadline", metavar="TIME", help="longest wait for an answer, in wall time (default 30s)")
+    parser.add_choice("--format", ("table", "json"), default="table", help="output format (default table)")
+    parser.set_defaults(run=f"{_PACKAGE}.conform:run")
 
 
 def _list(commands: Commands) -> None:

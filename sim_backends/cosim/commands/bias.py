@@ -13,6 +13,7 @@ from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
+from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.shootout import Bias, biases, outcomes
 
@@ -36,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.windows:
         scenario = settings.with_window(scenario, settings.windows_s(arguments, scenario)[0])
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
-    build(scenario)  # raises before any run if the scenario is invalid
+    build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, [scenario.policy.window], len(seeds))
     with working() as sink:
         runs = len({*policies, EventDriven.name}) * len(seeds)

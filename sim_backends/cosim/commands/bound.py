@@ -17,6 +17,7 @@ from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.bounds import BoundCost, FixedCost, bound_cost, fixed_cost, longest_for_all
 from sim_backends.cosim.studies.seeds import Task, run_many
@@ -53,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
             remedy="remove policy.bound_db; change the bound by --set policy.bound=1cm",
         )
     seeds = settings.seeds(arguments, scenario)
-    build(scenario)  # raises before any run if the scenario is invalid
+    build(without_federates(scenario))  # raises before any run if the scenario is invalid
     tasks = [Task(ErrorBounded.name, seed) for seed in seeds]
     with working() as sink:
         report = partial(progress_reporter(sink, "seeds"), "bound", len(seeds))
@@ -71,7 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(scenario: CosimScenario, task: Task, policy: SyncPolicy) -> Run:
-    return build(scenario, policy=policy, seed=task.seed, measures_all=True).run()
+    with build(scenario, policy=policy, seed=task.seed, measures_all=True) as simulation:
+        return simulation.run()
 
 
 def _cost(scenario: CosimScenario, task: Task) -> BoundCost:

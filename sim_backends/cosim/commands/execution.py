@@ -76,7 +76,7 @@ def simulate(
     states_at_start = [(0, name, state) for name, state in simulation.agents.states(0).items()]
     ended_by: FieldkitError | KeyboardInterrupt | None = None
     try:
-        with recorder or nullcontext(), between_windows(simulation.coordinator):
+        with simulation, recorder or nullcontext(), between_windows(simulation.coordinator):
             simulation.run(progress=progress)
     except (FieldkitError, KeyboardInterrupt) as error:
         ended_by = error

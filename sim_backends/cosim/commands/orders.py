@@ -19,6 +19,7 @@ from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
 from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.local_errors import (
     MEASURES,
@@ -63,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
         name for name in settings.policies(arguments) if not getattr(registry.policies()[name], "exact", False)
     ]
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
-    build(scenario)  # raises before any run if the scenario is invalid
+    build(without_federates(scenario))  # raises before any run if the scenario is invalid
     with working() as sink:
         by_policy, failures = _measure(scenario, policies, seeds, windows_s, sink)
     title = f"{scenario.name}, {scenario.topology}, {format_count(len(seeds), 'seed')}"

@@ -13,6 +13,7 @@ from sim_backends.cosim.commands.results import FORMATION, SeedResult, formation
 from sim_backends.cosim.commands.run_folder import RunFolder
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, number, show_all
 from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
 
@@ -43,7 +44,9 @@ def run(arguments: argparse.Namespace) -> int:
     policy = settings.policy(arguments, scenario)
     seeds = settings.seeds(arguments, scenario)
     text = settings.policy_text(policy, scenario)
-    build(scenario, policy=policy)  # raises before the folder is created if the scenario is invalid
+    build(
+        without_federates(scenario), policy=policy
+    )  # raises before the folder is created if the scenario is invalid
     folder = None if arguments.out is None else RunFolder(arguments.out, scenario, text, seeds)
     settings.note_commensurate_events(scenario, [policy], [scenario.policy.window], len(seeds))
     with working() as sink:

@@ -15,6 +15,7 @@ from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.satisfaction import Satisfaction, satisfy
 
@@ -51,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"--threshold: {arguments.threshold} is more than all packets", remedy="write for example --threshold 10%"
         )
     seed = scenario.seeds[0] if arguments.seed is None else arguments.seed
-    build(scenario)  # raises before any run if the scenario is invalid
+    build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, [arguments.policy], [scenario.policy.window], 1)
     with working() as sink:
         report = partial(progress_reporter(sink), "satisfy", arguments.rounds + 1)
@@ -85,7 +86,8 @@ class _CountedRuns:
     def __call__(self, policy: SyncPolicy) -> Run:
         self._report(self._done)
         self._done += 1
-        return build(self._scenario, policy=policy, seed=self._seed, measures_all=True).run()
+        with build(self._scenario, policy=policy, seed=self._seed, measures_all=True) as simulation:
+            return simulation.run()
 
 
 def _sheet(title: str, satisfaction: Satisfaction) -> Sheet:

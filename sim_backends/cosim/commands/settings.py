@@ -55,10 +55,19 @@ def scenario(arguments: argparse.Namespace) -> CosimScenario:
     return load_scenario(arguments.scenario, changes(arguments))
 
 
+_KEYS: Final = (
+    ("duration", "duration"),
+    ("window", "policy.window"),
+    ("physics", "physics.federate"),
+    ("network", "network.federate"),
+)
+"""Options that change values of a scenario."""
+
+
 def changes(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the values that options change, by their keys in the scenario's file."""
     values = dict(map(_change, arguments.set))
-    for option, key in (("duration", "duration"), ("window", "policy.window")):
+    for option, key in _KEYS:
         if (value := getattr(arguments, option, None)) is not None:
             values[key] = value
     return values

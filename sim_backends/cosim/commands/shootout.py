@@ -17,6 +17,7 @@ from sim_backends.cosim.comparison import Errors
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
+from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import formation, has_followers
 from sim_backends.cosim.studies.shootout import Row, outcomes, rows
@@ -69,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     seeds = settings.seeds(arguments, scenario)
     windows_s = settings.windows_s(arguments, scenario)
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
-    build(scenario)  # raises before any run if the scenario is invalid
+    build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, windows_s, len(seeds))
     with working() as sink:
         all_rows = _all_rows(scenario, policies, seeds, windows_s, sink)

@@ -4,7 +4,8 @@ The network consists of antennas, a radio model and transports, with the faults 
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
@@ -18,6 +19,7 @@ from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import QosOptions, Traffic
 from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stops
 from sim_backends.cosim.scenario.checks import check
+from sim_backends.cosim.scenario.external import open_network, open_physics
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.wall_time import DEADLINE_S, Stall, stalled
@@ -122,7 +124,7 @@ def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance
 
 @dataclass
 class Simulation:
-    """A scenario that is ready to run, once.
+    """A scenario that is ready to run, once; a context manager that ends its external federates.
 
     Attributes:
         scenario: The scenario.
@@ -131,6 +133,7 @@ class Simulation:
         agents: Bodies and programs.
         network: Carries packets.
         coordinator: Runs both.
+        federates: Ends the external federates when it is closed.
     """
 
     scenario: CosimScenario
@@ -139,6 +142,17 @@ class Simulation:
     agents: Agents
     network: NetworkFederate
     coordinator: Coordinator
+    federates: ExitStack = field(default_factory=ExitStack)
+
+    def __enter__(self) -> "Simulation":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the external federates; otherwise they end when they are not referenced any more."""
+        self.federates.close()
 
     def run(self, until_ns: int | None = None, progress: Progress | None = None) -> Run:
         """Simulate until a time, or until the scenario's end, and return the record so far.
@@ -173,36 +187,44 @@ def build(
         seed: Seed of all random draws; None for the scenario's first.
         recorder: Receives every window, and every IP packet if it has `log_ip`; or None.
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
-        physics: Replaces the built-in bodies, and receives their commands.
-        network: Replaces the built-in radio; faults of the radio are then its responsibility.
+        physics: Replaces the scenario's physics, and receives the commands to bodies.
+        network: Replaces the scenario's network; faults of the radio are then its responsibility.
         measures_all: As for `Coordinator`.
 
     Raises:
         ConfigurationError: The scenario cannot be run; the message says why.
+        FederateError: An external federate failed, or has not connected or answered in time.
     """
     seed = scenario.seeds[0] if seed is None else seed
     if policy is None or isinstance(policy, str):
         policy = make_policy(scenario.policy.name if policy is None else policy, **scenario.policy.parameters)
     world = load_world(scenario.world)
     check(scenario, world, lambda location: f"scenario {scenario.name}: {'.'.join(map(str, location))}")
-    scenario_bodies = bodies(scenario, world)
-    scenario_programs = programs(scenario, seed, controllers(scenario, scenario_bodies, seed), stops(scenario_bodies))
-    physics_federate = physics or Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
-    network_federate = network or radio_network(scenario, world, seed, recorder)
-    for fault in scenario.faults:
-        if isinstance(fault, StalledFederateFault):
-            stall = Stall(fault.begin_ns, fault.stall, deadline_s)
-            if fault.federate == "physics":
-                physics_federate = stalled(physics_federate, stall)
-            else:
-                network_federate = stalled(network_federate, stall)
-    agents = Agents(physics_federate, scenario_programs)
-    coordinator = Coordinator(
-        agents,
-        network_federate,
-        policy,
-        scenario.pairs,
-        observer=recorder,
-        measures_all=measures_all,
-    )
-    return Simulation(scenario, seed, policy, agents, network_federate, coordinator)
+    with ExitStack() as federates:
+        scenario_bodies = bodies(scenario, world)
+        details = scenario, world, scenario_bodies, seed, deadline_s
+        if physics is None and (remote_physics := open_physics(*details)) is not None:
+            federates.callback(remote_physics.close)
+            physics = remote_physics
+        if network is None and (remote_network := open_network(*details)) is not None:
+            federates.callback(remote_network.close)
+            network = remote_network
+        if physics is None:
+            physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
+        if network is None:
+            network = radio_network(scenario, world, seed, recorder)
+        for fault in scenario.faults:
+            if isinstance(fault, StalledFederateFault):
+                stall = Stall(fault.begin_ns, fault.stall, deadline_s)
+                if fault.federate == "physics":
+                    physics = stalled(physics, stall)
+                else:
+                    network = stalled(network, stall)
+        scenario_programs = programs(
+            scenario, seed, controllers(scenario, scenario_bodies, seed), stops(scenario_bodies)
+        )
+        agents = Agents(physics, scenario_programs)
+        coordinator = Coordinator(
+            agents, network, policy, scenario.pairs, observer=recorder, measures_all=measures_all
+        )
+        return Simulation(scenario, seed, policy, agents, network, coordinator, federates.pop_all())

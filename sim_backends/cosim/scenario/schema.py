@@ -63,14 +63,28 @@ class PhysicsOptions(Strict):
 
     Attributes:
         step: Its time step.
+        federate: An [external federate](federates.md) that replaces the built-in physics: a command,
+            `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`. A command is run when the scenario is.
     """
 
     step: Annotated[Duration, Field(ge=1e-6, le=1)] = 0.001
+    federate: str | None = None
 
     @property
     def step_ns(self) -> int:
         """Its time step in nanoseconds."""
         return round(self.step * 1e9)
+
+
+class NetworkOptions(Strict):
+    """The network of a scenario.
+
+    Attributes:
+        federate: An [external federate](federates.md) that replaces the built-in network, as for the physics. It is
+            then responsible for the radio, `tcp` and the faults of radios; there are no captures.
+    """
+
+    federate: str | None = None
 
 
 class AgentRadio(Strict):
@@ -148,6 +162,7 @@ class CosimScenario(Named):
         duration: Its duration, in simulated time.
         seeds: Seeds of the random draws, one for each run.
         physics: The physics.
+        network: The network.
         radio: The radio.
         tcp: The TCP of all agents, also under ROS 1 topics.
         topology: `masterless`, or `master`: all packets pass the relay, which is also the host of a ROS 1 master.
@@ -163,6 +178,7 @@ class CosimScenario(Named):
     duration: Annotated[Duration, Field(gt=0, le=1e6)]
     seeds: Annotated[tuple[Annotated[Int, Field(ge=0)], ...], Field(min_length=1)] = (1,)
     physics: PhysicsOptions = PhysicsOptions.defaults()
+    network: NetworkOptions = NetworkOptions.defaults()
     radio: RadioOptions = RadioOptions.defaults()
     tcp: TcpChoice = TcpChoice.defaults()
     topology: Topology = Topology.MASTERLESS

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, Protocol
@@ -28,6 +29,10 @@ class Simulated(Protocol):
 
     def run(self) -> Run:
         """Simulate until the scenario's end."""
+        ...
+
+    def close(self) -> None:
+        """End the external federates."""
         ...
 
 
@@ -108,7 +113,8 @@ def _outcome(make: Make, task: Task) -> RunOutcome | PolicyError:
     sampled = SampledPhysics(simulated.agents.physics, SAMPLING_NS)
     simulated.agents.physics = sampled
     try:
-        return RunOutcome(simulated.run(), sampled.tracks)
+        with closing(simulated):
+            return RunOutcome(simulated.run(), sampled.tracks)
     except PolicyError as error:
         return error
 

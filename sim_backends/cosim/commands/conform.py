@@ -1,0 +1,82 @@
+"""`fieldkit cosim conform COMMAND...`: checks that an external federate follows the protocol."""
+
+import argparse
+import shlex
+from functools import partial
+
+from fieldkit.cli.display import show_note
+from fieldkit.core.errors import FieldkitError
+from fieldkit.core.text import json_text, print_text
+from sim_backends.cosim.commands import settings
+from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.external import make_hello, without_federates
+from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.federates.conformance.probe import Target
+from sim_backends.federates.conformance.suite import CheckResult, run_checks
+from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
+from sim_backends.federates.handshake import Hello
+from sim_backends.federates.protocols import FederateError
+from sim_backends.federates.session import open_session
+from sim_backends.world.world import load_world
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run all checks of the federate's role, print the failures with request and answer; return 1 if one failed.
+
+    Raises:
+        FieldkitError: The federate cannot be started or connected.
+    """
+    where = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
+    deadline_s = settings.deadline_s(arguments.deadline)
+    scenario = without_federates(load_scenario(arguments.scenario))
+    role, name = _role(where, scenario, arguments.role, deadline_s)
+    opener = partial(open_session, role, where, deadline_s=deadline_s)
+    target = Target(opener, _hello(scenario, role), arguments.windows)
+    results = []
+    for result in run_checks(target):
+        results.append(result)
+        if arguments.format == "table":
+            _show(result)
+    if arguments.format == "json":
+        print_text(json_text([vars(result) for result in results], indent=2))
+    failed = sum(bool(result.failure) for result in results)
+    skipped = sum(bool(result.skipped) for result in results)
+    show_note(f"{name}: {len(results) - failed - skipped} checks passed, {skipped} not applicable, {failed} failed")
+    return 1 if failed else 0
+
+
+def _hello(scenario: CosimScenario, role: int) -> Hello:
+    world = load_world(scenario.world)
+    return make_hello(scenario, world, bodies(scenario, world), scenario.seeds[0], role)
+
+
+def _role(where: str, scenario: CosimScenario, requested: str | None, deadline_s: float) -> tuple[int, str]:
+    """Return the role of a federate, and its name for messages: the requested role, or the first that it accepts.
+
+    Raises:
+        FieldkitError: It accepts none.
+    """
+    roles = [role for role in (PHYSICS, NETWORK) if requested in {None, ROLES[role]}]
+    for role in roles:
+        try:
+            session, _, _ = open_session(role, where, _hello(scenario, role), deadline_s)
+        except FederateError:
+            if role == roles[-1]:
+                raise
+            continue
+        session.close()
+        return role, session.name
+    raise FieldkitError(f"{where} has no role")
+
+
+def _show(result: CheckResult) -> None:
+    state = "FAILED" if result.failure else "skipped" if result.skipped else "passed"
+    print_text(f"{state:7}  {result.name}: {result.meaning}")
+    for label, text in (
+        ("", result.failure or result.skipped),
+        ("request: ", result.request),
+        ("answer:  ", result.answer),
+    ):
+        if text:
+            print_text(f"         {label}{text}")

@@ -1,0 +1,102 @@
+"""External federates of a scenario: the one place where the co-simulation uses the wire protocol."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from sim_backends.cosim.scenario.agent_setup import antennas, limits
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.federates import remote
+from sim_backends.federates.frames import NETWORK, PHYSICS
+from sim_backends.federates.handshake import AgentStart, Hello
+from sim_backends.federates.remote import RemoteNetwork, RemotePhysics
+from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.body import Body
+from sim_backends.world.world import World
+
+
+def without_federates(scenario: CosimScenario) -> CosimScenario:
+    """Return the scenario with the built-in physics and network."""
+    return scenario.model_copy(
+        update={
+            "physics": scenario.physics.model_copy(update={"federate": None}),
+            "network": scenario.network.model_copy(update={"federate": None}),
+        }
+    )
+
+
+def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, role: int) -> Hello:
+    """Return the first message to an external federate.
+
+    Args:
+        scenario: The scenario.
+        world: Its world.
+        bodies: The body of each agent.
+        seed: Seed of all random draws.
+        role: `PHYSICS` or `NETWORK`.
+    """
+    built_in = Bodies(bodies, world, step_ns=scenario.physics.step_ns)
+    states = built_in.advance(0, {})
+    agents = [
+        AgentStart(
+            name,
+            plan.robot,
+            states[name],
+            bodies[name].flies,
+            bodies[name].antenna_m,
+            built_in.limits_m_s2[name],
+        )
+        for name, plan in scenario.agents.items()
+    ]
+    return Hello(
+        role,
+        agents,
+        seed,
+        scenario.physics.step_ns,
+        scenario.duration_ns,
+        scenario.name,
+        _configuration(scenario, world),
+    )
+
+
+def _configuration(scenario: CosimScenario, world: World) -> bytes:
+    """Return the configuration as JSON; the order of agents is that of the scenario, as results may depend on it."""
+    radios = antennas(scenario)
+    configuration = {
+        "scenario": without_federates(scenario).model_dump(mode="json", by_alias=True, exclude_none=True),
+        "world": world.model_dump(mode="json", by_alias=True, exclude_none=True),
+        "robots": {
+            name: {
+                "body": dataclasses.asdict(limits(plan.robot)),
+                "radio": dataclasses.asdict(radios[name]) if name in radios else None,
+            }
+            for name, plan in scenario.agents.items()
+        },
+    }
+    return json.dumps(configuration).encode()
+
+
+def open_physics(
+    scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
+) -> RemotePhysics | None:
+    """Start or connect the scenario's external physics, if it has one; arguments as `make_hello`.
+
+    Raises:
+        ConfigurationError: The command or the address cannot be used.
+        FederateError: The federate failed, or has not connected or answered in time.
+    """
+    where = scenario.physics.federate
+    if where is None:
+        return None
+    return remote.open_physics(where, make_hello(scenario, world, bodies, seed, PHYSICS), deadline_s)
+
+
+def open_network(
+    scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
+) -> RemoteNetwork | None:
+    """Start or connect the scenario's external network, if it has one; otherwise as `open_physics`."""
+    where = scenario.network.federate
+    if where is None:
+        return None
+    return remote.open_network(where, make_hello(scenario, world, bodies, seed, NETWORK), deadline_s)

@@ -1,0 +1,46 @@
+"""The built-in physics and network as external federates: `python -m sim_backends.cosim.scenario.served physics`.
+
+A second argument is an address as for `serve`; without it, standard input and output are used.
+"""
+
+import json
+import sys
+from functools import partial
+from typing import Any
+
+from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.build import radio_network
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
+from sim_backends.federates.handshake import Hello
+from sim_backends.federates.serving import serve
+from sim_backends.physics.bodies import Bodies
+from sim_backends.world.world import World
+
+
+def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
+    """Return the built-in federate of a run.
+
+    Args:
+        role: `PHYSICS` or `NETWORK`.
+        hello: The first message of a coordinator.
+
+    Raises:
+        ValidationError: The configuration is invalid.
+    """
+    configuration = json.loads(hello.configuration)
+    scenario = CosimScenario.model_validate(configuration["scenario"])
+    world = World.model_validate(configuration["world"])
+    if role == PHYSICS:
+        return Bodies(bodies(scenario, world), world, step_ns=hello.step_ns)
+    return radio_network(scenario, world, hello.seed)
+
+
+def main(role_name: str, address: str | None = None) -> None:
+    """Serve the built-in federate of a role: `physics` or `network`."""
+    role = PHYSICS if role_name == ROLES[PHYSICS] else NETWORK
+    serve(partial(make_federate, role), address=address, name=f"fieldkit {ROLES[role]}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

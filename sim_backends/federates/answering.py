@@ -1,0 +1,293 @@
+"""Answers of a federate to the requests of a coordinator."""
+
+import copy
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from sim_backends.federates import tcp
+from sim_backends.federates.agent_states import AgentTable
+from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
+from sim_backends.federates.exchanges import (
+    AdvanceNetwork,
+    NetworkOutcomes,
+    decode_advance_physics,
+    decode_fork,
+    decode_number,
+    encode_number,
+    encode_states,
+)
+from sim_backends.federates.frames import (
+    MAX_HELLO_BYTES,
+    MAX_TEXT_BYTES,
+    NETWORK,
+    PHYSICS,
+    ROLES,
+    MalformedFrameError,
+    MessageKind,
+    ProtocolFrame,
+    encode,
+    text_bytes,
+)
+from sim_backends.federates.handshake import NO_EVENT, Capability, Hello, Welcome
+from sim_backends.federates.records import COMMAND_TYPES, command_type
+from sim_backends.world.motion import DeadReckoned
+
+_MAX_COPIES: Final = 1000
+
+Make = Callable[[Hello], Any]
+
+
+@dataclass(frozen=True)
+class FederateService:
+    """A federate and its properties.
+
+    Attributes:
+        make: Returns a physics or a network for a run.
+        name: Its name in messages.
+        software: Name and version of its software.
+        is_deterministic: True if equal requests give equal answers.
+        forks: True if `copy.deepcopy` copies it in its present state.
+        agents_appear: True if agents may appear during a run.
+        agents_disappear: True if agents may disappear.
+        commands: Types of commands that it supports.
+        transports: Transports that it supports; empty for any.
+    """
+
+    make: Make
+    name: str = ""
+    software: str = ""
+    is_deterministic: bool = True
+    forks: bool = True
+    agents_appear: bool = False
+    agents_disappear: bool = False
+    commands: Sequence[int] = COMMAND_TYPES
+    transports: Sequence[str] = ()
+
+    def welcome(self, federate: Any, hello: Hello) -> Welcome:  # noqa: ANN401 (a physics or a network)
+        """Return the answer to a hello.
+
+        Raises:
+            ValueError: The federate has not the role that the coordinator expects.
+        """
+        role = PHYSICS if hasattr(federate, "step_ns") else NETWORK
+        if role != hello.role:
+            raise ValueError(f"it is a {ROLES[role]}, and a {ROLES[hello.role]} was requested")
+        flags = {
+            Capability.DETERMINISTIC: self.is_deterministic,
+            Capability.FORK: self.forks,
+            Capability.NEXT_EVENT: hasattr(federate, "next_event_ns"),
+            Capability.EXTRAPOLATES: getattr(federate, "extrapolates", False),
+            Capability.AGENTS_APPEAR: self.agents_appear,
+            Capability.AGENTS_DISAPPEAR: self.agents_disappear,
+        }
+        indices = AgentTable(agent.name for agent in hello.agents).indices
+        return Welcome(
+            role,
+            self.name or type(federate).__name__,
+            hello.configuration_hash,
+            self.software,
+            Capability(sum(flag for flag, has in flags.items() if has)),
+            federate.step_ns if role == PHYSICS else 0,
+            _next_event_ns(federate),
+            self.commands if role == PHYSICS else (),
+            self.transports if role == NETWORK else (),
+            [indices[name] for name in sorted(getattr(federate, "transmitters", ()))],
+            tuple(getattr(federate, "fixed_emitters_m", ())),
+        )
+
+
+def _next_event_ns(federate: Any) -> int:  # noqa: ANN401 (a physics or a network)
+    if not hasattr(federate, "next_event_ns"):
+        return NO_EVENT
+    at_ns = federate.next_event_ns()
+    return NO_EVENT if at_ns is None else int(at_ns)
+
+
+@dataclass
+class _FederateCopy:
+    """The federate, or a copy of it: it, its agents, and the last time to which it has advanced."""
+
+    federate: Any
+    agents: AgentTable
+    last_ns: int = 0
+
+
+class _Heartbeat:
+    """Sends `busy` while a request takes long.
+
+    Args:
+        channel: The channel.
+        interval_s: Interval between two of these messages.
+    """
+
+    def __init__(self, channel: FrameChannel, interval_s: float) -> None:
+        self._channel = channel
+        self._interval_s = interval_s
+        self._lock = threading.Lock()
+        self._request: tuple[int, int, int] | None = None
+        self._stopped = threading.Event()
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def begin(self, request: int, copy_number: int, at_ns: int) -> None:
+        """Begin a request, at a simulated time."""
+        self._request = request, copy_number, at_ns
+
+    def answer(self, frame: bytes) -> None:
+        """End the request with an answer."""
+        with self._lock:
+            self._request = None
+            self._channel.send(frame, None)
+
+    def stop(self) -> None:
+        """Send nothing from now on."""
+        with self._lock:
+            self._stopped.set()
+
+    def _run(self) -> None:
+        previous = None
+        while not self._stopped.wait(self._interval_s):
+            with self._lock, suppress(ClosedError):
+                current = self._request
+                if current is not None and current is previous and not self._stopped.is_set():
+                    request, copy_number, at_ns = current
+                    self._channel.send(encode(MessageKind.BUSY, request, copy_number, encode_number(at_ns)), None)
+                previous = current
+
+
+@dataclass
+class _Run:
+    """One run of a coordinator with a federate."""
+
+    service: FederateService
+    channel: FrameChannel
+    token: str
+    hello_s: float | None = None
+    copies: dict[int, _FederateCopy] = field(default_factory=dict)
+    heartbeat: _Heartbeat | None = None
+
+    def serve(self) -> bool:
+        """Answer requests until the coordinator ends the run; return True if it did so without an error."""
+        try:
+            deadline_s = None if self.hello_s is None else time.monotonic() + self.hello_s
+            frame = self.channel.receive(deadline_s, MAX_HELLO_BYTES)
+            while frame.header.kind is not MessageKind.BYE:
+                if not self._handle(frame):
+                    return False
+                frame = self.channel.receive(None)
+        except ClosedError:
+            pass
+        except (DeadlineError, MalformedFrameError) as error:
+            print(f"a connection was closed: {error}", file=sys.stderr)  # noqa: T201 (stderr is its log)
+            return False
+        finally:
+            if self.heartbeat is not None:
+                self.heartbeat.stop()
+        return True
+
+    def _handle(self, frame: ProtocolFrame) -> bool:
+        _, kind, request, copy_number = frame.header
+        if kind is MessageKind.RELEASE:
+            self.copies.pop(copy_number, None)
+            return True
+        try:
+            answer, body = self._answer(frame)
+            answer_frame = encode(answer, request, copy_number, body)
+        except Exception as error:  # noqa: BLE001 (every error is reported to the coordinator)
+            traceback.print_exc()
+            text = f"{type(error).__name__}: {error}".encode(errors="replace")[:MAX_TEXT_BYTES]
+            self._send(encode(MessageKind.ERROR, request, copy_number, text_bytes(text.decode(errors="ignore"))))
+            return False
+        self._send(answer_frame)
+        return True
+
+    def _send(self, frame: bytes) -> None:
+        if self.heartbeat is None:
+            self.channel.send(frame, None)
+        else:
+            self.heartbeat.answer(frame)
+
+    def _answer(self, frame: ProtocolFrame) -> tuple[MessageKind, bytes]:
+        """Return kind and body of the answer to a request.
+
+        Raises:
+            Exception: The request is malformed, or the federate failed.
+        """
+        header, body = frame
+        if header.kind is MessageKind.HELLO and not self.copies:
+            return MessageKind.WELCOME, self._begin(Hello.decode(body), header.request)
+        if header.kind is MessageKind.PING:
+            return MessageKind.PONG, encode_number(decode_number(body))
+        current = self.copies.get(header.copy)
+        if current is None:
+            raise MalformedFrameError(12, f"there is no copy {header.copy}, or hello is missing")
+        if self.heartbeat is not None:
+            self.heartbeat.begin(header.request, header.copy, current.last_ns)
+        if header.kind is MessageKind.ADVANCE_PHYSICS and hasattr(current.federate, "step_ns"):
+            return MessageKind.STATES, self._advance_physics(current, body)
+        if header.kind is MessageKind.ADVANCE_NETWORK and not hasattr(current.federate, "step_ns"):
+            return MessageKind.OUTCOMES, self._advance_network(current, body)
+        if header.kind is MessageKind.FORK and self.service.forks:
+            return MessageKind.DONE, self._fork(current, decode_fork(body))
+        raise MalformedFrameError(4, f"the request {header.kind.name.lower()} is not supported")
+
+    def _begin(self, hello: Hello, request: int) -> bytes:
+        if not tcp.is_same_token(hello.token, self.token):
+            raise PermissionError("the token is wrong")
+        self.heartbeat = _Heartbeat(self.channel, max(hello.heartbeat_ms / 1e3, 0.01))
+        self.heartbeat.begin(request, 0, 0)
+        federate = self.service.make(hello)
+        self.copies[0] = _FederateCopy(federate, AgentTable(agent.name for agent in hello.agents))
+        return self.service.welcome(federate, hello).encode()
+
+    def _advance_physics(self, current: _FederateCopy, body: bytes) -> bytes:
+        to_ns, from_ns, commands = decode_advance_physics(body, current.agents)
+        for name, command in commands.items():
+            if command_type(command) not in self.service.commands:
+                raise ValueError(f"the command {type(command).__name__} to {name} is not supported")
+        federate = current.federate
+        if from_ns > current.last_ns:
+            # The coordinator does not send requests that change nothing; the federate must get the time of the last.
+            federate.advance(from_ns, {})
+        states = federate.advance(to_ns, commands)
+        current.last_ns = to_ns
+        return encode_states(to_ns - to_ns % federate.step_ns, states, current.agents, federate.limits_m_s2)
+
+    def _advance_network(self, current: _FederateCopy, body: bytes) -> bytes:
+        request = AdvanceNetwork.decode(body, current.agents)
+        for packet in request.packets:
+            if self.service.transports and packet.protocol not in self.service.transports:
+                raise ValueError(f"the transport {packet.protocol} is not supported")
+        states = request.states
+        if request.reckoning_ns:
+            states = DeadReckoned(states, request.since_ns, request.reckoning_ns)
+        arrivals, drops = current.federate.advance(request.to_ns, request.packets, states)
+        current.last_ns = request.to_ns
+        return NetworkOutcomes(request.to_ns, _next_event_ns(current.federate), arrivals, drops).encode(
+            current.agents
+        )
+
+    def _fork(self, current: _FederateCopy, number: int) -> bytes:
+        if number in self.copies or len(self.copies) > _MAX_COPIES:
+            raise MalformedFrameError(16, f"copy {number} exists already, or there are too many")
+        self.copies[number] = _FederateCopy(copy.deepcopy(current.federate), current.agents.copy(), current.last_ns)
+        return b""
+
+
+def serve_channel(
+    channel: FrameChannel, service: FederateService, token: str = "", hello_s: float | None = None
+) -> bool:
+    """Serve one run over a channel; return True if it ended without an error.
+
+    Args:
+        channel: The channel.
+        service: The federate.
+        token: Token that the coordinator must send.
+        hello_s: Longest wait for its first message; None for no limit.
+    """
+    return _Run(service, channel, token, hello_s).serve()

@@ -1,0 +1,129 @@
+"""Federates that are child processes, with the protocol on their standard input and output."""
+
+import os
+import shlex
+import signal
+import subprocess
+import tempfile
+import time
+import weakref
+from contextlib import suppress
+from typing import IO, Final
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.federates.channels import StreamChannel
+
+_EXIT_S: Final = 1.0
+"""Time for a process to exit after its input was closed, and again after SIGTERM."""
+_POLL_S: Final = 0.005
+_TAIL_BYTES: Final = 4096
+
+
+class Child:
+    """A federate that is a child process. Its session is separate, so that Ctrl-C does not end it during a request.
+
+    It is ended when `close` is called, when this object is collected, or when this process exits.
+
+    Args:
+        command: Its command line, split as a shell does; there is no shell.
+
+    Attributes:
+        channel: The channel to it.
+
+    Raises:
+        ConfigurationError: It cannot be started.
+    """
+
+    def __init__(self, command: str) -> None:
+        try:
+            words = shlex.split(command)
+        except ValueError as error:
+            raise ConfigurationError(f"{command!r} is not a command: {error}") from error
+        if not words:
+            raise ConfigurationError("the command of a federate is empty")
+        # A file, because a pipe that nothing reads would block a federate that writes much.
+        self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
+        try:
+            process = subprocess.Popen(
+                words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._stderr, start_new_session=True
+            )
+        except OSError as error:
+            self._stderr.close()
+            raise ConfigurationError(
+                f"the federate {words[0]} cannot be started: {error.strerror}",
+                remedy="check the command and its path",
+            ) from error
+        assert process.stdin is not None
+        assert process.stdout is not None
+        self._process = process
+        # The channel owns duplicates, so that the process object does not close descriptors that are in use again.
+        self.channel = StreamChannel(os.dup(process.stdout.fileno()), os.dup(process.stdin.fileno()))
+        process.stdin.close()
+        process.stdout.close()
+        self._finalizer = weakref.finalize(self, _end, process, self.channel, self._stderr)
+
+    @property
+    def last_output(self) -> str:
+        """The last line that it wrote to its standard error."""
+        if self._stderr.closed:
+            return ""
+        size = os.fstat(self._stderr.fileno()).st_size
+        tail = os.pread(self._stderr.fileno(), _TAIL_BYTES, max(size - _TAIL_BYTES, 0)).decode(errors="replace")
+        return next((line for line in reversed(tail.splitlines()) if line.strip()), "").strip()
+
+    def exit_text(self, wait_s: float = 0.5) -> str:
+        """Return a text about its end, such as `it has exited with code 1`; empty if it still runs after a time."""
+        deadline_s = time.monotonic() + wait_s
+        while not _has_exited(self._process.pid):
+            if time.monotonic() > deadline_s:
+                return ""
+            time.sleep(_POLL_S)
+        try:
+            info = os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT)
+        except ChildProcessError:
+            info = None
+        if info is None or info.si_code == os.CLD_EXITED:
+            return "it has exited" if info is None else f"it has exited with code {info.si_status}"
+        return f"it was ended by {signal.Signals(info.si_status).name}"
+
+    def kill(self) -> None:
+        """End the process immediately, as it cannot be expected to end without that."""
+        if self._finalizer.alive:
+            _signal_group(self._process.pid, signal.SIGKILL)
+        self._finalizer()
+
+    def close(self) -> None:
+        """Close the channel and end the process with all processes of its session's group."""
+        self._finalizer()
+
+
+def _has_exited(pid: int) -> bool:
+    """Return True if a child has exited; it stays a zombie, so that its process id is not used again.
+
+    If this process ignores SIGCHLD, the kernel has removed the zombie.
+    """
+    try:
+        return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
+    except ChildProcessError:
+        return True
+
+
+def _end(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[bytes]) -> None:
+    channel.close()
+    for number in (None, signal.SIGTERM):
+        if number is not None:
+            _signal_group(process.pid, number)
+        deadline_s = time.monotonic() + _EXIT_S
+        while time.monotonic() < deadline_s and not _has_exited(process.pid):
+            time.sleep(_POLL_S)
+        if _has_exited(process.pid):
+            break
+    # Also ends what the command has started, and a process that is suspended.
+    _signal_group(process.pid, signal.SIGKILL)
+    process.wait()
+    stderr.close()
+
+
+def _signal_group(pid: int, number: signal.Signals) -> None:
+    with suppress(ProcessLookupError, PermissionError):  # if only the zombie is left
+        os.killpg(pid, number)

@@ -1,0 +1,1 @@
+"""Conformance suite: checks that an external federate follows the protocol."""

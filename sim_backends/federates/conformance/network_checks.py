@@ -1,0 +1,252 @@
+"""Checks of a network: times, fates of packets, window borders, reasons, determinism, forks."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from sim_backends.federates.conformance.probe import CheckError, FederateProbe, NotDeclaredError, Target
+from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
+from sim_backends.federates.frames import MessageKind
+from sim_backends.federates.handshake import NO_EVENT, Capability
+from sim_backends.network.packets import Arrival, Packet
+from sim_backends.world.motion import State
+
+_MS: Final = 1_000_000
+_WINDOW_NS: Final = 1_100_000
+_END_NS: Final = 5_000 * _MS
+"""Time until which the fate of every packet must be decided."""
+_FAR_M: Final = 1e6
+_SIZE_BYTES: Final = 200
+
+
+def _states(probe: FederateProbe) -> dict[str, State]:
+    return {agent.name: State(agent.start.position_m) for agent in probe.hello.agents}
+
+
+def _packets(probe: FederateProbe, times_ns: Sequence[int]) -> list[Packet]:
+    """Return packets between the first two agents, in both directions in turns."""
+    ends = [agent.name for agent in probe.hello.agents[:2]]
+    if len(ends) < 2:
+        raise NotDeclaredError("the scenario has only one agent")
+    protocol = (probe.welcome.transports or ("udp",))[0]
+    packets = []
+    for number, at_ns in enumerate(times_ns):
+        source, destination = ends[::-1] if number % 2 else ends
+        packets.append(
+            Packet(number + 1, source, destination, _SIZE_BYTES, ("check", number), at_ns, at_ns, protocol)
+        )
+    return packets
+
+
+def _times_ns() -> list[int]:
+    """Return times of packets: at ends and beginnings of windows, and within them."""
+    borders_ns = [number * _WINDOW_NS + offset_ns for number in range(0, 60, 4) for offset_ns in (0, 1, 500_000)]
+    return sorted(at_ns for at_ns in borders_ns)
+
+
+class _Account:
+    """Follows the fates of packets, and checks what the network reports."""
+
+    def __init__(self, probe: FederateProbe) -> None:
+        self._probe = probe
+        self._packets: dict[int, Packet] = {}
+        self._decided: set[int] = set()
+        self._next_event_ns = probe.welcome.next_event_ns
+        self.arrivals: list[Arrival] = []
+        self.reasons: dict[int, str] = {}
+
+    def advance(
+        self, to_ns: int, states: Mapping[str, State], packets: Sequence[Packet] = (), *, copy: int = 0
+    ) -> NetworkOutcomes:
+        """Advance the network, and check its answer."""
+        from_ns = self._probe.last_ns
+        outcomes = self._probe.network(to_ns, states, packets, copy=copy)
+        self._packets |= {packet.packet_id: packet for packet in packets}
+        if outcomes.at_ns != to_ns:
+            raise CheckError(f"asked to advance to {to_ns} ns, it advanced to {outcomes.at_ns} ns")
+        if self._probe.has(Capability.NEXT_EVENT):
+            self._check_next_event(outcomes, to_ns, has_packets=bool(packets))
+        for arrival in outcomes.arrivals:
+            self._check_arrival(arrival, from_ns, to_ns)
+        for drop in outcomes.drops:
+            self._decide(drop.packet_id)
+            if not drop.reason:
+                raise CheckError(f"packet {drop.packet_id} was dropped without a reason")
+            self.reasons[drop.packet_id] = drop.reason
+        times_ns = [arrival.at_ns for arrival in outcomes.arrivals]
+        if times_ns != sorted(times_ns):
+            raise CheckError(f"the arrivals are not in order of time: {times_ns}")
+        self.arrivals += outcomes.arrivals
+        return outcomes
+
+    def undecided(self) -> list[int]:
+        """Return the numbers of packets that neither arrived nor were dropped."""
+        return sorted(self._packets.keys() - self._decided)
+
+    def _decide(self, packet_id: int) -> None:
+        if packet_id not in self._packets:
+            raise CheckError(f"the fate of packet {packet_id} was reported, which it never got")
+        if packet_id in self._decided:
+            raise CheckError(f"the fate of packet {packet_id} was reported twice")
+        self._decided.add(packet_id)
+
+    def _check_arrival(self, arrival: Arrival, from_ns: int, to_ns: int) -> None:
+        self._decide(arrival.packet_id)
+        packet = self._packets[arrival.packet_id]
+        if arrival.receiver != packet.destination:
+            raise CheckError(f"packet {packet.packet_id} for {packet.destination} arrived at {arrival.receiver}")
+        earliest_ns = max(packet.enters_ns, from_ns)
+        if not earliest_ns <= arrival.at_ns <= to_ns:
+            raise CheckError(
+                f"packet {packet.packet_id} arrived at {arrival.at_ns} ns, not between {earliest_ns} and {to_ns} ns"
+            )
+
+    def _check_next_event(self, outcomes: NetworkOutcomes, to_ns: int, *, has_packets: bool) -> None:
+        announced_ns, self._next_event_ns = self._next_event_ns, outcomes.next_event_ns
+        if outcomes.next_event_ns != NO_EVENT and outcomes.next_event_ns <= to_ns:
+            raise CheckError(f"after advancing to {to_ns} ns, its next event is at {outcomes.next_event_ns} ns")
+        for arrival in () if has_packets else outcomes.arrivals:
+            if announced_ns == NO_EVENT or arrival.at_ns < announced_ns:
+                raise CheckError(
+                    f"packet {arrival.packet_id} arrived at {arrival.at_ns} ns, before the announced next event "
+                    f"({announced_ns} ns)"
+                )
+
+
+def _run(probe: FederateProbe, window_ns: int, until_ns: int = _END_NS) -> _Account:
+    """Carry packets in windows of equal length; after all have entered, windows are 100 times as long."""
+    account, states = _Account(probe), _states(probe)
+    waiting = _packets(probe, _times_ns())
+    to_ns = -1
+    while to_ns < until_ns:
+        to_ns += window_ns if waiting else 100 * window_ns
+        entering = [packet for packet in waiting if packet.enters_ns <= to_ns]
+        waiting = waiting[len(entering) :]
+        account.advance(to_ns, states, entering)
+    return account
+
+
+def check_first_request(target: Target) -> None:
+    """A first request for time -1, which a window of length 0 causes, is answered."""
+    probe = target.open()
+    outcomes = probe.network(-1, _states(probe))
+    if outcomes.at_ns != -1 or outcomes.arrivals or outcomes.drops:
+        raise CheckError("the first request for -1 ns was not answered with this time and without packets")
+
+
+def check_exactly_once(target: Target) -> None:
+    """Each packet arrives or is dropped exactly once, in its window, in order of time; drops have reasons."""
+    undecided = _run(target.open(), _WINDOW_NS).undecided()
+    if undecided:
+        raise CheckError(f"after {_END_NS / 1e9:g} s, {len(undecided)} packets neither arrived nor were dropped")
+
+
+def check_window_borders(target: Target) -> None:
+    """A packet may enter at the end of a window, or at the previous one's end, and arrives not before it entered."""
+    probe = target.open()
+    account, states = _Account(probe), _states(probe)
+    first, second, third = _packets(probe, (10 * _MS, 10 * _MS, 10 * _MS + 1))
+    account.advance(10 * _MS, states, [first])
+    account.advance(10 * _MS + 1, states, [second, third])
+    account.advance(10 * _MS + 1, states)
+    account.advance(_END_NS, states)
+    if undecided := account.undecided():
+        raise CheckError(f"packets {undecided} at the border of a window neither arrived nor were dropped")
+
+
+def check_window_length(target: Target) -> None:
+    """Agents that do not move get the same arrivals in short and in long windows."""
+    arrivals = []
+    for window_ns in (_WINDOW_NS, 13 * _WINDOW_NS):
+        probe = target.open()
+        probe.require(Capability.DETERMINISTIC)
+        arrivals.append(sorted(_run(probe, window_ns).arrivals, key=lambda arrival: arrival.packet_id))
+    for one, other in zip(*arrivals, strict=False):
+        if one != other:
+            raise CheckError(f"windows of another length changed an arrival: {one} and {other}")
+    if len(arrivals[0]) != len(arrivals[1]):
+        raise CheckError(f"windows of another length changed {len(arrivals[0])} arrivals into {len(arrivals[1])}")
+
+
+def check_far_away(target: Target) -> None:
+    """A packet to an agent that is 1,000 km away is decided; if it is dropped, with a reason."""
+    probe = target.open()
+    account, states = _Account(probe), _states(probe)
+    far = probe.hello.agents[-1].name if len(probe.hello.agents) < 2 else probe.hello.agents[1].name
+    states[far] = State((_FAR_M, 0.0, 1.0))
+    account.advance(10 * _MS, states, _packets(probe, [5 * _MS]))
+    account.advance(_END_NS, states)
+    if account.undecided():
+        raise CheckError("a packet to an agent that is 1,000 km away neither arrived nor was dropped")
+
+
+def check_unknown_transport(target: Target) -> None:
+    """A packet of a transport that is not listed is refused with an error, if transports are listed."""
+    probe = target.open()
+    if not probe.welcome.transports:
+        raise NotDeclaredError("it lists no transports")
+    (packet,) = _packets(probe, [_MS])
+    wrong = Packet(1, packet.source, packet.destination, 1, packet.identity, _MS, _MS, "no-such-transport")
+    body = AdvanceNetwork(2 * _MS, _states(probe), [wrong]).encode(probe.agents)
+    probe.expect_error(
+        MessageKind.ADVANCE_NETWORK, body, MessageKind.OUTCOMES, "a packet of a transport that is not listed"
+    )
+
+
+def check_determinism(target: Target) -> None:
+    """Equal requests give equal answers, if the federate declares this."""
+    accounts = []
+    for _ in range(2):
+        probe = target.open()
+        probe.require(Capability.DETERMINISTIC)
+        accounts.append(_run(probe, _WINDOW_NS))
+    one, other = accounts
+    if one.arrivals != other.arrivals or one.reasons != other.reasons:
+        raise CheckError("equal requests gave different arrivals or drops")
+
+
+def check_new_agent(target: Target) -> None:
+    """A packet to an agent that has appeared is decided, if the federate declares that agents may appear."""
+    probe = target.open()
+    probe.require(Capability.AGENTS_APPEAR)
+    account, states = _Account(probe), _states(probe)
+    account.advance(_MS, states)
+    first = probe.hello.agents[0].name
+    states["new agent"] = states[first]
+    protocol = (probe.welcome.transports or ("udp",))[0]
+    packet = Packet(1, first, "new agent", _SIZE_BYTES, ("check", 0), 2 * _MS, 2 * _MS, protocol)
+    account.advance(3 * _MS, states, [packet])
+    account.advance(_END_NS, states)
+    if account.undecided():
+        raise CheckError("a packet to an agent that has appeared neither arrived nor was dropped")
+
+
+def check_dead_reckoning(target: Target) -> None:
+    """Extrapolation at a velocity of 0 changes nothing, if the federate declares that it extrapolates."""
+    arrivals = []
+    for reckoning_ns in (0, _MS):
+        probe = target.open()
+        probe.require(Capability.EXTRAPOLATES)
+        states = _states(probe)
+        outcomes = [
+            probe.network(to_ns, states, packets, reckoning_ns=reckoning_ns)
+            for to_ns, packets in ((10 * _MS, _packets(probe, [5 * _MS])), (_END_NS, []))
+        ]
+        arrivals.append([outcome.arrivals for outcome in outcomes])
+    if arrivals[0] != arrivals[1]:
+        raise CheckError("extrapolation at a velocity of 0 changed the arrivals")
+
+
+def check_fork(target: Target) -> None:
+    """A copy continues as the original, and neither changes the other."""
+    probe = target.open()
+    probe.require(Capability.FORK)
+    states = _states(probe)
+    packets = _packets(probe, [number * _MS for number in range(5)])
+    probe.network(_MS, states, packets[:2])
+    probe.fork(1)
+    requests = (5 * _MS, packets[2:]), (_END_NS, packets[:0])
+    in_copy, in_original = (
+        [probe.network(to_ns, states, entering, copy=copy) for to_ns, entering in requests] for copy in (1, 0)
+    )
+    if in_copy != in_original:
+        raise CheckError("the copy and the original gave different answers to equal requests")

@@ -1,0 +1,208 @@
+"""Checks of a physics: times, commands, motion, determinism, forks."""
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+from sim_backends.federates.conformance.probe import Advanced, CheckError, FederateProbe, NotDeclaredError, Target
+from sim_backends.federates.exchanges import encode_number
+from sim_backends.federates.frames import MessageKind
+from sim_backends.federates.handshake import AgentStart, Capability
+from sim_backends.federates.records import TWIST, VELOCITY
+from sim_backends.physics.body import Twist, Velocity
+from sim_backends.world.motion import State, extrapolate
+
+_START_M: Final = 0.5
+"""Largest distance of an agent from the start that it was given."""
+_SAME_M: Final = 1e-6
+"""Largest difference between positions that must be equal; results may depend on the order of additions."""
+_MOVED_M: Final = 0.02
+_JUMP_M: Final = 0.05
+"""A body moves at most this much, and by twice its speed, in a step."""
+_UNKNOWN_TYPE: Final = 32767
+_LIMIT_STEPS: Final = 10
+_COMMANDED_STEPS: Final = 1000
+_SPEED_M_S: Final = 0.3
+
+
+def _command(agent: AgentStart) -> Twist | Velocity:
+    heading_rad = agent.start.heading_rad or 0.0
+    if agent.flies:
+        return Velocity((_SPEED_M_S * math.cos(heading_rad), _SPEED_M_S * math.sin(heading_rad), 0.1))
+    return Twist(_SPEED_M_S)
+
+
+def _commands(probe: FederateProbe) -> Mapping[str, Twist | Velocity]:
+    """Return commands to all agents that the federate can command."""
+    supported = {TWIST: False, VELOCITY: True}
+    flying = {flies for number, flies in supported.items() if number in probe.welcome.commands}
+    commands = {agent.name: _command(agent) for agent in probe.hello.agents if agent.flies in flying}
+    if not commands:
+        raise NotDeclaredError("it supports no type of command for these agents")
+    return commands
+
+
+def _check_same(first: Mapping[str, State], second: Mapping[str, State], what: str) -> None:
+    for name in first:
+        distance_m = math.dist(first[name].position_m, second[name].position_m)
+        if distance_m > _SAME_M:
+            raise CheckError(f"{what}: the positions of {name} differ by {distance_m:.3g} m")
+
+
+def _check_time(probe: FederateProbe, to_ns: int, advanced: Advanced) -> None:
+    step_ns = probe.welcome.step_ns
+    expected_ns = to_ns - to_ns % step_ns
+    if advanced.at_ns != expected_ns:
+        raise CheckError(
+            f"asked to advance to {to_ns} ns, it returned the states at {advanced.at_ns} ns instead of "
+            f"{expected_ns} ns, its last step of {step_ns} ns until then"
+        )
+
+
+def check_start(target: Target) -> None:
+    """At time 0 each agent has a state near the start that it was given."""
+    probe = target.open()
+    advanced = probe.physics(0)
+    _check_time(probe, 0, advanced)
+    for agent in target.hello.agents:
+        distance_m = math.dist(advanced.states[agent.name].position_m, agent.start.position_m)
+        if distance_m > _START_M:
+            raise CheckError(f"{agent.name} starts {distance_m:.3g} m away from the start that it was given")
+
+
+def check_remainders(target: Target) -> None:
+    """In windows of 1.1 steps, the states are always those at the last whole step."""
+    probe = target.open()
+    step_ns = probe.welcome.step_ns
+    window_ns = step_ns + max(step_ns // 10, 1)
+    for window in range(200):
+        to_ns = window * window_ns
+        _check_time(probe, to_ns, probe.physics(to_ns))
+
+
+def check_drift(target: Target) -> None:
+    """Many windows of 1.1 steps give the same motion as one window; 10^6 of them with --windows 1000000."""
+    probe = target.open()
+    step_ns = probe.welcome.step_ns
+    window_ns = step_ns + max(step_ns // 10, 1)
+    commands = _commands(probe)
+    advanced = probe.physics(0)
+    for window in range(1, target.windows + 1):
+        to_ns = window * window_ns
+        advanced = probe.physics(to_ns, commands if window == 1 else None)
+        _check_time(probe, to_ns, advanced)
+    if not probe.has(Capability.DETERMINISTIC):
+        raise NotDeclaredError("it does not declare DETERMINISTIC; only the times were compared")
+    once = target.open()
+    once.physics(0)
+    at_once = once.physics(target.windows * window_ns, commands)
+    _check_same(advanced.states, at_once.states, f"{target.windows} windows instead of one")
+
+
+def check_repeated_time(target: Target) -> None:
+    """A second request for the same time gives the same states."""
+    probe = target.open()
+    probe.physics(0)
+    to_ns = 20 * probe.welcome.step_ns
+    first = probe.physics(to_ns, _commands(probe))
+    second = probe.physics(to_ns)
+    if first.states != second.states:
+        raise CheckError(f"a second request for {to_ns} ns gave other states")
+
+
+def check_motion(target: Target) -> None:
+    """Commanded agents move, without jumps, and continue without a new command."""
+    probe = target.open()
+    before = start = probe.physics(0).states
+    step_ns, commands = probe.welcome.step_ns, _commands(probe)
+    for step in range(1, _COMMANDED_STEPS + 1):
+        advanced = probe.physics(step * step_ns, commands if step == 1 else None)
+        for name, state in advanced.states.items():
+            moved_m = math.dist(state.position_m, before[name].position_m)
+            speed_m_s = max(math.hypot(*state.velocity_m_s), math.hypot(*before[name].velocity_m_s))
+            if moved_m > _JUMP_M + 2 * speed_m_s * step_ns / 1e9:
+                raise CheckError(f"{name} moved by {moved_m:.3g} m in a step, at a speed of {speed_m_s:.3g} m/s")
+        before = advanced.states
+    for name in commands:
+        moved_m = math.dist(before[name].position_m, start[name].position_m)
+        if moved_m < min(_MOVED_M, 0.1 * _SPEED_M_S * _COMMANDED_STEPS * step_ns / 1e9):
+            raise CheckError(f"{name} moved by {moved_m:.3g} m in {_COMMANDED_STEPS} steps under {commands[name]}")
+
+
+def check_limits(target: Target) -> None:
+    """Extrapolation at the velocity is wrong by at most a t^2 / 2, where a is the returned limit."""
+    probe = target.open()
+    before = probe.physics(0)
+    step_ns, commands = probe.welcome.step_ns, _commands(probe)
+    window_s = _LIMIT_STEPS * step_ns / 1e9
+    # A simulator that moves bodies at the velocity of the end of a step is wrong by one more step.
+    per_limit_s2 = window_s**2 / 2 + window_s * step_ns / 1e9
+    for window in range(1, 40):
+        advanced = probe.physics(window * _LIMIT_STEPS * step_ns, commands if window == 1 else None)
+        for name, state in before.states.items():
+            expected = extrapolate(state, window_s).position_m
+            error_m = math.dist(advanced.states[name].position_m, expected)
+            if error_m > before.limits_m_s2[name] * per_limit_s2 + _SAME_M:
+                raise CheckError(
+                    f"{name} was {error_m:.3g} m away from its extrapolated position after {window_s:g} s; its limit "
+                    f"of {before.limits_m_s2[name]:.3g} m/s^2 allows {before.limits_m_s2[name] * per_limit_s2:.3g} m"
+                )
+        before = advanced
+
+
+def check_command_time(target: Target) -> None:
+    """A command applies from `from_ns` on, even if the federate was not asked to advance to it before."""
+    exact = target.open()
+    exact.require(Capability.DETERMINISTIC)
+    step_ns, commands = exact.welcome.step_ns, _commands(exact)
+    middle_ns, end_ns = 100 * step_ns, 300 * step_ns
+    exact.physics(0)
+    exact.physics(middle_ns)
+    expected = exact.physics(end_ns, commands)
+    late = target.open()
+    late.physics(0)
+    _check_same(
+        expected.states,
+        late.physics(end_ns, commands, from_ns=middle_ns).states,
+        f"a command from {middle_ns} ns on",
+    )
+
+
+def check_unknown_command(target: Target) -> None:
+    """A command of an unknown type is refused with an error."""
+    probe = target.open()
+    probe.physics(0)
+    body = (
+        encode_number(probe.welcome.step_ns) + encode_number(0) + b"\1\0\0\0" + b"\0\0\0\0\xff\x7f\x08\0" + bytes(8)
+    )
+    probe.expect_error(MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, "a command of an unknown type")
+
+
+def check_determinism(target: Target) -> None:
+    """Equal requests give equal answers, byte by byte, if the federate declares this."""
+    answers = []
+    for _ in range(2):
+        probe = target.open()
+        probe.require(Capability.DETERMINISTIC)
+        window_ns, commands = 7 * probe.welcome.step_ns, _commands(probe)
+        answers.append(
+            [probe.physics(number * window_ns, commands if number == 3 else None).body for number in range(100)]
+        )
+    for number, (first, second) in enumerate(zip(*answers, strict=True)):
+        if first != second:
+            raise CheckError(f"equal requests up to {number * window_ns} ns gave different answers")
+
+
+def check_fork(target: Target) -> None:
+    """A copy continues as the original, and neither changes the other."""
+    probe = target.open()
+    probe.require(Capability.FORK)
+    step_ns, commands = probe.welcome.step_ns, _commands(probe)
+    probe.physics(0)
+    middle_ns, end_ns = 100 * step_ns, 400 * step_ns
+    at_fork = probe.physics(middle_ns, commands)
+    probe.fork(1)
+    in_copy = probe.physics(end_ns, from_ns=middle_ns, copy=1)
+    again = probe.physics(middle_ns, from_ns=middle_ns)
+    _check_same(at_fork.states, again.states, "the original, after its copy has advanced")
+    _check_same(in_copy.states, probe.physics(end_ns, from_ns=middle_ns).states, "the original and its copy")

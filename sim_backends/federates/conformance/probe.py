@@ -1,0 +1,234 @@
+"""Means of the checks: connections to fresh federates, and the last request and answer of each."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final, Protocol
+
+from sim_backends.federates.agent_states import AgentTable
+from sim_backends.federates.channels import ClosedError, DeadlineError
+from sim_backends.federates.exchanges import (
+    AdvanceNetwork,
+    NetworkOutcomes,
+    decode_number,
+    decode_states,
+    encode_advance_physics,
+    encode_fork,
+    encode_number,
+)
+from sim_backends.federates.frames import HEADER_BYTES, PHYSICS, MessageKind, ProtocolFrame
+from sim_backends.federates.handshake import Capability, Hello, Welcome
+from sim_backends.federates.protocols import FederateError
+from sim_backends.federates.session import FederateSession
+from sim_backends.network.packets import Packet
+from sim_backends.world.motion import State
+
+_SHOWN_BYTES: Final = 120
+_CLOSE_S: Final = 5.0
+
+
+class CheckError(Exception):
+    """A federate does not conform; the message says how."""
+
+
+class NotDeclaredError(Exception):
+    """A check does not apply, because the federate does not declare the capability; the message names it."""
+
+
+class Opener(Protocol):
+    """Starts or connects a fresh federate."""
+
+    def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
+        """Return its session, as `open_session`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Advanced:
+    """The answer of a physics.
+
+    Attributes:
+        at_ns: Time of the states.
+        states: The states.
+        limits_m_s2: The limits.
+        body: The bytes of the answer.
+    """
+
+    at_ns: int
+    states: Mapping[str, State]
+    limits_m_s2: Mapping[str, float]
+    body: bytes
+
+
+def frame_text(frame: bytes) -> str:
+    """Return a frame for people: its size, and its first bytes in hexadecimal."""
+    rest = "" if len(frame) <= _SHOWN_BYTES else "..."
+    return f"{len(frame)} bytes: {frame[:_SHOWN_BYTES].hex(' ', 4)}{rest}"
+
+
+class FederateProbe:
+    """A fresh federate, which is used without the coordinator's safeguards.
+
+    Args:
+        opener: Starts or connects it.
+        hello: The hello that it receives.
+        exchange: Receives the last request and answer.
+
+    Attributes:
+        hello: The hello that it received.
+        welcome: Its answer.
+        agents: The agents that were announced.
+    """
+
+    def __init__(self, opener: Opener, hello: Hello, exchange: dict[str, str]) -> None:
+        self._session, self.hello, self.welcome = opener(hello)
+        self._exchange = exchange
+        self.agents = AgentTable(agent.name for agent in hello.agents)
+        self._session.observer = self._observe
+        self.last_ns = 0
+
+    def _observe(self, request: bytes, answer: ProtocolFrame | None) -> None:
+        self._exchange["request"] = f"{MessageKind(request[4]).name.lower()}, {frame_text(request)}"
+        self._exchange["answer"] = "none"
+        if answer is not None:
+            header = answer.header
+            size = HEADER_BYTES + header.size
+            self._exchange["answer"] = (
+                f"{header.kind.name.lower()} to request {header.request}, {size} bytes; "
+                f"after the header {frame_text(answer.body)}"
+            )
+
+    def has(self, capability: Capability) -> bool:
+        """Return True if the federate declares a capability."""
+        return bool(self.welcome.capabilities & capability)
+
+    def require(self, capability: Capability) -> None:
+        """Raise `NotDeclaredError` if the federate does not declare a capability."""
+        if not self.has(capability):
+            raise NotDeclaredError(f"it does not declare {capability.name}")
+
+    def request(
+        self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
+    ) -> Any:  # noqa: ANN401 (of `decode`)
+        """Send a request, and return the decoded answer; errors as `FederateSession.request`."""
+        what = kind.name.lower().replace("_", " ")
+        return self._session.request(kind, copy, body, answer, decode=decode, what=lambda: what)
+
+    def physics(
+        self, to_ns: int, commands: Mapping[str, Any] | None = None, *, from_ns: int | None = None, copy: int = 0
+    ) -> Advanced:
+        """Advance a physics; the commands apply from the time of the last call on, or from `from_ns`."""
+        begin_ns = self.last_ns if from_ns is None else from_ns
+        body = encode_advance_physics(to_ns, begin_ns, commands or {}, self.agents)
+        known = set(self.agents.names)
+        decode = partial(_decode_advanced, agents=self.agents)
+        advanced: Advanced = self.request(MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, decode, copy=copy)
+        self.last_ns = to_ns
+        if set(self.agents.names) - known and not self.has(Capability.AGENTS_APPEAR):
+            raise CheckError(f"an agent appeared, {self.agents.names[-1]}, which it does not declare")
+        missing = known - advanced.states.keys()
+        if missing and not self.has(Capability.AGENTS_DISAPPEAR):
+            raise CheckError(f"there is no state of {', '.join(sorted(missing))}, and it does not declare this")
+        return advanced
+
+    def network(
+        self,
+        to_ns: int,
+        states: Mapping[str, State],
+        packets: Sequence[Packet] = (),
+        *,
+        reckoning_ns: int = 0,
+        copy: int = 0,
+    ) -> NetworkOutcomes:
+        """Advance a network."""
+        body = AdvanceNetwork(to_ns, states, packets, self.last_ns, reckoning_ns).encode(self.agents)
+        decode = partial(NetworkOutcomes.decode, agents=self.agents)
+        outcomes: NetworkOutcomes = self.request(
+            MessageKind.ADVANCE_NETWORK, body, MessageKind.OUTCOMES, decode, copy=copy
+        )
+        self.last_ns = to_ns
+        return outcomes
+
+    def fork(self, copy: int) -> None:
+        """Let the federate copy itself."""
+        self.request(MessageKind.FORK, encode_fork(copy), MessageKind.DONE, bytes)
+
+    def ping(self, value: int) -> int:
+        """Return the value of the answer to a ping."""
+        number: int = self.request(MessageKind.PING, encode_number(value), MessageKind.PONG, decode_number)
+        return number
+
+    def expect_error(self, kind: MessageKind, body: bytes, answer: MessageKind, why: str) -> None:
+        """Send a request that the federate must refuse.
+
+        Raises:
+            CheckError: It answers, or does not react within the deadline.
+        """
+        started_s = time.monotonic()
+        try:
+            self.request(kind, body, answer, bytes)
+        except FederateError as error:
+            if error.exit_code == 1 and ("failed when it was asked" in error.what):
+                return
+            raise CheckError(f"it must refuse {why}: {error.what} ({time.monotonic() - started_s:.1f} s)") from error
+        raise CheckError(f"it must refuse {why}, and it answered")
+
+    def end(self) -> None:
+        """End the session by `bye`, and wait until the federate closes the connection.
+
+        Raises:
+            CheckError: It does not close the connection.
+        """
+        try:
+            self._session.say_bye(_CLOSE_S)
+        except DeadlineError as error:
+            raise CheckError(f"it has not closed the connection {_CLOSE_S:g} s after bye") from error
+        except ClosedError:
+            pass
+
+    def close(self) -> None:
+        """End the federate."""
+        self._session.close()
+
+
+def _decode_advanced(body: bytes, agents: AgentTable) -> Advanced:
+    at_ns, states = decode_states(body, agents)
+    return Advanced(at_ns, states, states.limits_m_s2, body)
+
+
+@dataclass
+class Target:
+    """An external federate under test.
+
+    Attributes:
+        opener: Starts or connects it.
+        hello: The hello that it receives.
+        windows: Number of windows of the check for drift.
+    """
+
+    opener: Opener
+    hello: Hello
+    windows: int = 2000
+
+    def __post_init__(self) -> None:
+        self.exchange: dict[str, str] = {}
+        self._probe: FederateProbe | None = None
+
+    @property
+    def is_physics(self) -> bool:
+        """True if a physics is tested."""
+        return self.hello.role == PHYSICS
+
+    def open(self) -> FederateProbe:
+        """Return a fresh federate, after the previous one has ended: one that listens may serve one at a time."""
+        self.close()
+        self.exchange |= {"request": "hello", "answer": "none"}
+        self._probe = FederateProbe(self.opener, self.hello, self.exchange)
+        return self._probe
+
+    def close(self) -> None:
+        """End the last federate."""
+        if self._probe is not None:
+            self._probe.close()
+            self._probe = None

@@ -1,0 +1,211 @@
+"""Requests and answers of the wire protocol after the handshake (docs/federates.md)."""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from sim_backends.federates.agent_states import (
+    AgentTable,
+    ReceivedStates,
+    announcements_bytes,
+    read_announcements,
+    read_states,
+    states_bytes,
+)
+from sim_backends.federates.frames import FrameReader, MalformedFrameError
+from sim_backends.federates.records import (
+    arrivals_bytes,
+    commands_bytes,
+    drops_bytes,
+    packets_bytes,
+    read_arrivals,
+    read_commands,
+    read_drops,
+    read_packets,
+)
+from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.physics.body import Twist, Velocity
+from sim_backends.world.motion import State
+
+_TIME: Final = struct.Struct("<q")
+_TWO_TIMES: Final = struct.Struct("<qq")
+_THREE_TIMES: Final = struct.Struct("<qqq")
+_U32: Final = struct.Struct("<I")
+
+
+def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any], agents: AgentTable) -> bytes:
+    """Return the body of a request to a physics; raises as `commands_bytes`.
+
+    Args:
+        to_ns: Time to advance to.
+        from_ns: Time from which the commands apply.
+        commands: Commands by agent.
+        agents: The agents.
+    """
+    return _TWO_TIMES.pack(to_ns, from_ns) + commands_bytes(commands, agents)
+
+
+def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, dict[str, Twist | Velocity]]:
+    """Return the two times and the commands of a request to a physics.
+
+    Raises:
+        MalformedFrameError: It is malformed.
+    """
+    reader = FrameReader(body)
+    to_ns, from_ns = reader.unpack(_TWO_TIMES)
+    commands = read_commands(reader, agents)
+    reader.end()
+    return to_ns, from_ns, commands
+
+
+def encode_states(
+    at_ns: int, states: Mapping[str, State], agents: AgentTable, limits_m_s2: Mapping[str, float]
+) -> bytes:
+    """Return the body of a physics' answer."""
+    return _TIME.pack(at_ns) + announcements_bytes(states, agents) + states_bytes(states, agents, limits_m_s2)
+
+
+def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]:
+    """Return time and states of a physics' answer; the states have the limits.
+
+    Raises:
+        MalformedFrameError: It is malformed.
+    """
+    reader = FrameReader(body)
+    (at_ns,) = reader.unpack(_TIME)
+    read_announcements(reader, agents)
+    states = read_states(reader, agents)
+    reader.end()
+    return at_ns, states
+
+
+@dataclass(frozen=True)
+class AdvanceNetwork:
+    """A request to a network.
+
+    Attributes:
+        to_ns: Time to advance to.
+        states: States of the agents.
+        packets: Packets that enter.
+        since_ns: Time of the states; it matters only for dead reckoning.
+        reckoning_ns: Step of dead reckoning; 0 if agents do not move until the next request.
+    """
+
+    to_ns: int
+    states: Mapping[str, State]
+    packets: Sequence[Packet]
+    since_ns: int = 0
+    reckoning_ns: int = 0
+
+    def encode(self, agents: AgentTable) -> bytes:
+        """Return the body of the message; `ValueError` if there are too many agents."""
+        return b"".join(
+            (
+                _THREE_TIMES.pack(self.to_ns, self.since_ns, self.reckoning_ns),
+                announcements_bytes(self.states, agents),
+                states_bytes(self.states, agents, None),
+                packets_bytes(self.packets, agents),
+            )
+        )
+
+    @staticmethod
+    def decode(body: bytes, agents: AgentTable) -> "AdvanceNetwork":
+        """Return the message of a body.
+
+        Raises:
+            MalformedFrameError: It is malformed.
+        """
+        reader = FrameReader(body)
+        to_ns, since_ns, reckoning_ns = reader.unpack(_THREE_TIMES)
+        if reckoning_ns < 0:
+            raise MalformedFrameError(reader.position - 8, f"a step of {reckoning_ns} ns is negative")
+        read_announcements(reader, agents)
+        states = read_states(reader, agents)
+        packets = read_packets(reader, agents)
+        reader.end()
+        return AdvanceNetwork(to_ns, states, packets, since_ns, reckoning_ns)
+
+
+@dataclass(frozen=True)
+class NetworkOutcomes:
+    """A network's answer.
+
+    Attributes:
+        at_ns: Time that it has reached.
+        next_event_ns: Time of its next event; `NO_EVENT` for none.
+        arrivals: Packets that arrived.
+        drops: Packets that will never arrive.
+    """
+
+    at_ns: int
+    next_event_ns: int
+    arrivals: Sequence[Arrival]
+    drops: Sequence[Drop]
+
+    def encode(self, agents: AgentTable) -> bytes:
+        """Return the body of the message."""
+        return (
+            _TWO_TIMES.pack(self.at_ns, self.next_event_ns)
+            + arrivals_bytes(self.arrivals, agents)
+            + drops_bytes(self.drops)
+        )
+
+    @staticmethod
+    def decode(body: bytes, agents: AgentTable) -> "NetworkOutcomes":
+        """Return the message of a body.
+
+        Raises:
+            MalformedFrameError: It is malformed.
+        """
+        reader = FrameReader(body)
+        at_ns, next_event_ns = reader.unpack(_TWO_TIMES)
+        arrivals, drops = read_arrivals(reader, agents), read_drops(reader)
+        reader.end()
+        return NetworkOutcomes(at_ns, next_event_ns, arrivals, drops)
+
+
+def encode_number(number: int) -> bytes:
+    """Return the body of `ping`, `pong` and `busy`: eight bytes."""
+    return _TIME.pack(number)
+
+
+def decode_number(body: bytes) -> int:
+    """Return the number in `ping`, `pong` and `busy`.
+
+    Raises:
+        MalformedFrameError: It is malformed.
+    """
+    reader = FrameReader(body)
+    (number,) = reader.unpack(_TIME)
+    reader.end()
+    return int(number)
+
+
+def encode_fork(copy: int) -> bytes:
+    """Return the body of `fork`."""
+    return _U32.pack(copy)
+
+
+def decode_fork(body: bytes) -> int:
+    """Return the number of the new copy.
+
+    Raises:
+        MalformedFrameError: It is malformed.
+    """
+    reader = FrameReader(body)
+    (copy,) = reader.unpack(_U32)
+    reader.end()
+    return int(copy)
+
+
+def decode_text(body: bytes) -> str:
+    """Return the text of `error`.
+
+    Raises:
+        MalformedFrameError: It is malformed.
+    """
+    reader = FrameReader(body)
+    text = reader.text()
+    reader.end()
+    return text

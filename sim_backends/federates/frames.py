@@ -1,0 +1,230 @@
+"""Frames of the wire protocol: header, kinds of message, and a reader that checks every length before it reads.
+
+The protocol is described in docs/federates.md. Both sides are untrusted: no length or count of a frame is used before
+it has been compared with the number of bytes that have arrived.
+"""
+
+import struct
+from enum import IntEnum
+from typing import Any, Final, NamedTuple
+
+VERSION: Final = 1
+MAGIC: Final = b"FIELDKIT"
+MAX_FRAME_BYTES: Final = 16 << 20
+MAX_HELLO_BYTES: Final = 4 << 20
+MAX_JOIN_BYTES: Final = 2048
+MAX_TEXT_BYTES: Final = 1000
+MAX_AGENTS: Final = 10_000
+PHYSICS, NETWORK = 1, 2
+ROLES: Final = {PHYSICS: "physics", NETWORK: "network"}
+
+_COUNT: Final = struct.Struct("<I")
+_LENGTH: Final = struct.Struct("<H")
+_HEADER: Final = struct.Struct("<IHHII")
+HEADER_BYTES: Final = _HEADER.size
+
+
+class MessageKind(IntEnum):
+    """Kind of a message."""
+
+    JOIN = 1
+    HELLO = 2
+    WELCOME = 3
+    ADVANCE_PHYSICS = 4
+    STATES = 5
+    ADVANCE_NETWORK = 6
+    OUTCOMES = 7
+    PING = 8
+    PONG = 9
+    BUSY = 10
+    FORK = 11
+    DONE = 12
+    RELEASE = 13
+    ERROR = 14
+    BYE = 15
+
+
+_KINDS: Final = {int(kind): kind for kind in MessageKind}
+
+
+class MalformedFrameError(ValueError):
+    """A frame is not as the protocol describes it.
+
+    Args:
+        position: Number of the wrong byte, from the beginning of the frame.
+        what: What is wrong.
+    """
+
+    def __init__(self, position: int, what: str) -> None:
+        super().__init__(f"byte {position}: {what}")
+        self.position = position
+
+
+class Header(NamedTuple):
+    """The header of a frame.
+
+    Attributes:
+        size: Number of bytes after the header.
+        kind: Kind of message.
+        request: Number of the request.
+        copy: Copy of the federate; 0 for the original.
+    """
+
+    size: int
+    kind: MessageKind
+    request: int
+    copy: int
+
+
+class ProtocolFrame(NamedTuple):
+    """A received frame.
+
+    Attributes:
+        header: Its header.
+        body: The bytes after it.
+    """
+
+    header: Header
+    body: bytes
+
+
+def encode(kind: MessageKind, request: int, copy: int, body: bytes = b"") -> bytes:
+    """Return a frame.
+
+    Raises:
+        ValueError: The body is too long.
+    """
+    if len(body) > MAX_FRAME_BYTES:
+        raise ValueError(f"a frame of {len(body)} bytes is longer than {MAX_FRAME_BYTES}")
+    return _HEADER.pack(len(body), kind, 0, request, copy) + body
+
+
+def read_header(data: bytes | bytearray, max_bytes: int = MAX_FRAME_BYTES) -> Header:
+    """Return the header at the beginning of some bytes.
+
+    Args:
+        data: At least `HEADER_BYTES` bytes.
+        max_bytes: Largest allowed size of the body.
+
+    Raises:
+        MalformedFrameError: The size, the kind or the reserved field is invalid.
+    """
+    size, kind, reserved, request, copy = _HEADER.unpack_from(data)
+    known = _KINDS.get(kind)
+    if known is None:
+        raise MalformedFrameError(4, f"there is no kind of message {kind}")
+    if size > max_bytes:
+        raise MalformedFrameError(0, f"a size of {size} bytes is above {max_bytes}")
+    if reserved:
+        raise MalformedFrameError(6, f"the reserved field is {reserved}, not 0")
+    return Header(size, known, request, copy)
+
+
+class FrameReader:
+    """Reads the body of a frame in order.
+
+    Args:
+        body: The body.
+    """
+
+    def __init__(self, body: bytes) -> None:
+        self._body = body
+        self._at = 0
+
+    @property
+    def position(self) -> int:
+        """Number of the next byte, from the beginning of the frame."""
+        return HEADER_BYTES + self._at
+
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Return the next values.
+
+        Raises:
+            MalformedFrameError: The frame ends before.
+        """
+        at, self._at = self._at, self._at + layout.size
+        if self._at > len(self._body):
+            self._fail_at_end()
+        return layout.unpack_from(self._body, at)
+
+    def take(self, size: int) -> bytes:
+        """Return the next bytes.
+
+        Raises:
+            MalformedFrameError: The frame ends before.
+        """
+        at, self._at = self._at, self._at + size
+        if self._at > len(self._body):
+            self._fail_at_end()
+        return self._body[at : self._at]
+
+    def text(self) -> str:
+        """Return the next text.
+
+        Raises:
+            MalformedFrameError: It is too long, the frame ends before, or it is not UTF-8.
+        """
+        position = self.position
+        (length,) = self.unpack(_LENGTH)
+        if length > MAX_TEXT_BYTES:
+            raise MalformedFrameError(position, f"a text of {length} bytes is longer than {MAX_TEXT_BYTES}")
+        try:
+            return self.take(length).decode()
+        except UnicodeDecodeError as error:
+            raise MalformedFrameError(position + 2 + error.start, "the text is not UTF-8") from None
+
+    def count(self, item_bytes: int, layout: struct.Struct = _COUNT) -> int:
+        """Return the next count of items.
+
+        Args:
+            item_bytes: Smallest size of an item.
+            layout: Layout of the count.
+
+        Raises:
+            MalformedFrameError: The frame has no room for that many items.
+        """
+        position = self.position
+        (count,) = self.unpack(layout)
+        if count * item_bytes > len(self._body) - self._at:
+            raise MalformedFrameError(
+                position, f"{count} items of at least {item_bytes} bytes do not fit in the rest of the frame"
+            )
+        return int(count)
+
+    def short_count(self, item_bytes: int) -> int:
+        """Return the next count of two bytes; otherwise as `count`."""
+        return self.count(item_bytes, _LENGTH)
+
+    def end(self) -> None:
+        """Check that nothing follows.
+
+        Raises:
+            MalformedFrameError: There are more bytes.
+        """
+        if self._at != len(self._body):
+            raise MalformedFrameError(self.position, f"{len(self._body) - self._at} bytes follow the message")
+
+    def _fail_at_end(self) -> None:
+        raise MalformedFrameError(HEADER_BYTES + len(self._body), "the frame ends too early")
+
+
+def text_bytes(text: str) -> bytes:
+    """Return a text with its length.
+
+    Raises:
+        ValueError: It is too long.
+    """
+    encoded = text.encode(errors="replace")
+    if len(encoded) > MAX_TEXT_BYTES:
+        raise ValueError(f"a text of {len(encoded)} bytes is longer than {MAX_TEXT_BYTES}: {text[:40]}...")
+    return _LENGTH.pack(len(encoded)) + encoded
+
+
+def count_bytes(count: int) -> bytes:
+    """Return a count."""
+    return _COUNT.pack(count)
+
+
+def short_count_bytes(count: int) -> bytes:
+    """Return a count of two bytes."""
+    return _LENGTH.pack(count)

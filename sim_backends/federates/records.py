@@ -1,0 +1,148 @@
+"""Records inside messages: commands, packets, arrivals and drops."""
+
+import math
+import struct
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+from sim_backends.federates.agent_states import AgentTable
+from sim_backends.federates.frames import FrameReader, MalformedFrameError, count_bytes, text_bytes
+from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.physics.body import Twist, Velocity
+
+_PACKET: Final = struct.Struct("<QqQqqII")
+_ARRIVAL: Final = struct.Struct("<QqII")
+_DROP: Final = struct.Struct("<Q")
+_COMMAND: Final = struct.Struct("<IHH")
+_TWIST: Final = struct.Struct("<2d")
+_VELOCITY: Final = struct.Struct("<4d")
+TWIST, VELOCITY = 1, 2
+COMMAND_TYPES: Final = (TWIST, VELOCITY)
+_MAX_BYTES: Final = 1 << 62
+
+
+def commands_bytes(commands: Mapping[str, Any], agents: AgentTable) -> bytes:
+    """Return commands to agents.
+
+    Raises:
+        ValueError: A command has no layout, or is to an agent that was not announced.
+    """
+    parts = [count_bytes(len(commands))]
+    for name, command in commands.items():
+        if name not in agents.indices:
+            raise ValueError(f"there is a command to {name}, which is not an agent")
+        kind, body = _command(name, command)
+        parts.append(_COMMAND.pack(agents.indices[name], kind, len(body)) + body)
+    return b"".join(parts)
+
+
+def command_type(command: object) -> int:
+    """Return the number of a command's type; 0 if it has no layout."""
+    return TWIST if isinstance(command, Twist) else VELOCITY if isinstance(command, Velocity) else 0
+
+
+def _command(name: str, command: object) -> tuple[int, bytes]:
+    if isinstance(command, Twist):
+        return TWIST, _TWIST.pack(command.forward_m_s, command.turn_rad_s)
+    if isinstance(command, Velocity):
+        yaw_rad = math.nan if command.yaw_rad is None else command.yaw_rad
+        return VELOCITY, _VELOCITY.pack(*command.velocity_m_s, yaw_rad)
+    raise ValueError(f"the command {command!r} to {name} cannot be sent to an external federate")
+
+
+def read_commands(reader: FrameReader, agents: AgentTable) -> dict[str, Twist | Velocity]:
+    """Return commands by agent.
+
+    Raises:
+        MalformedFrameError: A command is invalid, or its type is unknown.
+    """
+    commands: dict[str, Twist | Velocity] = {}
+    for _ in range(reader.count(_COMMAND.size)):
+        position = reader.position
+        index, kind, size = reader.unpack(_COMMAND)
+        name = agents.name(index, position)
+        if (kind, size) == (TWIST, _TWIST.size):
+            commands[name] = Twist(*reader.unpack(_TWIST))
+        elif (kind, size) == (VELOCITY, _VELOCITY.size):
+            e, n, u, yaw_rad = reader.unpack(_VELOCITY)
+            commands[name] = Velocity((e, n, u), None if math.isnan(yaw_rad) else yaw_rad)
+        else:
+            raise MalformedFrameError(position + 4, f"a command of type {kind} and {size} bytes is not supported")
+    return commands
+
+
+def packets_bytes(packets: Iterable[Packet], agents: AgentTable) -> bytes:
+    """Return packets."""
+    parts = [
+        _PACKET.pack(
+            packet.packet_id,
+            packet.identity[1],
+            packet.size_bytes,
+            packet.sent_ns,
+            packet.enters_ns,
+            agents.indices[packet.source],
+            agents.indices[packet.destination],
+        )
+        + text_bytes(packet.identity[0])
+        + text_bytes(packet.protocol)
+        for packet in packets
+    ]
+    return count_bytes(len(parts)) + b"".join(parts)
+
+
+def read_packets(reader: FrameReader, agents: AgentTable) -> list[Packet]:
+    """Return packets.
+
+    Raises:
+        MalformedFrameError: A packet is invalid.
+    """
+    packets = []
+    for _ in range(reader.count(_PACKET.size + 4)):
+        position = reader.position
+        packet_id, number, size_bytes, sent_ns, enters_ns, source, destination = reader.unpack(_PACKET)
+        if size_bytes > _MAX_BYTES:
+            raise MalformedFrameError(position + 16, f"a packet of {size_bytes} bytes is too large")
+        ends = agents.name(source, position + 40), agents.name(destination, position + 44)
+        identity = reader.text(), number
+        packets.append(Packet(packet_id, *ends, size_bytes, identity, sent_ns, enters_ns, reader.text()))
+    return packets
+
+
+def arrivals_bytes(arrivals: Iterable[Arrival], agents: AgentTable) -> bytes:
+    """Return arrivals; an agent that was not announced raises a KeyError."""
+    parts = [
+        _ARRIVAL.pack(arrival.packet_id, arrival.at_ns, agents.indices[arrival.receiver], 0) for arrival in arrivals
+    ]
+    return count_bytes(len(parts)) + b"".join(parts)
+
+
+def read_arrivals(reader: FrameReader, agents: AgentTable) -> list[Arrival]:
+    """Return arrivals.
+
+    Raises:
+        MalformedFrameError: An arrival is invalid.
+    """
+    count = reader.count(_ARRIVAL.size)
+    arrivals = []
+    for _ in range(count):
+        position = reader.position
+        packet_id, at_ns, index, reserved = reader.unpack(_ARRIVAL)
+        if reserved:
+            raise MalformedFrameError(position + 20, f"the reserved field is {reserved}, not 0")
+        arrivals.append(Arrival(packet_id, agents.name(index, position + 16), at_ns))
+    return arrivals
+
+
+def drops_bytes(drops: Iterable[Drop]) -> bytes:
+    """Return drops."""
+    parts = [_DROP.pack(drop.packet_id) + text_bytes(drop.reason) for drop in drops]
+    return count_bytes(len(parts)) + b"".join(parts)
+
+
+def read_drops(reader: FrameReader) -> list[Drop]:
+    """Return drops.
+
+    Raises:
+        MalformedFrameError: A drop is invalid.
+    """
+    return [Drop(reader.unpack(_DROP)[0], reader.text()) for _ in range(reader.count(_DROP.size + 2))]

@@ -1,0 +1,198 @@
+"""Physics and network in other processes, as the coordinator uses them."""
+
+import copy
+import weakref
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from sim_backends.federates.agent_states import AgentTable
+from sim_backends.federates.exchanges import (
+    AdvanceNetwork,
+    NetworkOutcomes,
+    decode_states,
+    encode_advance_physics,
+    encode_fork,
+)
+from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
+from sim_backends.federates.handshake import NO_EVENT, Capability, Hello, Welcome
+from sim_backends.federates.protocols import FederateError, seconds_text
+from sim_backends.federates.records import command_type
+from sim_backends.federates.session import FederateSession, open_session
+from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.world.motion import DeadReckoned, State
+
+
+class _RemoteFederate:
+    """Common part of both roles.
+
+    Attributes:
+        session: The session.
+        welcome: The federate's answer to the handshake.
+    """
+
+    def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
+        self.session = session
+        self.welcome = welcome
+        self._agents = AgentTable(agent.name for agent in hello.agents)
+        self._copy = 0
+
+    def close(self) -> None:
+        """End the federate."""
+        self.session.close()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:  # noqa: ANN401 (of the subclass)
+        """Return a remote for a copy of the federate, in its present state.
+
+        Raises:
+            FederateError: The federate does not support this, or failed.
+        """
+        if not self.welcome.capabilities & Capability.FORK:
+            raise FederateError(
+                f"{self.session.name} cannot be copied, as it does not support fork",
+                remedy="use another command, or a federate that supports it",
+            )
+        number = self.session.next_copy()
+        self.session.request(
+            MessageKind.FORK,
+            self._copy,
+            encode_fork(number),
+            MessageKind.DONE,
+            decode=bytes,
+            what=lambda: f"copy itself as copy {number}",
+        )
+        other = object.__new__(type(self))
+        memo[id(self)] = other
+        other.__dict__.update(copy.deepcopy({**self.__dict__, "_copy": number}, memo))
+        weakref.finalize(other, self.session.release, number).atexit = False
+        return other
+
+
+class RemotePhysics(_RemoteFederate):
+    """A physics in another process.
+
+    A request that changes nothing is not sent: the states between two steps are those at the first.
+
+    Args:
+        session: The session.
+        hello: The hello that the federate received.
+        welcome: Its answer.
+
+    Attributes:
+        step_ns: See `PhysicsFederate`.
+        limits_m_s2: See `PhysicsFederate`.
+    """
+
+    def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
+        super().__init__(session, hello, welcome)
+        self.step_ns = welcome.step_ns
+        self._limits_m_s2 = {agent.name: agent.limit_m_s2 for agent in hello.agents}
+        self.limits_m_s2: Mapping[str, float] = self._limits_m_s2
+        self._states: Mapping[str, State] = {}
+        self._states_ns: int | None = None
+        self._last_ns = 0
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        """Implement `PhysicsFederate.advance`."""
+        at_ns = to_ns - to_ns % self.step_ns
+        from_ns, self._last_ns = self._last_ns, to_ns
+        if at_ns == self._states_ns and not commands:
+            return self._states
+        for name, command in commands.items():
+            if command_type(command) not in self.welcome.commands:
+                raise FederateError(
+                    f"{self.session.name} does not support the command {type(command).__name__} to {name}"
+                )
+        states_ns, states = self.session.request(
+            MessageKind.ADVANCE_PHYSICS,
+            self._copy,
+            encode_advance_physics(to_ns, from_ns, commands, self._agents),
+            MessageKind.STATES,
+            decode=partial(decode_states, agents=self._agents),
+            what=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
+        )
+        if states_ns != at_ns:
+            self.session.fail(
+                f"{self.session.name}, asked to advance to {seconds_text(to_ns)}, returned the states at "
+                f"{seconds_text(states_ns)} instead of {seconds_text(at_ns)}, its last step until then"
+            )
+        self._states, self._states_ns = states, at_ns
+        self._limits_m_s2.update(states.limits_m_s2)
+        self.session.reached_ns = to_ns
+        return states
+
+
+class RemoteNetwork(_RemoteFederate):
+    """A network in another process.
+
+    Args:
+        session: The session.
+        hello: The hello that the federate received.
+        welcome: Its answer.
+
+    Attributes:
+        extrapolates: See `NetworkFederate`.
+        transmitters: See `NetworkFederate`.
+        fixed_emitters_m: See `NetworkFederate`.
+    """
+
+    def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
+        super().__init__(session, hello, welcome)
+        self.extrapolates = bool(welcome.capabilities & Capability.EXTRAPOLATES)
+        if any(index >= len(hello.agents) for index in welcome.transmitters):
+            session.fail(f"{session.name} names a transmitter that is not an agent")
+        self.transmitters = frozenset(hello.agents[index].name for index in welcome.transmitters)
+        self.fixed_emitters_m = tuple(welcome.emitters_m)
+        self._next_event_ns = welcome.next_event_ns
+        self._last_ns = 0
+
+    def advance(
+        self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
+    ) -> tuple[list[Arrival], list[Drop]]:
+        """Implement `NetworkFederate.advance`."""
+        transports = self.welcome.transports
+        for packet in packets if transports else ():
+            if packet.protocol not in transports:
+                raise FederateError(
+                    f"{self.session.name} does not support the transport {packet.protocol}",
+                    remedy=f"use one of {', '.join(transports)}",
+                )
+        since_ns, reckoning_ns = self._last_ns, 0
+        if isinstance(states, DeadReckoned):
+            since_ns, reckoning_ns = states.since_ns, states.step_ns
+        from_ns, self._last_ns = self._last_ns, to_ns
+        outcomes = self.session.request(
+            MessageKind.ADVANCE_NETWORK,
+            self._copy,
+            AdvanceNetwork(to_ns, states, packets, since_ns, reckoning_ns).encode(self._agents),
+            MessageKind.OUTCOMES,
+            decode=partial(NetworkOutcomes.decode, agents=self._agents),
+            what=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
+        )
+        if outcomes.at_ns != to_ns:
+            self.session.fail(
+                f"{self.session.name}, asked to advance to {seconds_text(to_ns)}, advanced to "
+                f"{seconds_text(outcomes.at_ns)}"
+            )
+        self._next_event_ns = outcomes.next_event_ns
+        self.session.reached_ns = to_ns
+        return list(outcomes.arrivals), list(outcomes.drops)
+
+    def next_event_ns(self) -> int | None:
+        """Implement `NetworkFederate.next_event_ns`."""
+        if not self.welcome.capabilities & Capability.NEXT_EVENT:
+            raise FederateError(
+                f"{self.session.name} does not report the time of its next event, which this sync policy needs",
+                remedy="use another policy, for example sliding_window",
+            )
+        return None if self._next_event_ns == NO_EVENT else self._next_event_ns
+
+
+def open_physics(where: str, hello: Hello, deadline_s: float | None) -> RemotePhysics:
+    """Start or connect a physics; arguments and errors as for `open_session`."""
+    return RemotePhysics(*open_session(PHYSICS, where, hello, deadline_s))
+
+
+def open_network(where: str, hello: Hello, deadline_s: float | None) -> RemoteNetwork:
+    """Start or connect a network; arguments and errors as for `open_session`."""
+    return RemoteNetwork(*open_session(NETWORK, where, hello, deadline_s))

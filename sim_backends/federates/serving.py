@@ -1,0 +1,85 @@
+"""The federate's side of the protocol: `serve(MyPhysics)` serves a physics or network class to a coordinator."""
+
+import os
+import time
+from contextlib import closing
+from typing import Any, Final
+
+from sim_backends.federates import tcp
+from sim_backends.federates.answering import FederateService, Make, serve_channel
+from sim_backends.federates.channels import DeadlineError, StreamChannel
+
+_CONNECT_S: Final = 60.0
+_HELLO_S: Final = 10.0
+"""Longest wait for the first message of a program that has connected; others wait for their turn meanwhile."""
+
+
+def serve(make: Make, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `FederateService`)
+    """Serve a physics or a network class.
+
+    Args:
+        make: Called with the `Hello` of each run; returns the federate, for example its class.
+        address: None for standard input and output, which then belong to the protocol: what the federate prints goes
+            to standard error. `tcp-listen:HOST:PORT` listens, `tcp:HOST:PORT` connects to a listening coordinator.
+        runs: Number of runs after which to return; None for one run if this side does not listen, else no limit.
+        **properties: Other attributes of `FederateService`.
+
+    Raises:
+        ConfigurationError: The address is invalid or cannot be used, or the token is missing.
+        SystemExit: The last run failed.
+    """
+    service = FederateService(make, **properties)
+    parsed = None if address is None else tcp.parse_address(address)
+    if address is not None and parsed is None:
+        raise ValueError(f"{address!r} is neither tcp:HOST:PORT nor tcp-listen:HOST:PORT")
+    if parsed is None:
+        with closing(_standard_channel()) as channel:
+            succeeded = serve_channel(channel, service)
+    elif parsed.listens:
+        succeeded = _listen(parsed, service, runs)
+    else:
+        succeeded = _connect(parsed, service, 1 if runs is None else runs)
+    if not succeeded:
+        raise SystemExit(1)
+
+
+def _listen(address: tcp.TcpAddress, service: FederateService, runs: int | None) -> bool:
+    token = tcp.token(address)
+    succeeded, served = True, 0
+    with tcp.listening(address) as server:
+        while runs is None or served < runs:
+            with closing(tcp.accept(server, None)) as channel:
+                succeeded = serve_channel(channel, service, token, _HELLO_S)
+            served += 1
+    return succeeded
+
+
+def _connect(address: tcp.TcpAddress, service: FederateService, runs: int) -> bool:
+    token = tcp.token(address)
+    succeeded = True
+    for _ in range(runs):
+        deadline_s = time.monotonic() + _CONNECT_S
+        try:
+            channel = tcp.connect(address, deadline_s)
+        except DeadlineError as error:
+            raise SystemExit(str(error)) from error
+        with closing(channel):
+            tcp.join(channel, token, deadline_s)
+            succeeded = serve_channel(channel, service, token)
+    return succeeded
+
+
+def _standard_channel() -> StreamChannel:
+    """Return the channel over standard input and output, which are replaced, so that nothing else uses them.
+
+    Raises:
+        SystemExit: Standard input is a terminal.
+    """
+    if os.isatty(0):
+        raise SystemExit("this program is a federate: fieldkit cosim run SCENARIO --physics COMMAND starts it")
+    channel = StreamChannel(os.dup(0), os.dup(1))
+    null = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(null, 0)
+    os.close(null)
+    os.dup2(2, 1)
+    return channel

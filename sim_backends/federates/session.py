@@ -1,0 +1,282 @@
+"""The coordinator's side of a connection to an external federate: handshake, requests, deadlines, errors."""
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final, NoReturn, TypeVar
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.federates import tcp
+from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
+from sim_backends.federates.children import Child
+from sim_backends.federates.exchanges import decode_number, decode_text
+from sim_backends.federates.frames import ROLES, Header, MalformedFrameError, MessageKind, ProtocolFrame, encode
+from sim_backends.federates.handshake import Hello, Welcome
+from sim_backends.federates.protocols import FederateError, UnansweredError, seconds_text
+
+PATIENCE: Final = 20
+"""A federate that reports that it computes may take this multiple of the deadline for an answer."""
+_FOREVER_S: Final = 1e9
+_BYE_S: Final = 0.2
+_MAX_SHOWN: Final = 400
+_REQUESTS: Final = 1 << 32
+
+Answer = TypeVar("Answer")
+
+
+def printable(text: str) -> str:
+    """Return a text of a federate for a message: in one line, without control characters, and not too long."""
+    line = "".join(letter if letter.isprintable() else " " for letter in text)
+    return line if len(line) <= _MAX_SHOWN else f"{line[:_MAX_SHOWN]}..."
+
+
+class FederateSession:
+    """A connection to an external federate. After an error it is closed, and its child process has ended.
+
+    Args:
+        role: `PHYSICS` or `NETWORK`.
+        where: Its command or address, for messages.
+        channel: The channel.
+        deadline_s: Longest wait for a frame, in seconds of wall time; None for no deadline.
+        child: Its process, if this process has started it.
+
+    Attributes:
+        name: Its role, its name if it is known, and its command or address.
+        reached_ns: Last simulated time that it has answered, or None.
+        observer: Called with each request and answer, in bytes, or None.
+    """
+
+    def __init__(
+        self, role: int, where: str, channel: FrameChannel, *, deadline_s: float | None, child: Child | None = None
+    ) -> None:
+        self._role = role
+        self._where = where
+        self._channel = channel
+        self._child = child
+        self._deadline_s = _FOREVER_S if deadline_s is None else deadline_s
+        self._requests = 0
+        self._copies = 0
+        self._released: list[int] = []
+        self._busy_ns: int | None = None
+        self._is_closed = False
+        self.name = f"{ROLES[role]} ({where})"
+        self.reached_ns: int | None = None
+        self.observer: Callable[[bytes, ProtocolFrame | None], None] | None = None
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "FederateSession":
+        return self  # copies of a federate share the connection
+
+    def next_copy(self) -> int:
+        """Return the number of a new copy of the federate."""
+        self._copies += 1
+        return self._copies
+
+    def release(self, copy: int) -> None:
+        """Release a copy of the federate, by a message before the next request."""
+        self._released.append(copy)
+
+    def welcome(self, hello: Hello) -> Welcome:
+        """Return the federate's answer to the beginning of a run.
+
+        Raises:
+            FederateError: It failed, does not answer, or does not suit; the message names it.
+        """
+        what = f"begin a run as {ROLES[self._role]}"
+        welcome = self.request(
+            MessageKind.HELLO, 0, hello.encode(), MessageKind.WELCOME, decode=Welcome.decode, what=lambda: what
+        )
+        if welcome.name:
+            self.name = f"{ROLES[self._role]} {printable(welcome.name)} ({self._where})"
+        if welcome.role != self._role:
+            self.fail(f"{self.name} is a {ROLES[welcome.role]}")
+        if welcome.configuration_hash != hello.configuration_hash:
+            self.fail(f"{self.name} answered with the hash of another configuration")
+        return welcome
+
+    def request(
+        self,
+        kind: MessageKind,
+        copy: int,
+        body: bytes,
+        answer: MessageKind,
+        *,
+        decode: Callable[[bytes], Answer],
+        what: Callable[[], str],
+    ) -> Answer:
+        """Send a request, and return its decoded answer.
+
+        Args:
+            kind: Kind of the request.
+            copy: Copy of the federate.
+            body: Body of the request.
+            answer: Kind of the answer.
+            decode: Returns the answer of its body.
+            what: Returns what the federate is asked to do, for errors.
+
+        Raises:
+            UnansweredError: It did not answer within its deadline.
+            FederateError: It failed, closed the connection, or sent a malformed frame.
+        """
+        if self._is_closed:
+            raise FederateError(f"the connection to {self.name} is closed")
+        try:
+            for number in self._released:
+                self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
+            self._released.clear()
+            self._requests = (self._requests + 1) % _REQUESTS
+            frame = self._exchange(encode(kind, self._requests, copy, body), Header(0, answer, self._requests, copy))
+            if frame.header.kind is MessageKind.ERROR:
+                text = printable(decode_text(frame.body))
+                self.fail(f"{self.name} failed when it was asked to {what()}: {text}")
+            return decode(frame.body)
+        except MalformedFrameError as error:
+            self.fail(
+                f"{self.name} answered request {self._requests}, to {what()}, with a malformed frame: {error}",
+                "compare it with the protocol: fieldkit docs federates",
+            )
+        except DeadlineError:
+            self._fail_unanswered(what())
+        except ClosedError as error:
+            self.fail(
+                f"{self.name} failed when it was asked to {what()}: {error}{self._progress()}{self._exit_text()}"
+            )
+
+    def _exchange(self, request: bytes, expected: Header) -> ProtocolFrame:
+        """Send a request, and return its answer or the error; the federate may report before that it computes."""
+        started_s = time.monotonic()
+        limit_s, last_s = started_s + self._deadline_s, started_s + PATIENCE * self._deadline_s
+        self._busy_ns = None
+        if self.observer is not None:
+            self.observer(request, None)
+        self._channel.send(request, limit_s)
+        while True:
+            frame = self._channel.receive(limit_s)
+            _, kind, number, copy = frame.header
+            if kind is MessageKind.BUSY:
+                if number == expected.request:  # otherwise it is late
+                    self._busy_ns = decode_number(frame.body)
+                    limit_s = min(time.monotonic() + self._deadline_s, last_s)
+                continue
+            if self.observer is not None:
+                self.observer(request, frame)
+            if number != expected.request or copy != expected.copy:
+                raise MalformedFrameError(
+                    8, f"it is for request {number} and copy {copy}, not {expected.request} and {expected.copy}"
+                )
+            if kind is not expected.kind and kind is not MessageKind.ERROR:
+                raise MalformedFrameError(4, f"it is {kind.name.lower()}, not {expected.kind.name.lower()}")
+            return frame
+
+    def fail(self, what: str, remedy: str = "") -> NoReturn:
+        """Close the session, end the child process, and raise an error.
+
+        Raises:
+            FederateError: Always.
+        """
+        error = FederateError(what, remedy=remedy)
+        self._end()
+        raise error
+
+    def _fail_unanswered(self, what: str) -> NoReturn:
+        limit_s = self._deadline_s if self._busy_ns is None else PATIENCE * self._deadline_s
+        busy = "" if self._busy_ns is None else f"; it last reported {seconds_text(self._busy_ns)}"
+        error = UnansweredError(
+            f"{self.name} has not answered for {limit_s:g} s: asked to {what}{self._progress()}{busy}"
+            f"{self._output_text()}",
+            remedy="check what it waits for, or give it a longer deadline",
+        )
+        self._end()
+        raise error
+
+    def _progress(self) -> str:
+        return "" if self.reached_ns is None else f"; its last time is {seconds_text(self.reached_ns)}"
+
+    def _exit_text(self) -> str:
+        if self._child is None:
+            return ""
+        exit_text = self._child.exit_text()
+        return (f"; {exit_text}" if exit_text else "") + self._output_text()
+
+    def _output_text(self) -> str:
+        output = "" if self._child is None else printable(self._child.last_output)
+        return f"; its last output: {output}" if output else ""
+
+    def _end(self) -> None:
+        self._is_closed = True
+        if self._child is not None:
+            self._child.kill()
+        self._channel.close()
+
+    def say_bye(self, limit_s: float) -> None:
+        """End the session, and wait until the federate closes the connection.
+
+        Args:
+            limit_s: Longest wait, in seconds of wall time.
+
+        Raises:
+            ClosedError: It has closed the connection.
+            DeadlineError: It has not.
+        """
+        deadline_s = time.monotonic() + limit_s
+        self._channel.send(encode(MessageKind.BYE, 0, 0), deadline_s)
+        while True:
+            self._channel.receive(deadline_s)
+
+    def close(self) -> None:
+        """End the session, and the process that it has started; nothing happens if it has ended."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        with suppress(ClosedError, DeadlineError):
+            self._channel.send(encode(MessageKind.BYE, 0, 0), time.monotonic() + _BYE_S)
+        if self._child is not None:
+            self._child.close()
+        self._channel.close()
+
+
+def open_session(
+    role: int, where: str, hello: Hello, deadline_s: float | None
+) -> tuple[FederateSession, Hello, Welcome]:
+    """Start or connect a federate, and return its session with both messages of the handshake.
+
+    Args:
+        role: `PHYSICS` or `NETWORK`.
+        where: A command, `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`.
+        hello: The hello that it receives; the token is added, and the interval of heartbeats
+            suits the deadline.
+        deadline_s: Longest wait for the connection and for each frame; None for no deadline.
+
+    Raises:
+        ConfigurationError: The command or the address cannot be used.
+        FederateError: The federate failed, or has not connected or answered in time.
+    """
+    address = tcp.parse_address(where)
+    if deadline_s is not None:
+        # Several heartbeats per deadline, as the federate's machine may be busy.
+        hello = replace(hello, heartbeat_ms=max(min(hello.heartbeat_ms, round(deadline_s * 250)), 1))
+    if address is None:
+        child = Child(where)
+        session = FederateSession(role, printable(where), child.channel, deadline_s=deadline_s, child=child)
+    else:
+        token = tcp.token(address)
+        hello = replace(hello, token=token)
+        limit_s = time.monotonic() + (_FOREVER_S if deadline_s is None else deadline_s)
+        try:
+            channel = (
+                tcp.accept_federate(address, token, limit_s) if address.listens else tcp.connect(address, limit_s)
+            )
+        except DeadlineError as error:
+            raise UnansweredError(
+                f"{ROLES[role]} ({address}): {error} within {deadline_s:g} s",
+                remedy="start the federate, or check its address and token",
+            ) from error
+        session = FederateSession(role, str(address), channel, deadline_s=deadline_s)
+    try:
+        return session, hello, session.welcome(hello)
+    except ValueError as error:
+        session.close()
+        raise ConfigurationError(f"{session.name}: {error}") from error
+    except BaseException:
+        session.close()
+        raise

@@ -1,0 +1,22 @@
+"""The decoder of each message with a body, by name, with the agents that the examples announce."""
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from sim_backends.federates import exchanges
+from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
+from sim_backends.federates.handshake import Hello, Welcome, decode_join
+from tests.helpers.federate_frames import agents
+
+DECODERS: Final[Mapping[str, Callable[[bytes], object]]] = {
+    "join": decode_join,
+    "hello": Hello.decode,
+    "welcome": Welcome.decode,
+    "advance physics": lambda body: exchanges.decode_advance_physics(body, agents()),
+    "states": lambda body: exchanges.decode_states(body, agents()),
+    "advance network": lambda body: AdvanceNetwork.decode(body, agents()),
+    "outcomes": lambda body: NetworkOutcomes.decode(body, agents()),
+    "ping": exchanges.decode_number,
+    "fork": exchanges.decode_fork,
+    "error": exchanges.decode_text,
+}

@@ -1,0 +1,78 @@
+"""An example of each message of the protocol of external federates: those of docs/federates.md."""
+
+from sim_backends.federates import exchanges
+from sim_backends.federates.agent_states import AgentTable
+from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
+from sim_backends.federates.frames import PHYSICS, MessageKind, encode, text_bytes
+from sim_backends.federates.handshake import AgentStart, Capability, Hello, Welcome, encode_join
+from sim_backends.federates.records import COMMAND_TYPES
+from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.physics.body import Twist, Velocity
+from sim_backends.world.motion import State
+
+START = State((1.0, 2.0, 0.5), (0.0, 0.0, 0.0), 0.25)
+DRONE = State((-1.5, 0.0, 10.0), (0.0, 0.5, -0.25), None)
+HELLO = Hello(
+    PHYSICS,
+    [AgentStart("ugv", "husky", START, flies=False, antenna_m=0.5, limit_m_s2=3.0)],
+    seed=7,
+    step_ns=1_000_000,
+    end_ns=2_000_000_000,
+    name="demo",
+    configuration=b"{}",
+    token="s3cret",
+)
+WELCOME = Welcome(
+    PHYSICS,
+    "carts",
+    HELLO.configuration_hash,
+    "carts 1.0",
+    Capability.DETERMINISTIC | Capability.AGENTS_APPEAR,
+    step_ns=1_000_000,
+    commands=COMMAND_TYPES,
+)
+
+
+def agents() -> AgentTable:
+    """Return the table of agents after the first answer of the physics."""
+    return AgentTable(["ugv", "uav"])
+
+
+def _name(kind: MessageKind) -> str:
+    return kind.name.lower().replace("_", " ")
+
+
+def example_frames() -> dict[str, bytes]:
+    """Return a frame of each kind, by its name."""
+    packet = Packet(9, "ugv", "uav", 300, ("pose", 4), 10_000_000, 10_500_000, "udp")
+    bodies = {
+        MessageKind.JOIN: encode_join("s3cret"),
+        MessageKind.HELLO: HELLO.encode(),
+        MessageKind.WELCOME: WELCOME.encode(),
+        MessageKind.ADVANCE_PHYSICS: exchanges.encode_advance_physics(
+            11_100_000, 10_000_000, {"ugv": Twist(0.5, -0.125), "uav": Velocity((1.0, 0.0, 0.25))}, agents()
+        ),
+        MessageKind.STATES: exchanges.encode_states(
+            11_000_000, {"ugv": START, "uav": DRONE}, AgentTable(["ugv"]), {"ugv": 3.0}
+        ),
+        MessageKind.ADVANCE_NETWORK: AdvanceNetwork(
+            11_099_999, {"ugv": START}, [packet], since_ns=10_000_000, reckoning_ns=1_000_000
+        ).encode(agents()),
+        MessageKind.OUTCOMES: NetworkOutcomes(
+            11_099_999, 12_000_000, [Arrival(9, "uav", 11_000_250)], [Drop(8, "out of range")]
+        ).encode(agents()),
+        MessageKind.PING: exchanges.encode_number(42),
+        MessageKind.PONG: exchanges.encode_number(42),
+        MessageKind.BUSY: exchanges.encode_number(10_000_000),
+        MessageKind.FORK: exchanges.encode_fork(2),
+        MessageKind.DONE: b"",
+        MessageKind.RELEASE: b"",
+        MessageKind.ERROR: text_bytes("ValueError: no wheels"),
+        MessageKind.BYE: b"",
+    }
+    copies = {MessageKind.RELEASE: 2}
+    without_number = {MessageKind.JOIN, MessageKind.RELEASE, MessageKind.BYE}
+    return {
+        _name(kind): encode(kind, 0 if kind in without_number else 3, copies.get(kind, 0), body)
+        for kind, body in bodies.items()
+    }

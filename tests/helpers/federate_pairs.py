@@ -1,0 +1,92 @@
+"""Federates served by a thread of the test, over a pair of sockets; the frames that they send can be changed."""
+
+import os
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from sim_backends.federates.answering import FederateService, _Run
+from sim_backends.federates.channels import StreamChannel
+from sim_backends.federates.frames import PHYSICS
+from sim_backends.federates.handshake import AgentStart, Hello, Welcome
+from sim_backends.federates.session import FederateSession
+from sim_backends.world.motion import State
+
+
+def children() -> set[int]:
+    """Return the process ids of this process's children."""
+    pids = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(path.read_text(encoding="utf-8").rpartition(")")[2].split()[1]) == os.getpid():
+                pids.add(int(path.parent.name))
+    return pids
+
+
+Alter = Callable[[bytes], bytes | None]
+
+HELLO = Hello(
+    PHYSICS,
+    [
+        AgentStart("ann", "husky", State((0.0, 0.0, 0.0), heading_rad=0.0), limit_m_s2=3.0),
+        AgentStart("bob", "husky", State((5.0, 3.0, 0.0), heading_rad=1.0), limit_m_s2=3.0),
+        AgentStart("cy", "iris", State((9.0, 0.0, 4.0), heading_rad=0.0), flies=True, limit_m_s2=9.0),
+    ],
+    end_ns=10_000_000_000,
+    name="three robots",
+)
+
+
+class AlteredChannel(StreamChannel):
+    """A channel that changes what a federate sends, or sends nothing."""
+
+    alter: Alter | None = None
+
+    def send(self, frame: bytes, deadline_s: float | None) -> None:
+        altered = frame if self.alter is None else self.alter(frame)
+        if altered is not None:
+            super().send(altered, deadline_s)
+
+
+@dataclass
+class Pair:
+    """Opens sessions with a federate that a thread serves.
+
+    Attributes:
+        service: The federate.
+        deadline_s: Longest wait for a frame after the handshake.
+        alter: Changes its frames; None removes a frame.
+        run_class: The class that answers requests.
+        stays: True if it does not close the connection at the end.
+    """
+
+    service: FederateService
+    deadline_s: float = 20.0
+    alter: Alter | None = None
+    stays: bool = False
+    run_class: type[_Run] = _Run
+
+    def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
+        """Return a session with a fresh federate."""
+        own, other = (channel_of(side) for side in socket.socketpair())
+        other.alter = self.alter
+        threading.Thread(target=self._serve, args=(other,), daemon=True).start()
+        session = FederateSession(hello.role, "test", own, deadline_s=20.0)
+        welcome = session.welcome(hello)
+        session._deadline_s = self.deadline_s  # later, because a busy machine may need longer for the handshake
+        return session, hello, welcome
+
+    def _serve(self, channel: StreamChannel) -> None:
+        self.run_class(self.service, channel, "").serve()
+        if self.stays:
+            threading.Event().wait(60)
+        channel.close()
+
+
+def channel_of(side: socket.socket) -> AlteredChannel:
+    """Return a channel over a socket, which it owns."""
+    fd = side.detach()
+    return AlteredChannel(fd, fd)

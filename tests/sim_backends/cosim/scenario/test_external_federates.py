@@ -1,0 +1,201 @@
+"""Scenarios with external federates: equal results with the built-in ones, recordings and processes after faults."""
+
+import io
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from sim_backends.cosim import build, load_scenario
+from sim_backends.cosim.policies.registry import BUILTIN
+from sim_backends.cosim.scenario.external import without_federates
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.federates.protocols import FederateError
+from tests.helpers.federate_examples import EXAMPLES
+from tests.helpers.federate_pairs import children
+from tests.helpers.runs import Run, finish, start, wait_during
+
+SERVED = f"{sys.executable} -m sim_backends.cosim.scenario.served"
+DURATION = {"duration": "400ms"}
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[dict[str, str]]:
+    """The built-in federates as processes that listen, and serve one run after another: addresses by role."""
+    processes, addresses = [], {}
+    for role in ("physics", "network"):
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            port = server.getsockname()[1]
+        command = [*SERVED.split(), role, f"tcp-listen:127.0.0.1:{port}"]
+        processes.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
+        addresses[role] = f"tcp:127.0.0.1:{port}"
+    yield addresses
+    for process in processes:
+        process.terminate()
+        process.wait()
+
+
+def digest(scenario: CosimScenario, policy: str) -> str:
+    with build(scenario, policy=policy) as simulation:
+        return simulation.run().digest
+
+
+@pytest.mark.parametrize("policy", sorted(BUILTIN))
+def test_the_built_in_federates_give_the_same_events_as_processes(policy: str, served: dict[str, str]) -> None:
+    external = load_scenario("convoy", {f"{role}.federate": where for role, where in served.items()} | DURATION)
+    assert external.physics.federate
+    assert digest(external, policy) == digest(without_federates(external), policy)
+
+
+def test_pipes_give_the_same_events() -> None:
+    changes = {f"{role}.federate": f"{SERVED} {role}" for role in ("physics", "network")}
+    external = load_scenario("convoy", changes | DURATION)
+    before = children()
+    assert digest(external, "sliding_window") == digest(without_federates(external), "sliding_window")
+    assert children() <= before
+
+
+def test_a_simulation_with_external_federates_can_be_copied(served: dict[str, str]) -> None:
+    external = load_scenario("convoy", {f"{role}.federate": where for role, where in served.items()} | DURATION)
+    digests = set()
+    for scenario in (external, without_federates(external)):
+        with build(scenario) as simulation:
+            simulation.run(150_000_000)
+            fork = simulation.coordinator.fork()
+            digests |= {simulation.run().digest, fork.advance(scenario.duration_ns).digest}
+    assert len(digests) == 1
+
+
+def cosim(lab: Path, *words: str) -> Run:
+    out, err = io.StringIO(), io.StringIO()
+    with chdir(lab), redirect_stdout(out), redirect_stderr(err):
+        code = main(("cosim", *words))
+    return Run(code, out.getvalue(), err.getvalue())
+
+
+def faulty(folder: Path, role: str, fault: str) -> str:
+    """Return the command of a federate that has a fault after 200 ms of simulated time."""
+    program = folder / f"{role}.py"
+    program.write_text(
+        f"""\
+import os, runpy, signal, time
+from sim_backends.federates import channels, serving
+from sim_backends.network.disc import Disc
+
+Carts = runpy.run_path({str(EXAMPLES / "carts.py")!r})["Carts"]
+
+class Net(Disc):
+    def __init__(self, hello):
+        super().__init__(1e5, 1_000_000)
+
+class Faulty({"Carts" if role == "physics" else "Net"}):
+    def advance(self, to_ns, *rest):
+        if to_ns > 200_000_000:
+            {fault}
+        return super().advance(to_ns, *rest)
+
+serving.serve(Faulty, name="faulty")
+""",
+        encoding="utf-8",
+    )
+    return f"{sys.executable} {program}"
+
+
+@pytest.mark.parametrize(
+    ("fault", "role", "code", "message"),
+    [
+        ("os.kill(os.getpid(), signal.SIGKILL)", "physics", 1, "it was ended by SIGKILL"),
+        (
+            "os.kill(os.getpid(), signal.SIGSTOP)",
+            "network",
+            3,
+            "has not answered for 6 s: asked to advance from 0.2",
+        ),
+        (
+            "channels.StreamChannel.send = lambda self, *_: os.write(self._write_fd, b'garbage' * 9)",
+            "network",
+            1,
+            "with a malformed frame: byte 4: there is no kind of message",
+        ),
+        ("raise ValueError('no wheels')", "physics", 1, "ValueError: no wheels"),
+    ],
+)
+def test_a_fault_ends_the_run_and_its_recording_is_readable(
+    fault: str, role: str, code: int, message: str, tmp_path: Path
+) -> None:
+    before = children()
+    federate = (f"--{role}", faulty(tmp_path, role, fault))
+    options = (
+        "--duration",
+        "1s",
+        "--policy",
+        "sliding_window",
+        "--window",
+        "10ms",
+        "--deadline",
+        "6s" if code == 3 else "60s",
+    )
+    run = cosim(tmp_path, "run", "convoy", *federate, *options, "--out", "faulty")
+    assert run.code == code, run.err
+    assert f"error: {role} faulty (" in run.err
+    assert message in run.err
+    assert children() <= before
+    replayed = cosim(tmp_path, "replay", "faulty", "--format", "json")
+    assert replayed.code == 0, replayed.err
+    assert json.loads(replayed.out)["flows"]
+
+
+def test_a_network_without_next_events_suits_policies_with_windows(tmp_path: Path) -> None:
+    program = tmp_path / "net.py"
+    program.write_text(
+        "from sim_backends.federates.serving import serve\n"
+        "from sim_backends.network.packets import Arrival\n"
+        "class Net:\n"
+        "    def __init__(self, hello):\n"
+        "        pass\n"
+        "    def advance(self, to_ns, packets, states):\n"
+        "        return [Arrival(p.packet_id, p.destination, p.enters_ns) for p in packets], []\n"
+        "serve(Net)\n",
+        encoding="utf-8",
+    )
+    scenario = load_scenario("convoy", {"network.federate": f"{sys.executable} {program}"} | DURATION)
+    assert digest(scenario, "sliding_window")
+    with pytest.raises(FederateError, match="does not report the time of its next event"):
+        digest(scenario, "event_driven")
+
+
+def processes_of(program: Path) -> list[int]:
+    """Return the process ids of the processes that run a program."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            if os.fsencode(program) in path.read_bytes().split(b"\0")[:3]:
+                found.append(int(path.parent.name))
+    return found
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_no_federate_is_left_if_the_run_is_interrupted_or_killed(
+    number: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    command = faulty(tmp_path, "physics", "pass")
+    program = tmp_path / "physics.py"
+    words = ("cosim", "run", "convoy", "--physics", command, "--duration", "10000s", "--out", "run")
+    process = start(tmp_path, *words)
+    wait_during(process, lambda: any((tmp_path / "run").rglob("*.parquet")))
+    assert processes_of(program)
+    process.send_signal(number)
+    assert finish(process).code == code
+    deadline_s = time.monotonic() + 30
+    while processes_of(program):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)

@@ -1,0 +1,349 @@
+"""Each check of the conformance suite fails for a federate that is broken in what it checks."""
+
+import math
+import random
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import pytest
+
+from sim_backends.federates.answering import FederateService, _FederateCopy, _Run
+from sim_backends.federates.conformance import probe
+from sim_backends.federates.conformance.probe import Target
+from sim_backends.federates.conformance.suite import CheckResult, checks, run_check
+from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
+from sim_backends.network.disc import Disc
+from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.world.motion import DeadReckoned, State
+from tests.helpers.federate_examples import carts
+from tests.helpers.federate_pairs import HELLO, Alter, Pair
+
+Carts: Final = carts()
+MS = 1_000_000
+States = Mapping[str, State]
+
+
+class Wrapped:
+    """Moves agents as the example does; subclasses break it."""
+
+    def __init__(self, hello: Any) -> None:  # noqa: ANN401
+        self.carts = Carts(hello)
+        self.step_ns = self.carts.step_ns
+        self.limits_m_s2 = self.carts.limits_m_s2
+        self.calls = 0
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> States:
+        self.calls += 1
+        return self.broken(self.carts.advance(to_ns, commands), to_ns)
+
+    def broken(self, states: States, to_ns: int) -> States:
+        return states
+
+
+def shifted(state: State, east_m: float) -> State:
+    east, north, up = state.position_m
+    return state._replace(position_m=(east + east_m, north, up))
+
+
+class StartsElsewhere(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: shifted(state, 1.0) for name, state in states.items()}
+
+
+class Drifts(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: shifted(state, 1e-6 * self.calls) for name, state in states.items()}
+
+
+class Jumps(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: shifted(state, 3.0 * (to_ns > 50 * MS)) for name, state in states.items()}
+
+
+class IgnoresCommands(Wrapped):
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> States:
+        return super().advance(to_ns, {})
+
+
+class HasWrongLimits(Wrapped):
+    def __init__(self, hello: Any) -> None:  # noqa: ANN401
+        super().__init__(hello)
+        self.limits_m_s2 = dict.fromkeys(self.limits_m_s2, 0.1)
+
+
+class Trembles(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: shifted(state, random.random() * 1e-9) for name, state in states.items()}
+
+
+class IsShared(Wrapped):
+    def __deepcopy__(self, memo: dict[int, Any]) -> "IsShared":
+        return self
+
+
+class LosesAnAgent(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: state for name, state in states.items() if name != "bob" or to_ns < 20 * MS}
+
+
+class AddsAnAgent(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {**states, **({"dan": states["bob"]} if to_ns > 20 * MS else {})}
+
+
+class IsNotFinite(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: shifted(state, math.nan * (to_ns > 0)) for name, state in states.items()}
+
+
+class IgnoresFrom(_Run):
+    def _advance_physics(self, current: _FederateCopy, body: bytes) -> bytes:
+        return super()._advance_physics(current, body[:8] + bytes(8) + body[16:])
+
+
+class Net(Disc):
+    """Delivers after 2 ms within 100 km; subclasses break it."""
+
+    def __init__(self, hello: Any) -> None:  # noqa: ANN401
+        super().__init__(1e5, 2 * MS, extrapolates=True)
+        self.last_ns = -1
+
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> tuple[list[Arrival], list[Drop]]:
+        arrivals, drops = super().advance(to_ns, packets, states)
+        outcomes = self.broken(arrivals, drops, to_ns)
+        self.last_ns = to_ns
+        return outcomes
+
+    def broken(self, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> tuple[list[Arrival], list[Drop]]:
+        return arrivals, drops
+
+
+Outcome = tuple[list[Arrival], list[Drop]]
+
+
+def net(broken: Callable[[Net, list[Arrival], list[Drop], int], Outcome]) -> type[Net]:
+    return type("Broken", (Net,), {"broken": broken})
+
+
+class DropsAtBorders(Net):
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
+        kept = [packet for packet in packets if packet.enters_ns > self.last_ns]
+        return super().advance(to_ns, kept, states)
+
+
+class RefusesNegativeTimes(Net):
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
+        if to_ns < 0:
+            raise ValueError("negative")
+        return super().advance(to_ns, packets, states)
+
+
+class ForgetsFarAway(Net):
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
+        return super().advance(to_ns, packets, states)[0], []
+
+
+class KnowsNoNewAgents(Net):
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
+        return super().advance(to_ns, packets, {name: states[name] for name in ("ann", "bob", "cy")})
+
+
+class Reckons(Net):
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
+        later = MS if isinstance(states, DeadReckoned) else 0
+        return super().advance(
+            to_ns, [replace(packet, enters_ns=packet.enters_ns + later) for packet in packets], states
+        )
+
+
+class SharedNet(Net):
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SharedNet":
+        return self
+
+
+class AnnouncesTooLate(Net):
+    def next_event_ns(self) -> int | None:
+        at_ns = super().next_event_ns()
+        return None if at_ns is None else at_ns + 10 * MS
+
+
+class AnnouncesThePast(Net):
+    def next_event_ns(self) -> int | None:
+        return 0
+
+
+class Transmits(Net):
+    transmitters = ("nobody",)
+
+
+def random_delay(self: Net, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
+    lost = [arrival for arrival in arrivals if random.random() < 0.5]
+    kept = [arrival for arrival in arrivals if arrival not in lost]
+    return kept, [Drop(arrival.packet_id, "bad luck") for arrival in lost]
+
+
+def as_answer(kind: MessageKind) -> Alter:
+    """Return a function that turns an error into an empty answer."""
+
+    def alter(frame: bytes) -> bytes:
+        return frame if frame[4] != MessageKind.ERROR else struct.pack("<IHH", 0, kind, 0) + frame[8:16]
+
+    return alter
+
+
+def later(kind: MessageKind, by: int) -> Alter:
+    """Return a function that changes the first integer in the body of messages."""
+
+    def alter(frame: bytes) -> bytes:
+        if frame[4] != kind:
+            return frame
+        return frame[:16] + struct.pack("<q", struct.unpack_from("<q", frame, 16)[0] + by) + frame[24:]
+
+    return alter
+
+
+def silent(frame: bytes) -> bytes | None:
+    return None if frame[4] in {MessageKind.STATES, MessageKind.OUTCOMES} else frame
+
+
+@dataclass(frozen=True)
+class Broken:
+    check: str
+    pair: Pair
+    message: str
+
+
+def physics(make: Any, **settings: Any) -> Pair:  # noqa: ANN401
+    return Pair(FederateService(make, **settings))
+
+
+PHYSICS_CASES = [
+    Broken("handshake", physics(Carts, commands=(1, 2, 9)), "unknown types of commands: [9]"),
+    Broken("ping", replace(physics(Carts), alter=later(MessageKind.PONG, 1)), "the ping 0 was answered with 1"),
+    Broken(
+        "malformed", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a frame that ends"
+    ),
+    Broken("counts", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a count"),
+    Broken(
+        "fork_absence", replace(physics(Carts, forks=False), alter=as_answer(MessageKind.DONE)), "it must refuse fork"
+    ),
+    Broken("bye", replace(physics(Carts), stays=True), "it has not closed the connection"),
+    Broken("start", physics(StartsElsewhere), "ann starts 1 m away"),
+    Broken("remainders", replace(physics(Carts), alter=later(MessageKind.STATES, 1)), "instead of 0 ns"),
+    Broken("remainders", physics(LosesAnAgent), "there is no state of bob"),
+    Broken("remainders", physics(AddsAnAgent), "an agent appeared, dan"),
+    Broken("remainders", replace(physics(Carts), alter=silent, deadline_s=0.2), "has not answered for 0.2 s"),
+    Broken("remainders", physics(IsNotFinite), "with a malformed frame: byte 32: the state of agent 0"),
+    Broken("drift", physics(Drifts), "windows instead of one: the positions of ann differ"),
+    Broken("repeated_time", physics(Drifts), "a second request for 20000000 ns gave other states"),
+    Broken("motion", physics(Jumps), "moved by 3 m in a step"),
+    Broken("motion", physics(IgnoresCommands), "moved by 0 m in 1000 steps"),
+    Broken("limits", physics(HasWrongLimits), "its limit of 0.1 m/s^2 allows"),
+    Broken("command_time", replace(physics(Carts), run_class=IgnoresFrom), "a command from 100000000 ns on"),
+    Broken(
+        "unknown_command", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a command"
+    ),
+    Broken("determinism", physics(Trembles), "gave different answers"),
+    Broken("fork", physics(IsShared), "the original"),
+]
+NETWORK_CASES = [
+    Broken("handshake", physics(Transmits), "KeyError: 'nobody'"),
+    Broken("ping", replace(physics(Net), alter=later(MessageKind.PONG, 1)), "the ping 0 was answered with 1"),
+    Broken(
+        "malformed", replace(physics(Net), alter=as_answer(MessageKind.OUTCOMES)), "it must refuse a frame that ends"
+    ),
+    Broken("counts", replace(physics(Net), alter=as_answer(MessageKind.OUTCOMES)), "it must refuse a count"),
+    Broken(
+        "fork_absence", replace(physics(Net, forks=False), alter=as_answer(MessageKind.DONE)), "it must refuse fork"
+    ),
+    Broken("bye", replace(physics(Net), stays=True), "it has not closed the connection"),
+    Broken("first_request", physics(RefusesNegativeTimes), "ValueError: negative"),
+    Broken("exactly_once", replace(physics(Net), alter=later(MessageKind.OUTCOMES, 1)), "it advanced to"),
+    Broken("exactly_once", physics(net(lambda _, arrived, drops, to_ns: ([], drops))), "neither arrived nor"),
+    Broken(
+        "exactly_once",
+        physics(net(lambda _, arrived, drops, to_ns: ([*arrived, *arrived[-1:]], drops))),
+        "reported twice",
+    ),
+    Broken(
+        "exactly_once",
+        physics(net(lambda _, arrived, drops, to_ns: ([], [Drop(one.packet_id, "") for one in arrived]))),
+        "was dropped without a reason",
+    ),
+    Broken(
+        "exactly_once",
+        physics(net(lambda _, arrived, drops, to_ns: ([replace(one, receiver="cy") for one in arrived], []))),
+        "for bob arrived at cy",
+    ),
+    Broken(
+        "exactly_once",
+        physics(net(lambda _, arrived, drops, to_ns: ([replace(one, at_ns=to_ns + 1) for one in arrived], []))),
+        "not between",
+    ),
+    Broken(
+        "exactly_once",
+        physics(net(lambda _, arrived, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
+        "the fate of packet 99 was reported, which it never got",
+    ),
+    Broken("exactly_once", physics(net(lambda _, arrived, drops, to_ns: (arrived[::-1], drops))), "order of time"),
+    Broken("exactly_once", physics(AnnouncesTooLate), "before the announced next event"),
+    Broken("exactly_once", physics(AnnouncesThePast), "its next event is at 0 ns"),
+    Broken("window_borders", physics(DropsAtBorders), "at the border of a window neither arrived"),
+    Broken(
+        "window_length",
+        physics(net(lambda _, arrived, drops, to_ns: ([replace(one, at_ns=to_ns) for one in arrived], []))),
+        "windows of another length changed an arrival",
+    ),
+    Broken("far_away", physics(ForgetsFarAway), "1,000 km away neither arrived nor"),
+    Broken(
+        "unknown_transport",
+        replace(physics(Net, transports=("udp",)), alter=as_answer(MessageKind.OUTCOMES)),
+        "it must refuse a packet of a transport",
+    ),
+    Broken("determinism", physics(net(random_delay)), "gave different arrivals or drops"),
+    Broken("new_agent", physics(KnowsNoNewAgents, agents_appear=True), "KeyError"),
+    Broken("dead_reckoning", physics(Reckons), "extrapolation at a velocity of 0 changed"),
+    Broken("fork", physics(SharedNet), "the copy and the original"),
+]
+
+
+def run(role: int, broken: Broken) -> CheckResult:
+    target = Target(broken.pair, replace(HELLO, role=role), windows=100)
+    return run_check(target, broken.check, checks(is_physics=role == PHYSICS)[broken.check])
+
+
+@pytest.mark.parametrize(
+    ("role", "broken"),
+    [*((PHYSICS, case) for case in PHYSICS_CASES), *((NETWORK, case) for case in NETWORK_CASES)],
+    ids=lambda value: value.check if isinstance(value, Broken) else str(value),
+)
+def test_a_broken_federate_fails(role: int, broken: Broken, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probe, "_CLOSE_S", 0.2)
+    result = run(role, broken)
+    assert broken.message in result.failure
+    assert result.request
+    assert result.answer
+
+
+def test_each_check_has_a_broken_federate() -> None:
+    assert {case.check for case in PHYSICS_CASES} == checks(is_physics=True).keys()
+    assert {case.check for case in NETWORK_CASES} == checks(is_physics=False).keys()
+
+
+@pytest.mark.parametrize("role", [PHYSICS, NETWORK])
+def test_the_federates_conform_before_they_are_broken(role: int) -> None:
+    make = Carts if role == PHYSICS else Net
+    for name in checks(is_physics=role == PHYSICS):
+        settings: dict[str, Any] = {"transports": ("udp",)} if role == NETWORK else {}
+        pair = physics(make, agents_appear=True, forks=name != "fork_absence", **settings)
+        result = run(role, Broken(name, pair, ""))
+        assert (result.failure, result.skipped) == ("", ""), result
+
+
+def test_a_check_of_a_capability_that_is_not_declared_does_not_apply() -> None:
+    for name in ("determinism", "fork", "drift", "command_time"):
+        result = run(PHYSICS, Broken(name, physics(Trembles, is_deterministic=False, forks=False), ""))
+        assert not result.failure
+        assert "does not declare" in result.skipped

@@ -1,0 +1,137 @@
+"""The test vectors of docs/federates.md: what the encoder gives, and what a decoder written by hand reads in them."""
+
+import hashlib
+import math
+import re
+import struct
+from typing import Any
+
+import pytest
+
+from sim_backends.federates import exchanges
+from sim_backends.federates.agent_states import AgentTable
+from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
+from sim_backends.federates.frames import HEADER_BYTES, MessageKind, read_header
+from sim_backends.federates.handshake import Hello, Welcome, decode_join
+from tests.helpers.federate_frames import DRONE, HELLO, START, WELCOME, agents, example_frames
+from tests.helpers.paths import ROOT
+
+PAGE = (ROOT / "docs" / "federates.md").read_text(encoding="utf-8")
+ROWS = re.findall(r"^\| ([a-z ]+) \| `([0-9a-f]+)` \|$", PAGE, re.MULTILINE)
+VECTORS = {name: bytes.fromhex(text) for name, text in ROWS}
+UGV = (0, 0, 1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 0.25)
+
+
+class ByHand:
+    """Reads a frame by the tables of the page, without the code under test."""
+
+    def __init__(self, frame: bytes) -> None:
+        size, self.kind, reserved, self.request, self.copy = struct.unpack("<IHHII", frame[:16])
+        self.rest = frame[16:]
+        assert (len(self.rest), reserved) == (size, 0)
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        size = struct.calcsize(f"<{layout}")
+        values, self.rest = struct.unpack(f"<{layout}", self.rest[:size]), self.rest[size:]
+        return values
+
+    def text(self) -> str:
+        (length,) = self.take("H")
+        text, self.rest = self.rest[:length], self.rest[length:]
+        return text.decode()
+
+
+def test_the_page_has_a_vector_of_each_message() -> None:
+    assert example_frames() == VECTORS
+    assert len(VECTORS) == len(MessageKind)
+
+
+def test_the_handshake_by_hand() -> None:
+    join = ByHand(VECTORS["join"])
+    assert (join.kind, join.take("8sH"), join.text(), join.rest) == (1, (b"FIELDKIT", 1), "s3cret", b"")
+    hello = ByHand(VECTORS["hello"])
+    assert (hello.kind, hello.request) == (2, 3)
+    assert hello.take("8sHBBIQqq") == (b"FIELDKIT", 1, 1, 0, 1000, 7, 1_000_000, 2_000_000_000)
+    assert hello.take("32s") == (hashlib.sha256(b"{}").digest(),)
+    assert (hello.text(), hello.text(), hello.take("I")) == ("s3cret", "demo", (1,))
+    assert (hello.text(), hello.text(), hello.take("Bd")) == ("ugv", "husky", (0, 0.5))
+    assert hello.take("IIddddddd d") == (*UGV, 3.0)
+    assert (hello.take("I"), hello.rest) == ((2,), b"{}")
+    welcome = ByHand(VECTORS["welcome"])
+    assert welcome.kind == 3
+    assert welcome.take("HBBIqq") == (1, 1, 0, 1 + 16, 1_000_000, -1)
+    assert welcome.take("32s") == (hashlib.sha256(b"{}").digest(),)
+    assert (welcome.text(), welcome.text()) == ("carts", "carts 1.0")
+    assert (welcome.take("HHH"), welcome.take("H"), welcome.take("II")) == ((2, 1, 2), (0,), (0, 0))
+    assert not welcome.rest
+
+
+def test_requests_and_answers_by_hand() -> None:
+    request = ByHand(VECTORS["advance physics"])
+    assert (request.kind, request.take("qqI")) == (4, (11_100_000, 10_000_000, 2))
+    assert request.take("IHHdd") == (0, 1, 16, 0.5, -0.125)
+    *velocity, yaw_rad = request.take("IHHdddd")
+    assert (velocity, math.isnan(yaw_rad), request.rest) == ([1, 2, 32, 1.0, 0.0, 0.25], True, b"")
+    states = ByHand(VECTORS["states"])
+    assert (states.kind, states.take("qII"), states.text()) == (5, (11_000_000, 1, 1), "uav")
+    assert (states.take("I"), states.take("II8d")) == ((2,), (*UGV, 3.0))
+    *drone, heading_rad, limit_m_s2 = states.take("II8d")
+    assert drone == [1, 0, -1.5, 0.0, 10.0, 0.0, 0.5, -0.25]
+    assert (math.isnan(heading_rad), limit_m_s2, states.rest) == (True, math.inf, b"")
+    network = ByHand(VECTORS["advance network"])
+    assert (network.kind, network.take("qqqII")) == (6, (11_099_999, 10_000_000, 1_000_000, 0, 1))
+    assert (network.take("II8d"), network.take("I")) == ((*UGV, math.inf), (1,))
+    assert network.take("QqQqqII") == (9, 4, 300, 10_000_000, 10_500_000, 0, 1)
+    assert (network.text(), network.text(), network.rest) == ("pose", "udp", b"")
+    outcomes = ByHand(VECTORS["outcomes"])
+    assert (outcomes.kind, outcomes.take("qqI")) == (7, (11_099_999, 12_000_000, 1))
+    assert (outcomes.take("QqII"), outcomes.take("IQ")) == ((9, 11_000_250, 1, 0), (1, 8))
+    assert (outcomes.text(), outcomes.rest) == ("out of range", b"")
+
+
+def test_short_messages_by_hand() -> None:
+    for name, kind, number in (("ping", 8, 42), ("pong", 9, 42), ("busy", 10, 10_000_000)):
+        frame = ByHand(VECTORS[name])
+        assert (frame.kind, frame.take("Q"), frame.rest) == (kind, (number,), b"")
+    fork = ByHand(VECTORS["fork"])
+    assert (fork.kind, fork.take("I"), fork.rest) == (11, (2,), b"")
+    for name, kind, copy in (("done", 12, 0), ("release", 13, 2), ("bye", 15, 0)):
+        frame = ByHand(VECTORS[name])
+        assert (frame.kind, frame.copy, frame.rest) == (kind, copy, b"")
+    error = ByHand(VECTORS["error"])
+    assert (error.kind, error.text(), error.rest) == (14, "ValueError: no wheels", b"")
+
+
+def body(name: str) -> bytes:
+    frame = VECTORS[name]
+    assert read_header(frame).size == len(frame) - HEADER_BYTES
+    return frame[HEADER_BYTES:]
+
+
+def test_our_decoder_reads_the_vectors() -> None:
+    assert decode_join(body("join")) == "s3cret"
+    assert Hello.decode(body("hello")) == HELLO
+    assert Welcome.decode(body("welcome")) == WELCOME.__class__(
+        **{**WELCOME.__dict__, "commands": [1, 2], "transports": [], "transmitters": [], "emitters_m": []}
+    )
+    to_ns, from_ns, commands = exchanges.decode_advance_physics(body("advance physics"), agents())
+    assert (to_ns, from_ns, set(commands)) == (11_100_000, 10_000_000, {"ugv", "uav"})
+    table = AgentTable(["ugv"])
+    at_ns, states = exchanges.decode_states(body("states"), table)
+    assert (at_ns, dict(states), states.limits_m_s2) == (
+        11_000_000,
+        {"ugv": START, "uav": DRONE},
+        {"ugv": 3.0, "uav": math.inf},
+    )
+    assert table.names == ["ugv", "uav"]
+    network = AdvanceNetwork.decode(body("advance network"), agents())
+    assert network.encode(agents()) == body("advance network")
+    outcomes = NetworkOutcomes.decode(body("outcomes"), agents())
+    assert outcomes.encode(agents()) == body("outcomes")
+    assert exchanges.decode_text(body("error")) == "ValueError: no wheels"
+
+
+@pytest.mark.parametrize("name", sorted(VECTORS))
+def test_the_size_in_the_header_is_that_of_the_body(name: str) -> None:
+    assert read_header(VECTORS[name]).kind is MessageKind[name.upper().replace(" ", "_")]
+    assert body(name) == VECTORS[name][16:]
