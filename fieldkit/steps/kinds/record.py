@@ -20,6 +20,15 @@ from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import ros_master, variants
 from fieldkit.steps.base import Step, StepName
+from fieldkit.steps.capabilities import (
+    HasNeeds,
+    HasRefusals,
+    Records,
+    ReservesSpace,
+    Subscribes,
+    Summarizes,
+    UsesSpace,
+)
 from fieldkit.steps.scene import (
     BY_ITSELF,
     BY_LIMIT,
@@ -67,7 +76,7 @@ SUBSCRIBED: Final = "log:Subscribed to topic"
 """Line of `ros2 bag record` when it starts to record. Its start takes seconds, which must not count."""
 
 
-class RecordStep(Step):
+class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, Records, Summarizes):
     """Records a ROS bag, by the record command of the robot's profile.
 
     A robot may record several bags of different names, one after the other; a `transfer` then names its `file`.

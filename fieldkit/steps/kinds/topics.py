@@ -18,6 +18,7 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import streams
 from fieldkit.steps.along import AlongStep
+from fieldkit.steps.capabilities import HasNeeds, Listens, Prepares, SendsTraffic, Summarizes, UsesSpace
 from fieldkit.steps.middlewares import Discovery, MiddlewareName
 from fieldkit.steps.scene import (
     BY_FIELDKIT,
@@ -60,7 +61,7 @@ _ENVELOPE_BYTES: Final = 100
 """Approximate size of the headers of middleware and IP per sample."""
 
 
-class TopicsStep(StreamOptions, AlongStep):
+class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Streams samples of a topic from one robot to another over a middleware.
 
     The program is part of fieldkit; both robots need the middleware for Python. See [topics](topics.md), also for the

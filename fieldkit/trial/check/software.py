@@ -13,6 +13,7 @@ from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
+from fieldkit.steps.capabilities import HasNeeds, Subscribes
 from fieldkit.steps.scene import CommandResult, Need, Planned
 from fieldkit.steps.variants import Tool, Variants
 from fieldkit.trial.check import radio, tools
@@ -132,7 +133,8 @@ def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -
 def can_record(plan: Plan, role: Role, sections: Sections) -> bool:
     """Return True if nothing that a recording needs is known to be missing on the robot."""
     ros = plan.cast[role].profile.ros
-    if ros is None or not any(placed.step.live_topics(role) for placed in plan.procedure.walk()):
+    steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, Subscribes))
+    if ros is None or not any(step.live_topics(role) for step in steps):
         return True
     program = ros.command.record[0]
     needed = (_section(program), *(need.name for need in _needs(plan, role) if need.missing_program == program))
@@ -156,5 +158,6 @@ def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
 def _needs(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:
     """Return the needs of steps on the robot without duplicates: those checked by the probe, or by the agent."""
     scene = plan.scenes()[0]
-    needs = (need for placed in plan.procedure.walk() for need in placed.step.needs(scene) if need.role is role)
+    steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, HasNeeds))
+    needs = (need for step in steps for need in step.needs(scene) if need.role is role)
     return tuple({need.name: need for need in needs if need.agent == by_agent}.values())

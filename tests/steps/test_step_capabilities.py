@@ -1,0 +1,103 @@
+"""Capabilities of steps: found by the methods that a class defines, also without deriving from them."""
+
+import inspect
+from collections.abc import Iterator
+from functools import partial
+
+import pytest
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.core.model import Protocol, Role
+from fieldkit.steps import capabilities
+from fieldkit.steps.base import Step, StepEntry, step_types
+from fieldkit.steps.capabilities import CAPABILITIES, HasNeeds, Listens, Prepares, Records, Restarts
+from fieldkit.steps.kinds.record import RecordStep
+from fieldkit.steps.kinds.send import SendStep
+from fieldkit.steps.kinds.transfer import TransferStep
+from fieldkit.steps.kinds.wait import WaitStep
+from fieldkit.steps.nest import Nest, with_record
+from fieldkit.steps.scene import Need, RecordedFile, Scene
+from tests.helpers.idle_testbed import IdleTestbed
+
+MAX_METHODS = 12
+
+
+class Outside(Step):
+    """A kind of another package that derives from no capability."""
+
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        return iter(())
+
+
+class Partial(Step):
+    """A kind that defines only a part of a capability."""
+
+    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
+        return iter(())
+
+
+def public_methods(cls: type) -> list[str]:
+    return [name for name, value in vars(cls).items() if not name.startswith("_") and is_method(value)]
+
+
+def is_method(value: object) -> bool:
+    return inspect.isfunction(value) or isinstance(value, classmethod | property)
+
+
+@pytest.mark.parametrize("cls", [Step, Nest, *CAPABILITIES], ids=lambda cls: cls.__name__)
+def test_contract_is_small(cls: type) -> None:
+    assert len(public_methods(cls)) <= MAX_METHODS
+
+
+def test_methods_of_capabilities_are_not_in_the_contract_and_in_one_capability() -> None:
+    methods = [name for capability in CAPABILITIES for name in public_methods(capability)]
+    assert len(set(methods)) == len(methods)
+    assert not set(methods) & set(public_methods(Step))
+
+
+def test_step_that_defines_the_methods_has_the_capability() -> None:
+    step = Outside()
+    assert isinstance(step, HasNeeds)
+    assert not isinstance(step, Listens | Restarts | Records)
+
+
+def test_derived_kind_has_the_capabilities_of_its_base_only() -> None:
+    """A step class that derives from a capability is no capability."""
+    assert issubclass(SendStep, Listens | Prepares)
+    assert not issubclass(Outside, TransferStep)
+    assert not issubclass(RecordStep, TransferStep)
+
+
+def test_kind_that_has_a_part_of_a_capability_lacks_its_other_methods() -> None:
+    assert capabilities.missing_methods(Partial) == ("records_on", "with_record")
+    assert not isinstance(Partial(), Records)
+    assert not capabilities.missing_methods(Outside)
+    for kind in step_types().values():
+        assert capabilities.missing_methods(kind) == ()
+
+
+def test_step_without_listener_is_run_when_it_has_been_prepared() -> None:
+    step, scene = WaitStep.model_validate({"duration": "1s"}), Scene(Protocol.TCP, {}, "f")
+    started = capabilities.prepare(step, scene, testbed := IdleTestbed({}))
+    assert isinstance(started, partial)
+    assert (started.func, started.args) == (step.run, (scene, testbed))
+
+
+def test_duration_of_recordings_is_changed_at_any_depth() -> None:
+    record = StepEntry(
+        "record", RecordStep.model_validate({"robot": "sender", "topics": ["/scan"], "duration": "15s"})
+    )
+    wait = StepEntry("wait", WaitStep.model_validate({"duration": "1s"}))
+    inner = step_types()["together"].model_validate({"during": [record, wait]})
+    entry = StepEntry("capture", step_types()["capture"].model_validate({"during": [StepEntry("together", inner)]}))
+    (changed,) = (step for step in _leaves(with_record(entry, 2.0)) if isinstance(step, RecordStep))
+    assert changed.duration == 2.0
+    assert with_record(wait, 2.0) == wait
+
+
+def _leaves(entry: StepEntry) -> Iterator[Step]:
+    if isinstance(entry.step, Nest):
+        for inner in entry.step.during:
+            yield from _leaves(inner)
+    else:
+        yield entry.step
