@@ -1,25 +1,28 @@
 """Capabilities of steps: found by the methods that a class defines, also without deriving from them."""
 
 import inspect
+import re
 from collections.abc import Iterator
 from functools import partial
 
 import pytest
 
 from fieldkit.backends.protocols import Cast
-from fieldkit.core.model import Protocol, Role
+from fieldkit.core.model import Protocol
 from fieldkit.steps import capabilities
-from fieldkit.steps.base import Step, StepEntry, step_types
+from fieldkit.steps.base import Step, step_types
 from fieldkit.steps.capabilities import CAPABILITIES, HasNeeds, Listens, Prepares, Records, Restarts
 from fieldkit.steps.kinds.record import RecordStep
 from fieldkit.steps.kinds.send import SendStep
 from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.kinds.wait import WaitStep
-from fieldkit.steps.nest import Nest, with_record
+from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Need, RecordedFile, Scene
 from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.paths import ROOT
 
 MAX_METHODS = 12
+PAGE = ROOT / "docs/add-a-procedure.md"
 
 
 class Outside(Step):
@@ -83,21 +86,8 @@ def test_step_without_listener_is_run_when_it_has_been_prepared() -> None:
     assert (started.func, started.args) == (step.run, (scene, testbed))
 
 
-def test_duration_of_recordings_is_changed_at_any_depth() -> None:
-    record = StepEntry(
-        "record", RecordStep.model_validate({"robot": "sender", "topics": ["/scan"], "duration": "15s"})
-    )
-    wait = StepEntry("wait", WaitStep.model_validate({"duration": "1s"}))
-    inner = step_types()["together"].model_validate({"during": [record, wait]})
-    entry = StepEntry("capture", step_types()["capture"].model_validate({"during": [StepEntry("together", inner)]}))
-    (changed,) = (step for step in _leaves(with_record(entry, 2.0)) if isinstance(step, RecordStep))
-    assert changed.duration == 2.0
-    assert with_record(wait, 2.0) == wait
-
-
-def _leaves(entry: StepEntry) -> Iterator[Step]:
-    if isinstance(entry.step, Nest):
-        for inner in entry.step.during:
-            yield from _leaves(inner)
-    else:
-        yield entry.step
+def test_page_lists_each_capability_with_its_methods() -> None:
+    """The rows are in the order of the module."""
+    text = PAGE.read_text(encoding="utf-8").partition("| capability |")[2].partition("\n\n")[0]
+    assert re.findall(r"`([A-Z]\w+)`", text) == [capability.__name__ for capability in CAPABILITIES]
+    assert re.findall(r"`([a-z]\w+)`", text) == [name for cls in CAPABILITIES for name in public_methods(cls)]
