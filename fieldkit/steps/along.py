@@ -10,10 +10,11 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Field
 from fieldkit.steps.base import Step
+from fieldkit.steps.capabilities import ChecksPlacement, DependsOnCast
 from fieldkit.steps.nest import Nest
 
 
-class AlongStep(Step):
+class AlongStep(Step, DependsOnCast, ChecksPlacement):
     """A step that can last as long as the motion around it.
 
     Attributes:

@@ -1,30 +1,26 @@
 """The contract of a step: its YAML keys, jobs, requirements, files, checks and columns."""
 
 from abc import ABC
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import EntryPoint
 from inspect import isabstract
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar
 
-from fieldkit.backends.protocols import Cast, Testbed
+from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import CoreSchema, Field, Strict
 from fieldkit.core import plugins
-from fieldkit.core.columns import Column, Measured, Value, step_prefixed
+from fieldkit.core.columns import Column, Measured, step_prefixed
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.lazy_mapping import LazyMapping
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.remote import jobs
-from fieldkit.steps import kinds
-from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, Pinging, Planned, RecordedFile, Refusal, Scene
+from fieldkit.steps import capabilities, kinds
+from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
-
-if TYPE_CHECKING:
-    from fieldkit.steps.nest import Nest
 
 StepName = Annotated[
     str,
@@ -47,7 +43,8 @@ class Step(Strict, ABC):
 
     Its fields are its YAML keys. Plans, preflight, gates, rows and reports call the methods below and contain no name
     of a kind. A kind usually defines `jobs`, `check` and `measure`; every method has a default. A kind that runs one
-    program is a `fieldkit.steps.program.ProgramStep`, which needs two methods.
+    program is a `fieldkit.steps.program.ProgramStep`, which needs two methods. Methods that few kinds need are in
+    `fieldkit.steps.capabilities`.
 
     `jobs` is pure: `--dry-run` prints it, tests compare it with golden lines, and `run` starts the same jobs. To add
     a kind, write its module and name its class in `fieldkit.steps.kinds`, or in an entry point of the group
@@ -86,8 +83,6 @@ class Step(Strict, ABC):
         """Return the class name in lower case without `Step`, a part of names of jobs and files."""
         return cls.__name__.removesuffix("Step").lower()
 
-    # Execution.
-
     def jobs(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (some steps need no robot)
         """Yield every job in the order in which it starts."""
         return iter(())
@@ -107,25 +102,6 @@ class Step(Strict, ABC):
             if code != 0:
                 raise scene.failure(planned, f"{planned.program} ended with exit code {code}")
 
-    def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        """Start processes that must be ready first, such as a listener; return the function that runs the step.
-
-        A capture calls it in a thread while tcpdump starts. Both functions raise the errors of `run`.
-        """
-        return partial(self.run, scene, testbed)
-
-    def own_jobs(self, scene: Scene) -> Iterator[Planned]:
-        """Yield the jobs of the step itself, without those of the steps inside it."""
-        return self.jobs(scene)
-
-    def dry_run_notes(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most steps have no such actions)
-        """Yield a line for each action that is not a command on a robot; `--dry-run` prints them."""
-        return iter(())
-
-    def abort_notes(self, scene: Scene) -> Iterator[str]:  # noqa: ARG002 (most move no robot)
-        """Yield a sentence for each moving robot on what it does if the attempt is stopped immediately."""
-        return iter(())
-
     def roles(self) -> frozenset[Role]:
         """Return the roles that the step needs. By default these are the roles among the values of its fields."""
         return frozenset(role for name in type(self).model_fields for role in _roles_in(getattr(self, name)))
@@ -133,72 +109,6 @@ class Step(Strict, ABC):
     def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
         """Return the approximate duration of the step on a good link, in seconds."""
         return 0.0
-
-    def with_record(self, duration_s: float) -> Self:  # noqa: ARG002 (most steps record nothing)
-        """Return this step with every recording in it `duration_s` long."""
-        return self
-
-    def resolved(self, cast: Cast, path_s: float | None = None) -> Self:  # noqa: ARG002 (most have no such setting)
-        """Return this step with each setting that depends on the robots filled in. A plan has resolved steps only.
-
-        Args:
-            cast: The robot in each role.
-            path_s: Duration of the path of the robot that moves meanwhile, in seconds; None if no robot moves.
-        """
-        return self
-
-    def adjustments(self, cast: Cast) -> Iterator[str]:  # noqa: ARG002 (most reduce nothing)
-        """Yield a sentence for each setting that `resolved` reduces."""
-        return iter(())
-
-    # Requirements.
-
-    def listens(self) -> tuple[ListeningPort, ...]:
-        """Return the listening ports of the step, which identify its packets in a capture."""
-        return ()
-
-    def restarts(self) -> frozenset[Role]:
-        """Return the roles whose robots the step restarts. Any other restart makes an attempt void."""
-        return frozenset()
-
-    def moves(self) -> frozenset[Role]:
-        """Return the roles whose robots the step moves from their places."""
-        return frozenset()
-
-    def placement_error(self, earlier: Sequence["Step"], within: Sequence["Nest"]) -> str | None:  # noqa: ARG002 (most fit)
-        """Return why the step is not allowed at its position in the procedure; None if it is.
-
-        Args:
-            earlier: The steps that start before it.
-            within: The steps around it, the outermost first.
-        """
-        return None
-
-    def may_prompt(self) -> bool:
-        """Return True if the step may prompt the operator; then no other step may run at the same time."""
-        return False
-
-    def refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (most work with every tool)
-        """Yield the reasons why the step cannot work with the tools of the robots."""
-        return iter(())
-
-    def needs(self, scene: Scene) -> Iterator[Need]:  # noqa: ARG002 (most need only programs)
-        """Yield the preflight checks of the step, in addition to the search for the programs of its `jobs`."""
-        return iter(())
-
-    def live_topics(self, role: Role) -> tuple[str, ...]:  # noqa: ARG002 (most subscribe to no topic)
-        """Return the ROS topics that must be published on the robot in `role`."""
-        return ()
-
-    def bytes_left(self, scene: Scene, role: Role) -> float:  # noqa: ARG002 (small text files are estimated elsewhere)
-        """Return the approximate size of its files on the robot in `role`, in bytes, without small text files."""
-        return 0.0
-
-    def reserve_bytes(self, scene: Scene, role: Role) -> int:  # noqa: ARG002 (most need no reserve)
-        """Return the free disk space that its programs need on the robot beyond their output, in bytes."""
-        return 0
-
-    # Traffic and files.
 
     def exclusive_resources(self) -> tuple[str, ...]:
         """Return the resources that no other step with the same `name` may use in a repeat, as text: `a ping`."""
@@ -213,24 +123,6 @@ class Step(Strict, ABC):
         """
         return ()
 
-    def laptop_files(self) -> tuple[str, ...]:
-        """Return those of `files` that the laptop writes; their names are in `fieldkit.core.laptop_files`."""
-        return ()
-
-    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:  # noqa: ARG002 (most record nothing)
-        """Yield the recordings of the step, which other steps may send."""
-        return iter(())
-
-    def records_on(self) -> frozenset[Role]:
-        """Return the roles of `recorded`, which do not depend on the cast."""
-        return frozenset()
-
-    def flows(self, scene: Scene) -> Iterator[Flow]:  # noqa: ARG002 (most send nothing over the radio)
-        """Yield the traffic of the step on the radio."""
-        return iter(())
-
-    # Checks and measurements.
-
     def check(self, view: View) -> Iterator[str]:  # noqa: ARG002 (missing values of columns are reported by the gates)
         """Yield each reason why the evidence is incomplete or contradictory, a sentence without a full stop."""
         return iter(())
@@ -242,26 +134,6 @@ class Step(Strict, ABC):
     def measure(self, view: View) -> Measured:  # noqa: ARG002 (some measure nothing)
         """Return a value for each of `output_columns`, or the reason why it is missing."""
         return Measured()
-
-    def summary(self, values: Mapping[str, Value]) -> Iterator[str]:  # noqa: ARG002 (some have no important figures)
-        """Yield the most important figures for the line of a repeat: `IP loss 3.2 %`.
-
-        Parts with the word `loss` come first in that line.
-        """
-        return iter(())
-
-    def transfer(self, scene: Scene, within: Sequence["Nest"]) -> Transfer | None:  # noqa: ARG002 (most send no file)
-        """Return the packet filter of the file transfer; None if the step sends no file.
-
-        Args:
-            scene: The attempt.
-            within: The steps around it, the outermost first.
-        """
-        return None
-
-    def pinging(self) -> Pinging | None:
-        """Return the source of the step's round-trip times; None if it measures none."""
-        return None
 
 
 def _roles_in(value: object) -> Iterator[Role]:
@@ -289,6 +161,9 @@ def _load(point: EntryPoint) -> type[Step]:
     if isabstract(loaded):
         missing = ", ".join(sorted(loaded.__abstractmethods__))
         raise ConfigurationError(f"the kind of step lacks {missing}", where=location, remedy=remedy)
+    if missing := ", ".join(capabilities.missing_methods(loaded)):
+        why = f"the kind of step has only a part of a capability: it lacks {missing}"
+        raise ConfigurationError(why, where=location, remedy=remedy)
     return loaded
 
 

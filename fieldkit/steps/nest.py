@@ -1,4 +1,4 @@
-"""Base class of steps that contain other steps."""
+"""Base class of steps that contain other steps, and functions on a step and all steps inside it."""
 
 from abc import ABC
 from collections.abc import Iterator, Mapping
@@ -12,10 +12,11 @@ from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.remote import jobs
 from fieldkit.steps.base import Step, StepEntry
-from fieldkit.steps.scene import Flow, Planned, Refusal, Scene
+from fieldkit.steps.capabilities import DependsOnCast, Records, SendsTraffic
+from fieldkit.steps.scene import Flow, Planned, Scene
 
 
-class Nest(Step, ABC):
+class Nest(Step, DependsOnCast, ABC):
     """A step that contains other steps.
 
     Attributes:
@@ -35,19 +36,6 @@ class Nest(Step, ABC):
         """Return the capture file of each robot that captures while the steps inside run."""
         return {}
 
-    def kept_bytes_inside(self) -> int:
-        """Return the maximum of `kept_bytes` of the steps inside, at any depth."""
-        nests = (entry.step.kept_bytes_inside() for entry in self.during if isinstance(entry.step, Nest))
-        return max((*nests, *(entry.step.kept_bytes for entry in self.during)), default=0)
-
-    def leaves_inside(self) -> "Iterator[Step]":
-        """Yield the steps inside, at any depth, that contain no steps."""
-        for entry in self.during:
-            if isinstance(entry.step, Nest):
-                yield from entry.step.leaves_inside()
-            else:
-                yield entry.step
-
     def inside(self, scene: Scene) -> Iterator[Planned]:
         """Yield every job of the steps inside, in the order in which it starts."""
         for entry in self.during:
@@ -59,56 +47,9 @@ class Nest(Step, ABC):
         return super().roles() | self.roles_inside()
 
     @override
-    def own_jobs(self, scene: Scene) -> Iterator[Planned]:
-        inside = {(planned.role, planned.job.name) for planned in self.inside(scene)}
-        return (planned for planned in self.jobs(scene) if (planned.role, planned.job.name) not in inside)
-
-    @override
-    def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        for entry in self.during:
-            yield from entry.step.refusals(scene)
-
-    @override
-    def dry_run_notes(self, scene: Scene) -> Iterator[str]:
-        for entry in self.during:
-            yield from entry.step.dry_run_notes(scene)
-
-    @override
-    def abort_notes(self, scene: Scene) -> Iterator[str]:
-        for entry in self.during:
-            yield from entry.step.abort_notes(scene)
-
-    @override
-    def with_record(self, duration_s: float) -> Self:
-        during = tuple(StepEntry(entry.kind, entry.step.with_record(duration_s)) for entry in self.during)
-        return self.model_copy(update={"during": during})
-
-    @override
     def resolved(self, cast: Cast, path_s: float | None = None) -> Self:
-        during = tuple(StepEntry(entry.kind, entry.step.resolved(cast, path_s)) for entry in self.during)
+        during = tuple(resolved(entry, cast, path_s) for entry in self.during)
         return self.model_copy(update={"during": during})
-
-    @override
-    def adjustments(self, cast: Cast) -> Iterator[str]:
-        for entry in self.during:
-            yield from entry.step.adjustments(cast)
-
-    def flows_inside(self, scene: Scene) -> Iterator[Flow]:
-        """Yield the traffic of the steps inside on the radio, at any depth."""
-        for entry in self.during:
-            yield from entry.step.flows(scene)
-            if isinstance(entry.step, Nest):
-                yield from entry.step.flows_inside(scene)
-
-    def end_inside(self, scene: Scene, testbed: Testbed) -> None:
-        """Stop every running job of the steps inside.
-
-        Raises:
-            LinkError: A robot did not answer.
-        """
-        for planned in self.inside(scene):
-            with suppress(RobotError):  # it was never started
-                jobs.stop(testbed.shells[planned.role], planned.job)
 
     def roles_inside(self) -> frozenset[Role]:
         """Return the roles that the steps inside need."""
@@ -117,3 +58,49 @@ class Nest(Step, ABC):
     def inside_s(self, protocol: Protocol) -> float:
         """Return the approximate duration of the steps inside on a good link, in seconds."""
         return sum(entry.step.expected_s(protocol) for entry in self.during)
+
+
+def steps_inside(nest: Nest) -> Iterator[Step]:
+    """Yield the steps inside `nest`, at any depth, in the order in which they start."""
+    for entry in nest.during:
+        yield entry.step
+        if isinstance(entry.step, Nest):
+            yield from steps_inside(entry.step)
+
+
+def flows_inside(nest: Nest, scene: Scene) -> Iterator[Flow]:
+    """Yield the traffic of the steps inside `nest` on the radio, at any depth."""
+    for step in steps_inside(nest):
+        if isinstance(step, SendsTraffic):
+            yield from step.flows(scene)
+
+
+def end_inside(nest: Nest, scene: Scene, testbed: Testbed) -> None:
+    """Stop every running job of the steps inside `nest`.
+
+    Raises:
+        LinkError: A robot did not answer.
+    """
+    for planned in nest.inside(scene):
+        with suppress(RobotError):  # it was never started
+            jobs.stop(testbed.shells[planned.role], planned.job)
+
+
+def own_jobs(step: Step, scene: Scene) -> Iterator[Planned]:
+    """Yield the jobs of a step without those of the steps inside it."""
+    inside = {(planned.role, planned.job.name) for planned in step.inside(scene)} if isinstance(step, Nest) else set()
+    return (planned for planned in step.jobs(scene) if (planned.role, planned.job.name) not in inside)
+
+
+def resolved(entry: StepEntry, cast: Cast, path_s: float | None = None) -> StepEntry:
+    """Return an entry whose step, and the steps inside it, are resolved; see `DependsOnCast.resolved`."""
+    step = entry.step
+    return StepEntry(entry.kind, step.resolved(cast, path_s)) if isinstance(step, DependsOnCast) else entry
+
+
+def with_record(entry: StepEntry, duration_s: float) -> StepEntry:
+    """Return an entry whose step, and the steps inside it, have recordings `duration_s` long."""
+    step = entry.step
+    if isinstance(step, Nest):
+        step = step.model_copy(update={"during": tuple(with_record(inner, duration_s) for inner in step.during)})
+    return StepEntry(entry.kind, step.with_record(duration_s) if isinstance(step, Records) else step)

@@ -8,6 +8,8 @@ from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import clock, endings, host
 from fieldkit.measure.evidence.host import HostState
+from fieldkit.steps.capabilities import Restarts
+from fieldkit.steps.nest import own_jobs
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure
 
@@ -41,7 +43,8 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> I
 
 def restarted(procedure: Procedure) -> frozenset[Role]:
     """Return the roles whose robots are restarted by a step."""
-    return frozenset[Role]().union(*(placed.step.restarts() for placed in procedure.walk()))
+    steps = (placed.step for placed in procedure.walk() if isinstance(placed.step, Restarts))
+    return frozenset[Role]().union(*(step.restarts() for step in steps))
 
 
 def without_effects(reasons: Sequence[str]) -> list[str]:
@@ -73,7 +76,7 @@ def _job_problems(
     """Yield the jobs of undisturbed steps that did not end as required."""
     for placed in procedure.walk():
         try:
-            planned_jobs = () if placed.disturbed else tuple(placed.step.own_jobs(scene))
+            planned_jobs = () if placed.disturbed else tuple(own_jobs(placed.step, scene))
         except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
             yield f"the commands of {placed.called} cannot be derived: {raised(error)}"
             continue

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from fieldkit.core.model import Role
+from fieldkit.steps.nest import own_jobs
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import Procedure
 
@@ -27,7 +28,7 @@ class FileOwners:
         """Return the owners of the files of a procedure."""
         owners: dict[str, Role] = {}
         for placed in procedure.walk():
-            for planned in placed.step.own_jobs(scene):
+            for planned in own_jobs(placed.step, scene):
                 for name in (planned.job.log, planned.job.stdout):
                     if name:
                         owners[name.casefold()] = planned.role

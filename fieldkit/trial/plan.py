@@ -15,6 +15,7 @@ from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, FieldkitError, raised
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
 from fieldkit.measure.transfers.transfer_spec import Transfer
+from fieldkit.steps.capabilities import DescribesActions, HasRefusals, Moves, Pings, SendsFile
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Pinging, Planned, PutProgram, Refusal, Scene
 from fieldkit.steps.variants import Variants
@@ -125,8 +126,10 @@ class Plan(Strict):
 
     def refusals(self, variants: Mapping[Role, Variants]) -> tuple[Refusal, ...]:
         """Return the parts of the procedure that cannot work with the robots' tools, without duplicates."""
-        scenes, steps = self.scenes(variants), self.procedure.steps
-        step_refusals = (refusal for scene in scenes for entry in steps for refusal in entry.step.refusals(scene))
+        steps = [placed.step for placed in self.procedure.walk() if isinstance(placed.step, HasRefusals)]
+        step_refusals = (
+            refusal for scene in self.scenes(variants) for step in steps for refusal in step.refusals(scene)
+        )
         section_refusals = (refusal for section in self._sections() for refusal in section.refusals(self))
         return tuple(dict.fromkeys((*step_refusals, *section_refusals)))
 
@@ -140,22 +143,28 @@ class Plan(Strict):
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
         """Return descriptions of what the testbed does in one repeat besides running the commands."""
         section_notes = (line for section in self._sections() for line in section.dry_run_notes(self))
-        return (*section_notes, *(line for entry in self.procedure.steps for line in entry.step.dry_run_notes(scene)))
+        steps = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, DescribesActions))
+        return (*section_notes, *(line for step in steps for line in step.dry_run_notes(scene)))
 
     def abort_notes(self, scene: Scene) -> tuple[str, ...]:
         """Return descriptions of what each robot that moves without a person does if a repeat is aborted."""
         section_notes = (line for section in self._sections() for line in section.abort_notes(self))
-        return (*section_notes, *(line for entry in self.procedure.steps for line in entry.step.abort_notes(scene)))
+        steps = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, Moves))
+        return (*section_notes, *(line for step in steps for line in step.abort_notes(scene)))
 
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
         """Return the packet filter of each transfer, in the order of their starts."""
         scene = self.procedure.scene(protocol, self.cast, "")
-        transfers = (placed.step.transfer(scene, placed.within) for placed in self.procedure.walk())
+        transfers = (
+            placed.step.transfer(scene, placed.within)
+            for placed in self.procedure.walk()
+            if isinstance(placed.step, SendsFile)
+        )
         return tuple(transfer for transfer in transfers if transfer is not None)
 
     def pingings(self) -> tuple[Pinging, ...]:
         """Return all round-trip time measurements of a repeat, in the order of their starts."""
-        pingings = (placed.step.pinging() for placed in self.procedure.walk())
+        pingings = (placed.step.pinging() for placed in self.procedure.walk() if isinstance(placed.step, Pings))
         return tuple(pinging for pinging in pingings if pinging is not None)
 
     def captures(self) -> Mapping[str, Role]:

@@ -30,8 +30,17 @@ from fieldkit.core.model import (
 )
 from fieldkit.measure.evidence import host, link_samples
 from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.capabilities import (
+    ChecksPlacement,
+    Listens,
+    Moves,
+    Records,
+    ReducesSettings,
+    SendsTraffic,
+    WritesOnLaptop,
+)
 from fieldkit.steps.legs import PathLeg
-from fieldkit.steps.nest import Nest
+from fieldkit.steps.nest import Nest, resolved, with_record
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import columns
@@ -133,7 +142,7 @@ class Procedure(catalog.Named, Sectioned):
         for placed in self.walk():
             step = placed.step
             before = [other.step for other in earlier if not placed.runs_beside(other)]
-            if why := step.placement_error(before, placed.within):
+            if isinstance(step, ChecksPlacement) and (why := step.placement_error(before, placed.within)):
                 raise schema.validation_error(why, *placed.at)
             for claim in step.exclusive_resources():
                 if (step.prefix, claim) in claimed:
@@ -184,6 +193,9 @@ class Procedure(catalog.Named, Sectioned):
         """Yield every step in the order of their starts, including nested ones."""
         return _walk(self.steps, ("steps",), ())
 
+    def _steps(self) -> Iterator[Step]:
+        return (placed.step for placed in self.walk())
+
     def scene(
         self, protocol: Protocol, cast: Cast, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})
     ) -> Scene:
@@ -196,11 +208,12 @@ class Procedure(catalog.Named, Sectioned):
             variants: The tools of each robot, as found by preflight.
         """
         recorded: dict[Role, tuple[RecordedFile, ...]] = {}
-        for placed in self.walk():
-            for file in placed.step.recorded(cast):
+        for step in self._steps():
+            for file in step.recorded(cast) if isinstance(step, Records) else ():
                 recorded[file.role] = (*recorded.get(file.role, ()), file)
         scene = Scene(protocol, cast, folder, recorded, variants, sections=self.sections)
-        return replace(scene, flows=tuple(flow for placed in self.walk() for flow in placed.step.flows(scene)))
+        senders = (step for step in self._steps() if isinstance(step, SendsTraffic))
+        return replace(scene, flows=tuple(flow for step in senders for flow in step.flows(scene)))
 
     def roles(self) -> frozenset[Role]:
         """Return the roles that the steps need."""
@@ -208,7 +221,7 @@ class Procedure(catalog.Named, Sectioned):
 
     def moved(self) -> frozenset[Role]:
         """Return the roles whose robots are moved by steps."""
-        return frozenset().union(*(placed.step.moves() for placed in self.walk()))
+        return frozenset().union(*(step.moves() for step in self._steps() if isinstance(step, Moves)))
 
     @property
     def posts(self) -> tuple[Post, ...]:
@@ -221,17 +234,18 @@ class Procedure(catalog.Named, Sectioned):
 
     def with_record(self, duration_s: float) -> "Procedure":
         """Return this procedure with every recording `duration_s` long."""
-        steps = tuple(StepEntry(entry.kind, entry.step.with_record(duration_s)) for entry in self.steps)
+        steps = tuple(with_record(entry, duration_s) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
     def resolved(self, cast: Cast) -> "Procedure":
         """Return this procedure with the values that its steps leave to the robots filled in."""
-        steps = tuple(StepEntry(entry.kind, entry.step.resolved(cast)) for entry in self.steps)
+        steps = tuple(resolved(entry, cast) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
     def adjustments(self, cast: Cast) -> Iterator[str]:
         """Yield a sentence for each value of a step that `resolved` reduces."""
-        return (line for entry in self.steps for line in entry.step.adjustments(cast))
+        reducing = (step for step in self._steps() if isinstance(step, ReducesSettings))
+        return (line for step in reducing for line in step.adjustments(cast))
 
 
 @dataclass(frozen=True)
@@ -268,6 +282,8 @@ class PlacedStep:
         """
         is_simultaneous = self.runs_beside(other) or any(nest is other.step for nest in self.within)
         is_captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)
+        if not (isinstance(self.step, Listens) and isinstance(other.step, Listens)):
+            return None
         for mine, theirs in product(self.step.listens(), other.step.listens()):
             is_exclusive = not (mine.shared and theirs.shared)
             if is_simultaneous and is_exclusive and (mine.role, mine.port) == (theirs.role, theirs.port):
@@ -286,7 +302,8 @@ class PlacedStep:
 
 def _file_conflict(step: Step, name: str, files: Set[str]) -> str | None:
     """Return the reason why a step cannot have a file of this name, or None if it can."""
-    if laptop_files.is_reserved(name) and name not in step.laptop_files():
+    written = step.laptop_files() if isinstance(step, WritesOnLaptop) else ()
+    if laptop_files.is_reserved(name) and name not in written:
         return f"only the laptop writes a file {name}; give it another name"
     return f"there is already a file {name}; give it, or its step, another name" if name in files else None
 

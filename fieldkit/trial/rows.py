@@ -14,6 +14,7 @@ from fieldkit.core.events import NOTHING_ARRIVED
 from fieldkit.core.model import FIXED_ROLES, Role, sort_roles
 from fieldkit.core.text import encodable
 from fieldkit.steps.base import Step
+from fieldkit.steps.capabilities import Summarizes
 from fieldkit.steps.nest import Nest
 from fieldkit.trial import store
 from fieldkit.trial.columns import Row
@@ -82,11 +83,8 @@ def describe(plan: Plan, row: Row) -> str:
 def _step_numbers(step: Step, row: Row) -> Iterator[str]:
     """Return the most important numbers of a step, from the columns with its prefix."""
     prefix = step_prefixed(step.prefix, "")
-    return iter(
-        step.summary(
-            {column.removeprefix(prefix): value for column, value in row.items() if column.startswith(prefix)}
-        )
-    )
+    values = {column.removeprefix(prefix): value for column, value in row.items() if column.startswith(prefix)}
+    return step.summary(values) if isinstance(step, Summarizes) else iter(())
 
 
 def _with_step_name(name: str, parts: Iterable[str]) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from typing import Final
 
 from fieldkit.core.model import Role
+from fieldkit.steps.capabilities import ReservesSpace, UsesSpace
 from fieldkit.trial.plan import Plan
 
 SPARE: Final = 2.0
@@ -23,7 +24,8 @@ def evidence_bytes(plan: Plan, role: Role) -> int:
     if role not in plan.procedure.roles():
         return 0
     scene = plan.scenes()[0]
-    left_bytes = sum(placed.step.bytes_left(scene, role) for placed in plan.procedure.walk())
+    steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, UsesSpace))
+    left_bytes = sum(step.bytes_left(scene, role) for step in steps)
     return round((_TEXT_BYTES + left_bytes) * SPARE)
 
 
@@ -40,7 +42,8 @@ def fetch_s(plan: Plan) -> float:
 def reserve_bytes(plan: Plan, role: Role) -> int:
     """Return the number of bytes that must stay free on the robot in `role`."""
     scene = plan.scenes()[0]
-    return max(RESERVE_BYTES, *(placed.step.reserve_bytes(scene, role) for placed in plan.procedure.walk()))
+    steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, ReservesSpace))
+    return max((RESERVE_BYTES, *(step.reserve_bytes(scene, role) for step in steps)))
 
 
 def trial_bytes(plan: Plan) -> int:

@@ -11,6 +11,7 @@ from fieldkit.config.schema import Strict
 from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Role
+from fieldkit.steps.capabilities import Records
 from fieldkit.steps.kinds.ping import Payloads
 from fieldkit.trial.procedure import Procedure, load_procedure
 from sim_backends.cosim.scenario.schema import PhysicsOptions, PolicyChoice
@@ -144,7 +145,8 @@ def test_bags_of_two_robots_need_different_names() -> None:
     other = "\nsteps:\n  - record: {robot: relay, topics: [/scan], duration: 1s, name: NAME}"
     two = PROCEDURE.replace("\nsteps:", other.replace("NAME", "theirs"), 1)
     procedure = schema.validate(schema.parse(two, source="los.yaml"), Procedure)
-    assert {role for placed in procedure.walk() for role in placed.step.records_on()} == {Role.SENDER, Role.RELAY}
+    recorders = [placed.step for placed in procedure.walk() if isinstance(placed.step, Records)]
+    assert {role for step in recorders for role in step.records_on()} == {Role.SENDER, Role.RELAY}
     one = PROCEDURE.replace("\nsteps:", other.replace("NAME", "scan"), 1)
     with pytest.raises(ConfigurationError, match=r"there is already a file scan\.bag"):
         schema.validate(schema.parse(one, source="los.yaml"), Procedure)

@@ -29,6 +29,7 @@ from fieldkit.motion.steps.driving import DriveLease
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.ros.bags import recorded_topics
+from fieldkit.steps.capabilities import HasNeeds
 from fieldkit.steps.kinds import ask
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check.report import Report
@@ -111,7 +112,7 @@ def _judge_needs(data: bytes, _: Path) -> None:
     scene = replace(los_plan().scenes()[0], cast=demanding_cast)
     report, text = Report("robot"), data.decode(errors="replace")
     for placed in _demanding_procedure().walk():
-        for need in placed.step.needs(scene):
+        for need in placed.step.needs(scene) if isinstance(placed.step, HasNeeds) else ():
             for code in (0, 1, CommandResult.MISSING):
                 report.add(need.name, *need.judge(CommandResult(text, code)))
     assert all(finding.detail.isprintable() and finding.remedy.isprintable() for finding in report.findings)

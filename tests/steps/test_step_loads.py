@@ -15,6 +15,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.base import Step
+from fieldkit.steps.capabilities import SendsTraffic, Summarizes
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.view import View
 from fieldkit.trial.procedure import Procedure
@@ -111,7 +112,9 @@ def test_an_iperf3_inside_a_soak_has_another_port() -> None:
     ],
 )
 def test_number_of_frames_of_a_flow(keys: str, frames: float) -> None:
-    (flow,) = step_of(f"iperf3: {{from: sender, to: receiver, {keys}}}").flows(Scene(Protocol.UDP, CAST, "f"))
+    step = step_of(f"iperf3: {{from: sender, to: receiver, {keys}}}")
+    assert isinstance(step, SendsTraffic)
+    (flow,) = step.flows(Scene(Protocol.UDP, CAST, "f"))
     assert flow.port == 5201
     assert flow.frames == pytest.approx(frames)
 
@@ -136,6 +139,7 @@ def test_values_are_from_reports_of_sending_and_receiving_end(tmp_path: Path) ->
     assert not list(step.check(view))
     assert (measured.values["iperf3_sent_bytes"], measured.values["iperf3_received_bytes"]) == (751800, 704200)
     assert "captures" in measured.missing["iperf3_captured_bit_s"]
+    assert isinstance(step, Summarizes)
     assert list(step.summary(measured.values)) == ["iperf3 loss 6.2 %", "iperf3 1.87 Mbit/s"]
     declared = {column.name for column in step.output_columns()}
     assert measured.values.keys() | measured.missing.keys() == declared

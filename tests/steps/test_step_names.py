@@ -12,6 +12,7 @@ from fieldkit.core.model import FaultKind, Protocol, RepeatId, Role
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.base import Step
+from fieldkit.steps.nest import own_jobs
 from fieldkit.steps.view import View, capture_around
 from fieldkit.trial import gates, rows
 from fieldkit.trial.plan import Plan
@@ -69,7 +70,7 @@ def test_jobs_and_files_of_named_step_have_its_prefix() -> None:
     scene = plan.scene(REPEAT, "folder")
     for (kind, name), step in steps_by_name(plan).items():
         prefix = "" if name in {"", "scan"} else f"{name}."
-        jobs = [planned.job for planned in step.own_jobs(scene)]
+        jobs = [planned.job for planned in own_jobs(step, scene)]
         assert jobs
         files = {file for job in jobs for file in (job.log, job.stdout) if file}
         names = {job.name for job in jobs} | files

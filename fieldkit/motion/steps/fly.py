@@ -29,9 +29,17 @@ from fieldkit.motion.steps.link_need import link_need
 from fieldkit.motion.steps.mavlink import MavlinkStep
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.base import Step, StepEntry
-from fieldkit.steps.kinds import follow
+from fieldkit.steps.capabilities import (
+    ChecksPlacement,
+    DescribesActions,
+    HasNeeds,
+    HasRefusals,
+    Moves,
+    Summarizes,
+    UsesSpace,
+)
 from fieldkit.steps.legs import PathLeg
-from fieldkit.steps.nest import Nest
+from fieldkit.steps.nest import Nest, steps_inside
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
 from fieldkit.steps.view import View
 
@@ -78,7 +86,7 @@ class FlyLeg(PathLeg):
         return self.leg.away_m, self.leg.left_m, (self.up or 0.0) - (self.down or 0.0)
 
 
-class FlyStep(Nest):
+class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNeeds, UsesSpace, Summarizes):
     """Lets a drone take off, fly its path while the steps in `during` run, and land.
 
     See [MAVLink](mavlink.md#fly-in-a-procedure). Forward is where its nose points before take-off: place it with its
@@ -198,7 +206,6 @@ class FlyStep(Nest):
         name, then = scene.robot(self.robot).name, {"return": "returns", "land": "lands there"}[self.then]
         flight = f"climbs to {self.height:g} m, flies {path_m:g} m at {self.speed:g} m/s, and {then}"
         yield f"{name} {flight}; after an abort, for example by Ctrl-C, it {self._abort_action(scene)}"
-        yield from super().dry_run_notes(scene)
 
     def _abort_action(self, scene: Scene) -> str:
         return {"return": "returns automatically", "land": "lands"}[abort_of(scene, self.robot)]
@@ -208,7 +215,6 @@ class FlyStep(Nest):
         takes = format_duration(self._descent_s + _SLACK_S)
         note = f"if it is in the air: this takes up to about {takes}, also after fieldkit has exited"
         yield f"{scene.robot(self.robot).name} {self._abort_action(scene)}, {note}"
-        yield from super().abort_notes(scene)
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
@@ -237,7 +243,6 @@ class FlyStep(Nest):
             why = f"its top speed is {limits.max_speed_m_s:g} m/s, but the flight needs {speed_m_s:g} m/s"
             remedy = "reduce the speed in the procedure; the limit is limits.max_speed_m_s in its profile"
             yield Refusal(self.robot, why, remedy)
-        yield from super().refusals(scene)
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:
@@ -346,7 +351,7 @@ class FlyStep(Nest):
             window=view.attempt_window(self.robot),
         )
         reasons = [damage] if damage else list(fly_checks.contradictions(log, plan))
-        for step in (*view.within, *follow.steps_inside(self)):
+        for step in (*view.within, *steps_inside(self)):
             if isinstance(step, MavlinkStep) and step.robot == self.robot and not reasons:
                 reasons += filter(None, (fly_checks.telemetry_contradiction(log, step.places_m(view)),))
         yield from (f"{self._log}: {why}" for why in reasons)

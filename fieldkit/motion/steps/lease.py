@@ -19,7 +19,7 @@ from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.nest import Nest
+from fieldkit.steps.nest import Nest, end_inside
 from fieldkit.steps.scene import Announce, Scene
 
 _POLL_S: Final = 0.25
@@ -189,7 +189,7 @@ def run_inside(nest: Nest, keeper: LeaseKeeper, scene: Scene, testbed: Testbed, 
     def end() -> None:
         inner.halt.set()
         with suppress(FieldkitError):  # it is called again at the next renewal
-            nest.end_inside(inner, testbed)
+            end_inside(nest, inner, testbed)
 
     with keeper.run_while_leased(end):
         for entry in nest.during:

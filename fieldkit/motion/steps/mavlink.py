@@ -27,6 +27,7 @@ from fieldkit.remote import agent
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import agent_commands
 from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.capabilities import ChecksPlacement, HasNeeds, SendsTraffic, Summarizes, UsesSpace, WritesOnLaptop
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Scene
@@ -69,7 +70,7 @@ def _is_message(name: str) -> str:
     return name
 
 
-class MavlinkStep(Nest):
+class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, WritesOnLaptop, Summarizes):
     """Records the telemetry of a robot's autopilot while the steps in `during` run.
 
     That is position, speed, attitude, battery and losses; see [MAVLink](mavlink.md#record-telemetry), also for

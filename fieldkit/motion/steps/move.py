@@ -20,6 +20,17 @@ from fieldkit.motion.steps import driving
 from fieldkit.motion.steps.lease import run_inside
 from fieldkit.ros.streams import stream_options
 from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.capabilities import (
+    AsksOperator,
+    ChecksPlacement,
+    DescribesActions,
+    HasNeeds,
+    HasRefusals,
+    Moves,
+    ReducesSettings,
+    Summarizes,
+    UsesSpace,
+)
 from fieldkit.steps.legs import PathLeg
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
@@ -31,7 +42,18 @@ _FENCE_MARGIN_M: Final = 0.5
 """Distance between the fence and the end of a shortened path, because the robot may overshoot."""
 
 
-class MoveStep(Nest):
+class MoveStep(
+    Nest,
+    DescribesActions,
+    Moves,
+    AsksOperator,
+    ReducesSettings,
+    ChecksPlacement,
+    HasRefusals,
+    HasNeeds,
+    UsesSpace,
+    Summarizes,
+):
     """Moves a robot while the steps in `during` run; afterwards the robot is at its place again.
 
     So all repeats start from the same place. At the end of its path the robot stops and waits. Robots of a lab move
@@ -89,7 +111,6 @@ class MoveStep(Nest):
             if permitted != requested:
                 permitted_text, requested_text = geometry.describe_move(permitted), geometry.describe_move(requested)
                 yield f"{cast[self.robot].name} moves {permitted_text}; {requested_text} is beyond its limits"
-        yield from super().adjustments(cast)
 
     @property
     def motion(self) -> model.Move:
@@ -144,13 +165,11 @@ class MoveStep(Nest):
             )
         duration = f"for up to {round(self.path_s(robot), 1):g} s"
         yield f"{robot.name} moves {geometry.describe_move(self.motion)}, {duration}{driving_note}"
-        yield from super().dry_run_notes(scene)
 
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:
         if drives(scene.robot(self.robot)):
             yield f"{scene.robot(self.robot).name} stops where it is"
-        yield from super().abort_notes(scene)
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
@@ -166,7 +185,6 @@ class MoveStep(Nest):
             )
         if drives(robot):
             yield from driving.refusals(scene, self.motion)
-        yield from super().refusals(scene)
 
     @override
     def bytes_left(self, scene: Scene, role: Role) -> float:

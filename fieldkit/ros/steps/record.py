@@ -22,6 +22,15 @@ from fieldkit.ros.bags import recorded_topics
 from fieldkit.ros.steps import ros_master
 from fieldkit.steps import variants
 from fieldkit.steps.base import Step, StepName
+from fieldkit.steps.capabilities import (
+    HasNeeds,
+    HasRefusals,
+    Records,
+    ReservesSpace,
+    Subscribes,
+    Summarizes,
+    UsesSpace,
+)
 from fieldkit.steps.scene import (
     BY_ITSELF,
     BY_LIMIT,
@@ -69,7 +78,7 @@ SUBSCRIBED: Final = "log:Subscribed to topic"
 """Line of `ros2 bag record` when it starts to record. Its start takes seconds, which must not count."""
 
 
-class RecordStep(Step):
+class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, Records, Summarizes):
     """Records a ROS bag, by the record command of the robot's profile.
 
     A robot may record several bags of different names, one after the other; a `transfer` then names its `file`.

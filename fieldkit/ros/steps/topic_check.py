@@ -16,6 +16,7 @@ from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Shell
 from fieldkit.ros.bags import bag
 from fieldkit.ros.steps.record import RecordStep
+from fieldkit.steps.capabilities import Subscribes
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.check import software
 from fieldkit.trial.check.report import Report
@@ -86,7 +87,8 @@ def _check_battery(path: Path, topic: str, report: Report) -> None:
 
 def recorded(plan: Plan, role: Role) -> tuple[str, ...]:
     """Return the topics that the procedure requires to be published on the robot in `role`."""
-    topics = (topic for placed in plan.procedure.walk() for topic in placed.step.live_topics(role))
+    steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, Subscribes))
+    topics = (topic for step in steps for topic in step.live_topics(role))
     return tuple(dict.fromkeys(topics))
 
 

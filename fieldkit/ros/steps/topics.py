@@ -20,6 +20,7 @@ from fieldkit.ros.streams import topic_checks
 from fieldkit.ros.streams.stream_options import LONGEST_S, StreamOptions
 from fieldkit.steps import agent_commands
 from fieldkit.steps.along import AlongStep
+from fieldkit.steps.capabilities import HasNeeds, Listens, Prepares, SendsTraffic, Summarizes, UsesSpace
 from fieldkit.steps.scene import (
     BY_FIELDKIT,
     BY_ITSELF,
@@ -63,7 +64,7 @@ _ENVELOPE_BYTES: Final = 100
 """Approximate size of the headers of middleware and IP per sample."""
 
 
-class TopicsStep(StreamOptions, AlongStep):
+class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Streams samples of a topic from one robot to another over a middleware.
 
     The program is part of fieldkit; both robots need the middleware for Python. See [topics](topics.md), also for the

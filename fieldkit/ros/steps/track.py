@@ -20,6 +20,15 @@ from fieldkit.measure.positions.position_sources import Account, Accounts
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.ros.steps.record import SUBSCRIBE_S, RecordStep
 from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.capabilities import (
+    ChecksPlacement,
+    HasNeeds,
+    HasRefusals,
+    ReservesSpace,
+    Subscribes,
+    UsesSpace,
+    WritesOnLaptop,
+)
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, Scene
@@ -106,7 +115,7 @@ class TrackedRobot(Strict):
         return self
 
 
-class TrackStep(Nest):
+class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, WritesOnLaptop):
     """Records the position of each robot on that robot, with its profile's record command, while inner steps run.
 
     The distance and speed columns of the transfers and pings inside use these positions
@@ -219,7 +228,6 @@ class TrackStep(Nest):
             if kinds.get(recorder.topics[0]) == ODOMETRY and self.robots[role].facing is None:
                 what = "its odometry needs its direction at the start of the step"
                 yield Refusal(role, what, "write facing: away, towards, left or right, in the step track")
-        yield from super().refusals(scene)
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:

@@ -21,6 +21,7 @@ from fieldkit.core.model import Protocol
 from fieldkit.core.prompts import UNKNOWN, Question
 from fieldkit.measure.evidence import reading
 from fieldkit.steps.base import Step, StepName
+from fieldkit.steps.capabilities import AsksOperator, DescribesActions, Summarizes, WritesOnLaptop
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
 
@@ -40,7 +41,7 @@ def _can_be_chosen(word: str) -> str:
 _Word = Annotated[str, AfterValidator(_can_be_chosen)]
 
 
-class AskStep(Step):
+class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
     """Asks the operator for a number or for one of several words, which becomes a column.
 
     The answer `-` means unknown: the column is then empty. It is also empty if no operator is asked (`--yes`) and

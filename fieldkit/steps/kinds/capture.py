@@ -26,8 +26,10 @@ from fieldkit.measure.transfers import altered_packets
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import StepEntry
-from fieldkit.steps.nest import Nest
+from fieldkit.steps import capabilities
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.capabilities import HasNeeds, UsesSpace
+from fieldkit.steps.nest import Nest, flows_inside, steps_inside
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, CommandResult, Flow, Need, Planned, Scene
 from fieldkit.steps.variants import Tool
 from fieldkit.steps.view import View
@@ -54,7 +56,7 @@ STAMP_NS: Final = 1_000
 """Resolution of time stamps: tcpdump truncates them to microseconds."""
 
 
-class CaptureStep(Nest):
+class CaptureStep(Nest, HasNeeds, UsesSpace):
     """Runs tcpdump on each robot, from before the steps in `during` begin until they have ended.
 
     The filter accepts the ports of the steps inside, ICMP, and every later IP fragment between their ends (a port
@@ -130,20 +132,24 @@ class CaptureStep(Nest):
 
     @property
     def _snap_bytes(self) -> int:
-        return max(SNAP_BYTES, self.kept_bytes_inside())
+        return max(SNAP_BYTES, *(step.kept_bytes for step in steps_inside(self)))
 
     @property
     def _buffer_kib(self) -> int:
-        return max(BUFFER_KIB, *(step.capture_buffer_kib for step in self.leaves_inside()))
+        return max(BUFFER_KIB, *(step.capture_buffer_kib for step in self._leaves()))
 
     @property
     def _needs_all_packets(self) -> bool:
         """Whether a packet dropped before tcpdump falsifies a measurement of a step inside."""
-        return any(step.needs_complete_capture for step in self.leaves_inside())
+        return any(step.needs_complete_capture for step in self._leaves())
+
+    def _leaves(self) -> Iterator[Step]:
+        """Yield the steps inside, at any depth, that contain no steps."""
+        return (step for step in steps_inside(self) if not isinstance(step, Nest))
 
     def _filter(self, scene: Scene) -> str:
         """Return the capture filter (pcap-filter(7))."""
-        flows = list(self.flows_inside(scene)) or [Flow(Role.SENDER, Role.RECEIVER)]
+        flows = list(flows_inside(self, scene)) or [Flow(Role.SENDER, Role.RECEIVER)]
         pairs = dict.fromkeys(frozenset({flow.source, flow.destination}) for flow in flows)
         hosts = [" and ".join(f"host {scene.robot(role).address}" for role in sort_roles(pair)) for pair in pairs]
         groups = {(flow.group, role) for flow in flows if flow.group for role in (flow.source, flow.destination)}
@@ -169,7 +175,7 @@ class CaptureStep(Nest):
     def bytes_left(self, scene: Scene, role: Role) -> float:
         if role not in self.robots:
             return 0.0
-        return (self._snap_bytes + _RECORD_BYTES) * sum(flow.frames for flow in self.flows_inside(scene))
+        return (self._snap_bytes + _RECORD_BYTES) * sum(flow.frames for flow in flows_inside(self, scene))
 
     @override
     def captures(self) -> Mapping[Role, str]:
@@ -188,7 +194,7 @@ class CaptureStep(Nest):
         prepared: list[Callable[[Announce], None]] = []
 
         def prepare() -> None:
-            prepared.append(first.prepare(scene, testbed))
+            prepared.append(capabilities.prepare(first, scene, testbed))
 
         starts: list[Callable[[], None]] = [
             partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures

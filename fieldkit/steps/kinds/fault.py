@@ -27,8 +27,9 @@ from fieldkit.measure.transfers.recoveries import FaultTimes
 from fieldkit.remote import jobs
 from fieldkit.steps import across, clocks
 from fieldkit.steps.base import StepEntry
+from fieldkit.steps.capabilities import AsksOperator, DescribesActions, Restarts, Summarizes
 from fieldkit.steps.kinds.observer import HEALED_S, Observer, observed_from
-from fieldkit.steps.nest import Nest
+from fieldkit.steps.nest import Nest, end_inside
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
 
@@ -44,7 +45,7 @@ _CLOCK_S: Final = 5.0
 _LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 
 
-class FaultStep(Nest):
+class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     """Causes a fault of a robot while the steps in `during` run; their losses are a result, not an error.
 
     A backend that can cause the fault does (on a lab's robots it is real). In the field the operator is asked to
@@ -123,7 +124,6 @@ class FaultStep(Nest):
         lasts = f" for {self.lasts:g} s" if self.lasts else ""
         what = f" of the process {self.process}" if self.process else ""
         yield f"{self.kind}{what} of {scene.robot(self.robot).name}{lasts}, after {self.after:g} s"
-        yield from super().dry_run_notes(scene)
 
     def _observer(self, scene: Scene) -> Observer:
         return Observer(scene, self.cause, self.prefix)
@@ -158,7 +158,7 @@ class FaultStep(Nest):
         except Exception:
             inner.halt.set()
             with suppress(FieldkitError):
-                self.end_inside(scene, testbed)
+                end_inside(self, scene, testbed)
             wait([steps])
             raise
         finally:
@@ -220,7 +220,7 @@ class FaultStep(Nest):
         except (RobotError, LinkError) as error:
             if error.ends_trial:
                 raise
-            self.end_inside(scene, testbed)
+            end_inside(self, scene, testbed)
 
     @override
     def roles(self) -> frozenset[Role]:

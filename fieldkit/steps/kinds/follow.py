@@ -17,8 +17,8 @@ from fieldkit.measure.positions.samples import PLACED
 from fieldkit.measure.robot_clock import Exchange, Offset, offset
 from fieldkit.remote import jobs
 from fieldkit.steps import clocks
-from fieldkit.steps.base import Step
-from fieldkit.steps.nest import Nest
+from fieldkit.steps.capabilities import Moves
+from fieldkit.steps.nest import Nest, steps_inside
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
 
@@ -108,17 +108,9 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
 def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, Account]:
     """Return the fixed positions of the robots that stay where they were placed while the steps inside run."""
     leads = (step for step in steps_inside(nest) if isinstance(step, Nest) and step.leads)
-    moving = frozenset[Role]().union(*(step.moves() for step in leads))
+    moving = frozenset[Role]().union(*(step.moves() for step in leads if isinstance(step, Moves)))
     places_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moving}
     return {role: Account(place=places_m[role]) for role in nest.roles() if role in places_m}
-
-
-def steps_inside(nest: Nest) -> Iterator[Step]:
-    """Yield the steps inside `nest`, at any depth."""
-    for entry in nest.during:
-        yield entry.step
-        if isinstance(entry.step, Nest):
-            yield from steps_inside(entry.step)
 
 
 def placement_error(what: str, within: Sequence[Nest]) -> str | None:

@@ -28,6 +28,7 @@ from fieldkit.measure.transfers.iperf3_load import LoadFlow, LoadStreams
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.along import AlongStep
+from fieldkit.steps.capabilities import Listens, Prepares, SendsTraffic, Summarizes, UsesSpace
 from fieldkit.steps.loads import PROGRAM, LoadOptions
 from fieldkit.steps.scene import Announce, Flow, ListeningPort, Planned, Scene
 from fieldkit.steps.view import View
@@ -44,7 +45,7 @@ _INTERVAL_BYTES: Final = 600
 _STALLS: Final = stalls.declare_columns("iperf3", "iperf3", 67)
 
 
-class Iperf3Step(LoadOptions, AlongStep):
+class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Measures with iperf3, 3.1 or later, which both robots need: `sudo apt-get install iperf3`.
 
     The server ends with the test. Leaves `ROLE-iperf3.json`, the reports of both ends second by second. Inside a

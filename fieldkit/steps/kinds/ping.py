@@ -25,6 +25,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
 from fieldkit.steps.along import AlongStep
+from fieldkit.steps.capabilities import HasNeeds, HasRefusals, Pings, SendsTraffic, Summarizes
 from fieldkit.steps.scene import Announce, Flow, Need, Pinging, Planned, Refusal, Scene, fragments
 from fieldkit.steps.variants import PingTool, Tool
 from fieldkit.steps.view import View
@@ -63,7 +64,7 @@ class Payloads(Strict):
         return {"tcp": data, "udp": data} if isinstance(data, int) and not isinstance(data, bool) else data
 
 
-class PingStep(AlongStep):
+class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes):
     """Measures round-trip times with ping. Leaves `ping.txt`.
 
     Attributes:

@@ -20,6 +20,7 @@ from fieldkit.remote import jobs, programs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import arguments
 from fieldkit.steps.base import FileName, Step
+from fieldkit.steps.capabilities import Summarizes, UsesSpace
 from fieldkit.steps.scene import Announce, Planned, PutProgram, Scene
 from fieldkit.steps.view import View
 
@@ -133,7 +134,7 @@ class Expected(Strict):
     values: dict[str, Bounds] = Field(default_factory=dict)
 
 
-class RunStep(Step):
+class RunStep(Step, UsesSpace, Summarizes):
     """Runs a program on a robot, keeps its output, and reads columns from the output.
 
     The program is found in the PATH of a session without a terminal, or by its absolute path; it runs in the folder

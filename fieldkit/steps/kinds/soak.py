@@ -17,6 +17,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import across
 from fieldkit.steps.base import StepEntry
+from fieldkit.steps.capabilities import Listens, SendsTraffic
 from fieldkit.steps.loads import PROGRAM, LoadOptions
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, ListeningPort, Planned, Scene
@@ -39,7 +40,7 @@ _FLOWS: Final = (
 )
 
 
-class SoakStep(LoadOptions, Nest):
+class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
     """Loads the radio while the steps in `during` run: iperf3 sends until the last of them has ended.
 
     Of the load only [stalls](method-delay.md#stalls-of-a-flow) are measured. Its robots need iperf3, 3.1 or later. A

@@ -14,8 +14,10 @@ from fieldkit.config.schema import Field
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol
 from fieldkit.core.threads import run_parallel
+from fieldkit.steps import capabilities
 from fieldkit.steps.base import Step, StepEntry
-from fieldkit.steps.nest import Nest
+from fieldkit.steps.capabilities import AsksOperator, DescribesActions, Prepares
+from fieldkit.steps.nest import Nest, end_inside
 from fieldkit.steps.scene import Announce, Planned, Scene
 
 T = TypeVar("T")
@@ -24,7 +26,7 @@ MAX_PARALLEL: Final = 8
 """OpenSSH permits 10 simultaneous commands per connection (MaxSessions); two are reserved."""
 
 
-class TogetherStep(Nest):
+class TogetherStep(Nest, Prepares, DescribesActions):
     """Runs its steps at the same time: all listeners are up before the first step begins.
 
     It ends when the last of them ends. The first that fails ends the others, a `wait` too. For a sequence within it,
@@ -59,13 +61,12 @@ class TogetherStep(Nest):
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         names = (f"{entry.kind} {entry.step.prefix}".rstrip() for entry in self.during)
         yield f"at the same time: {', '.join(names)}"
-        yield from super().dry_run_notes(scene)
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         inner = replace(scene, halt=scene.halt.child())
         prepared = self._run_all(
-            [partial(entry.step.prepare, inner, testbed) for entry in self.during], inner, testbed
+            [partial(capabilities.prepare, entry.step, inner, testbed) for entry in self.during], inner, testbed
         )
 
         def carry_out(announce: Announce) -> None:
@@ -83,7 +84,7 @@ class TogetherStep(Nest):
         def end() -> None:
             scene.halt.set()
             with suppress(FieldkitError):  # the first error is reported
-                self.end_inside(scene, testbed)
+                end_inside(self, scene, testbed)
 
         try:
             return run_parallel(lambda call: call(), calls, end_others=end)
@@ -107,7 +108,7 @@ def _operator_steps(nest: Nest) -> Iterator[tuple[str, schema.Location]]:
     """Yield kind and location of each step inside, at any depth, that may prompt the operator."""
     for index, entry in enumerate(nest.during):
         location = ("during", index, entry.kind)
-        if entry.step.may_prompt():
+        if isinstance(entry.step, AsksOperator) and entry.step.may_prompt():
             yield entry.kind, location
         if isinstance(entry.step, Nest):
             yield from ((kind, (*location, *inside)) for kind, inside in _operator_steps(entry.step))

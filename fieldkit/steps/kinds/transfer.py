@@ -28,7 +28,19 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job, Pending
 from fieldkit.steps import netcat
 from fieldkit.steps.base import FileName, Step
-from fieldkit.steps.nest import Nest
+from fieldkit.steps.capabilities import (
+    ChecksPlacement,
+    HasRefusals,
+    Listens,
+    Prepares,
+    Records,
+    SendsFile,
+    SendsTraffic,
+    Summarizes,
+    UsesSpace,
+    WritesOnLaptop,
+)
+from fieldkit.steps.nest import Nest, flows_inside
 from fieldkit.steps.scene import (
     BY_ITSELF_OR_LIMIT,
     Announce,
@@ -59,7 +71,18 @@ MAX_LATE_SHARE: Final = 0.1
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
 
 
-class TransferStep(Step):
+class TransferStep(
+    Step,
+    Prepares,
+    ChecksPlacement,
+    HasRefusals,
+    UsesSpace,
+    Listens,
+    SendsTraffic,
+    SendsFile,
+    WritesOnLaptop,
+    Summarizes,
+):
     """Sends a file with netcat, by the protocol of the repeat.
 
     The receiver runs `nc -l -p PORT > recv.bag`, the sender `nc ADDRESS PORT < scan.bag`, with the options of the
@@ -97,7 +120,7 @@ class TransferStep(Step):
 
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
-        recorders = [step for step in earlier if self.sender in step.records_on()]
+        recorders = [step for step in earlier if isinstance(step, Records) and self.sender in step.records_on()]
         what = f"the transfer from {self.sender} {f'sends {self.file}' if self.file else 'names no file'}"
         if not recorders:
             return f"{what}, but no step before it records on {self.sender}"
@@ -336,7 +359,7 @@ class TransferStep(Step):
     def _shares_port(self, view: View) -> bool:
         """Return True if another flow in the same capture uses its port, also in the reverse direction."""
         captures = (nest for nest in reversed(view.within) if nest.captures())
-        flows = next((list(nest.flows_inside(view.scene)) for nest in captures), [])
+        flows = next((list(flows_inside(nest, view.scene)) for nest in captures), [])
         return sum(flow.port == self.port for flow in flows) > 1
 
     def _shares_udp_counters(self, scene: Scene) -> bool:

@@ -11,10 +11,11 @@ from fieldkit.config.schema import Duration, Field
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol
 from fieldkit.steps.along import AlongStep
+from fieldkit.steps.capabilities import AsksOperator, DescribesActions
 from fieldkit.steps.scene import Announce, Planned, Scene
 
 
-class WaitStep(AlongStep):
+class WaitStep(AlongStep, DescribesActions, AsksOperator):
     """Waits for a time, or until the operator has done something and pressed Enter.
 
     With `--yes` no operator is asked.

@@ -14,6 +14,7 @@ from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
+from fieldkit.steps.capabilities import HasNeeds
 from fieldkit.steps.scene import CommandResult, Need, Planned
 from fieldkit.steps.variants import Tool, Variants
 from fieldkit.trial import session_jobs
@@ -166,5 +167,6 @@ def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
 def needs_of(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:
     """Return the needs of steps on the robot without duplicates: those checked by the probe, or by the agent."""
     scene = plan.scenes()[0]
-    needs = (need for placed in plan.procedure.walk() for need in placed.step.needs(scene) if need.role is role)
+    steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, HasNeeds))
+    needs = (need for step in steps for need in step.needs(scene) if need.role is role)
     return tuple({need.name: need for need in needs if need.agent == by_agent}.values())

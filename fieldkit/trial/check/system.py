@@ -8,6 +8,7 @@ from fieldkit.core import files
 from fieldkit.core.model import Role
 from fieldkit.core.units import format_bytes, format_duration
 from fieldkit.remote.command import quote
+from fieldkit.steps.capabilities import SendsTraffic
 from fieldkit.trial import size
 from fieldkit.trial.check.probe import NOTHING, Sections
 from fieldkit.trial.check.report import Report, UserTools
@@ -32,7 +33,8 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
     report.ok("system", sections.get("system", NOTHING).text)
     _judge_disk(plan, role, sections, report)
     scene = plan.scenes()[0]
-    flows = (flow for placed in plan.procedure.walk() for flow in placed.step.flows(scene) if not flow.served)
+    steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, SendsTraffic))
+    flows = (flow for step in steps for flow in step.flows(scene) if not flow.served)
     for port in dict.fromkeys(flow.port for flow in flows if flow.destination is role and flow.port is not None):
         _judge_port(port, sections, report)
     for battery in _BATTERY.finditer(sections.get("batteries", NOTHING).text):

@@ -13,8 +13,8 @@ from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
+from fieldkit.steps import capabilities
 from fieldkit.steps.kinds.capture import CaptureStep
-from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.scene import Announce, Scene
 from tests.helpers.casts import CAST, los_plan
 from tests.helpers.idle_testbed import IdleTestbed
@@ -45,7 +45,7 @@ def run(home: Path, patch: pytest.MonkeyPatch, prepare: Callable[[], None], barr
 
     patch.setattr(jobs, "start", start)
     patch.setattr(jobs, "stop", stop)
-    patch.setattr(PingStep, "prepare", prepared)
+    patch.setattr(capabilities, "prepare", prepared)
     step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
     shells = {role: LocalShell(home, robot=role) for role in step.robots}
     try:
@@ -79,7 +79,7 @@ def test_step_inside_waits_for_captures_with_sudo(tmp_path: Path, monkeypatch: p
     slow = CAST[Role.SENDER].model_copy(update={"profile": profile.model_copy(update={"tools": tools})})
     monkeypatch.setattr(jobs, "start", start)
     monkeypatch.setattr(jobs, "stop", lambda *_, **__: 0)
-    monkeypatch.setattr(PingStep, "prepare", prepared)
+    monkeypatch.setattr(capabilities, "prepare", prepared)
     step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
     shells = {role: LocalShell(tmp_path, robot=role) for role in step.robots}
     step.run(Scene(Protocol.TCP, CAST | {Role.SENDER: slow}, "f"), IdleTestbed(shells), lambda *_: None)

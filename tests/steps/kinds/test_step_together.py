@@ -172,7 +172,7 @@ def test_started_listener_is_stopped_if_another_step_is_not_ready(robots: IdleTe
     receiver = robots.shells[Role.RECEIVER]
 
     class Unready(CommandStep):
-        def prepare(self, scene: Scene, testbed: IdleTestbed) -> Callable[[Announce], None]:  # type: ignore[override]
+        def prepare(self, scene: Scene, testbed: IdleTestbed) -> Callable[[Announce], None]:
             wait_until(lambda: bool(jobs.list_running(receiver, Deadline.after(30))), Deadline.after(30))
             raise RobotError("it is not ready")
 

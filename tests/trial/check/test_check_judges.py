@@ -13,6 +13,7 @@ from fieldkit.config import schema
 from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
 from fieldkit.measure.robot_clock import Offset
+from fieldkit.steps.nest import with_record
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial import size
 from fieldkit.trial.check import contact, radio, software, system
@@ -206,7 +207,7 @@ def test_evidence_that_takes_long_to_fetch_is_a_warning_with_size_and_rate(tmp_p
     system.judge_laptop(PLAN, tmp_path, report)
     assert "fetch" not in {finding.check for finding in report.findings}
     (entry, *others) = PLAN.procedure.steps
-    long = type(entry)(entry.kind, entry.step.with_record(36_000.0))
+    long = with_record(entry, 36_000.0)
     procedure = PLAN.procedure.model_copy(update={"steps": (long, *others)})
     system.judge_laptop(PLAN.model_copy(update={"procedure": procedure}), tmp_path, report)
     finding = only(report.findings, "fetch")

@@ -1,0 +1,93 @@
+"""Capabilities of steps: found by the methods that a class defines, also without deriving from them."""
+
+import inspect
+import re
+from collections.abc import Iterator
+from functools import partial
+
+import pytest
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.core.model import Protocol
+from fieldkit.ros.steps.record import RecordStep
+from fieldkit.steps import capabilities
+from fieldkit.steps.base import Step, step_types
+from fieldkit.steps.capabilities import CAPABILITIES, HasNeeds, Listens, Prepares, Records, Restarts
+from fieldkit.steps.kinds.send import SendStep
+from fieldkit.steps.kinds.transfer import TransferStep
+from fieldkit.steps.kinds.wait import WaitStep
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import Need, RecordedFile, Scene
+from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.paths import ROOT
+
+MAX_METHODS = 12
+PAGE = ROOT / "docs/add-a-procedure.md"
+
+
+class Outside(Step):
+    """A kind of another package that derives from no capability."""
+
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        return iter(())
+
+
+class Partial(Step):
+    """A kind that defines only a part of a capability."""
+
+    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
+        return iter(())
+
+
+def public_methods(cls: type) -> list[str]:
+    return [name for name, value in vars(cls).items() if not name.startswith("_") and is_method(value)]
+
+
+def is_method(value: object) -> bool:
+    return inspect.isfunction(value) or isinstance(value, classmethod | property)
+
+
+@pytest.mark.parametrize("cls", [Step, Nest, *CAPABILITIES], ids=lambda cls: cls.__name__)
+def test_contract_is_small(cls: type) -> None:
+    assert len(public_methods(cls)) <= MAX_METHODS
+
+
+def test_methods_of_capabilities_are_not_in_the_contract_and_in_one_capability() -> None:
+    methods = [name for capability in CAPABILITIES for name in public_methods(capability)]
+    assert len(set(methods)) == len(methods)
+    assert not set(methods) & set(public_methods(Step))
+
+
+def test_step_that_defines_the_methods_has_the_capability() -> None:
+    step = Outside()
+    assert isinstance(step, HasNeeds)
+    assert not isinstance(step, Listens | Restarts | Records)
+
+
+def test_derived_kind_has_the_capabilities_of_its_base_only() -> None:
+    """A step class that derives from a capability is no capability."""
+    assert issubclass(SendStep, Listens | Prepares)
+    assert not issubclass(Outside, TransferStep)
+    assert not issubclass(RecordStep, TransferStep)
+
+
+def test_kind_that_has_a_part_of_a_capability_lacks_its_other_methods() -> None:
+    assert capabilities.missing_methods(Partial) == ("records_on", "with_record")
+    assert not isinstance(Partial(), Records)
+    assert not capabilities.missing_methods(Outside)
+    for kind in step_types().values():
+        assert capabilities.missing_methods(kind) == ()
+
+
+def test_step_without_listener_is_run_when_it_has_been_prepared() -> None:
+    step, scene = WaitStep.model_validate({"duration": "1s"}), Scene(Protocol.TCP, {}, "f")
+    started = capabilities.prepare(step, scene, testbed := IdleTestbed({}))
+    assert isinstance(started, partial)
+    assert (started.func, started.args) == (step.run, (scene, testbed))
+
+
+def test_page_lists_each_capability_with_its_methods() -> None:
+    """The rows are in the order of the module."""
+    text = PAGE.read_text(encoding="utf-8").partition("| capability |")[2].partition("\n\n")[0]
+    assert re.findall(r"`([A-Z]\w+)`", text) == [capability.__name__ for capability in CAPABILITIES]
+    assert re.findall(r"`([a-z]\w+)`", text) == [name for cls in CAPABILITIES for name in public_methods(cls)]
