@@ -62,7 +62,7 @@ class PhysicsFederate(Protocol):
     """Moves the agents.
 
     Attributes:
-        step_ns: Its step; its states are those at whole steps.
+        step_ns: Time step; there are states at whole steps only.
         limits_m_s2: Largest change of each agent's velocity per second, in m/s^2. The mapping is read once; its
             values may change during the run.
     """
@@ -88,16 +88,16 @@ def check_physics(physics: object) -> None:
         ConfigurationError: It lacks an attribute or method; the message names it.
     """
     step_ns = getattr(physics, "step_ns", None)
-    lacks = ""
+    missing = ""
     if not isinstance(step_ns, int) or isinstance(step_ns, bool) or step_ns <= 0:
-        lacks = f"no step_ns, an integer above 0 (it is {step_ns!r})"
+        missing = f"no step_ns, an integer above 0 (it is {step_ns!r})"
     elif not isinstance(getattr(physics, "limits_m_s2", None), Mapping):
-        lacks = "no limits_m_s2, a mapping from each agent to a number"
+        missing = "no limits_m_s2, a mapping from each agent to a number"
     elif not callable(getattr(physics, "advance", None)):
-        lacks = "no method advance(to_ns, commands)"
-    if lacks:
+        missing = "no method advance(to_ns, commands)"
+    if missing:
         raise ConfigurationError(
-            f"the physics {type(physics).__name__} has {lacks}",
+            f"the physics {type(physics).__name__} has {missing}",
             remedy="see what a physics class needs: fieldkit docs cosim-api",
         )
 
@@ -146,7 +146,7 @@ class NetworkFederate(Protocol):
 
 @dataclass(frozen=True)
 class Action:
-    """What a program does when it wakes.
+    """The output of a program when it wakes.
 
     Attributes:
         datagrams: Datagrams that it sends.
@@ -161,7 +161,7 @@ class Program(Protocol):
     """Software of one agent: it reads the agent's state, receives datagrams, sends, and steers."""
 
     def next_wake_ns(self) -> int | None:
-        """Return when its timer wakes it next, or None if only a datagram does; waking alone changes this time."""
+        """Return the time when its timer wakes it next, or None without a timer; only a wake changes this time."""
         ...
 
     def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:

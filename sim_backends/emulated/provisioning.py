@@ -125,7 +125,7 @@ def neighbour(number: int, profile: RobotProfile) -> Neighbour:
     A profile whose body is not in the table has the body of the paper's robot of its kind.
     """
     from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER  # noqa: PLC0415 (numpy takes 60 ms)
-    from sim_backends.physics.known import BODIES, quadrotor  # noqa: PLC0415
+    from sim_backends.physics.robot_limits import BODIES, quadrotor  # noqa: PLC0415
 
     default = quadrotor(profile.name) if profile.kind == "uav" else TURTLEBOT3_BURGER
     body = BODIES.get(profile.name, default)

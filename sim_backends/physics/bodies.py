@@ -30,7 +30,7 @@ class Collision:
     Attributes:
         at_ns: Its time.
         body: The moving body.
-        obstacle: What it touched: an obstacle, another body, or the ground.
+        obstacle: Name of the obstacle or body that it touched, or of the ground.
     """
 
     at_ns: int
@@ -231,7 +231,7 @@ class Bodies:
                 if overlaps(footprint, body, place_m):
                     raise ConfigurationError(
                         f"{name} starts within {footprint.name}, at {_metres(place_m)} m",
-                        remedy=f"start it at least {body.radius_m:g} m away from everything",
+                        remedy=f"start it at least {body.radius_m:g} m away from obstacles and other bodies",
                     )
             grid.add(number, place_m)
 

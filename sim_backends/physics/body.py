@@ -114,7 +114,7 @@ class Body(Protocol[PoseT]):
         ...
 
     def course(self, pose: PoseT, command: object, step_s: float) -> Course[PoseT]:
-        """Return its course from a pose under a command; None if it has not received a command.
+        """Return its course from a pose under a command, which is None before the first command.
 
         Raises:
             ConfigurationError: The command does not suit the body.

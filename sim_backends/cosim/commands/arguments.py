@@ -15,21 +15,21 @@ _TABLES: Final = ("1", "2", "3", "emane", "claims")
 def add(parser: Parser) -> None:
     """Declare the commands of `fieldkit cosim`."""
     parser.description = (
-        "Simulate robots that move and communicate, and measure what each synchronization method costs."
+        "Simulate robots that move and communicate; measure the error and the cost of each synchronization method."
     )
     parser.epilog = "example: fieldkit cosim run baylands --policy sliding_window"
     commands = parser.add_commands(title="commands", metavar="COMMAND")
-    _run(commands)
-    _shootout(commands)
-    _paper(commands)
-    _satisfy(commands)
-    _plot(commands)
-    _replay(commands)
-    _list(commands)
-    _schema(commands)
+    _add_run(commands)
+    _add_shootout(commands)
+    _add_table(commands)
+    _add_satisfy(commands)
+    _add_plot(commands)
+    _add_replay(commands)
+    _add_list(commands)
+    _add_schema(commands)
 
 
-def _run(commands: Commands) -> None:
+def _add_run(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "run",
         help="run a scenario",
@@ -55,7 +55,7 @@ def _run(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.run:run")
 
 
-def _shootout(commands: Commands) -> None:
+def _add_shootout(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "shootout",
         help="measure the error and the cost of each sync policy",
@@ -72,12 +72,12 @@ def _shootout(commands: Commands) -> None:
     modes.add_argument(
         "--orders",
         action="store_true",
-        help="errors of single windows that begin in the reference's own state, and their order in the window",
+        help="errors of single windows that begin in the state of the reference, and the order of each error",
     )
     modes.add_argument(
         "--bound",
         action="store_true",
-        help="exchanges that the scenario's policy.bound costs with error_bounded, and with fixed windows",
+        help="number of exchanges that keep the scenario's policy.bound, with error_bounded and with fixed windows",
     )
     parser.add_argument(
         "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
@@ -86,7 +86,7 @@ def _shootout(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.shootout:run")
 
 
-def _paper(commands: Commands) -> None:
+def _add_table(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "table",
         help="regenerate a table of the paper",
@@ -94,7 +94,12 @@ def _paper(commands: Commands) -> None:
         "its interval, and whether they agree.",
         epilog="example: fieldkit cosim table 1 --format markdown",
     )
-    parser.add_choice("which", _TABLES, metavar="TABLE", help="1, 2 or 3 of its simulation, emane, or claims")
+    parser.add_choice(
+        "which",
+        _TABLES,
+        metavar="TABLE",
+        help="1, 2 or 3: tables of its simulations; emane: its emulation; claims: its claims",
+    )
     seeds = parser.add_mutually_exclusive_group()
     _add_seed(seeds, "see --seeds")
     seeds.add_argument(
@@ -105,7 +110,7 @@ def _paper(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.table:run")
 
 
-def _satisfy(commands: Commands) -> None:
+def _add_satisfy(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "satisfy",
         help="run the paper's satisfaction loop, and report its effect",
@@ -122,9 +127,9 @@ def _satisfy(commands: Commands) -> None:
         "--policy",
         ("velocity_aware_raw", "velocity_aware"),
         default="velocity_aware_raw",
-        help="the rule: as the paper prints it (default), or made safe",
+        help="the rule: as the paper prints it (default), or corrected so that each window is positive",
     )
-    _add_window(parser, "w of the first round")
+    _add_window(parser, "window of the first round")
     parser.add_argument(
         "--rounds", type=repeats, default=20, metavar="N", help="largest number of rounds (default 20)"
     )
@@ -133,7 +138,7 @@ def _satisfy(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.satisfy:run")
 
 
-def _plot(commands: Commands) -> None:
+def _add_plot(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "plot",
         help="draw a recording, or the table of a shootout",
@@ -148,12 +153,11 @@ def _plot(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.plot:run")
 
 
-def _replay(commands: Commands) -> None:
+def _add_replay(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "replay",
-        help="print the numbers of a recording",
-        description="Print the numbers that the run of a recording printed; refuse a recording that was changed or "
-        "truncated.",
+        help="print the results of a recording",
+        description="Print the results of a recorded run; a recording that was changed or truncated is an error.",
     )
     _add_recording(parser)
     parser.add_argument("--mcap", type=Path, metavar="FILE", help="also write it as MCAP, for Foxglove")
@@ -161,7 +165,7 @@ def _replay(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.replay:run")
 
 
-def _list(commands: Commands) -> None:
+def _add_list(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "list", help="list scenarios and sync policies", description="List every scenario and sync policy."
     )
@@ -169,7 +173,7 @@ def _list(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.listing:list_all")
 
 
-def _schema(commands: Commands) -> None:
+def _add_schema(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "schema",
         help="print the JSON schema of scenario files",
@@ -240,6 +244,6 @@ def _scenario_names() -> Iterable[str]:
 
 
 def _policy_names() -> Iterable[str]:
-    from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (as above
+    from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (as above)
 
     return policies()

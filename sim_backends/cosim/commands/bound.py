@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bound`: the cost of a bound with `error_bounded` and with fixed windows."""
+"""`fieldkit cosim shootout SCENARIO --bound`: exchanges that keep a bound, with `error_bounded` and fixed windows."""
 
 import argparse
 import math
@@ -43,13 +43,13 @@ def run(arguments: argparse.Namespace) -> int:
     """
     if arguments.figure is not None or arguments.policy or arguments.windows:
         raise ConfigurationError(
-            "--bound is about error_bounded and its bound, and has no figure",
+            "--bound compares error_bounded with fixed windows, and has no figure",
             remedy="remove --figure, --policy and --window; change the bound by --set policy.bound=1cm",
         )
     scenario = settings.scenario(arguments)
     if scenario.policy.bound_db is not None:
         raise ConfigurationError(
-            "--bound compares position errors, and policy.bound_db is about path loss",
+            "--bound compares position errors, and policy.bound_db limits the error of path loss",
             remedy="remove policy.bound_db; change the bound by --set policy.bound=1cm",
         )
     seeds = settings.seeds(arguments, scenario)
@@ -58,15 +58,15 @@ def run(arguments: argparse.Namespace) -> int:
     with working() as sink:
         report = partial(progress_reporter(sink, "seeds"), "bound", len(seeds))
         report(0)
-        costs = run_many(partial(_cost, scenario), tasks, progress=report)
-        window_s, fixed = longest_for_all(
+        costs = run_many(partial(_bound_cost, scenario), tasks, progress=report)
+        window_s, fixed_costs = longest_for_all(
             [cost.window_s for cost in costs],
-            lambda fixed_s: run_many(partial(_fixed, scenario, fixed_s), tasks),
+            lambda fixed_s: run_many(partial(_fixed_cost, scenario, fixed_s), tasks),
             scenario.policy.bound,
         )
-    _sheet(scenario, seeds, costs, window_s, fixed).show(arguments.format)
+    _sheet(scenario, seeds, costs, window_s, fixed_costs).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        print_text(_summary(scenario, costs, window_s, fixed))
+        print_text(_summary(scenario, costs, window_s, fixed_costs))
     return 0
 
 
@@ -74,13 +74,13 @@ def _run(scenario: CosimScenario, task: Task, policy: SyncPolicy) -> Run:
     return build(scenario, policy=policy, seed=task.seed, measures_all=True).run()
 
 
-def _cost(scenario: CosimScenario, task: Task) -> BoundCost:
+def _bound_cost(scenario: CosimScenario, task: Task) -> BoundCost:
     policy = scenario.policy
     run = partial(_run, scenario, task)
     return bound_cost(run, policy.bound, step_s=scenario.physics.step, longest_s=policy.longest)
 
 
-def _fixed(scenario: CosimScenario, window_s: float, task: Task) -> FixedCost:
+def _fixed_cost(scenario: CosimScenario, window_s: float, task: Task) -> FixedCost:
     return fixed_cost(partial(_run, scenario, task), window_s)
 
 
@@ -89,7 +89,7 @@ def _sheet(
     seeds: Sequence[int],
     costs: Sequence[BoundCost],
     window_s: float,
-    fixed: Sequence[FixedCost],
+    fixed_costs: Sequence[FixedCost],
 ) -> Sheet:
     rows = [
         (
@@ -98,8 +98,8 @@ def _sheet(
             cost.exchanges,
             cost.added_s,
             window_s,
-            fixed[index].exchanges if fixed else None,
-            fixed[index].exchanges / cost.exchanges if fixed else None,
+            fixed_costs[index].exchanges if fixed_costs else None,
+            fixed_costs[index].exchanges / cost.exchanges if fixed_costs else None,
             cost.window_s,
             cost.fixed_exchanges or None,
             cost.factor,
@@ -118,7 +118,9 @@ def _sheet(
     )
 
 
-def _summary(scenario: CosimScenario, costs: Sequence[BoundCost], window_s: float, fixed: Sequence[FixedCost]) -> str:
+def _summary(
+    scenario: CosimScenario, costs: Sequence[BoundCost], window_s: float, fixed_costs: Sequence[FixedCost]
+) -> str:
     exchanges = sum(cost.exchanges for cost in costs)
     added_s = [cost.added_s for cost in costs if not math.isnan(cost.added_s)]
     text = f"error_bounded keeps {number(scenario.policy.bound * 1e3)} mm in {format_count(exchanges, 'exchange')}"
@@ -127,9 +129,9 @@ def _summary(scenario: CosimScenario, costs: Sequence[BoundCost], window_s: floa
             f", and adds {number(math.fsum(added_s) / len(added_s) * 1e3)} ms to a delay, because an arrival waits "
             f"for the end of its window: half of policy.longest is {number(scenario.policy.longest * 500)} ms"
         )
-    if not fixed:
-        return f"{text}, and no fixed window does"
-    fixed_exchanges = sum(cost.exchanges for cost in fixed)
+    if not fixed_costs:
+        return f"{text}, and no fixed window keeps it"
+    fixed_exchanges = sum(cost.exchanges for cost in fixed_costs)
     run_exchanges = sum(cost.fixed_exchanges for cost in costs)
     text += (
         f"; the fixed window that keeps it in {format_count(len(costs), 'run')}, {number(window_s * 1e3)} ms, needs "

@@ -96,7 +96,7 @@ def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
             flow.loss,
             flow.delay_s.mean,
             flow.delay_s.p95,
-            flow.delay_s.most,
+            flow.delay_s.maximum,
             flow.added_s,
             flow.distances_m[2],
         )

@@ -82,7 +82,7 @@ def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet
 
 
 def _columns(name: str, factor: float) -> list[SheetColumn]:
-    """Return the columns of a cell of seconds or shares; `factor` is the one from SI to the shown unit."""
+    """Return the columns of delays or losses; `factor` converts from the SI unit to the shown unit."""
     suffix = "" if name == "loss" else "_s"
     return [
         SheetColumn(f"{name}_paper{suffix}", "paper", "as printed", factor, digits=6),

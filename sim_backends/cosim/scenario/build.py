@@ -75,7 +75,7 @@ def radio_network(
 
 
 def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFactory]:
-    """Return the transports; publish-subscribe ones only if they are used, as they send even without traffic."""
+    """Return the transports; without publish-subscribe if no flow uses it, because it sends even without traffic."""
     topics: dict[str, TopicFlow] = {}
     ros1: dict[str, Ros1Flow] = {}
     for traffic in scenario.traffic:
@@ -178,7 +178,7 @@ def build(
         measures_all: As for `Coordinator`.
 
     Raises:
-        ConfigurationError: The scenario cannot be run; the message says why.
+        ConfigurationError: The scenario cannot be run; the message states the reason.
     """
     seed = scenario.seeds[0] if seed is None else seed
     if policy is None or isinstance(policy, str):

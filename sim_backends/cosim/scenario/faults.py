@@ -26,7 +26,7 @@ class _Fault(Strict):
 
     @property
     def agents(self) -> tuple[tuple[str, str], ...]:
-        """The agents that it names, each after the key that names it."""
+        """The agents that the fault names, each as a pair of key and agent."""
         return ()
 
 
@@ -123,7 +123,7 @@ class JammerFault(_TimedFault):
 
 
 class ClockSkewFault(_TimedFault):
-    """The clock of an agent, which its programs use to wake and stamp, is wrong; at the fault's end it is set right.
+    """The clock of an agent, which its programs use for timers and time stamps, is wrong until the fault ends.
 
     Attributes:
         kind: `clock-skew`.

@@ -255,7 +255,8 @@ class PaperTable:
             samples: The result of `flow_samples` for the setups.
         """
         return [
-            self._row(source, [of_seed[source.flow] for of_seed in samples[source.setup]]) for source in self.sources
+            self._row(source, [flow_samples[source.flow] for flow_samples in samples[source.setup]])
+            for source in self.sources
         ]
 
     def _row(self, source: RowSource, samples: Sequence[FlowSample]) -> PaperRow:

@@ -71,7 +71,7 @@ def satisfy(
     window_s: float = 0.001,
     max_rounds: int = 20,
 ) -> Satisfaction:
-    """Run rounds until one is satisfactory, or none can be.
+    """Run rounds until one is satisfactory, or further rounds cannot change the result.
 
     Args:
         run: Runs the same scenario and seed with a policy.

@@ -90,7 +90,7 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
     from sim_backends.emulated.autopilot.parameters import DEFAULT_M, FlightLimits  # noqa: PLC0415
     from sim_backends.emulated.autopilot.px4 import PX4  # noqa: PLC0415
     from sim_backends.physics.ground import Ground  # noqa: PLC0415
-    from sim_backends.physics.known import quadrotor  # noqa: PLC0415
+    from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
     from sim_backends.world.world import World  # noqa: PLC0415
 
     world = World.model_validate_json(drone.world) if drone.world else None
