@@ -44,7 +44,7 @@ def federate_error(error: BaseException, federate: str, request: str) -> Federat
     if isinstance(error, AnswerTimeoutError):
         return UnansweredError(
             f"{federate} has not answered for {error.limit_s:g} s: request to {request}",
-            remedy="check what it waits for, or give it a longer deadline",
+            remedy="find out why it waits, or set a longer deadline",
         )
     return FederateError(
         f"{federate} failed at the request to {request}: {type(error).__name__}: {error}",

@@ -46,7 +46,7 @@ class Fate:
         return self.arrived_ns is not None or bool(self.reason)
 
 
-def no_wall_s() -> dict[str, float]:
+def zero_wall_s() -> dict[str, float]:
     """Return the parts of the wall time, each 0."""
     return {"agents": 0.0, "network": 0.0, "exchange": 0.0, "wait": 0.0}
 
@@ -64,7 +64,7 @@ class Run:
 
     fates: dict[PacketIdentity, Fate] = field(default_factory=dict)
     windows_ns: list[int] = field(default_factory=list)
-    wall_s: dict[str, float] = field(default_factory=no_wall_s)
+    wall_s: dict[str, float] = field(default_factory=zero_wall_s)
     digest: str = ""
 
 

@@ -90,7 +90,7 @@ def self_steered(
 
 
 class Mobility:
-    """Places robots, moves them, and takes one out of range.
+    """Places robots, moves them, and moves one out of range.
 
     Args:
         cast: The robot of each role.
@@ -148,7 +148,7 @@ class Mobility:
             self._update_medium()
 
     def set_out_of_range(self, role: Role | None) -> None:
-        """Take one robot out of the range of all others, or bring it back with None.
+        """Move one robot out of the range of all others, or move it back with None.
 
         Without the relay no robot receives another.
 

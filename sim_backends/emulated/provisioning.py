@@ -202,7 +202,7 @@ def _ros2_spec(
     settings = options.ros2
     if settings.router is not None and settings.router not in addresses:
         raise ConfigurationError(
-            f"emulated.ros2.router is {settings.router}, which does not take part in this trial",
+            f"emulated.ros2.router is {settings.router}, which is not in this trial",
             where=robot.name,
             remedy=f"name one of: {', '.join(addresses)}; or write discovery: multicast",
         )

@@ -44,7 +44,7 @@ class EmulatedOracle:
         names: Name of each robot.
         medium: The medium that carries the robots' packets.
         mobility: The object that places the robots in the medium.
-        options: The lab's options, with the limit of lateness and whether transmissions are recorded.
+        options: The lab's options, with the limit of lateness and the option that records transmissions.
     """
 
     def __init__(

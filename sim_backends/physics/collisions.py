@@ -1,4 +1,4 @@
-"""Contacts of upright cylinders with their surroundings: they stop there, and slide along it.
+"""Contacts of upright cylinders with their surroundings: a cylinder stops at an obstacle, and slides along it.
 
 A moving body slides around an obstacle as far as possible; no body is pushed. A move is divided into pieces shorter
 than half a radius, so that a body cannot pass through even a thin obstacle. A body that would still overlap stays

@@ -91,7 +91,7 @@ def _add_table(commands: Commands) -> None:
         "table",
         help="regenerate a table of the paper",
         description="Run the simulations of a table of the paper, and print each of its numbers next to ours with "
-        "its interval, and whether they agree.",
+        "its interval and the result of the comparison.",
         epilog="example: fieldkit cosim table 1 --format markdown",
     )
     parser.add_choice(

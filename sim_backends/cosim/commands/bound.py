@@ -12,7 +12,7 @@ from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
-from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, filled, number
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number_text, wrapped
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.run_record import Run
@@ -106,14 +106,14 @@ def _sheet(
         )
         for index, (seed, cost) in enumerate(zip(seeds, costs, strict=True))
     ]
-    title = f"{scenario.name}, {scenario.topology}: a bound of {number(scenario.policy.bound * 1e3)} mm"
+    title = f"{scenario.name}, {scenario.topology}: a bound of {number_text(scenario.policy.bound * 1e3)} mm"
     names = [column.name for column in _COLUMNS]
     return Sheet(
         _COLUMNS,
         rows,
         [
             SheetPart(title, names[:7]),
-            SheetPart("longest fixed window of each run, known only after the run", [names[0], *names[7:]]),
+            SheetPart("longest fixed window of each run, determined after the run", [names[0], *names[7:]]),
         ],
     )
 
@@ -123,25 +123,28 @@ def _summary(
 ) -> str:
     exchanges = sum(cost.exchanges for cost in costs)
     added_s = [cost.added_s for cost in costs if not math.isnan(cost.added_s)]
-    text = f"error_bounded keeps {number(scenario.policy.bound * 1e3)} mm in {format_count(exchanges, 'exchange')}"
+    text = (
+        f"error_bounded keeps {number_text(scenario.policy.bound * 1e3)} mm in {format_count(exchanges, 'exchange')}"
+    )
     if added_s:
         text += (
-            f", and adds {number(math.fsum(added_s) / len(added_s) * 1e3)} ms to a delay, because an arrival waits "
-            f"for the end of its window: half of policy.longest is {number(scenario.policy.longest * 500)} ms"
+            f", and adds {number_text(math.fsum(added_s) / len(added_s) * 1e3)} ms to a delay, because an arrival "
+            "waits for the end of its window: half of policy.longest is "
+            f"{number_text(scenario.policy.longest * 500)} ms"
         )
     if not fixed_costs:
         return f"{text}, and no fixed window keeps it"
     fixed_exchanges = sum(cost.exchanges for cost in fixed_costs)
     run_exchanges = sum(cost.fixed_exchanges for cost in costs)
     text += (
-        f"; the fixed window that keeps it in {format_count(len(costs), 'run')}, {number(window_s * 1e3)} ms, needs "
-        f"{fixed_exchanges:,}, {number(fixed_exchanges / exchanges)} times as many"
+        f"; the fixed window that keeps it in {format_count(len(costs), 'run')}, {number_text(window_s * 1e3)} ms, "
+        f"needs {fixed_exchanges:,}, {number_text(fixed_exchanges / exchanges)} times as many"
     )
     if len(costs) > 1:
         text += (
-            f"; the longest windows of the single runs need {run_exchanges:,}, {number(run_exchanges / exchanges)} "
-            "times as many"
+            f"; the longest windows of the single runs need {run_exchanges:,}, "
+            f"{number_text(run_exchanges / exchanges)} times as many"
         )
     if window_s == scenario.policy.longest:
         text += "; the fixed window is as long as policy.longest, which limits it"
-    return filled(text)
+    return wrapped(text)

@@ -18,7 +18,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 BACKEND: Final = "cosim"
 
 _NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration"})
-"""Keys of a scenario that do not change the procedure: what is compared, the number of runs, and their duration."""
+"""Keys of a scenario that do not change the procedure: the compared policy, the number of runs, their duration."""
 
 
 def table(trial: str, scenario: CosimScenario, policy: str, number: int, result: SeedResult) -> str:

@@ -101,7 +101,7 @@ STATION_M_S: Final = 1.0
 """Largest speed at which an agent returns to its station."""
 
 
-def stops(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
+def stop_commands(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
     """Return the command that stops each body."""
     return {name: Velocity() if body.flies else Twist() for name, body in bodies.items()}
 

@@ -16,7 +16,7 @@ from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import QosOptions, Traffic
-from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stops
+from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -186,7 +186,9 @@ def build(
     world = load_world(scenario.world)
     check(scenario, world, lambda location: f"scenario {scenario.name}: {'.'.join(map(str, location))}")
     scenario_bodies = bodies(scenario, world)
-    scenario_programs = programs(scenario, seed, controllers(scenario, scenario_bodies, seed), stops(scenario_bodies))
+    scenario_programs = programs(
+        scenario, seed, controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
+    )
     physics_federate = physics or Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
     network_federate = network or radio_network(scenario, world, seed, recorder)
     for fault in scenario.faults:

@@ -42,7 +42,7 @@ def mean(values: Floats) -> IntervalEstimate:
     value = float(values.mean()) if count else math.nan
     if count < 2:
         return IntervalEstimate(value, math.nan, math.nan)
-    half = student(count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
+    half = t_quantile(count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
     return IntervalEstimate(value, value - half, value + half)
 
 
@@ -60,7 +60,7 @@ def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
     if count < 2 or not np.isfinite(leave_one_out).all():
         return IntervalEstimate(value, math.nan, math.nan)
     error = math.sqrt((count - 1) * float(leave_one_out.var()))
-    half = student(count - 1) * error
+    half = t_quantile(count - 1) * error
     return IntervalEstimate(value, value - half, value + half)
 
 
@@ -81,7 +81,7 @@ def repeats_needed(difference: float, deviation: float) -> int | None:
 
 
 @lru_cache(maxsize=1024)
-def student(degrees: int) -> float:
+def t_quantile(degrees: int) -> float:
     """Return the 97.5 % quantile of Student's t distribution with at least 1 degree of freedom."""
     low, high = 0.0, 13.0  # the quantile for one degree is 12.7
     for _ in range(60):

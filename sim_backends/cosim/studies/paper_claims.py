@@ -13,7 +13,7 @@ import numpy as np
 from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.policies.window_policies import SlidingWindow
 from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean
-from sim_backends.cosim.studies.paper_setups import Changes, FlowSample, Setup, master_based, masterless, the_flow
+from sim_backends.cosim.studies.paper_setups import Changes, FlowSample, Setup, master_based, masterless, only_flow
 from sim_backends.cosim.studies.paper_tables import (
     CLAIMS,
     DISTANCES_M,
@@ -87,7 +87,7 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
         samples: The result of `flow_samples` for them.
     """
     flows = {
-        name: [flow_samples[the_flow(setup)] for flow_samples in samples[name]] for name, setup in setups.items()
+        name: [flow_samples[only_flow(setup)] for flow_samples in samples[name]] for name, setup in setups.items()
     }
     all_claims: list[Claim] = []
     for than in (FIXED, MASTER):

@@ -175,7 +175,7 @@ def mesh(radio: Changes, changes: Changes) -> Setup:
     return Setup(load_scenario("ten_node_mesh", {**radio, **changes}), EventDriven.name)
 
 
-def the_flow(setup: Setup) -> str:
+def only_flow(setup: Setup) -> str:
     """Return the name of the only flow of a setup."""
     (traffic,) = setup.scenario.traffic
     (flow,) = traffic.flows

@@ -2,8 +2,8 @@
 
 The only module that imports `pymavlink` for the emulated autopilot. Constants and messages have the names of the
 dialect (https://mavlink.io/en/messages/common.html). The port is behind a router: one stream of frames for several
-clients, with its own sequence numbers and message rates. As in mavlink-router, a frame with a target goes only to the
-clients that have sent frames of this system and component, so that other clients see gaps in the sequence numbers.
+clients, with its own sequence numbers and message rates. As in mavlink-router, a frame with a target is sent only to
+the clients that have sent frames of this system and component, so other clients receive gaps in the sequence numbers.
 """
 
 import struct

@@ -61,7 +61,7 @@ class ParameterService:
         if kind == "PARAM_REQUEST_LIST":
             yield from (self.value(name) for name in names)
         elif kind in {"PARAM_REQUEST_READ", "PARAM_SET"}:
-            name = text(message.param_id)
+            name = decoded_name(message.param_id)
             number = getattr(message, "param_index", _NO_NUMBER)
             if number != _NO_NUMBER:
                 name = names[number] if 0 <= number < len(names) else ""
@@ -135,7 +135,7 @@ def _file_answer(message: Message) -> Message:
     )
 
 
-def text(name: str | bytes) -> str:
+def decoded_name(name: str | bytes) -> str:
     """Return a name in a message: it ends at the first zero byte, and bytes that are not printable become "?"."""
     raw = name if isinstance(name, bytes) else name.encode("utf-8", "replace")
     return "".join(

@@ -40,7 +40,7 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
         reporter = MotionReporter(motion, steered, time.monotonic_ns())
         ready.touch()
         select.select([channel], [], [])
-        # The physics need numpy, which takes 20 MB; most robots of most trials are never driven.
+        # The physics need numpy, which uses 20 MB; most robots of most trials are never driven.
         from sim_backends.emulated.robot.base_controller import BaseController  # noqa: PLC0415
 
         controller = BaseController(base, time.monotonic_ns())

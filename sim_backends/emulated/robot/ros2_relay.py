@@ -131,7 +131,7 @@ class Ros2Relay:
 
 def _network(address: str, node: str, spec: Ros2Spec) -> Network:
     """Return the settings of a robot's node in the ROS 2 network."""
-    # With peers the node must use the default port, which the peers know. Otherwise it uses any free port, because
+    # With peers the node must use the default port, which the peers use. Otherwise it uses any free port, because
     # another program of the robot may have the default one.
     settings = (
         {"listen/endpoints": json.dumps([f"tcp/{address}:0"])}

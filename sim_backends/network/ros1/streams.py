@@ -56,7 +56,7 @@ class TcpStreams:
             size_bytes: Size of the message.
             on_delivered: Called when the message is complete at the destination.
             on_lost: Called when the connection was given up before that.
-            reverse: True if the message goes to the host that opened the connection.
+            reverse: True if the message is sent to the host that opened the connection.
         """
         source, destination = ends
         if source == destination:

@@ -231,7 +231,7 @@ class TopicWriter:
         for number in nack.missing:
             sample = self._history.samples.get(number)
             if sample is not None:
-                # The reader requests the other fragments of a larger sample when it knows their number.
+                # The reader requests the other fragments of a larger sample when it has received their number.
                 submessages.append(self._data(sample, 0, 1))
         self._respond(submessages)
 
