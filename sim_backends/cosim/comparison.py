@@ -45,7 +45,7 @@ class Errors:
         first_disagreement: The packet of these that was sent first, or None.
         first_disagreement_s: Time when it was sent, or nan.
         causality_violations: Number of arrivals at a time that the receiver had already passed.
-        late_s: How far the receiver had passed the time of arrival, over all arrivals.
+        late_s: Time by which the receiver had passed the time of arrival, over all arrivals.
         delay_added_s: Mean delay that the policy added, before a packet entered the network and after its delivery.
         exchanges_per_s: Windows per simulated second.
         wall_s: Wall time by part.
@@ -156,7 +156,7 @@ def delay_added_s(run: Run) -> float:
 
 
 def lost_share(run: Run) -> float:
-    """Return the share of packets lost, of those whose fate is decided; nan if there are none."""
+    """Return the share of packets lost, of those whose fate is decided; nan without such packets."""
     lost = [bool(fate.reason) for fate in run.fates.values() if fate.is_decided]
     return sum(lost) / len(lost) if lost else math.nan
 

@@ -246,9 +246,9 @@ class Coordinator:
             if later_ns <= end_ns:
                 break
             lap("exchange")
-            more, states = agents.advance(end_ns, later_ns - 1, later_ns)
+            later_sent, states = agents.advance(end_ns, later_ns - 1, later_ns)
             lap("agents")
-            sent += more
+            sent += later_sent
             end_ns = later_ns
         if agents.new_agents:
             begin = agents.with_new_agents(begin, states)

@@ -146,7 +146,7 @@ class Window(NamedTuple):
     Attributes:
         begin_ns: Its beginning.
         end_ns: Its end.
-        decided_by: What determined its length, for example a pair of agents; empty if the policy does not report it.
+        decided_by: Reason for its length, for example a pair of agents; empty if the policy does not report it.
         entered: Fates of the packets that entered the network in it, in order. Most are not decided yet; the same
             objects are in `ended` of a later window.
         ended: Fates that were decided in it, in order.

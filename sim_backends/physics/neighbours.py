@@ -18,7 +18,7 @@ _ROUNDING: Final = 1 + 1e-9
 
 
 class CellGrid:
-    """Numbers by the square cell of their position; all within a given distance are in nine cells.
+    """Numbers by the square cell of their position; those within a given distance are in nine cells.
 
     Args:
         within_m: That distance, horizontally, in metres.

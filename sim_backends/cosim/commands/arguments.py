@@ -210,11 +210,11 @@ def _add_recording(parser: Parser) -> None:
     )
 
 
-def _add_policy(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (argparse's own)
+def _add_policy(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (options of argparse)
     _set_completer(parser.add_argument("--policy", metavar="NAME", help=meaning, **options), _policy_names)
 
 
-def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (argparse's own)
+def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (options of argparse)
     parser.add_argument("--window", **{"metavar": "TIME", "help": f"{meaning} (default: the scenario's)", **options})
 
 

@@ -76,15 +76,15 @@ def error_against_cost(points: Sequence[CostPoint], growth: LogPanel | None = No
         points: The points.
         growth: An additional panel, or None.
     """
-    shown = [
+    panel_specs = [
         ("Delivery time", "mean error (ms)", "delivery_error_mean_s"),
         ("Position", "mean error (mm)", "position_error_mean_m"),
     ]
     if any(point.path_error_max_m > 0 for point in points):
-        shown.append(("Path of the agents", "largest error (mm)", "path_error_max_m"))
+        panel_specs.append(("Path of the agents", "largest error (mm)", "path_error_max_m"))
     panels = [
         LogPanel(title, "exchanges per simulated second", label, _curves(points, name))
-        for title, label, name in shown
+        for title, label, name in panel_specs
     ]
     panels += [] if growth is None else [growth]
     return lambda form: plots.log_figure(panels, form)

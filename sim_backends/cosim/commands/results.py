@@ -86,7 +86,7 @@ _JITTER_GAIN = 1 / 16
 
 @dataclass(frozen=True)
 class FlowSpread:
-    """Statistics of times of packets that arrived, in seconds; nan if none did.
+    """Statistics of times of packets that arrived, in seconds; nan if no packet arrived.
 
     Attributes:
         minimum: The minimum.

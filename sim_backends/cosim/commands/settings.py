@@ -210,5 +210,5 @@ def _change(text: str) -> tuple[str, Any]:
             f"--set: {text!r} is not KEY=VALUE",
             remedy="write for example --set policy.window=5ms",
         )
-        # A value is parsed as YAML, as in the file: a number, a list, or a text.
+    # A value is parsed as YAML, as in the file: a number, a list, or a text.
     return key, schema.parse(f"value: {value}", source="--set").data["value"]

@@ -38,7 +38,7 @@ class LatestStates:
 
     Args:
         names: The other agents.
-        timeout_ns: How long a state is valid after its arrival.
+        timeout_ns: Time for which a state is valid after its arrival.
 
     Raises:
         ConfigurationError: There are no other agents, or the timeout is not above 0.

@@ -22,7 +22,7 @@ _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
 _FIRST_PORT: Final = 40_000
 """Destination port of the first flow; each further flow has the next."""
 _FIRST_EPHEMERAL_PORT: Final = 50_000
-"""Source port of the first flow: a dynamic port (RFC 6335, section 6), of which tcpdump decodes 49152 specially."""
+"""Source port of the first flow: a dynamic port (RFC 6335, section 6), not 49152, which tcpdump decodes specially."""
 _PORTS: Final = 9_000
 """Number of ports after which they are reused."""
 

@@ -26,11 +26,11 @@ _CHECKSUM: Final = "content_hash"
 
 
 class RunEnding(StrEnum):
-    """The end of a run."""
+    """The status of a run: under way, or the kind of its end."""
 
     UNDER_WAY = "under way"
     KILLED = "killed"
-    """Never in `run.json`, which has `under way`, but no process holds the lock."""
+    """`run.json` has `under way`, but no process holds the lock; this value is never written."""
     WHOLE = "whole"
     INTERRUPTED = "interrupted"
     FAILED = "failed"

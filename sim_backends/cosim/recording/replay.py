@@ -21,7 +21,7 @@ class Recording:
         manifest: The scenario and its settings, and the end of the run.
         run: The run. If it is under way or was killed, the packets whose fate was not decided yet are missing.
         states: True states as they were recorded: time in nanoseconds, agent, state.
-        decided_by: What determined the length of each window; empty if the policy does not report it.
+        decided_by: Reason for the length of each window; empty if the policy does not report it.
     """
 
     manifest: RunManifest

@@ -313,7 +313,7 @@ class FileTraffic(_Traffic):
 
 
 class PingTraffic(_Traffic):
-    """Echo requests, to each of which the receiver replies; the replies are the flow `NAME/RECEIVER/reply`.
+    """Echo requests; the receiver replies to each of them, in the flow `NAME/RECEIVER/reply`.
 
     Attributes:
         kind: `ping`.

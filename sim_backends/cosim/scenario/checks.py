@@ -136,7 +136,7 @@ class ScenarioProblem(NamedTuple):
     Attributes:
         location: Keys of the invalid value.
         message: The error.
-        remedy: How to correct it.
+        remedy: The correction.
     """
 
     location: Location

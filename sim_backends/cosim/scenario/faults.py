@@ -128,8 +128,7 @@ class ClockSkewFault(_TimedFault):
     Attributes:
         kind: `clock-skew`.
         agent: The agent.
-        offset_ms: How far the clock is ahead at the beginning of the fault, in milliseconds; negative if it is
-            behind.
+        offset_ms: Offset of the clock at the beginning of the fault, in milliseconds; positive if it is ahead.
         rate_ppm: Rate error of the clock from then on, in microseconds per second; positive if it is fast.
     """
 

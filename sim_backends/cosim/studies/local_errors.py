@@ -25,13 +25,13 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
-"""Error of the delivery time; how far the receiver had passed the time of an arrival; error of the network's relative
+"""Error of the delivery time; time by which the receiver had passed an arrival; error of the network's relative
 position of sender and receiver; share of packets with another fate; position error of agents at the window's end."""
 
 TAIL_NS: Final = 200_000_000
 """Time that forks continue after the window, so that the fates of the affected packets are decided."""
 _LONGEST_NS: Final = 3_600_000_000_000
-"""Longer than any window, as long as there are events."""
+"""A time that is longer than any window if there are events."""
 
 
 @dataclass(frozen=True)

@@ -106,9 +106,9 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
 def delay_change(ours_s: Floats, theirs_s: Floats) -> tuple[IntervalEstimate, int]:
     """Return the relative change of delays, and the number of rows that it is based on.
 
-    In each row, it compares the means over the seeds with which packets arrived in both systems, of which there must
-    be two. The total is the geometric mean over the rows, so that each has the same weight. The interval is computed
-    for the logarithm of the change.
+    In each row, it compares the means over the seeds with which packets arrived in both systems; at least two such
+    seeds are needed. The total is the geometric mean over the rows, so that each has the same weight. The interval is
+    computed for the logarithm of the change.
 
     Args:
         ours_s: Mean delay of a packet in the paper's system, shape (rows, seeds); nan if none arrived.

@@ -59,7 +59,7 @@ class FlowSample:
 
     @property
     def delay_mean_s(self) -> float:
-        """Mean delay of packets that arrived; nan if none did."""
+        """Mean delay of packets that arrived; nan if no packet arrived."""
         return self.delay_sum_s / self.arrived if self.arrived else np.nan
 
 

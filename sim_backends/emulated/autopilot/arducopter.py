@@ -151,7 +151,9 @@ ARDUCOPTER: Final = Firmware(
     autopilot=_d.MAV_AUTOPILOT_ARDUPILOTMEGA,
     version=0x040600FF,
     capabilities=COMMON_CAPABILITIES | _d.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
-    base=_d.MAV_MODE_FLAG_STABILIZE_ENABLED | _d.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
+    base_mode=_d.MAV_MODE_FLAG_STABILIZE_ENABLED
+    | _d.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+    | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
     # ArduCopter/mode.h; a commanded take-off is part of GUIDED, and the descent at home is part of RTL.
     modes={
         Mode.OFFBOARD: 4,

@@ -133,7 +133,7 @@ class ArduCopterFailsafes:
 
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
         parameters = self._parameters
-        for stage, (name, words) in enumerate(self._STAGES, 1):
+        for stage, (name, level_text) in enumerate(self._STAGES, 1):
             volt, charge_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
             left_mah = parameters["BATT_CAPACITY"] - state.battery.used_mah
             low = charge_mah > 0 and left_mah < charge_mah
@@ -146,8 +146,10 @@ class ArduCopterFailsafes:
                 continue
             self._stage = stage
             battery = state.battery
-            yield Reaction(f"Battery 1 {words} {battery.voltage_v:.2f}V used {battery.used_mah:.0f} mAh")
-            yield from self._act(int(parameters[f"BATT_FS_{name}_ACT"]), _BATTERY_ACTIONS, "Battery Failsafe", state)
+            yield Reaction(f"Battery 1 {level_text} {battery.voltage_v:.2f}V used {battery.used_mah:.0f} mAh")
+            yield from self._action_reactions(
+                int(parameters[f"BATT_FS_{name}_ACT"]), _BATTERY_ACTIONS, "Battery Failsafe", state
+            )
 
     def _gcs(self, state: VehicleState) -> Iterator[Reaction]:
         parameters = self._parameters
@@ -159,12 +161,14 @@ class ArduCopterFailsafes:
         lost = state.now_ns - self._gcs_heartbeat_ns > parameters["FS_GCS_TIMEOUT"] * 1e9
         if lost and not self._gcs_lost:
             self._gcs_lost = True
-            yield from self._act(int(parameters["FS_GCS_ENABLE"]), _GCS_ACTIONS, "GCS Failsafe", state)
+            yield from self._action_reactions(int(parameters["FS_GCS_ENABLE"]), _GCS_ACTIONS, "GCS Failsafe", state)
         elif self._gcs_lost and not lost:
             self._gcs_lost = False
             yield Reaction("GCS Failsafe Cleared")
 
-    def _act(self, action: int, modes: dict[int, Mode], text: str, state: VehicleState) -> Iterator[Reaction]:
+    def _action_reactions(
+        self, action: int, modes: dict[int, Mode], text: str, state: VehicleState
+    ) -> Iterator[Reaction]:
         mode = modes.get(action)
         if not state.armed or mode is None:
             yield Reaction(text)

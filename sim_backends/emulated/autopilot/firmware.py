@@ -64,7 +64,7 @@ class Firmware:
         autopilot: MAV_AUTOPILOT.
         version: AUTOPILOT_VERSION.flight_sw_version: major, minor, patch, type.
         capabilities: MAV_PROTOCOL_CAPABILITY.
-        base: Constant MAV_MODE_FLAG bits of its heartbeat.
+        base_mode: Constant MAV_MODE_FLAG bits of its heartbeat.
         modes: Custom mode of each mode.
         names: Name of each mode in AVAILABLE_MODES.
         starting_flags: Flags of its position estimate before the estimate has an origin.
@@ -92,7 +92,7 @@ class Firmware:
     autopilot: int
     version: int
     capabilities: int
-    base: int
+    base_mode: int
     modes: Mapping[Mode, int]
     names: Mapping[Mode, str]
     starting_flags: int

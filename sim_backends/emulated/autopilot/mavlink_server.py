@@ -53,7 +53,7 @@ class Drone:
 
 
 def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
-    """Serve forever.
+    """Serve until the process is killed.
 
     Args:
         drone: Settings of the drone.

@@ -66,9 +66,10 @@ def integer(name: str, value: int, minimum: int, maximum: int, key: str = "") ->
 
 def stored(**values: float) -> tuple[Parameter, ...]:
     """Return parameters that ground stations read and write, without effect on the emulated vehicle."""
-    big = 1e9
+    limit = 1e9
     return tuple(
-        Parameter(name, value, -big, big, integer=isinstance(value, int)) for name, value in sorted(values.items())
+        Parameter(name, value, -limit, limit, integer=isinstance(value, int))
+        for name, value in sorted(values.items())
     )
 
 

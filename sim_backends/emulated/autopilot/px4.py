@@ -115,7 +115,7 @@ PX4: Final = Firmware(
     autopilot=_d.MAV_AUTOPILOT_PX4,
     version=0x011000FF,
     capabilities=COMMON_CAPABILITIES | _d.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE,
-    base=_d.MAV_MODE_FLAG_STABILIZE_ENABLED | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
+    base_mode=_d.MAV_MODE_FLAG_STABILIZE_ENABLED | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
     # Main and sub mode (px4_custom_mode.h).
     modes={
         Mode.TAKEOFF: _custom(4, 2),

@@ -113,7 +113,7 @@ class Telemetry:
 
     def _heartbeat(self) -> Message:
         vehicle, firmware = self._vehicle, self._vehicle.firmware
-        base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | firmware.base
+        base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | firmware.base_mode
         px4 = not firmware.is_ardupilot
         is_automatic = vehicle.mode not in {Mode.OFFBOARD, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD}
         base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if px4 and is_automatic else 0

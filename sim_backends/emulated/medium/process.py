@@ -101,7 +101,7 @@ class Medium:
         self._by_fd: dict[int, Port] = {}
         self._late: Counter[int] = Counter()
         self._flows = FlowDelays()
-        # A device with packets was empty at the earlier time, if the round before read all of them.
+        # A device with packets was empty at the earlier time, if the previous round read all of them.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._armed_ns: int | None = None
         self._scheduling = _raise_priority()
@@ -304,7 +304,7 @@ class Medium:
         self._model.log_attempts(None if self._air_log is None else self._air_log.write)
 
     def _sample(self) -> None:
-        """Sample the links of all radios; packets that arrive meanwhile are delivered in the next round."""
+        """Sample the links of all radios; packets that arrive during the sampling are delivered in the next round."""
         now_ns = time.monotonic_ns()
         self._sample_ns = now_ns + _SAMPLE_NS
         self._sampled.append(self._model.sample(now_ns, time.time_ns()))

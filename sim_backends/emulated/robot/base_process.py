@@ -22,7 +22,7 @@ _TICK_S: Final = 0.02
 
 
 def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
-    """Serve forever; while the robot is idle, the process sleeps.
+    """Serve until the process is killed; while the robot is idle, the process sleeps.
 
     Args:
         base: Settings of the robot's base.

@@ -266,7 +266,7 @@ def kill_processes(process: str) -> None:
     """Kill every process of the robot that has this name, except init.
 
     Raises:
-        RobotError: There is none.
+        RobotError: There is no such process.
     """
     pids = [pid for pid in _pids() if pid != os.getpid() and _process_name(pid) == process]
     if not pids:

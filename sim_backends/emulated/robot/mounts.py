@@ -41,7 +41,7 @@ OWN_FOLDERS: Final = {
 def isolate(*, replaced: Iterable[str] = ()) -> None:
     """Mount the robot's own folders in this process's mount namespace, and make everything of the host read-only.
 
-    What the robot needs of the host stays visible: this Python, this package, and everything in `/opt`.
+    All that the robot needs from the host remains visible: this Python, this package, and everything in `/opt`.
 
     Args:
         replaced: Files that the robot writes itself. Children of `/opt` that contain them are hidden; a top-level
@@ -109,7 +109,7 @@ def clear(folder: Path, keep: Iterable[str] = ()) -> None:
 def _pivot_root(folders: Iterable[str]) -> None:
     """Change to a new root with the content of the old one, a new `/proc`, and `folders`, which the old one lacks.
 
-    The new root is built at `/proc`, so that it hides nothing else meanwhile.
+    The new root is built at `/proc`, so that it hides nothing else until the change.
     """
     root = Path("/proc")
     _mirror(Path("/"), root, without={root.name})

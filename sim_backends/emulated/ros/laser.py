@@ -135,8 +135,8 @@ class Neighbour(NamedTuple):
     Attributes:
         number: Its position among the robots of the lab, from 0.
         radius_m: Radius of the cylinder.
-        below_m: How far the cylinder extends below the antenna.
-        above_m: How far it extends above the antenna.
+        below_m: Height of the antenna above the bottom of the cylinder.
+        above_m: Height of the top above the antenna.
     """
 
     number: int

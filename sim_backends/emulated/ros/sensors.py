@@ -196,7 +196,7 @@ def publish(
     steered: Path,
     ready: Path,
 ) -> None:
-    """Publish forever.
+    """Publish until the process is killed.
 
     Args:
         sensors: The sensors.
