@@ -95,7 +95,7 @@ def goodput_mbit_s(
     space = _Equidistant(1, antennas, options)
     space.set_distance(distance_m)
     wifi: Wifi[str] = Wifi(space, 1)
-    wifi.relay("relay" if relay else None)
+    wifi.set_relay("relay" if relay else None)
     arrived = dropped = 0
     for name in names[:stations]:
         for _ in range(50):

@@ -1,1 +1,1 @@
-"""Robots, radio and worlds that stand in for the field: back ends that `fieldkit` finds through entry points."""
+"""Simulated and emulated robots, radio and worlds: back ends that `fieldkit` loads through entry points."""

@@ -109,7 +109,7 @@ class Agents:
         return self._next_ns
 
     def next_send_ns(self) -> int | None:
-        """Return a time before which no program sends because of a timer, or None if none will.
+        """Return a time before which no program sends because of a timer, or None if no timer causes sending.
 
         Raises:
             FederateError: A program failed, or did not answer in time.
@@ -145,17 +145,17 @@ class Agents:
         self._next_ns = queue[0][0] if queue else None
 
     def deliver(self, receiver: str, received: Received) -> None:
-        """Keep a datagram for the program of an agent, which gets it when `advance` is called next."""
+        """Store a datagram for the program of an agent; the next call of `advance` delivers it."""
         if receiver in self.programs:
             self._received.setdefault(receiver, []).append(received)
 
     @property
     def has_undelivered(self) -> bool:
-        """True if a program has a datagram for which it was not woken yet."""
+        """True if a stored datagram waits for the next call of `advance`."""
         return bool(self._received)
 
     def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[Sent], Mapping[str, State]]:
-        """Wake programs that have received datagrams, then those due up to `last_ns`; then move bodies to `end_ns`.
+        """Wake programs that received datagrams or whose timer is due up to `last_ns`; move bodies to `end_ns`.
 
         Returns:
             The datagrams that programs sent, and the states at `end_ns` (see `states`).
@@ -174,15 +174,15 @@ class Agents:
             repeats = repeats + 1 if wake_ns <= woke_ns else 0
             if repeats > _MAX_WAKES_AT_ONE_TIME:
                 raise FederateError(
-                    f"the program of {' and '.join(names)} woke {repeats} times at {seconds_text(wake_ns)}, and "
-                    "continues"
+                    f"the program of {' and '.join(names)} woke {repeats} times at {seconds_text(wake_ns)}: its "
+                    "next wake time does not advance"
                 )
             woke_ns = wake_ns
             sent += self._wake(wake_ns, dict.fromkeys(names, ()))
         return sent, self.states(end_ns)
 
     def _pop_due(self, wake_ns: int) -> list[str]:
-        """Remove the agents whose programs wake at a time from the queue, and return their names."""
+        """Remove the agents whose programs wake at `wake_ns` from the queue, and return their names."""
         names = []
         while self._queue and self._queue[0][0] == wake_ns:
             _, name = heapq.heappop(self._queue)

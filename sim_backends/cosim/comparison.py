@@ -45,7 +45,7 @@ class Errors:
         first_disagreement: The packet of these that was sent first, or None.
         first_disagreement_s: Time when it was sent, or nan.
         causality_violations: Number of arrivals at a time that the receiver had already passed.
-        late_s: How far the receiver had passed the time of arrival, over all arrivals.
+        late_s: Time by which the receiver had passed the time of arrival, over all arrivals.
         delay_added_s: Mean delay that the policy added, before a packet entered the network and after its delivery.
         exchanges_per_s: Windows per simulated second.
         wall_s: Wall time by part.
@@ -76,8 +76,8 @@ def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Err
         path_errors_m: Distance of each agent from its position in the reference, at equal times, any shape; None if
             positions were not sampled.
     """
-    both = [(fate, run.fates[identity]) for identity, fate in reference.fates.items() if identity in run.fates]
-    decided = [(expected, actual) for expected, actual in both if expected.is_decided and actual.is_decided]
+    fate_pairs = [(fate, run.fates[identity]) for identity, fate in reference.fates.items() if identity in run.fates]
+    decided = [(expected, actual) for expected, actual in fate_pairs if expected.is_decided and actual.is_decided]
     differing = [expected.packet for expected, actual in decided if bool(expected.reason) != bool(actual.reason)]
     counted_ns = [
         (expected.counted_ns, actual.counted_ns)
@@ -104,23 +104,23 @@ def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Err
     )
 
 
-def mean_errors(several: Sequence[Errors]) -> Errors:
+def mean_errors(all_errors: Sequence[Errors]) -> Errors:
     """Return the errors of several runs, for example of all seeds, as one.
 
     Numbers are means over the runs that have them. A maximum is the largest of all runs, and the first disagreement
     is the earliest of all runs.
 
     Args:
-        several: The errors of each run, at least one.
+        all_errors: The errors of each run, at least one.
     """
-    first = min(several, key=lambda errors: (math.isnan(errors.first_disagreement_s), errors.first_disagreement_s))
+    first = min(all_errors, key=lambda errors: (math.isnan(errors.first_disagreement_s), errors.first_disagreement_s))
 
     def mean(value: Callable[[Errors], float]) -> float:
-        values = [number for errors in several if not math.isnan(number := value(errors))]
+        values = [number for errors in all_errors if not math.isnan(number := value(errors))]
         return math.fsum(values) / len(values) if values else math.nan
 
     def spread(name: str) -> Spread:
-        largest = [number for errors in several if not math.isnan(number := getattr(errors, name).largest)]
+        largest = [number for errors in all_errors if not math.isnan(number := getattr(errors, name).largest)]
         return Spread(
             mean(lambda errors: getattr(errors, name).mean),
             mean(lambda errors: getattr(errors, name).p95),
@@ -129,7 +129,7 @@ def mean_errors(several: Sequence[Errors]) -> Errors:
 
     spreads = {field.name: spread(field.name) for field in fields(Errors) if field.type is Spread}
     return Errors(
-        packets=sum(errors.packets for errors in several),
+        packets=sum(errors.packets for errors in all_errors),
         **spreads,
         fate_disagreement=mean(lambda errors: errors.fate_disagreement),
         first_disagreement=first.first_disagreement,
@@ -138,7 +138,8 @@ def mean_errors(several: Sequence[Errors]) -> Errors:
         delay_added_s=mean(lambda errors: errors.delay_added_s),
         exchanges_per_s=mean(lambda errors: errors.exchanges_per_s),
         wall_s={
-            part: math.fsum(errors.wall_s[part] for errors in several) / len(several) for part in several[0].wall_s
+            part: math.fsum(errors.wall_s[part] for errors in all_errors) / len(all_errors)
+            for part in all_errors[0].wall_s
         },
         real_time_factor=mean(lambda errors: errors.real_time_factor),
     )
@@ -155,7 +156,7 @@ def delay_added_s(run: Run) -> float:
 
 
 def lost_share(run: Run) -> float:
-    """Return the share of packets lost, of those whose fate is decided; nan if there are none."""
+    """Return the share of packets lost, of those whose fate is decided; nan without such packets."""
     lost = [bool(fate.reason) for fate in run.fates.values() if fate.is_decided]
     return sum(lost) / len(lost) if lost else math.nan
 

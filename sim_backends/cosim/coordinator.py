@@ -48,7 +48,7 @@ class Coordinator:
         situation: The input of the policy for the next window.
         run: The record so far.
         is_committing: True while a window is being hashed and passed to the observer. An interrupt must wait until
-            both are done, or the recording and the event hash differ by that window (`interrupts`).
+            both are done, or the recording and the event hash differ by that window (`between_windows`).
         is_interrupted: True if `KeyboardInterrupt` must be raised after that.
 
     Raises:
@@ -246,9 +246,9 @@ class Coordinator:
             if later_ns <= end_ns:
                 break
             lap("exchange")
-            more, states = agents.advance(end_ns, later_ns - 1, later_ns)
+            later_sent, states = agents.advance(end_ns, later_ns - 1, later_ns)
             lap("agents")
-            sent += more
+            sent += later_sent
             end_ns = later_ns
         if agents.new_agents:
             begin = agents.with_new_agents(begin, states)
@@ -295,7 +295,7 @@ class Coordinator:
         return entered, [fate.packet for fate in entered]
 
     def _add_active(self, *names: str) -> None:
-        """Add agents that send or receive but are not in `pairs`, so that looking-ahead policies include them."""
+        """Add agents that send or receive but are not in `pairs`, so that policies that look ahead include them."""
         self._active.update(names)
         other_agents = {*self.situation.other_agents, *names}
         self.situation.other_agents = tuple(sorted(other_agents))
@@ -339,7 +339,7 @@ class Coordinator:
 
 
 def _rate_limited(progress: Progress) -> Callable[[int], None]:
-    """Return a function that takes the simulated time, and calls `progress` at most every `_PROGRESS_EVERY_S`."""
+    """Return a function of the simulated time that calls `progress` at most every `_PROGRESS_EVERY_S`."""
     started_s = reported_s = time.perf_counter()
 
     def report(now_ns: int) -> None:

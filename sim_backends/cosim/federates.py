@@ -41,16 +41,16 @@ def check_physics(physics: object) -> None:
         ConfigurationError: It lacks an attribute or method; the message names it.
     """
     step_ns = getattr(physics, "step_ns", None)
-    lacks = ""
+    missing = ""
     if not isinstance(step_ns, int) or isinstance(step_ns, bool) or step_ns <= 0:
-        lacks = f"no step_ns, an integer above 0 (it is {step_ns!r})"
+        missing = f"no step_ns, an integer above 0 (it is {step_ns!r})"
     elif not isinstance(getattr(physics, "limits_m_s2", None), Mapping):
-        lacks = "no limits_m_s2, a mapping from each agent to a number"
+        missing = "no limits_m_s2, a mapping from each agent to a number"
     elif not callable(getattr(physics, "advance", None)):
-        lacks = "no method advance(to_ns, commands)"
-    if lacks:
+        missing = "no method advance(to_ns, commands)"
+    if missing:
         raise ConfigurationError(
-            f"the physics {type(physics).__name__} has {lacks}",
+            f"the physics {type(physics).__name__} has {missing}",
             remedy="see what a physics class needs: fieldkit docs cosim-api",
         )
 
@@ -71,7 +71,7 @@ def check_states(states: Mapping[str, object]) -> None:
 
 @dataclass(frozen=True)
 class Action:
-    """What a program does when it wakes.
+    """The output of a program when it wakes.
 
     Attributes:
         datagrams: Datagrams that it sends.
@@ -86,7 +86,7 @@ class Program(Protocol):
     """Software of one agent: it reads the agent's state, receives datagrams, sends, and steers."""
 
     def next_wake_ns(self) -> int | None:
-        """Return when its timer wakes it next, or None if only a datagram does; waking alone changes this time."""
+        """Return the time when its timer wakes it next, or None without a timer; only a wake changes this time."""
         ...
 
     def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:

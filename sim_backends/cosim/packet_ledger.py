@@ -168,5 +168,5 @@ class PacketLedger:
         try:
             return self._under_way.pop(packet_id)
         except KeyError:
-            why = "which was reported before" if 0 < packet_id <= self._packets else "which it never got"
+            why = "which was reported before" if 0 < packet_id <= self._packets else "which never entered it"
             raise FederateError(f"the network reported the fate of packet {packet_id}, {why}") from None

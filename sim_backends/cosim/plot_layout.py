@@ -1,4 +1,4 @@
-"""Contents and layout of plots: curves, outlines of obstacles, directions of travel, and places of labels."""
+"""Contents and layout of plots: curves, outlines of obstacles, directions of travel, and positions of labels."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -97,8 +97,8 @@ def outlines(world: World) -> Iterator[ObstacleOutline]:
             yield ObstacleOutline(shape.corners_m(), is_above or isinstance(obstacle, Raised | Ramp))
 
 
-def last_heading(path_m: Sequence[Point]) -> tuple[Point, Point] | None:
-    """Return both ends of an arrow at the end of a path, in the direction of travel; None if nothing moves."""
+def direction_arrow(path_m: Sequence[Point]) -> tuple[Point, Point] | None:
+    """Return both ends of an arrow at the end of a path, in the direction of travel; None without motion."""
     east_m, north_m = path_m[-1]
     covered_m = math.hypot(*(max(axis) - min(axis) for axis in zip(*path_m, strict=True)))
     for from_e, from_n in reversed(path_m):

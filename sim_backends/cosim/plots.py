@@ -1,6 +1,6 @@
 """Figures of co-simulations for publications; the only module of `sim_backends` that imports matplotlib.
 
-They have the style of the figures of trials (`fieldkit.report.theme`), and are identical bytes on every machine.
+The figures have the style of those of trials (`fieldkit.report.theme`), and the same bytes on every machine.
 """
 
 import io
@@ -27,7 +27,7 @@ from sim_backends.cosim.plot_layout import (
     ObstacleOutline,
     Point,
     curve_boxes,
-    last_heading,
+    direction_arrow,
     place_labels,
     stack_labels,
 )
@@ -46,7 +46,7 @@ _POINTS_PER_INCH: Final = 72.0
 _ZERO_SHARE: Final = 0.16
 """Distance of the line for zeros below the axis, as a share of the axis' decades."""
 _LEADER_POINTS: Final = 5.0
-"""Distance from which on a leader line connects a label with its point."""
+"""Minimum distance of a label from its point at which a line connects them."""
 _BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.3}
 _DARKENING: Final = 0.75
 _LETTER_WIDTH: Final = 0.58
@@ -198,9 +198,9 @@ def _draw_paths(axes: Axes, paths_m: Mapping[str, Sequence[tuple[float, float]]]
     for number, path_m in enumerate(paths_m.values()):
         marker = CYCLE[number % len(CYCLE)][1]
         axes.plot(*path_m[0], marker=marker, color=LIGHT["ink"], markersize=_MARKER_POINTS, zorder=3)
-        if (heading := last_heading(path_m)) is not None:
+        if (arrow_ends := direction_arrow(path_m)) is not None:
             arrow = {"arrowstyle": "-|>", "color": LIGHT["ink"], "linewidth": 0.6, "shrinkA": 0, "shrinkB": 0}
-            axes.annotate("", heading[1], heading[0], arrowprops=arrow, zorder=3)
+            axes.annotate("", arrow_ends[1], arrow_ends[0], arrowprops=arrow, zorder=3)
     axes.margins(0.15)
     axes.set_adjustable("datalim")
 

@@ -23,11 +23,12 @@ class Fate:
         true: True states of source and destination at the time of sending: those at the last physics step,
             extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
         arrived_ns: Time when the network delivered it, or None.
-        counted_ns: Time when its receiver got it, which depends on the policy: the window's end, or `arrived_ns`.
-        late_ns: Time by which the receiver was already past `counted_ns`.
-        reason: Why it never arrived; empty if it arrived or is under way.
+        counted_ns: Time from which the arrival counts for its receiver: by the policy, `arrived_ns` or the end of the
+            window.
+        late_ns: Time by which the receiver had already passed `counted_ns`.
+        reason: The reason why it never arrived; empty if it arrived or is under way.
         position_error_m: Largest error of the relative position that the network assumed for two of the agents that
-            matter for the packet; None if these are source and destination only (`packet_ledger.position_error_m`).
+            affect the packet; None if these are source and destination only (`packet_ledger.position_error_m`).
     """
 
     packet: Packet
@@ -45,7 +46,7 @@ class Fate:
         return self.arrived_ns is not None or bool(self.reason)
 
 
-def no_wall_s() -> dict[str, float]:
+def zero_wall_s() -> dict[str, float]:
     """Return the parts of the wall time, each 0."""
     return {"agents": 0.0, "network": 0.0, "exchange": 0.0, "wait": 0.0}
 
@@ -63,7 +64,7 @@ class Run:
 
     fates: dict[PacketIdentity, Fate] = field(default_factory=dict)
     windows_ns: list[int] = field(default_factory=list)
-    wall_s: dict[str, float] = field(default_factory=no_wall_s)
+    wall_s: dict[str, float] = field(default_factory=zero_wall_s)
     digest: str = ""
 
 
@@ -77,8 +78,8 @@ _HASHED_BYTES: Final = 1 << 15
 class EventDigest:
     """Hashes windows in order: packets that entered the network, arrivals, drops, and the end of each window.
 
-    A window is hashed when it is over, so a run that stops within a window has the digest of the windows before.
-    States are not hashed: the last bit of a position may differ between two mathematical libraries, times may not.
+    A window is hashed after its end, so a run that stops within a window has the digest of the windows before.
+    States are not hashed: the last bit of a position may differ between two mathematical libraries; times are equal.
 
     Attributes:
         quiet_ends_ns: Ends of the windows since the last window with packets. They are hashed together; for a window
@@ -118,7 +119,7 @@ class EventDigest:
             events.clear()
 
     def _add_quiet_windows(self) -> None:
-        """Append the ends of the quiet windows to the events."""
+        """Append the ends of the windows without packets to the events."""
         ends_ns = self.quiet_ends_ns
         numbers = range(self._windows, self._windows + len(ends_ns))
         self._events += b"".join(map(_EVENT.pack, repeat(b"w"), numbers, ends_ns))
@@ -126,10 +127,10 @@ class EventDigest:
         ends_ns.clear()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "EventDigest":
-        other = EventDigest()
-        other.quiet_ends_ns = self.quiet_ends_ns.copy()
-        other._hash, other._events, other._windows = self._hash.copy(), self._events.copy(), self._windows
-        return other
+        duplicate = EventDigest()
+        duplicate.quiet_ends_ns = self.quiet_ends_ns.copy()
+        duplicate._hash, duplicate._events, duplicate._windows = self._hash.copy(), self._events.copy(), self._windows
+        return duplicate
 
     def hexdigest(self) -> str:
         """Return the hash over all windows so far, in hexadecimal."""
@@ -145,7 +146,7 @@ class Window(NamedTuple):
     Attributes:
         begin_ns: Its beginning.
         end_ns: Its end.
-        decided_by: What determined its length, for example a pair of agents; empty if the policy does not report it.
+        decided_by: Reason for its length, for example a pair of agents; empty if the policy does not report it.
         entered: Fates of the packets that entered the network in it, in order. Most are not decided yet; the same
             objects are in `ended` of a later window.
         ended: Fates that were decided in it, in order.
@@ -173,7 +174,7 @@ class WindowObserver(Protocol):
         ...
 
     def window(self, window: Window) -> None:
-        """Receive a window, right after it has ended."""
+        """Receive a window, immediately after it has ended."""
         ...
 
 

@@ -39,21 +39,21 @@ class WallTime:
             "network": [federate for federate in network if isinstance(federate, Waits)],
             "exchange": (),
         }
-        self._waited_s = {part: self._sum_s(part) for part in self._waiting}
+        self._waited_s = {part: self._total_waited_s(part) for part in self._waiting}
         self._spent_s = dict.fromkeys(total_s, 0.0)
-        self._lap_s = time.perf_counter()
+        self._lap_start_s = time.perf_counter()
 
     def start(self) -> None:
-        """Begin a lap; the time since the last lap belongs to no part."""
-        self._lap_s = time.perf_counter()
+        """Start a lap; the time since the last lap belongs to no part."""
+        self._lap_start_s = time.perf_counter()
 
     def lap(self, part: Literal["agents", "network", "exchange"]) -> None:
         """Add the time since the last lap to a part."""
         now_s = time.perf_counter()
-        self._spent_s[part] += now_s - self._lap_s
-        self._lap_s = now_s
+        self._spent_s[part] += now_s - self._lap_start_s
+        self._lap_start_s = now_s
         if self._waiting[part]:
-            waited_s = self._sum_s(part)
+            waited_s = self._total_waited_s(part)
             new_s = waited_s - self._waited_s[part]
             self._waited_s[part] = waited_s
             self._spent_s[part] -= new_s
@@ -66,7 +66,7 @@ class WallTime:
             self._total_s[part] += part_s
         return spent_s
 
-    def _sum_s(self, part: str) -> float:
+    def _total_waited_s(self, part: str) -> float:
         return sum(federate.waited_s for federate in self._waiting[part])
 
 

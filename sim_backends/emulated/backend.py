@@ -196,9 +196,9 @@ class EmulatedBackend:
         from sim_backends.emulated import requirements  # noqa: PLC0415 (as in `open`)
 
         variants = self._options.robots
-        tools = (variants[name] for name in names if name in variants)
+        robot_variants = (variants[name] for name in names if name in variants)
         mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
-        requirements.check({program for options in tools for program in options.programs()} | mesh)
+        requirements.check({program for options in robot_variants for program in options.programs()} | mesh)
         return requirements.ros_in_use(self._options.ros)
 
 

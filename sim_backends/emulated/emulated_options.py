@@ -38,7 +38,7 @@ class RobotOptions(Strict):
 
     Attributes:
         ssh: Its SSH server: `openssh` or `dropbear`.
-        sftp: Whether that server offers SFTP.
+        sftp: True if that server offers SFTP.
         userland: `gnu` or `busybox`. With `busybox`, `sh`, `tar`, `ip` and similar programs are busybox's, and
             programs that busybox lacks are missing.
         netcat: `traditional`, `openbsd`, `ncat` or `busybox`: its only netcat, installed as `nc` and under its own
@@ -60,14 +60,14 @@ class RobotOptions(Strict):
         return programs | ({"busybox"} if "busybox" in {self.userland, self.ping} else set())
 
 
-AS_THIS_MACHINE: Final = RobotOptions.defaults()
+HOST_TOOLS: Final = RobotOptions.defaults()
 
 
 class MeshOptions(Strict):
     """A mesh: robots forward packets for each other, and a routing daemon on each robot finds the routes.
 
     Attributes:
-        daemon: `babeld`, which speaks Babel (RFC 8966).
+        daemon: `babeld`, which implements Babel (RFC 8966).
         hello: Hello interval; the daemon's default is 4 s. A lost route is replaced within a multiple of it.
     """
 
@@ -91,7 +91,7 @@ class Ros2Options(Strict):
     def _check_router(self) -> "Ros2Options":
         if (self.discovery == "router") != (self.router is not None):
             raise schema.validation_error(
-                "`discovery: router` and `router: ROBOT`, which runs it, go together", "router"
+                "`discovery: router` and `router: ROBOT`, which runs it, require each other", "router"
             )
         return self
 
@@ -102,10 +102,10 @@ class EmulatedOptions(Strict):
     Attributes:
         ros: `debian`: ROS's own master and rosbag from Debian. `builtin`: fieldkit's own
             ([cheaper](add-a-robot.md#built-in-or-debians-ros)). `auto`: Debian's where installed. Robots with ROS 2
-            always use fieldkit's own, and [speak over the radio](add-a-robot.md#ros-2-over-the-radio) unless this is
-            `builtin`.
-        ros2: How robots with ROS 2 discover each other.
-        robots: Variants of tools, by robot; the default is what this machine has. See [add a
+            always use fieldkit's own, and [communicate over the
+            radio](add-a-robot.md#ros-2-over-the-radio) unless this is `builtin`.
+        ros2: Discovery between robots with ROS 2.
+        robots: Variants of tools, by robot; the default is the tools of this machine. See [add a
             robot](add-a-robot.md#variants-of-tools).
         world: The world around the robots: a file in the folder `worlds/` of the lab, or a shipped one (`lawn`,
             `baylands`, `open`). See [world file](world-file.md).
@@ -113,9 +113,9 @@ class EmulatedOptions(Strict):
             fixes the links.
         late_bound: A repeat is void if a packet was delayed by the emulator itself by more than this in total, before
             and after the radio model.
-        record_air: Whether every transmission attempt and ACK is written to `air.pcap` and `air.csv` of each repeat;
+        record_air: True to write every transmission attempt and ACK to `air.pcap` and `air.csv` of each repeat;
             fixed links have none.
-        boot: How long a robot that reboots stays off before its programs start.
+        boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
     """
 

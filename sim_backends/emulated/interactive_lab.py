@@ -43,7 +43,7 @@ class EmulatedLab:
     def __init__(
         self, members: Mapping[str, LabRobot], up: RunningRobots[str], options: EmulatedOptions, world: World
     ) -> None:
-        self._up = up
+        self._running = up
         self._options = options
         self._world = world
         self._places_m = placement.square_m(members, world)
@@ -54,17 +54,17 @@ class EmulatedLab:
         up.medium.place(self._places_m)
         up.places.write(self._places_m)
         for name in members:
-            self._put(name)
+            self._assign_place(name)
         self.members = members
         self.login = Login(USER, up.private_key, up.host_keys)
 
     def connect(self, name: str, timeout_s: float) -> socket.socket:
         """Implement `Lab.connect`."""
-        return self._up.robots[name].connect(timeout_s)
+        return self._running.robots[name].connect(timeout_s)
 
     def programs(self, name: str) -> tuple[str, ...]:
         """Implement `Lab.programs` from `/proc`, which also works for a robot that does not respond."""
-        return tuple(dict.fromkeys(_programs(self._up.robots[name].pid)))
+        return tuple(dict.fromkeys(_programs(self._running.robots[name].pid)))
 
     def place_m(self, name: str) -> Vector:
         """Implement `Lab.place_m`."""
@@ -76,20 +76,20 @@ class EmulatedLab:
         with self._lock:
             place_m = placement.moved_m(self._places_m[name], to, self._world)
             places_m = self._places_m | {name: place_m}
-            self._up.medium.place(places_m)
-            self._up.places.write(places_m)
+            self._running.medium.place(places_m)
+            self._running.places.write(places_m)
             self._places_m = places_m
-            self._put(name)
+            self._assign_place(name)
             return place_m
 
-    def _put(self, name: str) -> None:
+    def _assign_place(self, name: str) -> None:
         """Send a robot its new place; it faces east there."""
         self._path_starts_ns[name] = start_ns = time.monotonic_ns()
-        self._up.robots[name].move(AssignedPath(start_ns, [self._places_m[name]], speed_m_s=1.0, facing_rad=0.0))
+        self._running.robots[name].move(AssignedPath(start_ns, [self._places_m[name]], speed_m_s=1.0, facing_rad=0.0))
 
     def watching(self) -> AbstractContextManager[object]:
         """Return a context that keeps the medium up to date with robots that steer themselves."""
-        if not any(robot.spec.steers for robot in self._up.robots.values()):
+        if not any(robot.spec.steers for robot in self._running.robots.values()):
             return nullcontext()
         return MotionThread(self._follow, "watch")
 
@@ -100,14 +100,14 @@ class EmulatedLab:
                 name: motion.state
                 if mavlink_of(self.members[name].profile) is not None
                 else placement.on_ground(motion.state, self._world)
-                for name, motion in self_steered(self._up.robots, self._path_starts_ns).items()
+                for name, motion in self_steered(self._running.robots, self._path_starts_ns).items()
             }
             if states != self._states:
                 self._states = states
                 self._places_m = self._places_m | {name: state.position_m for name, state in states.items()}
                 velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
-                self._up.medium.place(self._places_m, velocities_m_s=velocities_m_s)
-                self._up.places.write(self._places_m)
+                self._running.medium.place(self._places_m, velocities_m_s=velocities_m_s)
+                self._running.places.write(self._places_m)
         return WATCH_S
 
     def overview(self) -> Overview:
@@ -178,7 +178,7 @@ def overview(
 
 def _programs(robot_pid: int) -> Iterator[str]:
     """Yield the name of each process of a robot except its init process."""
-    pending = [pid for first in _children(robot_pid) for pid in _children(first)]
+    pending = [pid for init_pid in _children(robot_pid) for pid in _children(init_pid)]
     while pending:
         yield from filter(None, map(_name, pending))
         pending = [child for pid in pending for child in _children(pid)]

@@ -91,15 +91,15 @@ def self_steered(
 
 
 class Mobility:
-    """Places robots, moves them, and takes one out of range.
+    """Places robots, moves them, and moves one out of range.
 
     Args:
         cast: The robot of each role.
         medium: The medium that carries the robots' packets.
         world: The world around the robots.
         laptop: The operator's laptop, placed beside the robots; None if it is not on the air.
-        robots: Handles of the robots, which get their paths and report motion of their own.
-        show: Called with each robot's position, metres east, north, up, for the lasers of the other robots.
+        robots: Handles of the robots, which get their paths and report their motion if they steer themselves.
+        write_positions: Called with the robots' positions, metres east, north, up, for the lasers of other robots.
     """
 
     def __init__(
@@ -110,16 +110,16 @@ class Mobility:
         laptop: Laptop | None,
         robots: Mapping[Role, EmulatedRobot] = MappingProxyType({}),
         *,
-        show: Callable[[Mapping[str, Vector]], None] = lambda positions_m: None,  # noqa: ARG005
+        write_positions: Callable[[Mapping[str, Vector]], None] = lambda positions_m: None,  # noqa: ARG005
     ) -> None:
-        self._show = show
+        self._write_positions = write_positions
         self._robots = robots
         self._cast = cast
         self._medium = medium
         self._world = world
         self._laptop = laptop
         self._placement: Placement | None = None
-        self._away: Role | None = None
+        self._out_of_range_role: Role | None = None
         # Each with its start, by the monotonic clock.
         self._motions: list[tuple[int, Motion]] = []
         # Start of each robot's last assigned path; motion that refers to an earlier path is ignored.
@@ -137,7 +137,7 @@ class Mobility:
         """
         with self._lock:
             self._placement = placement
-            # Robots before the medium: the new path invalidates motion that refers to the old one.
+            # The robots are updated before the medium: the new path invalidates motion that refers to the old one.
             for role in self._robots:
                 self._send_path(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
             self._update_medium()
@@ -149,7 +149,7 @@ class Mobility:
             self._update_medium()
 
     def set_out_of_range(self, role: Role | None) -> None:
-        """Take one robot out of the range of all others, or bring it back with None.
+        """Move one robot out of the range of all others, or move it back with None.
 
         Without the relay no robot receives another.
 
@@ -159,7 +159,7 @@ class Mobility:
         """
         with self._lock:
             self._require_placement()
-            self._away = role
+            self._out_of_range_role = role
             self._update_medium()
 
     @contextmanager
@@ -207,16 +207,8 @@ class Mobility:
     def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
         """Return the positions of all robots from a time on; earlier ones are discarded."""
         with self._lock:
-            last = {
-                whereabouts.role: number
-                for number, whereabouts in enumerate(self._track)
-                if whereabouts.utc_ns <= since_utc_ns
-            }
-            self._track = [
-                whereabouts
-                for number, whereabouts in enumerate(self._track)
-                if number >= last.get(whereabouts.role, 0)
-            ]
+            last = {point.role: number for number, point in enumerate(self._track) if point.utc_ns <= since_utc_ns}
+            self._track = [point for number, point in enumerate(self._track) if number >= last.get(point.role, 0)]
             return tuple(self._track)
 
     def _send_path(self, move: Move, start_ns: int) -> None:
@@ -245,8 +237,8 @@ class Mobility:
             relay = places.relay(self._cast, placement)
             if self._laptop is not None:
                 states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
-            away = None if self._away is None else self._cast[self._away].name
-            self._show({name: state.position_m for name, state in states.items() if name != away})
+            away = None if self._out_of_range_role is None else self._cast[self._out_of_range_role].name
+            self._write_positions({name: state.position_m for name, state in states.items() if name != away})
             if away is not None:
                 states = {} if away == relay else {name: state for name, state in states.items() if name != away}
             self._medium.place(
@@ -260,7 +252,7 @@ class Mobility:
     def _extend_track(self, states: Mapping[str, State]) -> None:
         """Append robots whose position or velocity has changed to the track."""
         utc_ns = time.time_ns()
-        last = {whereabouts.role: whereabouts for whereabouts in self._track}
+        last = {point.role: point for point in self._track}
         for role, robot in self._cast.items():
             state = states.get(robot.name)
             now = (None, STILL) if state is None else (state.position_m, state.velocity_m_s)

@@ -37,8 +37,9 @@ LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_po
 class Node:
     """A process tree in its own network, mount, PID, UTS and IPC namespaces; use as a context manager.
 
-    The process starts when the object is made, and the first request waits until it is up. It stops as a `Worker`
-    does, so make the object in a thread that lives as long as the lab.
+    The process starts when the object is created, and the first request waits until the process is ready. The kernel
+    kills the process when the thread that created the object ends, so create it in a thread that exists as long as
+    the lab.
 
     Args:
         name: Its name in the lab.
@@ -73,7 +74,7 @@ class Node:
         Args:
             mesh: True if robots forward packets for each other.
             guest_hello_s: Hello interval of a node that uses the robots' routes and forwards nothing itself; None if
-                the node starts a routing daemon of its own, or needs none.
+                the node is a robot with a complete routing daemon, or needs none.
 
         Raises:
             LinkError: The node has exited or did not answer.
@@ -85,7 +86,7 @@ class Node:
 
     @property
     def radio_fd(self) -> int:
-        """Descriptor of its TUN or TAP device, open as long as the node is up.
+        """Descriptor of its TUN or TAP device, open as long as the node runs.
 
         Raises:
             RobotError: The radio was not opened.
@@ -162,7 +163,7 @@ class EmulatedRobot(Node):
         return None if self._record is None else self._record.read()
 
     def start(self) -> None:
-        """Start the robot's programs and return when they serve. Errors as `open_radio`."""
+        """Start the robot's programs and return when they are ready. Errors as `open_radio`."""
         self._worker.request({"do": "start", "robot": asdict(self.spec)}, timeout_s=START_S + REPLY_S)
 
     def switch_off(self) -> None:
@@ -179,7 +180,7 @@ class EmulatedRobot(Node):
 
     def move(self, path: AssignedPath) -> None:
         """Send the robot's sensors the path on which the lab moves it. Errors as `open_radio`."""
-        self._worker.request({"do": "move", "way": asdict(path)})
+        self._worker.request({"do": "move", "path": asdict(path)})
 
     def halt(self) -> None:
         """Cut the power: all processes except init are killed, and memory is lost. Errors as `open_radio`."""
@@ -254,7 +255,7 @@ def running_robots(
     ros: RosChoice,
     seed: int,
 ) -> Iterator[RunningRobots[RobotKey]]:
-    """Yield robots whose programs serve; leaving the context stops all their processes.
+    """Yield robots whose programs are ready; leaving the context stops all their processes.
 
     The arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
     and connect to it over the radio.
@@ -269,24 +270,28 @@ def running_robots(
         framing = IP if options.mesh is None else ETHERNET
         medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
         places = stack.enter_context(closing(PlacesWriter([robot.name for robot in robots.values()])))
-        # Entered before the robots and left after them: when a robot exits, the request that waits for it fails.
+        # The pool is left after the robots: a request that waits for a robot fails only when the robot exits.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _MAX_PARALLEL_STARTS)))
-        up: dict[RobotKey, EmulatedRobot] = {}
+        running: dict[RobotKey, EmulatedRobot] = {}
         for key in robots:
             spec = robot_spec(
                 robots, key, ros=ros, login=login, host_key=host_keys[key], options=options, world=world
             )
-            up[key] = stack.enter_context(EmulatedRobot(spec, places.fd))
-        list(pool.map(_build, up.values()))
+            running[key] = stack.enter_context(EmulatedRobot(spec, places.fd))
+        list(pool.map(_build, running.values()))
         # Robots with a ROS master start first, because the other robots wait for it.
-        started = pool.map(EmulatedRobot.start, sorted(up.values(), key=lambda robot: not robot.spec.runs_master))
-        for key, robot in up.items():
+        started = pool.map(
+            EmulatedRobot.start, sorted(running.values(), key=lambda robot: not robot.spec.runs_master)
+        )
+        for key, robot in running.items():
             medium.attach(robot.name, robot.address, robots[key].profile.radio, robot.radio_fd)
-        if any(robot.spec.waits_for_another for robot in up.values()):
-            medium.place(placement.side_by_side_m(robot.name for robot in up.values()))
+        if any(robot.spec.waits_for_another for robot in running.values()):
+            medium.place(placement.side_by_side_m(robot.name for robot in running.values()))
         list(started)
-        yield RunningRobots(up, medium, places, {key: pair.public for key, pair in host_keys.items()}, login.private)
-        for robot in up.values():
+        yield RunningRobots(
+            running, medium, places, {key: pair.public for key, pair in host_keys.items()}, login.private
+        )
+        for robot in running.values():
             robot.request_exit()
 
 

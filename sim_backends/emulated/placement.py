@@ -118,7 +118,7 @@ def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
     """Return the position of an antenna after a move.
 
     Args:
-        place_m: Its position before.
+        place_m: Its position before the move.
         to: The destination.
         world: The world around the robot.
 
@@ -145,7 +145,7 @@ def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
         raise ConfigurationError(
             f"{up_m:g} m up is not a valid height: the ground is at {ground_m:g} m there, and nothing flies above "
             f"{_CEILING_M / 1000:g} km",
-            remedy=f"leave UP out for a robot on the ground, whose antenna is {ANTENNA_M:g} m above it",
+            remedy=f"omit UP for a robot on the ground, whose antenna is {ANTENNA_M:g} m above it",
         )
     return *end_m, up_m
 
@@ -153,8 +153,8 @@ def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
 def laptop_m(cast: Cast, placement: Placement, world: World) -> Vector:
     """Return the position of the laptop: 2 m beside the robot that stays in its place.
 
-    In master this is the relay, since people sit near the access point. In masterless it is the receiver, because a
-    person carries the sender, also behind the wall, where the laptop never is.
+    With a master this is the relay, because operators are near the access point. Without a master it is the receiver,
+    because a person carries the sender, also behind the wall, where the laptop never is.
     """
     staying = Role.RELAY if placement.topology is Topology.MASTER else Role.RECEIVER
     east_m, north_m, up_m = positions_m(cast, placement, world)[cast[staying].name]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, Self, TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.emulated.emulated_options import AS_THIS_MACHINE, EmulatedOptions, RosChoice, uses_debian_ros
+from sim_backends.emulated.emulated_options import HOST_TOOLS, EmulatedOptions, RosChoice, uses_debian_ros
 from sim_backends.emulated.motion_sections import drive_of, mavlink_of
 from sim_backends.emulated.robot.spec import ANTENNA_M, LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros import static_frames
@@ -55,12 +55,14 @@ class KeyPair:
     def make(cls) -> Self:
         """Return a new key."""
         # Importing cryptography takes 50 ms, and a dry run uses this module without making a key.
-        from cryptography.hazmat.primitives import serialization as form  # noqa: PLC0415
+        from cryptography.hazmat.primitives import serialization  # noqa: PLC0415
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey  # noqa: PLC0415
 
         key = Ed25519PrivateKey.generate()
-        private = key.private_bytes(form.Encoding.PEM, form.PrivateFormat.OpenSSH, form.NoEncryption())
-        public = key.public_key().public_bytes(form.Encoding.OpenSSH, form.PublicFormat.OpenSSH)
+        private = key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.OpenSSH, serialization.NoEncryption()
+        )
+        public = key.public_key().public_bytes(serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH)
         return cls(private.decode(), public.decode())
 
 
@@ -126,7 +128,7 @@ def neighbour(number: int, profile: RobotProfile) -> Neighbour:
     A profile whose body is not in the table has the body of the paper's robot of its kind.
     """
     from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER  # noqa: PLC0415 (numpy takes 60 ms)
-    from sim_backends.physics.known import BODIES, quadrotor  # noqa: PLC0415
+    from sim_backends.physics.robot_limits import BODIES, quadrotor  # noqa: PLC0415
 
     default = quadrotor(profile.name) if profile.kind == "uav" else TURTLEBOT3_BURGER
     body = BODIES.get(profile.name, default)
@@ -157,7 +159,7 @@ def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
     """Return True if robots of a profile can be driven by a topic of Debian's ROS 1, or of ROS 2 over the radio.
 
-    Not with a Zenoh router on another robot, because the driver discovers only the base on its own robot.
+    The result is False with a Zenoh router on another robot, because the driver discovers only the base of its robot.
     """
     ros = profile.ros
     if drive_of(profile) is None or ros is None:
@@ -201,13 +203,13 @@ def _ros2_spec(
     settings = options.ros2
     if settings.router is not None and settings.router not in addresses:
         raise ConfigurationError(
-            f"emulated.ros2.router is {settings.router}, which does not take part in this trial",
+            f"emulated.ros2.router is {settings.router}, which is not in this trial",
             where=robot.name,
             remedy=f"name one of: {', '.join(addresses)}; or write discovery: multicast",
         )
     peers = tuple(address for address in addresses.values() if address != robot.address)
     return Ros2Spec(
-        over=middleware,
+        middleware=middleware,
         distribution=ros.command.distribution,
         discovery=settings.discovery,
         peers=peers if settings.discovery == "peers" else (),
@@ -217,7 +219,7 @@ def _ros2_spec(
 
 
 def _bridge(robot: "Robot | LabRobot") -> tuple[str, ...]:
-    """Return the command of the bridge that starts with the robot, in an interactive lab; a trial starts its own."""
+    """Return the command of the bridge that starts with the robot in an interactive lab; empty in a trial."""
     ros = robot.profile.ros
     if ros is None or ros.bridge is None or isinstance(robot, Robot):
         return ()
@@ -236,7 +238,7 @@ def robot_spec(
 ) -> RobotSpec:
     """Return the specification of a robot; `world` is needed for a robot that flies or has a laser."""
     robot = robots[key]
-    tools = options.robots.get(robot.name, AS_THIS_MACHINE)
+    tools = options.robots.get(robot.name, HOST_TOOLS)
     profile_ros = robot.profile.ros
     is_ros2 = profile_ros is not None and profile_ros.variant == "ros2"
     ros2_over_radio = _ros2_spec(robots, robot, options)

@@ -67,12 +67,12 @@ def check(programs: Iterable[str] = ()) -> None:
 
 
 def _check_files() -> None:
-    """Raise ConfigurationError if a file that robots mount their own over is missing; only root can create it."""
-    lacking = [path for path in rootfs.OWN_FILES if not Path(path).exists()]
-    if lacking:
+    """Raise ConfigurationError if a file that each robot replaces by a mount is missing; only root can create it."""
+    missing = [path for path in rootfs.OWN_FILES if not Path(path).exists()]
+    if missing:
         raise ConfigurationError(
-            f"this machine has no {', '.join(lacking)}, which a robot's own file is mounted over",
-            remedy=f"sudo touch {' '.join(lacking)}",
+            f"this machine has no {', '.join(missing)}, over which each robot's file is mounted",
+            remedy=f"sudo touch {' '.join(missing)}",
         )
 
 

@@ -44,7 +44,7 @@ class EmulatedOracle:
         names: Name of each robot.
         medium: The medium that carries the robots' packets.
         mobility: The object that places the robots in the medium.
-        options: The lab's options, with the limit of lateness and whether transmissions are recorded.
+        options: The lab's options, with the limit of lateness and the option that records transmissions.
     """
 
     def __init__(
@@ -109,7 +109,9 @@ class EmulatedTestbed:
         self._laptop = laptop
         self._shells = shells
         self._boot_s = options.boot
-        self._mobility = Mobility(cast, running.medium, world, laptop, running.robots, show=running.places.write)
+        self._mobility = Mobility(
+            cast, running.medium, world, laptop, running.robots, write_positions=running.places.write
+        )
         names = {role: robot.name for role, robot in running.robots.items()}
         self._oracle = EmulatedOracle(names, running.medium, self._mobility, options)
 
@@ -196,7 +198,7 @@ def bring_up(
         ros: Source of ROS for robots with ROS 1, `debian` or `builtin`.
         seed: Seed of all random numbers of the medium.
         control: Network of SSH; over the radio, a robot out of the laptop's range cannot be reached.
-        patience_s: How long to wait for a lost control connection.
+        patience_s: Time to wait for a lost control connection.
         notice: Called with a message when a control connection is lost or restored.
         operator: The person who answers the questions of steps.
 
@@ -204,41 +206,45 @@ def bring_up(
         FieldkitError: A robot or the medium did not start.
     """
     with ExitStack() as stack:
-        up = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
-        laptop = stack.enter_context(laptop_on_air(up, options.mesh)) if control is Control.RADIO else None
+        running = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
+        laptop = stack.enter_context(laptop_on_air(running, options.mesh)) if control is Control.RADIO else None
         if laptop is not None:  # it connects to the robots before they have places
-            up.medium.place(places.side_by_side_m([*(robot.name for robot in up.robots.values()), laptop.name]))
+            running.medium.place(
+                places.side_by_side_m([*(robot.name for robot in running.robots.values()), laptop.name])
+            )
         shells: dict[Role, Shell] = {}
-        for role in up.robots:
-            shell = _shell(up, role, laptop, patience_s, notice)
+        for role in running.robots:
+            shell = _shell(running, role, laptop, patience_s, notice)
             shells[role] = stack.enter_context(closing(shell))
-        testbed = EmulatedTestbed(cast, up, shells, options=options, world=world, laptop=laptop, operator=operator)
+        testbed = EmulatedTestbed(
+            cast, running, shells, options=options, world=world, laptop=laptop, operator=operator
+        )
         stack.enter_context(testbed.watching())
         yield testbed
 
 
 @contextmanager
-def laptop_on_air(up: RunningRobots[RobotKey], mesh: MeshOptions | None) -> Iterator[Laptop]:
+def laptop_on_air(running: RunningRobots[RobotKey], mesh: MeshOptions | None) -> Iterator[Laptop]:
     """Yield the laptop, attached to the medium without a place.
 
     In a mesh it uses the routes of the robots, and forwards no packets.
     """
     with Laptop(f"{LAPTOP_ADDRESS}/{NETWORK.prefixlen}") as laptop:
         laptop.open_radio(mesh=mesh is not None, guest_hello_s=None if mesh is None else mesh.hello)
-        up.medium.attach(laptop.name, laptop.address, LAPTOP_RADIO, laptop.radio_fd)
+        running.medium.attach(laptop.name, laptop.address, LAPTOP_RADIO, laptop.radio_fd)
         yield laptop
 
 
 def _shell(
-    up: RunningRobots[Role], role: Role, laptop: Laptop | None, patience_s: float, notice: Callable[[str], None]
+    running: RunningRobots[Role], role: Role, laptop: Laptop | None, patience_s: float, notice: Callable[[str], None]
 ) -> SshShell:
     """Return the control connection of a robot, over the radio if the laptop is on the air."""
-    robot = up.robots[role]
+    robot = running.robots[role]
 
     def connect(timeout_s: float) -> socket.socket:
         if laptop is None:
             return robot.connect(timeout_s)
-        up.medium.check_alive()  # otherwise a connection attempt would wait for an answer that cannot arrive
+        running.medium.check_alive()  # otherwise a connection attempt would wait for an answer that cannot arrive
         robot.check_alive()
         return laptop.reach(robot.spec.ip, timeout_s)
 
@@ -246,8 +252,8 @@ def _shell(
         robot.name,
         connect=connect,
         user=USER,
-        host_key=up.host_keys[role],
-        private_key=up.private_key,
+        host_key=running.host_keys[role],
+        private_key=running.private_key,
         patience_s=patience_s,
         notice=notice,
         on_air=laptop is not None,

@@ -43,7 +43,7 @@ def federate_error(error: BaseException, federate: str, request: str) -> Federat
     if isinstance(error, AnswerTimeoutError):
         return UnansweredError(
             f"{federate} has not answered for {error.limit_s:g} s: request to {request}",
-            remedy="check what it waits for, or give it a longer deadline",
+            remedy="find out why it waits, or set a longer deadline",
         )
     return FederateError(
         f"{federate} failed at the request to {request}: {type(error).__name__}: {error}",
@@ -61,7 +61,7 @@ class PhysicsFederate(Protocol):
     """Moves the agents.
 
     Attributes:
-        step_ns: Its step; its states are those at whole steps.
+        step_ns: Time step; there are states at whole steps only.
         limits_m_s2: Largest change of each agent's velocity per second, in m/s^2. The mapping is read once; its
             values may change during the run.
     """

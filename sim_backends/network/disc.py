@@ -30,8 +30,8 @@ class Disc:
         """Implement `NetworkFederate.advance`."""
         drops = []
         for packet in packets:
-            now = states.at(packet.enters_ns) if isinstance(states, DeadReckoned) else states
-            ends = (now[name].position_m for name in (packet.source, packet.destination))
+            current_states = states.at(packet.enters_ns) if isinstance(states, DeadReckoned) else states
+            ends = (current_states[name].position_m for name in (packet.source, packet.destination))
             if math.dist(*ends) > self._range_m:
                 drops.append(Drop(packet.packet_id, "out of range"))
             else:

@@ -8,7 +8,7 @@ from fieldkit.core.model import Vector
 
 @dataclass(frozen=True, slots=True)
 class NodeLoss:
-    """A node is off: packets in its radio's queue are lost, and so is all that its programs send in this time.
+    """A node is off: packets in its radio's queue and packets that its programs send in this time are lost.
 
     Its transports are suspended: timers that expire in this time fire when the node is on again.
 

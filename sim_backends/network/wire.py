@@ -49,7 +49,7 @@ class Wire(Protocol):
         ...
 
     def at(self, at_ns: int, host: str, call: Callable[[], None]) -> None:
-        """Call `call` on a host at `at_ns`, which is not in the past; if the host is off then, when it is on again.
+        """Call `call` on a host at `at_ns`, which is not in the past; if the host is off, call when it is on again.
 
         Calls cannot be cancelled; a function whose timer was stopped must do nothing.
         """

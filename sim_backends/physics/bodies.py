@@ -1,10 +1,10 @@
-"""The physics federate of bodies in a world: each follows its course, and stops at what it touches.
+"""The physics federate of bodies in a world: each follows its course, and stops at a contact.
 
 Bodies move in time steps. A command takes effect at the first step that is not before the time at which it was given,
 and the motion does not depend on how the time is divided into calls. Two things make it fast. A course is evaluated
 only when a state is requested. And contacts are checked only between bodies in a neighbour list (Verlet, Phys. Rev.
-159, 98, 1967): a body that is farther from everything than its top speed allows cannot touch anything until the list
-expires.
+159, 98, 1967): a body that is farther from all obstacles and bodies than its top speed allows cannot touch
+anything until the list expires.
 """
 
 import math
@@ -30,7 +30,7 @@ class Collision:
     Attributes:
         at_ns: Its time.
         body: The moving body.
-        obstacle: What it touched: an obstacle, another body, or the ground.
+        obstacle: Name of the obstacle or body that it touched, or of the ground.
     """
 
     at_ns: int
@@ -162,7 +162,7 @@ class Bodies:
             )
 
     def _resolve_contacts(self, candidates: Mapping[str, ContactCandidates], step: int) -> None:
-        """Stop moving bodies at what they touch in the step that ends now, in order of their names."""
+        """Stop moving bodies at their contacts in the step that ends now, in order of their names."""
         before_m = {name: self._tracks[name].pose(step - 1).place_m for name in candidates}
         current_m = dict(before_m)
         tracks, touching = {}, {}
@@ -231,7 +231,7 @@ class Bodies:
                 if overlaps(footprint, body, place_m):
                     raise ConfigurationError(
                         f"{name} starts within {footprint.name}, at {_metres(place_m)} m",
-                        remedy=f"start it at least {body.radius_m:g} m away from everything",
+                        remedy=f"start it at least {body.radius_m:g} m away from obstacles and other bodies",
                     )
             grid.add(number, place_m)
 

@@ -89,7 +89,7 @@ class Body(Protocol[PoseT]):
 
     Attributes:
         place_m: Position at time 0, metres east, north, up; up is used only if it flies.
-        flies: True if its height is independent of the ground; otherwise it stands on the ground.
+        flies: True if its height is independent of the ground; otherwise it is on the ground.
         max_grade: Maximum grade of ground on which it drives, rise over run; used only if it does not fly.
         radius_m: Radius of the upright cylinder that contains it.
         height_m: Height of that cylinder, whose lower face is at its position.
@@ -114,7 +114,7 @@ class Body(Protocol[PoseT]):
         ...
 
     def course(self, pose: PoseT, command: object, step_s: float) -> Course[PoseT]:
-        """Return its course from a pose under a command; None if it has not received a command.
+        """Return its course from a pose under a command, which is None before the first command.
 
         Raises:
             ConfigurationError: The command does not suit the body.
@@ -126,7 +126,7 @@ class Body(Protocol[PoseT]):
 
         Args:
             pose: The pose that the body would have without the contact.
-            stop: Its position after the contact, and what it touched.
+            stop: Its position after the contact, and its contacts.
             command: Its last command, None for none.
         """
         ...

@@ -1,4 +1,4 @@
-"""Contacts of upright cylinders with their surroundings: they stop there, and slide along it.
+"""Contacts of upright cylinders with their surroundings: a cylinder stops at an obstacle, and slides along it.
 
 A moving body slides around an obstacle as far as possible; no body is pushed. A move is divided into pieces shorter
 than half a radius, so that a body cannot pass through even a thin obstacle. A body that would still overlap stays
@@ -92,7 +92,7 @@ class Extent(Protocol):
 
 
 class Edge(Protocol):
-    """Edges of raised ground, below which there is air."""
+    """Edges of raised ground, over which no body drives."""
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
         """Return the edge over which a body would drive, and the point where it stops; None if there is no edge."""
@@ -183,21 +183,23 @@ def move(
         edge: Edges over which it cannot drive, or None.
     """
     path_m = math.dist(from_m, to_m)
-    place_m, contacts = _walk(extent, from_m, to_m, footprints, edge)
+    place_m, contacts = _move_in_pieces(extent, from_m, to_m, footprints, edge)
     if not contacts:
         return None
     moved_m = math.dist(from_m, place_m)
     if moved_m > path_m:
-        # If sliding around a corner made the path longer than the intended one, it is shortened; in a corner, to
-        # nothing.
-        place_m, retry_contacts = _walk(extent, from_m, _between(from_m, to_m, path_m / moved_m), footprints, edge)
+        # If sliding around a corner made the path longer than the intended one, it is shortened; in a corner,
+        # to 0.
+        place_m, retry_contacts = _move_in_pieces(
+            extent, from_m, _between(from_m, to_m, path_m / moved_m), footprints, edge
+        )
         contacts += retry_contacts
         if math.dist(from_m, place_m) > path_m:
             place_m = from_m
     return ContactStop(place_m, tuple(contacts))
 
 
-def _walk(
+def _move_in_pieces(
     extent: Extent, from_m: Vector, to_m: Vector, footprints: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:
     """Return the position of a cylinder after a path, and its contacts."""

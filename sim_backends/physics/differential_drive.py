@@ -2,10 +2,11 @@
 
 Forward speed and yaw rate approach the commanded values as fast as their limits allow, independently of each other,
 like in ROS's `diff_drive_controller`. With a constant acceleration a and yaw rate w, the displacement in a time t is
-exact (the integral of the speed along the heading, about its middle): with the mean speed v, the mean heading h and x
-= w t / 2,
+exact (the integral of the speed along the heading, about its middle): with the mean speed v, the mean heading h and
+x = w t / 2, it is
 
-    along h:     v t sin(x) / x left of h:   a t^2 / 2 (sin(x) - x cos(x)) / x^2
+    v t sin(x) / x                            along h, and
+    a t^2 / 2 (sin(x) - x cos(x)) / x^2       to the left of h.
 
 If the yaw rate changes while the robot moves, this is a Fresnel integral; a single step with the mean yaw rate is
 then used, with an error below v (dw/dt) t^3 / 12.
@@ -127,10 +128,10 @@ class Arc:
             return self.start
         t = steps * self.step_s
         (east_m, north_m, up_m), heading_rad = self.start.place_m, self.start.heading_rad
-        middle_m_s = self.speed_m_s + self.acceleration_m_s2 * t / 2
+        mean_m_s = self.speed_m_s + self.acceleration_m_s2 * t / 2
         half_turn_rad = (self.turn_rad_s + self.turn_acceleration_rad_s2 * t / 2) * t / 2
         sinc, bend = _arc(half_turn_rad)
-        ahead_m, left_m = middle_m_s * t * sinc, self.acceleration_m_s2 * t * t / 2 * bend
+        ahead_m, left_m = mean_m_s * t * sinc, self.acceleration_m_s2 * t * t / 2 * bend
         cos, sin = math.cos(heading_rad + half_turn_rad), math.sin(heading_rad + half_turn_rad)
         east, north = ahead_m * cos - left_m * sin, ahead_m * sin + left_m * cos
         grade = self.start.grade
@@ -209,14 +210,14 @@ class DifferentialDrive:
         speed_m_s = _clamp(twist.forward_m_s, limits.speed_m_s)
         turn_rad_s = _clamp(twist.turn_rad_s, limits.turn_rad_s)
         max_m_s2 = self._acceleration_m_s2(pose, faster=speed_m_s > pose.speed_m_s)
-        no_grip = max_m_s2 <= _NO_GRIP_M_S2 and speed_m_s != pose.speed_m_s
-        if no_grip:  # the friction is just sufficient to hold the robot on the slope
+        has_no_grip = max_m_s2 <= _NO_GRIP_M_S2 and speed_m_s != pose.speed_m_s
+        if has_no_grip:  # the friction is just sufficient to hold the robot on the slope
             speed_m_s = pose.speed_m_s
         a_m_s2, speed_steps = _approach(pose.speed_m_s, speed_m_s, max_m_s2, step_s)
         a_rad_s2, turn_steps = _approach(pose.turn_rad_s, turn_rad_s, limits.turn_acceleration_rad_s2, step_s)
         steps = min((count for count in (speed_steps, turn_steps) if count), default=None)
         is_turning = bool(turn_steps or turn_rad_s)
-        if (turn_steps or (is_turning and pose.grade != _LEVEL)) and (speed_steps or speed_m_s or no_grip):
+        if (turn_steps or (is_turning and pose.grade != _LEVEL)) and (speed_steps or speed_m_s or has_no_grip):
             steps = 1  # see the top of this module
         return Arc(
             pose,

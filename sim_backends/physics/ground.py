@@ -1,7 +1,7 @@
 """The ground for bodies on wheels: flat, with raised areas and ramps.
 
 Vertical faces are walls from below and edges from above, over which no body drives; where a ramp leads to raised
-ground there is neither. Ground is too steep for a robot if its tires have no grip on it; it is then a wall as well.
+ground there is neither. For a robot, ground on which its tires have no grip, because it is too steep, is also a wall.
 """
 
 import math
@@ -93,15 +93,15 @@ class Ground:
         drop_m = from_m[2] - self.surface(east_m, north_m).height_m
         if drop_m <= _LEVEL_M + self._max_grade * math.dist(from_m, to_m):
             return None
-        under = [
+        pieces_below = [
             piece
             for piece in self._pieces
             if piece.distance_m(from_m[0], from_m[1]) <= _LEVEL_M
             and abs(piece.obstacle.height_m((from_m[0], from_m[1])) - from_m[2]) <= _LEVEL_M
         ]
-        if not under:
+        if not pieces_below:
             return None
-        nearest = min(under, key=lambda piece: piece.distance_m(east_m, north_m))
+        nearest = min(pieces_below, key=lambda piece: piece.distance_m(east_m, north_m))
         return nearest.obstacle.name, (*nearest.nearest_m(east_m, north_m), up_m)
 
     def _side(self, piece: _Piece) -> Footprint:

@@ -1,6 +1,6 @@
-"""Neighbour lists: what each body may touch before a list expires, and the minimum time to a contact.
+"""Neighbour lists: possible contacts of each body before a list expires, and the minimum time to a contact.
 
-A grid over the ground finds what is near a position without a search through everything.
+A grid over the ground gives the bodies near a position without a search through all bodies.
 """
 
 import math
@@ -18,7 +18,7 @@ _ROUNDING: Final = 1 + 1e-9
 
 
 class CellGrid:
-    """Numbers by the square cell of their position; all within a given distance are in nine cells.
+    """Numbers by the square cell of their position; those within a given distance are in nine cells.
 
     Args:
         within_m: That distance, horizontally, in metres.

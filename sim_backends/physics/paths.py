@@ -1,4 +1,4 @@
-"""Physics of agents with prescribed motion: way-points and velocity profiles."""
+"""Physics of agents with prescribed motion: waypoints and velocity profiles."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ class Paths:
         self, motions: Sequence[Motion], *, step_ns: int = STEP_NS, limits_m_s2: Mapping[str, float] | None = None
     ) -> None:
         self._motions = tuple(motions)
-        self._way_points = {motion.name: motion for motion in motions if isinstance(motion, WayPoints)}
+        self._waypoints = {motion.name: motion for motion in motions if isinstance(motion, WayPoints)}
         self.step_ns = step_ns
         self._at_ns = 0
         self._states = self._at(0)
@@ -39,8 +39,8 @@ class Paths:
 
     def limit_m_s2(self, name: str) -> float:
         """Return the limit of an agent that was not given one, valid from the last returned states on."""
-        way_points = self._way_points.get(name)
-        return math.inf if way_points is None else way_points.limit_m_s2(self._at_ns)
+        waypoints = self._waypoints.get(name)
+        return math.inf if waypoints is None else waypoints.limit_m_s2(self._at_ns)
 
     @property
     def names(self) -> frozenset[str]:

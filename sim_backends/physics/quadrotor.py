@@ -1,7 +1,7 @@
 """Quadrotors: point masses with an attitude, moved by thrust, gravity and drag, and controlled by an autopilot.
 
 The autopilot is a cascade, like PX4's (PX4 user guide, controller diagrams): the target velocity gives an
-acceleration within limits; with gravity and drag, which are known to the controller, it gives a thrust vector within
+acceleration within limits; with gravity and drag, which the controller compensates, it gives a thrust vector within
 bounds of tilt and size; that gives roll and pitch. These follow with a first-order lag and a limited rate; the thrust
 is chosen so that its vertical component at the actual attitude has the desired value. With f the thrust per mass, in
 axes of its yaw (forward, left, up),
@@ -350,7 +350,7 @@ class Quadrotor:
         )
 
     def _is_steady(self, pose: FlightPose, target: Velocity) -> bool:
-        """Return True if it will keep the target velocity for ever, except for rounding."""
+        """Return True if it will keep the target velocity permanently, except for rounding."""
         if math.dist(pose.velocity_m_s, target.velocity_m_s) > _REACHED:
             return False
         later = self._autopilot.fly(pose, target, 1.0)

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from sim_backends.radio.modes import CW_MAX, CW_MIN, DIFS_NS, SLOT_NS
 
-BLIND_NS: Final = 4_000
+CCA_TIME_NS: Final = 4_000
 """Stations that start within this time of each other do not sense each other and collide: aCCATime, table 17-21."""
 
 
@@ -38,7 +38,7 @@ class Contention:
         self.slots = 0
 
     def earliest_start_ns(self, now_ns: int) -> int:
-        """Return the earliest start time of a station that wants to send at `now_ns`, if the channel stays idle."""
+        """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle."""
         self._count_down(now_ns)
         if now_ns < self.busy_until_ns and not self.slots:
             self._draw_backoff()
@@ -69,11 +69,11 @@ class Contention:
         return self.count_from_ns + self.slots * SLOT_NS
 
     def defer_until(self, until_ns: int) -> None:
-        """Count down no slot before `until_ns`: EIFS, the time of the ACK, after a frame that was not decoded."""
+        """Suspend the countdown until `until_ns`: EIFS, the time of the ACK, after a frame that was not decoded."""
         self.count_from_ns = max(self.count_from_ns, until_ns)
 
     def set_busy_until(self, until_ns: int) -> None:
-        """Record that the station itself occupies the channel until `until_ns`."""
+        """Record that the channel is busy until `until_ns`."""
         # This runs for every station in range of every frame; a call of `max` would take longer than all other
         # statements.
         if until_ns > self.busy_until_ns:  # noqa: PLR1730 (see above)

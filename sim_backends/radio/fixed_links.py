@@ -66,7 +66,7 @@ class FixedLink:
     def use(self, parameters: LinkParameters) -> None:
         """Use `parameters` for packets from now on; packets in flight are not affected."""
         self._parameters = parameters
-        # Few lengths occur, and computing these values per packet costs more than a look-up.
+        # Few lengths occur, and computing these values per packet costs more than a lookup.
         self._by_size: dict[int, tuple[int, Delay]] = {}
 
     def offer(self, now_ns: int, size_bytes: int, packet: PacketIdentity) -> tuple[int, Delay] | str:
@@ -382,8 +382,8 @@ class UniformLinks(FixedLinks[Payload]):
         """Implement `RadioModel.jam`; fixed links support no jammers."""
         if emitters:
             raise ConfigurationError(
-                "fixed links hear no jammer",
-                remedy="leave the jammer out, or loss, delay, rate and jitter of the radio",
+                "fixed links do not support jammers",
+                remedy="remove the jammer, or remove loss, delay, rate and jitter of the radio",
             )
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:

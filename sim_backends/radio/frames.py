@@ -54,8 +54,8 @@ class Transmission:
         packet: The packet that it carries or acknowledges.
         attempt: Number of the transmission attempt on this hop, from 1.
         powers_mw: Received power at each station, by index; 0 at the transmitter.
-        heard_by: Indices of the stations that detect it, whether or not they can receive it.
-        others: Frames and jammer noise that overlap it in time.
+        detected_by: Indices of the stations that detect it, whether or not they can receive it.
+        interferers: Frames and jammer noise that overlap it in time.
         receivers: Indices of the stations that are synchronized to it, and so receive it.
     """
 
@@ -67,12 +67,12 @@ class Transmission:
     packet: PacketIdentity
     attempt: int
     powers_mw: list[float] = field(default_factory=list)
-    heard_by: Sequence[int] = ()
-    others: list["Transmission | Emission"] = field(default_factory=list)
+    detected_by: Sequence[int] = ()
+    interferers: list["Transmission | Emission"] = field(default_factory=list)
     receivers: set[int] = field(default_factory=set)
 
 
-def success(frame: Transmission, receiver: int, noise_mw: float) -> float:
+def success_probability(frame: Transmission, receiver: int, noise_mw: float) -> float:
     """Return the probability that `receiver`, which is synchronized to the frame, decodes it.
 
     The bits are spread evenly over the frame's duration. Each interval between two changes of interference has its
@@ -80,17 +80,19 @@ def success(frame: Transmission, receiver: int, noise_mw: float) -> float:
     """
     signal_mw = frame.powers_mw[receiver]
     bits = 8.0 * frame.size_bytes
-    if not frame.others:
+    if not frame.interferers:
         return math.exp(log_success(frame.mode, decibel(signal_mw / noise_mw), bits))
     edges = {frame.start_ns, frame.end_ns}
-    for other in frame.others:
+    for other in frame.interferers:
         edges.update(min(max(edge, frame.start_ns), frame.end_ns) for edge in (other.start_ns, other.end_ns))
     times = sorted(edges)
     length_ns = frame.end_ns - frame.start_ns
     logarithm = 0.0
     for begin, end in itertools.pairwise(times):
         interference_mw = sum(
-            other.powers_mw[receiver] for other in frame.others if other.start_ns <= begin and other.end_ns >= end
+            other.powers_mw[receiver]
+            for other in frame.interferers
+            if other.start_ns <= begin and other.end_ns >= end
         )
         ratio_db = decibel(signal_mw / (noise_mw + interference_mw))
         logarithm += log_success(frame.mode, ratio_db, bits * (end - begin) / length_ns)
@@ -132,10 +134,10 @@ class Frame(Generic[Payload]):
     first_attempt_ns: int = 0
     attempts: int = 0
 
-    def total_delay(self, now_ns: int, wave_ns: int) -> Delay:
-        """Return the delay over all hops so far, for a frame decoded at `now_ns` after `wave_ns` of propagation."""
+    def total_delay(self, now_ns: int, propagation_ns: int) -> Delay:
+        """Return the delay over all hops so far, for a frame decoded at `now_ns`."""
         waited_ns, sent_ns = self.first_attempt_ns - self.queued_ns, now_ns - self.first_attempt_ns
-        parts = QUEUING_NS * waited_ns + TRANSMISSION_NS * sent_ns + PROPAGATION_NS * wave_ns
+        parts = QUEUING_NS * waited_ns + TRANSMISSION_NS * sent_ns + PROPAGATION_NS * propagation_ns
         return parts + (self.before or PACKET)
 
     def for_second_hop(self, now_ns: int, receiver: int | None, before: Delay) -> "Frame[Payload]":

@@ -1,6 +1,6 @@
 """Directed links: their parameters and counters, the delays of packets over them, and reasons for losses.
 
-Importable without the models that use it. Delays have the four parts of the paper's eq. 2, to the nanosecond. A
+Importable without the models that use it. Delays have the four parts of the paper's eq. 2, in nanoseconds. A
 `Delay` is one integer with five fields of 64 bits (584 years each): a number of packets and the sums of their four
 parts. Delays are added with `+`. Updating the delay of a packet costs 45 ns; five separate counters cost 100 ns, and
 the medium has only 4 us per packet.
@@ -46,9 +46,9 @@ class LinkCounters:
     A packet offered to the link is sent or dropped by its queue; a sent packet is lost, delivered or still in flight.
 
     Attributes:
-        sent: Packets that went on the air.
+        sent: Packets that were transmitted.
         queue_dropped: Packets dropped because the queue was full.
-        lost: Packets that went on the air and did not arrive.
+        lost: Packets that were transmitted and did not arrive.
         delivered: Packets that arrived.
     """
 
@@ -90,12 +90,12 @@ PROPAGATION_NS: Final = 1 << 128
 QUEUING_NS: Final = 1 << 192
 PACKET: Final = 1 << 256
 
-_FIELD: Final = (1 << 64) - 1
+_FIELD_MASK: Final = (1 << 64) - 1
 
 
 def processing_ns(delay: Delay) -> int:
     """Return the processing part of a delay, in ns."""
-    return delay & _FIELD
+    return delay & _FIELD_MASK
 
 
 def delay_parts(delay: Delay) -> DelayParts:
@@ -103,7 +103,7 @@ def delay_parts(delay: Delay) -> DelayParts:
     return DelayParts(
         packets=delay // PACKET,
         processing_ns=processing_ns(delay),
-        transmission_ns=delay // TRANSMISSION_NS & _FIELD,
-        propagation_ns=delay // PROPAGATION_NS & _FIELD,
-        queuing_ns=delay // QUEUING_NS & _FIELD,
+        transmission_ns=delay // TRANSMISSION_NS & _FIELD_MASK,
+        propagation_ns=delay // PROPAGATION_NS & _FIELD_MASK,
+        queuing_ns=delay // QUEUING_NS & _FIELD_MASK,
     )

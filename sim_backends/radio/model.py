@@ -136,7 +136,7 @@ class WifiInWorld(Wifi[Payload]):
         """Implement `RadioModel.place`."""
         self.advance(now_ns)
         self._world_channel.move(now_ns, places_m, velocities_m_s)
-        self.relay(relay)
+        self.set_relay(relay)
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
         """Implement `RadioModel.disturb`."""

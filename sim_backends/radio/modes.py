@@ -124,7 +124,7 @@ BASIC: Final = G_MODES[0]
 """The mode of broadcasts and multicasts: the lowest basic rate, which every station receives (10.6.5.3)."""
 
 # The mandatory rates of clause 18.
-_CONTROL: Final = (G_MODES[4], G_MODES[2], G_MODES[0])
+_CONTROL_MODES: Final = (G_MODES[4], G_MODES[2], G_MODES[0])
 
 
 def standard_of(radio: Radio) -> Standard:
@@ -166,7 +166,7 @@ def control_mode(mode: WifiMode) -> WifiMode:
             g_mode for g_mode in G_MODES if (g_mode.modulation, g_mode.code_rate) == (mode.modulation, mode.code_rate)
         ]
         reference = matches[0] if matches else G_MODES[-1]
-    return next(control for control in _CONTROL if control.bits_per_symbol <= reference.bits_per_symbol)
+    return next(control for control in _CONTROL_MODES if control.bits_per_symbol <= reference.bits_per_symbol)
 
 
 @cache
@@ -219,7 +219,9 @@ def decoded_bit_error(mode: WifiMode, snr: float) -> float:
     raw = bit_error(mode, snr)
     bhattacharyya = math.sqrt(4 * raw * (1 - raw))
     inputs, free_distance, weights = _SPECTRA[mode.code_rate]
-    bound = sum(weight * bhattacharyya ** (free_distance + more) for more, weight in enumerate(weights))
+    bound = sum(
+        weight * bhattacharyya ** (free_distance + excess_weight) for excess_weight, weight in enumerate(weights)
+    )
     return min(bound / (2 * inputs), 1.0)
 
 

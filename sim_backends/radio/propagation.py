@@ -1,6 +1,6 @@
 """Propagation: mean path loss in the open, for many paths together, and fading of links.
 
-Fast fading is by multipath as the ends or the scatterers move; slow fading is by shadowing in space.
+Fast fading is caused by multipath while the ends or the scatterers move; slow fading is caused by shadowing.
 """
 
 import math
@@ -16,9 +16,7 @@ from sim_backends.world.materials import GROUND, SPEED_OF_LIGHT_M_S
 from sim_backends.world.shapes import Floats
 
 NEAREST_M: Final = 1.0
-"""Minimum distance; the loss does not fall further below it, because antennas have a size and far-field formulas do
-not.
-"""
+"""At smaller distances the loss is constant, because far-field formulas do not apply near an antenna."""
 
 
 def free_space_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
@@ -170,12 +168,12 @@ class Echoes:
             k: Power ratio of the constant component and the echoes, shape (n,).
             since_ns: Time at which the ends have the given positions.
         """
-        path_m = _along(start_m, end_m, self.directions)
+        path_m = _projections(start_m, end_m, self.directions)
         steady_rad = self.rad_per_m * (end_m - start_m)
         rate_m_s = self.stir_rates_m_s
         square: tuple[Floats, ...] = (_dot(steady_rad, steady_rad),)
         if velocities_m_s is not None:
-            rate_m_s = _along(*velocities_m_s, self.directions) + rate_m_s
+            rate_m_s = _projections(*velocities_m_s, self.directions) + rate_m_s
             steady_rad_s = self.rad_per_m * (velocities_m_s[1] - velocities_m_s[0])
             square += _dot(2 * steady_rad, steady_rad_s), _dot(steady_rad_s, steady_rad_s)
         echoes_rad = self.rad_per_m * (path_m + since_ns * 1e-9 * self.stir_rates_m_s) + self.initial_rad
@@ -206,14 +204,14 @@ class Fades:
         echoes = np.cos(phases_rad).sum(axis=1) + 1j * np.sin(phases_rad).sum(axis=1)
         square, *changes = self._square
         if changes:
-            slope, bend = changes
-            square = np.maximum(square + after_s * (slope + after_s * bend), 0.0)
+            linear, quadratic = changes
+            square = np.maximum(square + after_s * (linear + after_s * quadratic), 0.0)
         steady = self._steady * np.exp(1j * np.sqrt(square))
         gains: Floats = np.abs(steady + self._share * echoes) ** 2
         return gains
 
 
-def _along(start: Floats, end: Floats, directions: Floats) -> Floats:
+def _projections(start: Floats, end: Floats, directions: Floats) -> Floats:
     """Return the sum of both ends' projections (of positions or velocities) on the directions of the echoes."""
     along: Floats = np.einsum("ld,lde->le", np.hstack((start[:, :2], end[:, :2])), directions)
     return along

@@ -61,7 +61,7 @@ class RadioOptions(Strict):
             P.1238 gives for 2.4 GHz in offices; free space has 2.
         shadowing_db: Standard deviation of shadowing, in dB; 0 for none.
         decorrelation: Distance over which shadowing decorrelates to 1/e.
-        fading: Whether multipath components fade: Rician with line of sight, Rayleigh without. `false` gives a link
+        fading: True if multipath components fade: Rician with line of sight, Rayleigh without. `false` gives a link
             without randomness within its range.
         k_db: Rician K factor in dB: power of the constant component over that of the scattered ones, with line of
             sight. 6 dB is that of model F, large spaces indoors and outdoors, of IEEE 802.11-03/940r4 (TGn channel
@@ -76,12 +76,12 @@ class RadioOptions(Strict):
             rate to acknowledgements.
         queue_packets: Queue length per station, or per fixed link, in packets, without the packet on the air; 1000 is
             Linux's default.
-        loss: Fixed links: share of packets lost per link, independently of their length; 0 % if only others of these
-            four are given.
+        loss: Fixed links: share of packets lost per link, independently of their length; 0 % if it is omitted
+            and one of the next three is given.
         delay: Fixed links: delay of a link in addition to queueing and serialization. The default is 0.2 ms, about
             DIFS, mean first backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the host's
             interrupt.
-        rate: Fixed links: bit rate of every link, `20Mbit/s`, or `unlimited`; 54 Mbit/s if left out.
+        rate: Fixed links: bit rate of every link, `20Mbit/s`, or `unlimited`; 54 Mbit/s if omitted.
         jitter: Fixed links: width of the uniformly distributed extra delay of a link.
     """
 

@@ -29,7 +29,7 @@ class RandomStream:
 
     The draw for number n is the n-th word of Philox-4x64 (Salmon et al., "Parallel random numbers: as easy as 1, 2,
     3", SC 2011) with a key hashed from the name. Words are generated in blocks and the last block is kept, so numbers
-    in ascending order cost one list look-up each.
+    in ascending order cost one list lookup each.
 
     Args:
         seed: Seed of the trial.
@@ -66,11 +66,11 @@ class RandomStream:
 def first_draws(seed: int, names: Sequence[Sequence[str]], count: int) -> NDArray[np.float64]:
     """Return the first draws of `RandomStream(seed, *name)` by name, 3 times faster. Shape (names, count)."""
     generator = Philox(key=0)
-    unused = generator.state
+    initial_state = generator.state
     words = np.empty((len(names), count), dtype=np.uint64)
     for row, name in zip(words, names, strict=True):
-        unused["state"]["key"] = np.frombuffer(_key(seed, name), dtype="<u8")
-        generator.state = unused
+        initial_state["state"]["key"] = np.frombuffer(_key(seed, name), dtype="<u8")
+        generator.state = initial_state
         row[:] = generator.random_raw(count)
     return _uniforms(words)
 

@@ -6,8 +6,8 @@ from operator import ge
 from typing import Final, Generic
 
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.contention import BLIND_NS, EventQueue
-from sim_backends.radio.frames import PREAMBLE_SNR_DB, Emission, Transmission, success
+from sim_backends.radio.contention import CCA_TIME_NS, EventQueue
+from sim_backends.radio.frames import PREAMBLE_SNR_DB, Emission, Transmission, success_probability
 from sim_backends.radio.links import Payload
 from sim_backends.radio.modes import BASIC, DIFS_NS, ENERGY_DETECTION_DBM, SIFS_NS, ack_ns
 from sim_backends.radio.random_streams import PacketDraws
@@ -24,11 +24,11 @@ class _Reach:
 
     Attributes:
         powers_mw: The list returned by `RadioChannel.powers_mw`.
-        heard_by: Indices of the stations that detect its frames and therefore do not send.
+        detected_by: Indices of the stations that detect its frames and therefore do not send.
     """
 
     powers_mw: list[float]
-    heard_by: Sequence[int]
+    detected_by: Sequence[int]
 
 
 class Reception(Generic[Payload]):
@@ -58,52 +58,52 @@ class Reception(Generic[Payload]):
         self._reaches: dict[int, _Reach] = {}
 
     def start(self, transmission: Transmission, reserved_ns: int) -> None:
-        """Put a frame on the air; stations that detect it do not send until `reserved_ns`."""
+        """Start a transmission; stations that detect it do not send until `reserved_ns`."""
         station, now_ns, end_ns = self._stations[transmission.transmitter], transmission.start_ns, transmission.end_ns
         reach = self._reach(transmission.transmitter, now_ns)
-        transmission.powers_mw, transmission.heard_by = reach.powers_mw, reach.heard_by
+        transmission.powers_mw, transmission.detected_by = reach.powers_mw, reach.detected_by
         on_air = self._on_air
         for other in on_air:
-            other.others.append(transmission)
-        transmission.others.extend(on_air)
-        transmission.others.extend(self._emissions.values())
+            other.interferers.append(transmission)
+        transmission.interferers.extend(on_air)
+        transmission.interferers.extend(self._emissions.values())
         if station.receiving is not None:
             station.receiving.receivers.discard(station.index)
             station.receiving = None
         station.sending_until_ns = end_ns
         station.contention.set_busy_until(end_ns)
         stations, events, starts = self._stations, self._events, self._events.starts
-        alone, powers_mw, noise_mw = not transmission.others, reach.powers_mw, self._channel.noise_mw
+        alone, powers_mw, noise_mw = not transmission.interferers, reach.powers_mw, self._channel.noise_mw
         add_receiver = transmission.receivers.add
-        sensed_ns = now_ns + BLIND_NS
-        for index in reach.heard_by:
-            hearer = stations[index]
-            if hearer.receiving is None and hearer.sending_until_ns <= now_ns:
-                others_mw = 0.0 if alone else sum([other.powers_mw[index] for other in transmission.others])
+        sensed_ns = now_ns + CCA_TIME_NS
+        for index in reach.detected_by:
+            neighbour = stations[index]
+            if neighbour.receiving is None and neighbour.sending_until_ns <= now_ns:
+                others_mw = 0.0 if alone else sum([other.powers_mw[index] for other in transmission.interferers])
                 if powers_mw[index] >= (noise_mw[index] + others_mw) * _DETECTABLE_RATIO:
-                    hearer.receiving = transmission
+                    neighbour.receiving = transmission
                     add_receiver(index)
             scheduled = starts.get(index)
             if scheduled is None:
-                hearer.contention.on_busy(now_ns, reserved_ns)
+                neighbour.contention.on_busy(now_ns, reserved_ns)
             elif scheduled[0] > sensed_ns:
-                events.schedule_start(hearer.contention.postpone(now_ns, reserved_ns), index)
+                events.schedule_start(neighbour.contention.postpone(now_ns, reserved_ns), index)
         on_air.append(transmission)
 
     def end(self, now_ns: int, transmission: Transmission) -> None:
-        """Take a frame off the air; stations that detected it without receiving it defer (EIFS)."""
+        """End a transmission; stations that detected it without receiving it defer (EIFS)."""
         self._on_air.remove(transmission)
         for index in transmission.receivers:
             self._stations[index].receiving = None
-        if transmission.others:
+        if transmission.interferers:
             until_ns = now_ns + _EIFS_EXTRA_NS + DIFS_NS
-            for index in transmission.heard_by:
-                hearer = self._stations[index]
-                if index not in transmission.receivers and hearer.sending_until_ns < now_ns:
-                    hearer.contention.defer_until(until_ns)
+            for index in transmission.detected_by:
+                neighbour = self._stations[index]
+                if index not in transmission.receivers and neighbour.sending_until_ns < now_ns:
+                    neighbour.contention.defer_until(until_ns)
                     if index in self._events.starts:
-                        self._events.schedule_start(hearer.contention.earliest_start_ns(now_ns), index)
-            transmission.others.clear()
+                        self._events.schedule_start(neighbour.contention.earliest_start_ns(now_ns), index)
+            transmission.interferers.clear()
 
     def abort(self, index: int, now_ns: int) -> None:
         """Abort the transmission of a station, so that no station decodes it, and its reception."""
@@ -127,7 +127,7 @@ class Reception(Generic[Payload]):
         for name, emission in current.items():
             if name not in self._emissions:
                 for transmission in self._on_air:
-                    transmission.others.append(emission)
+                    transmission.interferers.append(emission)
             emission.powers_mw = emissions[name].powers_mw
         self._emissions = current
 
@@ -146,16 +146,18 @@ class Reception(Generic[Payload]):
         """
         if index not in transmission.receivers:
             return False
-        return self._draw(transmission, index, purpose) < success(transmission, index, self._channel.noise_mw[index])
+        return self._draw(transmission, index, purpose) < success_probability(
+            transmission, index, self._channel.noise_mw[index]
+        )
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
         reach = self._reaches.get(transmitter)
         if reach is not None and reach.powers_mw is powers_mw:
             return reach
-        heard = map(ge, powers_mw, self._channel.sensitivity_mw)
-        heard_by = [index for index, hears in enumerate(heard) if hears and index != transmitter]
-        reach = self._reaches[transmitter] = _Reach(powers_mw, heard_by)
+        is_detected = map(ge, powers_mw, self._channel.sensitivity_mw)
+        detected_by = [index for index, detected in enumerate(is_detected) if detected and index != transmitter]
+        reach = self._reaches[transmitter] = _Reach(powers_mw, detected_by)
         return reach
 
     def _draw(self, transmission: Transmission, receiver: int, purpose: str) -> float:

@@ -27,7 +27,7 @@ class Station(Generic[Payload]):
         sending_until_ns: End of its last or current frame.
         exchange_id: Number that increases at the start and the end of each exchange of a frame and its ACK; odd
             during an exchange.
-        offered: Number of packets that it was given to send.
+        offered: Number of packets that were passed to it for sending.
     """
 
     __slots__ = (
@@ -72,16 +72,16 @@ class Peer(Generic[Payload]):
         rate: Rate control of the link.
 
     Attributes:
-        last: The last frame that the peer received; a retry after a lost ACK is a duplicate of it.
+        last_frame: The last frame that the peer received; a retry after a lost ACK is a duplicate of it.
     """
 
-    __slots__ = ("delivered", "last", "lost", "queue_dropped", "rate", "receiver", "sent")
+    __slots__ = ("delivered", "last_frame", "lost", "queue_dropped", "rate", "receiver", "sent")
 
     def __init__(self, receiver: int, rate: RateControl) -> None:
         self.receiver = receiver
         self.rate = rate
         self.sent = self.queue_dropped = self.lost = self.delivered = 0
-        self.last: Frame[Payload] | None = None
+        self.last_frame: Frame[Payload] | None = None
 
     def count(self, *, delivered: bool) -> None:
         """Count the final result of a frame."""
@@ -128,7 +128,7 @@ class RadioMeter:
         """Record a frame that starts now; `receiver` is None for broadcasts and ACKs."""
         start_ns, end_ns = transmission.start_ns, transmission.end_ns
         busy_ns, busy_until_ns = self._busy_ns, self._busy_until_ns
-        for index in (transmission.transmitter, *transmission.heard_by):
+        for index in (transmission.transmitter, *transmission.detected_by):
             until_ns = busy_until_ns[index]
             if end_ns > until_ns:
                 busy_ns[index] += end_ns - max(start_ns, until_ns)

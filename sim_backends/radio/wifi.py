@@ -53,7 +53,7 @@ from sim_backends.radio.stations import Peer, RadioMeter, Station
 _ACK_TIMEOUT_NS: Final = SIFS_NS + SLOT_NS + 20_000
 
 # Retry interval of a station that finds the channel jammed; a robot hardly moves in this time.
-_JAMMED_NS: Final = 1_000_000
+_JAMMED_RETRY_NS: Final = 1_000_000
 
 
 class Wifi(Generic[Payload]):
@@ -78,7 +78,7 @@ class Wifi(Generic[Payload]):
             Station(index, PacketDraws(seed, name, "backoff")) for name, index in self._index.items()
         ]
         self._peers: dict[tuple[int, int], Peer[Payload]] = {}
-        self._events = EventQueue(self._begin)
+        self._events = EventQueue(self._start_transmission)
         self._reception = Reception(channel, seed, self._stations, self._events)
         self._arrived: list[Delivery[Payload]] = []
 
@@ -143,7 +143,7 @@ class Wifi(Generic[Payload]):
             station.exchange_id += station.exchange_id & 1
             while station.queue:
                 frame = station.queue.popleft()
-                if frame.receiver is None or self._peer(station.index, frame.receiver).last is not frame:
+                if frame.receiver is None or self._peer(station.index, frame.receiver).last_frame is not frame:
                     self._lose(now_ns, station.index, frame, RADIO_OFF)
         self._off = frozenset(names)
 
@@ -155,7 +155,7 @@ class Wifi(Generic[Payload]):
             for station in self._stations:
                 self._retry_when_idle(now_ns, station)
 
-    def relay(self, name: str | None) -> None:
+    def set_relay(self, name: str | None) -> None:
         """Set the station that is the access point from now on; None for direct links."""
         self._relay = None if name is None else self._index[name]
 
@@ -226,11 +226,11 @@ class Wifi(Generic[Payload]):
     def _contend(self, now_ns: int, station: Station[Payload]) -> None:
         self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
-    def _begin(self, now_ns: int, index: int) -> None:
+    def _start_transmission(self, now_ns: int, index: int) -> None:
         station = self._stations[index]
         station.contention.earliest_start_ns(now_ns)
         if self._reception.is_jammed(index):
-            self._events.at(now_ns + _JAMMED_NS, self._retry_when_idle, station)
+            self._events.at(now_ns + _JAMMED_RETRY_NS, self._retry_when_idle, station)
             return
         station.exchange_id += 1
         frame = station.queue[0]
@@ -252,7 +252,7 @@ class Wifi(Generic[Payload]):
         if not station.queue or station.exchange_id & 1 or station.index in self._events.starts:
             return
         if self._reception.is_jammed(station.index):
-            self._events.at(now_ns + _JAMMED_NS, self._retry_when_idle, station)
+            self._events.at(now_ns + _JAMMED_RETRY_NS, self._retry_when_idle, station)
         else:
             station.contention.set_busy_until(now_ns)
             self._contend(now_ns, station)
@@ -336,10 +336,10 @@ class Wifi(Generic[Payload]):
             station.contention.set_busy_until(now_ns)
         done = acknowledged or frame.attempts >= SHORT_RETRY_LIMIT
         if done:
-            peer.count(delivered=peer.last is frame)
+            peer.count(delivered=peer.last_frame is frame)
             if self._meter is not None and not acknowledged:
                 self._meter.on_failure(station.index, frame.receiver)
-            if peer.last is not frame:
+            if peer.last_frame is not frame:
                 self._lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
         self._end_exchange(now_ns, station, done=done)
 
@@ -355,13 +355,15 @@ class Wifi(Generic[Payload]):
 
     def _receive(self, now_ns: int, transmitter: int, receiver: int, frame: Frame[Payload]) -> None:
         peer = self._peer(transmitter, receiver)
-        if peer.last is frame:
+        if peer.last_frame is frame:
             return
-        peer.last = frame
-        wave_ns = self._channel.delay_ns(transmitter, receiver)
-        delay_so_far = frame.total_delay(now_ns, wave_ns)
+        peer.last_frame = frame
+        propagation_ns = self._channel.delay_ns(transmitter, receiver)
+        delay_so_far = frame.total_delay(now_ns, propagation_ns)
         if frame.keep:
-            self._events.at(now_ns + wave_ns, self._deliver, receiver, frame.payload, frame.source, delay_so_far)
+            self._events.at(
+                now_ns + propagation_ns, self._deliver, receiver, frame.payload, frame.source, delay_so_far
+            )
         for onward in frame.onward:
             self._enqueue(now_ns, self._stations[receiver], frame.for_second_hop(now_ns, onward, delay_so_far))
 

@@ -243,7 +243,7 @@ class WorldChannel(RadioChannel):
 
     def _gains(self, station: int, slot: int) -> Floats:
         """Return the gains of a station's links in a time slot, 0 to itself; `_row` must have been called before."""
-        cache, own = self._gain_cache(station), self._own_links[station]
+        cache, own_links = self._gain_cache(station), self._own_links[station]
         if cache.fades is None or cache.revision != self._revision:
             first, second = cache.ends
             start_m, end_m = self._places_m[first], self._places_m[second]
@@ -254,7 +254,7 @@ class WorldChannel(RadioChannel):
             cache.gains = cache.fades.gains((slot * self._gain_valid_ns - self._moved_ns) * 1e-9)
             cache.slot = slot
         gains = np.zeros(len(self.names))
-        gains[self._others[station]] = cache.gains if cache.links is own else cache.gains[own]
+        gains[self._others[station]] = cache.gains if cache.links is own_links else cache.gains[own_links]
         return gains
 
     def _gain_cache(self, station: int) -> _GainCache:
@@ -272,8 +272,8 @@ class WorldChannel(RadioChannel):
 
     def _update_links(self, station: int) -> None:
         """Compute the stale links of a station, and all other stale links too if there are few."""
-        own = self._own_links[station]
-        stale = own[self._stale[own]]
+        own_links = self._own_links[station]
+        stale = own_links[self._stale[own_links]]
         if not len(stale):
             return
         if np.count_nonzero(self._stale) <= _BATCH_LINKS:

@@ -158,11 +158,11 @@ class _Extrapolated(Mapping[str, State]):
 
 
 class DeadReckoned(Mapping[str, State]):
-    """States known at a time, and extrapolated later; as a mapping, it contains those of that time.
+    """States at a reference time, and extrapolated to later times; as a mapping, those of the reference time.
 
     Args:
         states: The states.
-        since_ns: Their time.
+        since_ns: The reference time.
         step_ns: The extrapolation moves in whole steps of this length, counted from `since_ns`.
 
     Attributes:
@@ -175,15 +175,15 @@ class DeadReckoned(Mapping[str, State]):
         self.since_ns = since_ns
         self.step_ns = step_ns
         self._steps = 0
-        self._now = states
+        self._current = states
 
     def at(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states at a time that is not before theirs; the same object for a whole step."""
+        """Return the states at `now_ns`, not before the reference time; the same object during a whole step."""
         steps = (now_ns - self.since_ns) // self.step_ns
         if steps != self._steps:
             self._steps = steps
-            self._now = _Extrapolated(self._states, steps * self.step_ns / 1e9) if steps else self._states
-        return self._now
+            self._current = _Extrapolated(self._states, steps * self.step_ns / 1e9) if steps else self._states
+        return self._current
 
     def __getitem__(self, name: str) -> State:
         return self._states[name]

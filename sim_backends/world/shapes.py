@@ -92,8 +92,8 @@ class Solids:
         cylinders = [shape for shape in shapes if isinstance(shape, Cylinder)]
         is_box = np.array([isinstance(shape, Box) for shape in shapes], dtype=bool)
         self._kinds: list[tuple[NDArray[np.int64], Callable[..., Floats], tuple[Floats, ...]]] = [
-            (np.flatnonzero(is_box), _in_boxes, (*_reach(boxes), *_box_arrays(boxes))),
-            (np.flatnonzero(~is_box), _in_cylinders, (*_reach(cylinders), *_cylinder_arrays(cylinders))),
+            (np.flatnonzero(is_box), _in_boxes, (*_bounding_boxes(boxes), *_box_arrays(boxes))),
+            (np.flatnonzero(~is_box), _in_cylinders, (*_bounding_boxes(cylinders), *_cylinder_arrays(cylinders))),
         ]
 
     def depths_m(self, start_m: Floats, end_m: Floats) -> Floats:
@@ -117,7 +117,7 @@ class Solids:
         return depths
 
 
-def _reach(shapes: Sequence[Shape]) -> tuple[Floats, Floats]:
+def _bounding_boxes(shapes: Sequence[Shape]) -> tuple[Floats, Floats]:
     """Return the lowest and the highest coordinates of each shape, with a small margin, shape (m, 1, 3)."""
     centre, half = _vectors(shape.centre_m for shape in shapes), _vectors(_half_m(shape) for shape in shapes)
     return centre - half - _NEAR_M, centre + half + _NEAR_M

@@ -108,7 +108,7 @@ def test_all_seeds_of_the_scenario_are_run_by_default(lab: Path) -> None:
     cosim(lab, "run", "pass.yaml", "--duration", "100ms", "--out", "sim")
     assert sorted(path.parent.name for path in (lab / "sim").glob("*/run.json")) == ["seed-3", "seed-7"]
     rejected = cosim(lab, "run", "pass.yaml", "--set", "seeds=[1, 1]")
-    assert (rejected.code, "a seed is named twice" in rejected.err) == (2, True)
+    assert (rejected.code, "a seed is listed twice" in rejected.err) == (2, True)
 
 
 def test_a_folder_has_a_recording_for_each_seed_and_equal_runs_are_equal(lab: Path) -> None:

@@ -169,7 +169,7 @@ def test_the_cost_of_a_bound_is_reported_with_the_fixed_windows_that_keep_it(lab
     )
     assert f"{factor:.3g} times as many; the longest windows of the single runs need" in report
     rejected = cosim(lab, "shootout", "pass.yaml", "--bound", "--set", "policy.bound_db=1")
-    assert (rejected.code, "bound_db is about path loss" in rejected.err) == (2, True)
+    assert (rejected.code, "bound_db limits the error of path loss" in rejected.err) == (2, True)
     rejected = cosim(lab, "shootout", "pass.yaml", "--bound", "--figure", "b.svg")
     assert (rejected.code, "has no figure" in rejected.err) == (2, True)
 

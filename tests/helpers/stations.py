@@ -55,7 +55,7 @@ def saturate(
     """UDP goodput of each sender in bit/s; each sender always has packets in its queue."""
     wifi: Wifi[str] = Wifi(channel, seed)
     wifi.log_attempts(None if log is None else log.append)
-    wifi.relay(relay)
+    wifi.set_relay(relay)
     arrived = dict.fromkeys(senders, 0)
     for name in senders:
         for _ in range(50):

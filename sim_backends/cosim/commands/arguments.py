@@ -15,22 +15,22 @@ _TABLES: Final = ("1", "2", "3", "emane", "claims")
 def add(parser: Parser) -> None:
     """Declare the commands of `fieldkit cosim`."""
     parser.description = (
-        "Simulate robots that move and communicate, and measure what each synchronization method costs."
+        "Simulate robots that move and communicate; measure the error and the cost of each synchronization method."
     )
     parser.epilog = "example: fieldkit cosim run baylands --policy sliding_window"
     commands = parser.add_commands(title="commands", metavar="COMMAND")
-    _run(commands)
-    _shootout(commands)
-    _paper(commands)
-    _satisfy(commands)
-    _plot(commands)
-    _replay(commands)
+    _add_run(commands)
+    _add_shootout(commands)
+    _add_table(commands)
+    _add_satisfy(commands)
+    _add_plot(commands)
+    _add_replay(commands)
     _conform(commands)
-    _list(commands)
-    _schema(commands)
+    _add_list(commands)
+    _add_schema(commands)
 
 
-def _run(commands: Commands) -> None:
+def _add_run(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "run",
         help="run a scenario",
@@ -62,7 +62,7 @@ def _run(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.run:run")
 
 
-def _shootout(commands: Commands) -> None:
+def _add_shootout(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "shootout",
         help="measure the error and the cost of each sync policy",
@@ -79,12 +79,12 @@ def _shootout(commands: Commands) -> None:
     modes.add_argument(
         "--orders",
         action="store_true",
-        help="errors of single windows that begin in the reference's own state, and their order in the window",
+        help="errors of single windows that begin in the state of the reference, and the order of each error",
     )
     modes.add_argument(
         "--bound",
         action="store_true",
-        help="exchanges that the scenario's policy.bound costs with error_bounded, and with fixed windows",
+        help="number of exchanges that keep the scenario's policy.bound, with error_bounded and with fixed windows",
     )
     parser.add_argument(
         "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
@@ -93,15 +93,20 @@ def _shootout(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.shootout:run")
 
 
-def _paper(commands: Commands) -> None:
+def _add_table(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "table",
         help="regenerate a table of the paper",
         description="Run the simulations of a table of the paper, and print each of its numbers next to ours with "
-        "its interval, and whether they agree.",
+        "its interval and the result of the comparison.",
         epilog="example: fieldkit cosim table 1 --format markdown",
     )
-    parser.add_choice("which", _TABLES, metavar="TABLE", help="1, 2 or 3 of its simulation, emane, or claims")
+    parser.add_choice(
+        "which",
+        _TABLES,
+        metavar="TABLE",
+        help="1, 2 or 3: tables of its simulations; emane: its emulation; claims: its claims",
+    )
     seeds = parser.add_mutually_exclusive_group()
     _add_seed(seeds, "see --seeds")
     seeds.add_argument(
@@ -112,7 +117,7 @@ def _paper(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.table:run")
 
 
-def _satisfy(commands: Commands) -> None:
+def _add_satisfy(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "satisfy",
         help="run the paper's satisfaction loop, and report its effect",
@@ -129,9 +134,9 @@ def _satisfy(commands: Commands) -> None:
         "--policy",
         ("velocity_aware_raw", "velocity_aware"),
         default="velocity_aware_raw",
-        help="the rule: as the paper prints it (default), or made safe",
+        help="the rule: as the paper prints it (default), or corrected so that each window is positive",
     )
-    _add_window(parser, "w of the first round")
+    _add_window(parser, "window of the first round")
     parser.add_argument(
         "--rounds", type=repeats, default=20, metavar="N", help="largest number of rounds (default 20)"
     )
@@ -140,7 +145,7 @@ def _satisfy(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.satisfy:run")
 
 
-def _plot(commands: Commands) -> None:
+def _add_plot(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "plot",
         help="draw a recording, or the table of a shootout",
@@ -155,12 +160,11 @@ def _plot(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.plot:run")
 
 
-def _replay(commands: Commands) -> None:
+def _add_replay(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "replay",
-        help="print the numbers of a recording",
-        description="Print the numbers that the run of a recording printed; refuse a recording that was changed or "
-        "truncated.",
+        help="print the results of a recording",
+        description="Print the results of a recorded run; a recording that was changed or truncated is an error.",
     )
     _add_recording(parser)
     parser.add_argument("--mcap", type=Path, metavar="FILE", help="also write it as MCAP, for Foxglove")
@@ -194,7 +198,7 @@ def _conform(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.conform:run")
 
 
-def _list(commands: Commands) -> None:
+def _add_list(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "list", help="list scenarios and sync policies", description="List every scenario and sync policy."
     )
@@ -202,7 +206,7 @@ def _list(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.listing:list_all")
 
 
-def _schema(commands: Commands) -> None:
+def _add_schema(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "schema",
         help="print the JSON schema of scenario files",
@@ -239,11 +243,11 @@ def _add_recording(parser: Parser) -> None:
     )
 
 
-def _add_policy(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (argparse's own)
+def _add_policy(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (options of argparse)
     _set_completer(parser.add_argument("--policy", metavar="NAME", help=meaning, **options), _policy_names)
 
 
-def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (argparse's own)
+def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (options of argparse)
     parser.add_argument("--window", **{"metavar": "TIME", "help": f"{meaning} (default: the scenario's)", **options})
 
 
@@ -273,6 +277,6 @@ def _scenario_names() -> Iterable[str]:
 
 
 def _policy_names() -> Iterable[str]:
-    from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (as above
+    from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (as above)
 
     return policies()

@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bias`: errors in distribution, over seeds."""
+"""`fieldkit cosim shootout SCENARIO --bias`: the bias of each sync policy, over seeds."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     with working() as sink:
         runs = len({*policies, EventDriven.name}) * len(seeds)
         all_outcomes = outcomes(
-            partial(_make, scenario), policies, seeds, progress=partial(progress_reporter(sink), "bias", runs)
+            partial(_build, scenario), policies, seeds, progress=partial(progress_reporter(sink), "bias", runs)
         )
     by_policy = {name: measures for name, measures in biases(all_outcomes).items() if name in policies}
     title = f"{scenario.name}, {scenario.topology}, {len(seeds)} seeds"
@@ -56,18 +56,18 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _make(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
+def _build(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
     return build(scenario, policy=policy, seed=seed)
 
 
 def _sheet(title: str, by_policy: Mapping[str, Mapping[str, Bias]], form: str) -> Sheet:
     rows: list[Sequence[Value]] = []
     for name, (label, factor) in LABELS.items():
-        scale, shown = (factor, label) if form in {"table", "markdown"} else (1.0, name)
+        scale, measure_label = (factor, label) if form in {"table", "markdown"} else (1.0, name)
         for policy, measures in by_policy.items():
             bias = measures[name]
             values = bias.mean.value, bias.bias.value, bias.bias.low, bias.bias.high
-            rows.append((policy, shown, *(value * scale for value in values), bias.seeds_needed))
+            rows.append((policy, measure_label, *(value * scale for value in values), bias.seeds_needed))
     columns = (
         SheetColumn("policy", "policy", ""),
         SheetColumn("measure", "of", ""),

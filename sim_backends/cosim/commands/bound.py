@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bound`: the cost of a bound with `error_bounded` and with fixed windows."""
+"""`fieldkit cosim shootout SCENARIO --bound`: exchanges that keep a bound, with `error_bounded` and fixed windows."""
 
 import argparse
 import math
@@ -12,7 +12,7 @@ from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
-from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, filled, number
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number_text, wrapped
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.run_record import Run
@@ -44,13 +44,13 @@ def run(arguments: argparse.Namespace) -> int:
     """
     if arguments.figure is not None or arguments.policy or arguments.windows:
         raise ConfigurationError(
-            "--bound is about error_bounded and its bound, and has no figure",
+            "--bound compares error_bounded with fixed windows, and has no figure",
             remedy="remove --figure, --policy and --window; change the bound by --set policy.bound=1cm",
         )
     scenario = settings.scenario(arguments)
     if scenario.policy.bound_db is not None:
         raise ConfigurationError(
-            "--bound compares position errors, and policy.bound_db is about path loss",
+            "--bound compares position errors, and policy.bound_db limits the error of path loss",
             remedy="remove policy.bound_db; change the bound by --set policy.bound=1cm",
         )
     seeds = settings.seeds(arguments, scenario)
@@ -59,15 +59,15 @@ def run(arguments: argparse.Namespace) -> int:
     with working() as sink:
         report = partial(progress_reporter(sink, "seeds"), "bound", len(seeds))
         report(0)
-        costs = run_many(partial(_cost, scenario), tasks, progress=report)
-        window_s, fixed = longest_for_all(
+        costs = run_many(partial(_bound_cost, scenario), tasks, progress=report)
+        window_s, fixed_costs = longest_for_all(
             [cost.window_s for cost in costs],
-            lambda fixed_s: run_many(partial(_fixed, scenario, fixed_s), tasks),
+            lambda fixed_s: run_many(partial(_fixed_cost, scenario, fixed_s), tasks),
             scenario.policy.bound,
         )
-    _sheet(scenario, seeds, costs, window_s, fixed).show(arguments.format)
+    _sheet(scenario, seeds, costs, window_s, fixed_costs).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        print_text(_summary(scenario, costs, window_s, fixed))
+        print_text(_summary(scenario, costs, window_s, fixed_costs))
     return 0
 
 
@@ -76,13 +76,13 @@ def _run(scenario: CosimScenario, task: Task, policy: SyncPolicy) -> Run:
         return simulation.run()
 
 
-def _cost(scenario: CosimScenario, task: Task) -> BoundCost:
+def _bound_cost(scenario: CosimScenario, task: Task) -> BoundCost:
     policy = scenario.policy
     run = partial(_run, scenario, task)
     return bound_cost(run, policy.bound, step_s=scenario.physics.step, longest_s=policy.longest)
 
 
-def _fixed(scenario: CosimScenario, window_s: float, task: Task) -> FixedCost:
+def _fixed_cost(scenario: CosimScenario, window_s: float, task: Task) -> FixedCost:
     return fixed_cost(partial(_run, scenario, task), window_s)
 
 
@@ -91,7 +91,7 @@ def _sheet(
     seeds: Sequence[int],
     costs: Sequence[BoundCost],
     window_s: float,
-    fixed: Sequence[FixedCost],
+    fixed_costs: Sequence[FixedCost],
 ) -> Sheet:
     rows = [
         (
@@ -100,48 +100,53 @@ def _sheet(
             cost.exchanges,
             cost.added_s,
             window_s,
-            fixed[index].exchanges if fixed else None,
-            fixed[index].exchanges / cost.exchanges if fixed else None,
+            fixed_costs[index].exchanges if fixed_costs else None,
+            fixed_costs[index].exchanges / cost.exchanges if fixed_costs else None,
             cost.window_s,
             cost.fixed_exchanges or None,
             cost.factor,
         )
         for index, (seed, cost) in enumerate(zip(seeds, costs, strict=True))
     ]
-    title = f"{scenario.name}, {scenario.topology}: a bound of {number(scenario.policy.bound * 1e3)} mm"
+    title = f"{scenario.name}, {scenario.topology}: a bound of {number_text(scenario.policy.bound * 1e3)} mm"
     names = [column.name for column in _COLUMNS]
     return Sheet(
         _COLUMNS,
         rows,
         [
             SheetPart(title, names[:7]),
-            SheetPart("longest fixed window of each run, known only after the run", [names[0], *names[7:]]),
+            SheetPart("longest fixed window of each run, determined after the run", [names[0], *names[7:]]),
         ],
     )
 
 
-def _summary(scenario: CosimScenario, costs: Sequence[BoundCost], window_s: float, fixed: Sequence[FixedCost]) -> str:
+def _summary(
+    scenario: CosimScenario, costs: Sequence[BoundCost], window_s: float, fixed_costs: Sequence[FixedCost]
+) -> str:
     exchanges = sum(cost.exchanges for cost in costs)
     added_s = [cost.added_s for cost in costs if not math.isnan(cost.added_s)]
-    text = f"error_bounded keeps {number(scenario.policy.bound * 1e3)} mm in {format_count(exchanges, 'exchange')}"
+    text = (
+        f"error_bounded keeps {number_text(scenario.policy.bound * 1e3)} mm in {format_count(exchanges, 'exchange')}"
+    )
     if added_s:
         text += (
-            f", and adds {number(math.fsum(added_s) / len(added_s) * 1e3)} ms to a delay, because an arrival waits "
-            f"for the end of its window: half of policy.longest is {number(scenario.policy.longest * 500)} ms"
+            f", and adds {number_text(math.fsum(added_s) / len(added_s) * 1e3)} ms to a delay, because an arrival "
+            "waits for the end of its window: half of policy.longest is "
+            f"{number_text(scenario.policy.longest * 500)} ms"
         )
-    if not fixed:
-        return f"{text}, and no fixed window does"
-    fixed_exchanges = sum(cost.exchanges for cost in fixed)
+    if not fixed_costs:
+        return f"{text}, and no fixed window keeps it"
+    fixed_exchanges = sum(cost.exchanges for cost in fixed_costs)
     run_exchanges = sum(cost.fixed_exchanges for cost in costs)
     text += (
-        f"; the fixed window that keeps it in {format_count(len(costs), 'run')}, {number(window_s * 1e3)} ms, needs "
-        f"{fixed_exchanges:,}, {number(fixed_exchanges / exchanges)} times as many"
+        f"; the fixed window that keeps it in {format_count(len(costs), 'run')}, {number_text(window_s * 1e3)} ms, "
+        f"needs {fixed_exchanges:,}, {number_text(fixed_exchanges / exchanges)} times as many"
     )
     if len(costs) > 1:
         text += (
-            f"; the longest windows of the single runs need {run_exchanges:,}, {number(run_exchanges / exchanges)} "
-            "times as many"
+            f"; the longest windows of the single runs need {run_exchanges:,}, "
+            f"{number_text(run_exchanges / exchanges)} times as many"
         )
     if window_s == scenario.policy.longest:
         text += "; the fixed window is as long as policy.longest, which limits it"
-    return filled(text)
+    return wrapped(text)

@@ -70,7 +70,7 @@ def simulate(
         progress: As for `Simulation.run`.
         deadline_s: As for `build`.
     """
-    recorder = None if folder is None else RunRecorder(folder.recording(seed), _about(scenario, policy, seed))
+    recorder = None if folder is None else RunRecorder(folder.recording(seed), _run_settings(scenario, policy, seed))
     samples = StateSamples(recorder) if has_followers(scenario) else None
     simulation = build(scenario, policy=policy, seed=seed, recorder=samples or recorder, deadline_s=deadline_s)
     states_at_start = [(0, name, state) for name, state in simulation.agents.states(0).items()]
@@ -145,5 +145,5 @@ def _simulate(scenario: CosimScenario, folder: RunFolder | None, deadline_s: flo
     return simulate(scenario, task.policy, task.seed, folder, deadline_s=deadline_s)
 
 
-def _about(scenario: CosimScenario, policy: str, seed: int) -> RunSettings:
+def _run_settings(scenario: CosimScenario, policy: str, seed: int) -> RunSettings:
     return RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)

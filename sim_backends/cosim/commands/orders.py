@@ -33,7 +33,7 @@ from sim_backends.cosim.studies.seeds import Task, run_many
 
 WINDOWS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 START_TIMES: Final = 20
-"""Number of times in the exact reference of each seed at which a window of each policy is started."""
+"""Number of times in the exact reference of each seed at which a window of each policy starts."""
 _COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "actual window, mean", 1e3),
@@ -43,7 +43,7 @@ _COLUMNS: Final = (
         "mean magnitude of the difference between the delivery time and the reference's",
         1e3,
     ),
-    SheetColumn("late_s", "late (ms)", "mean time by which the receiver was past an arrival", 1e3),
+    SheetColumn("late_s", "late (ms)", "mean time by which the receiver had passed an arrival", 1e3),
     SheetColumn(
         "position_m", "place (mm)", "mean error of the relative position of two agents that the network assumes", 1e3
     ),

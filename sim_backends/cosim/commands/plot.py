@@ -25,7 +25,7 @@ from sim_backends.cosim.studies.local_errors import LocalErrors
 from sim_backends.cosim.studies.shootout import Bias, Row
 from sim_backends.world.world import load_world
 
-_LOCAL: Final = {
+_LOCAL_ERRORS: Final = {
     "delivery_s": ("Delivery time", "mean error (ms)", 1e3),
     "late_s": ("Arrivals in the past", "mean lateness (ms)", 1e3),
     "position_m": ("Assumed position", "mean error (mm)", 1e3),
@@ -76,22 +76,22 @@ def error_against_cost(points: Sequence[CostPoint], growth: LogPanel | None = No
         points: The points.
         growth: An additional panel, or None.
     """
-    shown = [
+    panel_specs = [
         ("Delivery time", "mean error (ms)", "delivery_error_mean_s"),
         ("Position", "mean error (mm)", "position_error_mean_m"),
     ]
     if any(point.path_error_max_m > 0 for point in points):
-        shown.append(("Path of the agents", "largest error (mm)", "path_error_max_m"))
+        panel_specs.append(("Path of the agents", "largest error (mm)", "path_error_max_m"))
     panels = [
         LogPanel(title, "exchanges per simulated second", label, _curves(points, name))
-        for title, label, name in shown
+        for title, label, name in panel_specs
     ]
     panels += [] if growth is None else [growth]
     return lambda form: plots.log_figure(panels, form)
 
 
 def growth(rows: Iterable[Row], title: str) -> LogPanel | None:
-    """Return a panel of the distance of agents from the reference's path over time; None if there is none.
+    """Return a panel of the distance of agents from the reference's path over time; None if all distances are 0.
 
     Args:
         rows: The results of the policies; exact policies, which have no such distance, are omitted.
@@ -111,7 +111,7 @@ def growth(rows: Iterable[Row], title: str) -> LogPanel | None:
 def error_against_window(by_policy: Mapping[str, LocalErrors]) -> Callable[[Format], bytes]:
     """Return a function that draws local errors against the window: a panel per error, a curve per policy."""
     panels = []
-    for measure, (panel_title, label, factor) in _LOCAL.items():
+    for measure, (panel_title, label, factor) in _LOCAL_ERRORS.items():
         curves = [
             Curve(name, x, y, f"{name}\norder {orders.order_text(errors, measure)}")
             for name, errors in by_policy.items()

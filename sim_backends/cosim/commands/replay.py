@@ -49,12 +49,12 @@ def recording_at(folder: Path) -> Recording:
     Raises:
         EvidenceError: It does not exist, or is damaged.
     """
-    several = sorted(path.parent for path in folder.glob("seed-*/run.json"))
-    if several and not (folder / "run.json").exists():
+    seed_folders = sorted(path.parent for path in folder.glob("seed-*/run.json"))
+    if seed_folders and not (folder / "run.json").exists():
         raise EvidenceError(
-            f"there are recordings of {len(several)} runs",
+            f"there are recordings of {len(seed_folders)} runs",
             where=str(folder),
-            remedy=f"name one of them: {several[0]}",
+            remedy=f"name one of them: {seed_folders[0]}",
         )
     return read_recording(folder)
 

@@ -27,7 +27,7 @@ class FlowRecovery:
         flow: Name of the flow.
         end_ns: Time when the fault ended.
         lost: Number of packets that were sent during the fault and never arrived.
-        recovered_s: Time from then to the first arrival of a packet that was sent after it; None if there was none.
+        recovered_s: Time from `end_ns` to the first arrival of a packet sent after it; None if there was none.
     """
 
     fault: int
@@ -86,21 +86,21 @@ _JITTER_GAIN = 1 / 16
 
 @dataclass(frozen=True)
 class FlowSpread:
-    """Statistics of times of packets that arrived, in seconds; nan if none did.
+    """Statistics of times of packets that arrived, in seconds; nan if no packet arrived.
 
     Attributes:
-        least: The minimum.
+        minimum: The minimum.
         mean: The mean.
         median: The median.
         p95: The 95th percentile.
-        most: The maximum.
+        maximum: The maximum.
     """
 
-    least: float
+    minimum: float
     mean: float
     median: float
     p95: float
-    most: float
+    maximum: float
 
 
 @dataclass(frozen=True)
@@ -216,14 +216,14 @@ def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) ->
 
 
 def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> FlowRoundTrips:
-    by_number = {reply.packet.identity[1]: reply for reply in replies}
+    replies_by_number = {reply.packet.identity[1]: reply for reply in replies}
     sent, trips_s = 0, []
     for request in sorted(requests, key=lambda fate: fate.packet.identity[1]):
-        reply = by_number.get(request.packet.identity[1])
-        back_s = None if reply is None else _network_s(reply)
-        there_s = _network_s(request)
-        if there_s is not None and back_s is not None:
-            trips_s.append(there_s + back_s)
+        reply = replies_by_number.get(request.packet.identity[1])
+        reply_s = None if reply is None else _network_s(reply)
+        request_s = _network_s(request)
+        if request_s is not None and reply_s is not None:
+            trips_s.append(request_s + reply_s)
         sent += bool(request.reason) or (reply is not None and reply.is_decided)
     jitter_s = float(np.abs(np.diff(trips_s)).mean()) if len(trips_s) > 1 else np.nan
     return FlowRoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s)
@@ -293,8 +293,8 @@ class SeedResult:
         digest: Hash over all events.
         starts_m: Position of each agent at time 0, metres east, north, up.
         recoveries: Recoveries of flows after faults.
-        formation: How well followers kept their positions.
-        stopped: Why it ended early; empty if it is complete.
+        formation: Errors of the positions of followers.
+        stopped: The reason why it ended early; empty if it is complete.
         error: The error that ended it early; None if it is complete or was interrupted.
     """
 

@@ -11,7 +11,7 @@ from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.results import FORMATION, SeedResult, formation_values
 from sim_backends.cosim.commands.run_folder import RunFolder
-from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, number, show_all
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, number_text, show_all
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -99,7 +99,7 @@ def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
             flow.loss,
             flow.delay_s.mean,
             flow.delay_s.p95,
-            flow.delay_s.most,
+            flow.delay_s.maximum,
             flow.added_s,
             flow.distances_m[2],
         )
@@ -154,8 +154,8 @@ def _cost_text(results: Sequence[SeedResult]) -> str:
     split = ", ".join(f"{part} {100 * spent_s / wall_s:.0f} %" for part, spent_s in parts.items())
     exchanges = sum(result.windows for result in results) / simulated_s
     return (
-        f"{number(simulated_s)} s simulated, {number(simulated_s / wall_s)} times as fast as real time\n"
-        f"{number(exchanges)} exchanges per simulated second\n"
+        f"{number_text(simulated_s)} s simulated, {number_text(simulated_s / wall_s)} times as fast as real time\n"
+        f"{number_text(exchanges)} exchanges per simulated second\n"
         f"wall time: {split}\n"
         f"event hash: {_combined_digest([result.digest for result in results])}"
     )

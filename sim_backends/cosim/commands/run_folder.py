@@ -18,7 +18,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 BACKEND: Final = "cosim"
 
 _NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration"})
-"""Keys of a scenario that do not change the procedure: what is compared, the number of runs, and their duration."""
+"""Keys of a scenario that do not change the procedure: the compared policy, the number of runs, their duration."""
 
 
 def table(trial: str, scenario: CosimScenario, policy: str, number: int, result: SeedResult) -> str:
@@ -81,13 +81,13 @@ def _measured(flow: FlowResult) -> dict[str, Value]:
             "byte_loss": 1 - flow.arrived_bytes / flow.sent_bytes if flow.sent_bytes else math.nan,
             "transfer_s": flow.first_to_last_s,
             "transfer_from": "receiver",
-            "one_way_min_s": delay_s.least,
+            "one_way_min_s": delay_s.minimum,
             "one_way_median_s": delay_s.median,
             "one_way_mean_s": delay_s.mean,
             "one_way_p95_s": delay_s.p95,
             "one_way_error_s": 0.0,
-            "delay_variation_median_s": delay_s.median - delay_s.least,
-            "delay_variation_p95_s": delay_s.p95 - delay_s.least,
+            "delay_variation_median_s": delay_s.median - delay_s.minimum,
+            "delay_variation_p95_s": delay_s.p95 - delay_s.minimum,
             "jitter_s": flow.jitter_s,
             "delay_s": delay_s.mean,
             "delay_packets": flow.arrived,
@@ -111,11 +111,11 @@ def _ping_columns(flow: FlowResult) -> dict[str, Value]:
         "rtt_received": trips.answered,
         "rtt_loss": 1 - trips.answered / trips.sent if trips.sent else math.nan,
         "rtt_payload_bytes": flow.sent_bytes // flow.sent if flow.sent else math.nan,
-        "rtt_min_s": trips.network_s.least,
+        "rtt_min_s": trips.network_s.minimum,
         "rtt_median_s": trips.network_s.median,
         "rtt_mean_s": trips.network_s.mean,
         "rtt_p95_s": trips.network_s.p95,
-        "rtt_max_s": trips.network_s.most,
+        "rtt_max_s": trips.network_s.maximum,
         "rtt_jitter_s": trips.jitter_s,
     }
 
@@ -127,8 +127,8 @@ def _is_missing(value: Value) -> bool:
 def _distance_m(flow: FlowResult, scenario: CosimScenario, starts_m: Mapping[str, Vector]) -> float:
     """Return the distance of a flow at time 0, to the millimetre; with a relay, the distance to it, as in trials."""
     is_relayed = scenario.topology is Topology.MASTER and scenario.relay is not None
-    other = scenario.relay if is_relayed and scenario.relay else flow.destination
-    return round(math.dist(starts_m[flow.source], starts_m[other]), 3)
+    peer = scenario.relay if is_relayed and scenario.relay else flow.destination
+    return round(math.dist(starts_m[flow.source], starts_m[peer]), 3)
 
 
 def _digest(value: object) -> str:

@@ -10,7 +10,7 @@ from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count, parse_quantity
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
-from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, number_text
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.run_record import Run
@@ -108,13 +108,13 @@ def _sheet(title: str, satisfaction: Satisfaction) -> Sheet:
 
 
 def _summary(satisfaction: Satisfaction, threshold: float) -> str:
-    reference = f"the exact reference loses {number(100 * satisfaction.reference_loss)} %"
+    reference = f"the exact reference loses {number_text(100 * satisfaction.reference_loss)} %"
     lines = [f"{reference} in {satisfaction.reference_exchanges:,} exchanges, independently of the window"]
     if satisfaction.rounds:
         last = satisfaction.rounds[-1]
         outcome = "accepted" if satisfaction.satisfied else "not accepted"
         lines.append(
-            f"{outcome} at {number(100 * threshold)} %: {number(100 * last.loss)} % after "
+            f"{outcome} at {number_text(100 * threshold)} %: {number_text(100 * last.loss)} % after "
             f"{format_count(len(satisfaction.rounds), 'round')} and {satisfaction.exchanges:,} exchanges"
         )
     return "\n".join(lines)

@@ -50,7 +50,7 @@ def scenario(arguments: argparse.Namespace) -> CosimScenario:
     """Return the scenario that the arguments name, with their changes.
 
     Raises:
-        ConfigurationError: It does not exist, or a change is invalid; the message says what, and where.
+        ConfigurationError: It does not exist, or a change is invalid; the message states the key and its place.
     """
     return load_scenario(arguments.scenario, changes(arguments))
 
@@ -147,7 +147,7 @@ def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], Non
 
 
 def deadline_s(text: str | None) -> float:
-    """Return the longest wait of a federate for an answer, in seconds of wall time.
+    """Return the longest wait for the answer of a federate, in seconds of wall time.
 
     Raises:
         ConfigurationError: It is not a duration above 0.
@@ -174,7 +174,7 @@ def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:
 def note_commensurate_events(
     chosen: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int
 ) -> None:
-    """Print a note on each window of which packets sample few phases, with a better window.
+    """Print a note on each window that is commensurate with a period of the scenario, with a better window.
 
     Args:
         chosen: The scenario.
@@ -203,7 +203,7 @@ def note_commensurate_events(
 
 
 def policy_text(name: str, chosen: CosimScenario) -> str:
-    """Return a sync policy with the parameter that determines its windows: `sliding_window 10 ms`."""
+    """Return the name of a sync policy and the parameter that determines its windows: `sliding_window 10 ms`."""
     if has_window(name):
         return f"{name} {chosen.policy.window * 1e3:g} ms"
     if "bound_m" not in inspect.signature(registry.policies()[name]).parameters:
@@ -219,5 +219,5 @@ def _change(text: str) -> tuple[str, Any]:
             f"--set: {text!r} is not KEY=VALUE",
             remedy="write for example --set policy.window=5ms",
         )
-        # A value is parsed as YAML, as in the file: a number, a list, or a text.
+    # A value is parsed as YAML, as in the file: a number, a list, or a text.
     return key, schema.parse(f"value: {value}", source="--set").data["value"]

@@ -48,7 +48,7 @@ class SheetColumn:
         scaled = value * self.factor
         if isinstance(value, int) and self.factor == 1:
             return f"{value:,}"
-        return _MISSING if math.isnan(scaled) else number(scaled, self.digits)
+        return _MISSING if math.isnan(scaled) else number_text(scaled, self.digits)
 
 
 @dataclass(frozen=True)
@@ -118,14 +118,14 @@ def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
         sheet.show(form)
 
 
-def number(value: float, digits: int = 3) -> str:
+def number_text(value: float, digits: int = 3) -> str:
     """Return a number with that many significant digits, without an exponent unless it would be long."""
     if value == 0 or 1e-4 <= abs(value) < 1e3:
         return f"{value:.{digits}g}"
     return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"
 
 
-def filled(text: str) -> str:
+def wrapped(text: str) -> str:
     """Return a text wrapped to the width of the terminal."""
     return textwrap.fill(text, min(shutil.get_terminal_size().columns - 1, _MAX_WIDTH))
 
@@ -139,7 +139,7 @@ def _table(sheet: Sheet) -> None:
         legend = sheet.legend(part, explained)
         explained |= legend.keys()
         if legend:
-            print_text(filled(_legend_text(legend)))
+            print_text(wrapped(_legend_text(legend)))
         print_text()
 
 

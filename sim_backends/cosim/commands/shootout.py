@@ -100,12 +100,12 @@ def _all_rows(
     report = progress_reporter(sink)
     for number, window_s in enumerate(windows_s):
         chosen = [name for name in policies if number == 0 or settings.has_window(name)]
-        make = partial(_make, settings.with_window(scenario, window_s))
+        make = partial(_build, settings.with_window(scenario, window_s))
         runs = len({*chosen, EventDriven.name}) * len(seeds)
         progress = partial(report, f"window {window_s * 1e3:g} ms", runs)
         progress(0)
-        of_window = rows(outcomes(make, chosen, seeds, progress=progress), partial(formation, scenario))
-        all_rows += [(window_s, row) for row in of_window if row.policy in chosen]
+        window_rows = rows(outcomes(make, chosen, seeds, progress=progress), partial(formation, scenario))
+        all_rows += [(window_s, row) for row in window_rows if row.policy in chosen]
     return sorted(all_rows, key=lambda window_and_row: policies.index(window_and_row[1].policy))
 
 
@@ -123,7 +123,7 @@ def _exceeded_bound(scenario: CosimScenario, row: Row) -> str | None:
     )
 
 
-def _make(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
+def _build(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
     return build(scenario, policy=policy, seed=seed, measures_all=True)
 
 

@@ -1,4 +1,4 @@
-"""`fieldkit cosim table TABLE`: the paper's numbers next to ours, and whether they agree."""
+"""`fieldkit cosim table TABLE`: the paper's numbers next to ours, and their agreement."""
 
 import argparse
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
-from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, filled
+from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, wrapped
 from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims
 from sim_backends.cosim.studies.paper_setups import flow_samples
 from sim_backends.cosim.studies.paper_tables import Agreement, PaperCell, PaperRow, paper_table
@@ -19,7 +19,7 @@ _TITLES: Final = {
     "1": "table 1, masterless, UGV to UGV",
     "2": "table 2, masterless, UGV to UAV",
     "3": "table 3, master-based (ROS 1), UGV to UGV",
-    "claims": "what the paper's adaptive masterless system changes, in %",
+    "claims": "changes by the paper's adaptive masterless system, in %",
     "emane": "EMANE, before and after node 10 moved",
 }
 _LABELS: Final = {
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     rows = table.rows(samples)
     paper_sheet(title, rows, is_ping=which == "emane").show(arguments.format)
     if arguments.format in {"table", "markdown"}:
-        print_text(filled(summary(rows)))
+        print_text(wrapped(summary(rows)))
     return 0
 
 
@@ -82,7 +82,7 @@ def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet
 
 
 def _columns(name: str, factor: float) -> list[SheetColumn]:
-    """Return the columns of a cell of seconds or shares; `factor` is the one from SI to the shown unit."""
+    """Return the columns of delays or losses; `factor` converts from the SI unit to the shown unit."""
     suffix = "" if name == "loss" else "_s"
     return [
         SheetColumn(f"{name}_paper{suffix}", "paper", "as printed", factor, digits=6),
@@ -95,7 +95,7 @@ def _columns(name: str, factor: float) -> list[SheetColumn]:
         SheetColumn(
             f"{name}_agreement",
             "verdict",
-            "whether the printed value, with its precision, is within the interval, or equals our mean",
+            "agrees if the printed value, with its precision, is within the interval, or equals our mean",
         ),
         SheetColumn(f"{name}_off{suffix}", "off", "ours less the paper's", factor),
     ]
@@ -134,7 +134,7 @@ def claim_sheet(title: str, claims: Sequence[Claim]) -> Sheet:
         SheetColumn("low", "from", "lower end of its 95 % interval", 100),
         SheetColumn("high", "to", "upper end", 100),
         SheetColumn("row_count", "n", "number of rows that it is based on"),
-        SheetColumn("agreement", "verdict", "whether the paper's statement is within the interval"),
+        SheetColumn("agreement", "verdict", "agrees if the paper's statement is within the interval"),
     )
     rows = [
         (

@@ -1,1 +1,1 @@
-"""Synchronization policies: how long physics and network run independently, and which states the network assumes."""
+"""Synchronization policies: the time for which physics and network run independently, and the assumed states."""

@@ -3,18 +3,18 @@
 The network extrapolates the agents at the velocities that they had at the beginning of the window, as simulators of
 many vehicles do between updates (dead reckoning, IEEE Std 1278.1, annex E). Physics and programs advance ahead of the
 network: arrivals count from the end of the window, so nothing that they do in the window depends on the network. At
-that time a pair of agents has an error x, the distance between their true relative position and the one that the
-network assumes. It grows at a speed v, which changes by at most the acceleration limit a: after a time t it is at
-most x + v t + a t^2 / 2. Before this can reach the bound, the policy evaluates the errors again; when not even one
-step of the physics is left, the window ends. So the bound holds for any motion, and no margin is lost to motions that
-were possible but did not occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
+the time that they have reached, a pair of agents has an error x, the distance between their true relative position
+and the one that the network assumes. It grows at a speed v, which changes by at most the acceleration limit a: after
+a time t it is at most x + v t + a t^2 / 2. Before this can reach the bound, the policy evaluates the errors again; if
+less than one step of the physics remains, the window ends. So the bound holds for any motion, and no margin is lost
+to motions that were possible but did not occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
 
-The pairs are those of all agents that send, receive, forward or interfere. With a bound in metres, the ground is one
-more of them, so that the bound also holds for each agent's absolute position; with a bound in dB, fixed sources of
-interference are.
+The pairs are those of all agents that send, receive, forward or interfere. A bound in metres adds the pairs of each
+agent and a fixed point on the ground, so that the bound also holds for the agent's absolute position; a bound in dB
+adds the pairs of each agent and a fixed source of interference.
 
-The network extrapolates in steps, but the trajectory is continuous: between two steps the error grows by u q at an
-assumed relative speed u and a step q. The step is that of the physics if this takes at most an eighth of the bound;
+The network extrapolates in steps, but the trajectory is continuous: with an assumed relative speed u and a step q,
+the error grows by u q between two steps. The step is that of the physics if u q is at most an eighth of the bound;
 otherwise it is shorter.
 
 While no program sends and the network has no events, positions are not used, and the window extends to the last step
@@ -24,7 +24,7 @@ policy raises an error.
 
 The bound may be given in dB of path loss. By the log-distance law, 10 n log10(d), if a pair has the assumed distance
 d and is nearer by x, its path loss is lower by 10 n log10(d / (d - x)); if it is farther by x, the change is smaller.
-So b dB allow x = d (1 - 10^(-b / 10 n)), which decreases no faster than the assumed distance.
+A bound of b dB therefore allows x = d (1 - 10^(-b / 10 n)), which decreases no faster than the assumed distance.
 """
 
 import math
@@ -52,7 +52,7 @@ _GROUND_M: Final = (STILL,)
 
 
 class ErrorBounded:
-    """Windows of whole physics steps, as many as a bound allows and at least one, in which no state changes.
+    """Windows of as many physics steps as a bound on position errors allows, at least one.
 
     Args:
         bound_m: Largest error of the network's relative position of two agents, in metres.
@@ -120,7 +120,7 @@ class ErrorBounded:
         return self._reckoning_step_ns
 
     def extended_end_ns(self, situation: Situation) -> int:
-        """Return the last physics step up to which no error can exceed its bound, or up to which none is used."""
+        """Return the last physics step up to which no error can exceed its bound, or no position is used."""
         pairs = self._pairs(situation)
         allowed_s = pairs.allowed_s(0.0 if self._reckoning_step_ns == 1 else self._reckoning_step_ns / 1e9)
         first = int(np.argmin(allowed_s)) if len(allowed_s) else None
@@ -218,12 +218,12 @@ class _Pairs:
         Args:
             step_s: Step of dead reckoning; 0 if the extrapolation is continuous.
         """
-        left_m = self.bounds_m - self.errors_m - self.assumed_m_s * step_s
+        margin_m = self.bounds_m - self.errors_m - self.assumed_m_s * step_s
         rates_m_s = self.error_rates_m_s + self.bound_rates_m_s
         with np.errstate(divide="ignore", invalid="ignore"):
-            # The positive root of a t^2 / 2 + v t = left, in the form that loses no digits if a is small.
-            allowed_s = 2 * left_m / (rates_m_s + np.sqrt(rates_m_s**2 + 2 * self.limits_m_s2 * left_m))
-        positive_s: Floats = np.where(left_m > 0, allowed_s, 0.0)
+            # The positive root of a t^2 / 2 + v t = margin, in the form that loses no digits if a is small.
+            allowed_s = 2 * margin_m / (rates_m_s + np.sqrt(rates_m_s**2 + 2 * self.limits_m_s2 * margin_m))
+        positive_s: Floats = np.where(margin_m > 0, allowed_s, 0.0)
         return positive_s
 
 

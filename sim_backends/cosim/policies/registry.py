@@ -66,7 +66,7 @@ def policies() -> Mapping[str, PolicyKind]:
             )
         if getattr(kind, "name", None) != point.name:
             raise ConfigurationError(
-                f"the sync policy's name is {getattr(kind, 'name', None)!r}, and must be {point.name!r}",
+                f"the sync policy's name is {getattr(kind, 'name', None)!r}, but must be {point.name!r}",
                 where=where,
                 remedy=plugins.REMEDY,
             )
@@ -74,13 +74,13 @@ def policies() -> Mapping[str, PolicyKind]:
     return MappingProxyType(kinds)
 
 
-def unknown_policy(name: str) -> str:
+def unknown_policy_remedy(name: str) -> str:
     """Return the remedy for the name of a policy that does not exist."""
     return did_you_mean(name, policies(), f"policies: {', '.join(policies())}; others need their package installed")
 
 
 def make_policy(name: str, **parameters: float) -> SyncPolicy:
-    """Return a new policy; a policy object serves one run.
+    """Return a new policy; each policy object is used for one run only.
 
     Args:
         name: One of `policies()`.
@@ -91,7 +91,7 @@ def make_policy(name: str, **parameters: float) -> SyncPolicy:
         ConfigurationError: There is no such policy, or the value of a parameter is invalid.
     """
     if name not in policies():
-        raise ConfigurationError(f"there is no sync policy {name!r}", remedy=unknown_policy(name))
+        raise ConfigurationError(f"there is no sync policy {name!r}", remedy=unknown_policy_remedy(name))
     kind = policies()[name]
     accepted = inspect.signature(kind).parameters
     values = {"window_s": _WINDOW_S} | parameters

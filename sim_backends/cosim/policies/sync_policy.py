@@ -18,7 +18,7 @@ class Situation:
     """The input of a policy. A co-simulation has one object, which it updates as it advances.
 
     Attributes:
-        now_ns: Time that both simulators have reached.
+        now_ns: Time that physics and network have reached.
         states: States of the agents now.
         pairs: Sender and receiver of each possible transmission.
         next_wake_ns: Returns the next time at which a program's timer wakes it, or None.
@@ -27,7 +27,7 @@ class Situation:
         limits_m_s2: Largest change of each agent's velocity per second.
         next_send_ns: Time before which no program sends, or None; only set for policies that look ahead.
         assumed: States of the agents that the network assumes now, and from which it extrapolates; only set for
-            policies that look ahead. None means: at their positions, not moving.
+            policies that look ahead. None means that they stay at their positions.
         other_agents: Agents that forward or interfere, or have sent without being in `pairs`.
         fixed_emitters_m: Positions of sources of interference that are not agents.
     """
@@ -108,7 +108,7 @@ class LookingAhead(SyncPolicy, Protocol):
 
         Args:
             situation: The present situation, except for the network, which is still at the beginning of the window:
-                its next event is the one that it had then. A program that has sent in the window may require
+                its next event is the one that it had then. If a program has sent in the window, the network may need
                 positions immediately.
 
         Returns:

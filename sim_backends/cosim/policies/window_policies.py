@@ -6,7 +6,7 @@ from typing import Final
 
 from sim_backends.cosim.policies.sync_policy import PolicyError, Situation, window_ns
 
-_PER_NS: Final = 10**9
+_AS_PER_NS: Final = 10**9
 """Attoseconds per nanosecond. Rounding each window to half an attosecond adds up to 0.5 ns after 10^9 windows."""
 
 
@@ -24,11 +24,11 @@ class Windows:
         """Return the end of a window of a length that begins at the end of the previous one."""
         if length_ns != self._length_ns:
             self._length_ns = length_ns
-            self._whole_ns, self._rest = divmod(round(length_ns * _PER_NS), _PER_NS)
+            self._whole_ns, self._rest = divmod(round(length_ns * _AS_PER_NS), _AS_PER_NS)
         self._carried += self._rest
-        if self._carried < _PER_NS:
+        if self._carried < _AS_PER_NS:
             return begin_ns + self._whole_ns
-        self._carried -= _PER_NS
+        self._carried -= _AS_PER_NS
         return begin_ns + self._whole_ns + 1
 
 
@@ -66,7 +66,7 @@ class FixedWindow:
 
 
 class TimeStepped(FixedWindow):
-    """Data is exchanged at thresholds only."""
+    """Data is exchanged at the ends of windows only."""
 
     name = "time_stepped"
     defers_sends = True
@@ -75,7 +75,7 @@ class TimeStepped(FixedWindow):
 
 
 class Scheduled(FixedWindow):
-    """Packets enter the network immediately, and leave it at samples."""
+    """Packets enter the network immediately; arrivals count from the end of the window."""
 
     name = "scheduled"
     defers_sends = False
@@ -124,11 +124,11 @@ class VariableStepped:
 
 
 NS_PER_M_S = 1e6
-"""Change of the window per m/s: 1/1000 s."""
+"""Change of the window in nanoseconds per m/s of speed difference: 1/1000 s."""
 
 
 class VelocityAwareRaw:
-    """The smallest window that the rule gives for any pair, from publisher to subscriber.
+    """The smallest window `w + (Vp - Vs) / 1000` of any pair of publisher and subscriber: the rule of the paper.
 
     Args:
         window_s: w, in seconds.
@@ -172,19 +172,19 @@ class VelocityAwareRaw:
                 f"{speeds_m_s[subscriber]:g} m/s: w + (Vp - Vs)/1000 is {length_ns / 1e9:g} s, so that time "
                 f"{'stops' if length_ns >= 0 else 'runs backwards'}",
                 where=f"{self.name} at {situation.now_ns / 1e9:g} s",
-                remedy="use velocity_aware, which is the rule made safe",
+                remedy="use velocity_aware, whose windows are always positive",
             )
         self._pair = publisher, subscriber
         return self._windows.end_ns(situation.now_ns, length_ns)
 
     @property
     def decided_by(self) -> str:
-        """Publisher and subscriber with the shortest window of the last one."""
+        """Publisher and subscriber of the pair that determined the last window."""
         return " to ".join(filter(None, self._pair))
 
 
 class VelocityAware:
-    """The smallest window that `w + |Vp - Vs| / 1000` gives for any pair, at least a step of the physics.
+    """The smallest window `w + |Vp - Vs| / 1000` of any pair, at least a step of the physics.
 
     Args:
         window_s: w, in seconds.
@@ -221,5 +221,5 @@ class VelocityAware:
 
     @property
     def decided_by(self) -> str:
-        """The pair with the lowest relative velocity in the last window."""
+        """The pair with the lowest relative velocity, which determined the last window."""
         return " and ".join(self._pair)

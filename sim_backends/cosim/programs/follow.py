@@ -38,7 +38,7 @@ class LatestStates:
 
     Args:
         names: The other agents.
-        timeout_ns: How long a state is valid after its arrival.
+        timeout_ns: Time for which a state is valid after its arrival.
 
     Raises:
         ConfigurationError: There are no other agents, or the timeout is not above 0.
@@ -55,7 +55,7 @@ class LatestStates:
         self._latest: dict[str, Received] = {}
 
     def update(self, received: Sequence[Received]) -> None:
-        """Keep the state of each agent that has the latest time stamp."""
+        """Store the state with the latest time stamp for each agent."""
         for datagram in received:
             latest = self._latest.get(datagram.source)
             if isinstance(datagram.payload, State) and (latest is None or datagram.sent_ns >= latest.sent_ns):
@@ -119,7 +119,7 @@ class FollowAtHeadway(NeverSends):
         return self._timer.next_ns
 
     def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
-        """Keep received states; if a command is due, steer, or stop if there is no valid state."""
+        """Store received states; if a command is due, steer, or stop if there is no valid state."""
         self._leader.update(received)
         if not self._timer.fire_if_due(now_ns):
             return Action()
@@ -183,7 +183,7 @@ class HoldStation(NeverSends):
         return self._timer.next_ns
 
     def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
-        """Keep received states; if a command is due, steer, or hover if there is no valid state."""
+        """Store received states; if a command is due, steer, or hover if there is no valid state."""
         self._leaders.update(received)
         if not self._timer.fire_if_due(now_ns):
             return Action()
@@ -192,10 +192,12 @@ class HoldStation(NeverSends):
 
     def _command(self, own_state: State, leaders: Sequence[State]) -> Velocity:
         e, n, u = _mean([leader.position_m for leader in leaders])
-        off_m = [there - here for here, there in zip(own_state.position_m, (e, n, u + self._above_m), strict=True)]
-        gain_per_s = min(self._gain_per_s, self._top_speed_m_s / (math.hypot(*off_m) or math.inf))
+        offset_m = [there - here for here, there in zip(own_state.position_m, (e, n, u + self._above_m), strict=True)]
+        gain_per_s = min(self._gain_per_s, self._top_speed_m_s / (math.hypot(*offset_m) or math.inf))
         v_e, v_n, v_u = _mean([leader.velocity_m_s for leader in leaders])
-        return Velocity((v_e + gain_per_s * off_m[0], v_n + gain_per_s * off_m[1], v_u + gain_per_s * off_m[2]))
+        return Velocity(
+            (v_e + gain_per_s * offset_m[0], v_n + gain_per_s * offset_m[1], v_u + gain_per_s * offset_m[2])
+        )
 
 
 def _mean(vectors: Sequence[Vector]) -> Vector:

@@ -165,7 +165,7 @@ class BagMessage:
         return self  # it is immutable, so a run and its forks share it
 
 
-def recorded(
+def generated_bag(
     draws: RandomStream, *, length_ns: int, rate_hz: float, size_bytes: int, jitter_ns: int
 ) -> list[BagMessage]:
     """Return a bag of messages of one size and rate; each is recorded with a random delay, and the order is kept.
@@ -219,7 +219,7 @@ class Playback:
         return Action(datagrams)
 
 
-def pieces(size_bytes: int, piece_bytes: int) -> list[BagMessage]:
+def file_pieces(size_bytes: int, piece_bytes: int) -> list[BagMessage]:
     """Return a file as messages of at most `piece_bytes` that are all due at the same time."""
     whole, rest = divmod(size_bytes, piece_bytes)
     return [BagMessage(0, size) for size in (*[piece_bytes] * whole, *([rest] if rest else []))]

@@ -1,4 +1,4 @@
-"""Programs that steer an agent along way points or with a profile of velocities."""
+"""Programs that steer an agent along waypoints or with a profile of velocities."""
 
 import math
 from bisect import bisect_right
@@ -192,12 +192,12 @@ def fly_towards(own_state: State, point_m: Vector, speed_m_s: float, *, stops: b
         speed_m_s: Top speed.
         stops: True to slow down and stop at the point.
     """
-    off_m = [there - here for here, there in zip(own_state.position_m, point_m, strict=True)]
-    left_m = math.hypot(*off_m)
+    offset_m = [there - here for here, there in zip(own_state.position_m, point_m, strict=True)]
+    left_m = math.hypot(*offset_m)
     if not left_m:
         return Velocity()
     target_m_s = min(speed_m_s, _APPROACH_PER_S * left_m) if stops else speed_m_s
-    east, north, up = (target_m_s * part / left_m for part in off_m)
+    east, north, up = (target_m_s * part / left_m for part in offset_m)
     return Velocity((east, north, up))
 
 
@@ -223,7 +223,7 @@ class ProfileLeg:
 
 
 class VelocityProfile(NeverSends):
-    """Commands one leg after the other, and then stops.
+    """Sends the command of each leg in order, and then stops.
 
     Args:
         legs: The legs.

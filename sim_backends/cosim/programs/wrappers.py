@@ -67,12 +67,12 @@ class Outage:
         self._is_stopped = False
 
     def next_wake_ns(self) -> int | None:
-        """Return the program's next time; before the body has been stopped, at the latest the beginning."""
+        """Return the program's next wake time; before the body was stopped, at most the start of the outage."""
         wake_ns = self._program.next_wake_ns()
         return wake_ns if self._is_stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
 
     def next_send_ns(self) -> int | None:
-        """Return the program's next time of sending."""
+        """Return the program's next send time."""
         return next_send_ns(self._program)
 
     def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
@@ -96,7 +96,7 @@ class AgentClock:
 
     Attributes:
         begin_ns: Beginning of the interval.
-        end_ns: End of the interval, when the clock is set right again; None for never.
+        end_ns: End of the interval, when the clock is corrected; None for never.
         offset_ns: Offset of the clock at `begin_ns`, positive if it is ahead.
         rate_ppb: Rate error of the clock in nanoseconds per second, positive if it is fast.
 

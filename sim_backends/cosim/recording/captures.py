@@ -1,4 +1,4 @@
-"""A capture per robot, with the internet headers of its packets."""
+"""A pcap file per robot, with the internet headers of its packets."""
 
 import os
 import struct
@@ -22,7 +22,7 @@ _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
 _FIRST_PORT: Final = 40_000
 """Destination port of the first flow; each further flow has the next."""
 _FIRST_EPHEMERAL_PORT: Final = 50_000
-"""Source port of the first flow: a dynamic port (RFC 6335, section 6), of which tcpdump decodes 49152 specially."""
+"""Source port of the first flow: a dynamic port (RFC 6335, section 6), not 49152, which tcpdump decodes specially."""
 _PORTS: Final = 9_000
 """Number of ports after which they are reused."""
 
@@ -59,7 +59,7 @@ class IpEncoder:
         packet = fragment.packet
         protocol, transport_header = self._transport(packet)
         begin = fragment.offset_bytes
-        carried = transport_header[begin : begin + fragment.size_bytes - HEADER_BYTES]
+        payload_part = transport_header[begin : begin + fragment.size_bytes - HEADER_BYTES]
         more = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
         words = (
             0x45,
@@ -72,8 +72,8 @@ class IpEncoder:
         )
         ends = self._packed[packet.source], self._packed[packet.destination]
         header = _IP.pack(*words, _checksum(_IP.pack(*words, 0, *ends)), *ends)
-        data_bytes = min(fragment.size_bytes, max_bytes) - HEADER_BYTES - len(carried)
-        return (header + carried + bytes(max(data_bytes, 0)))[:max_bytes]
+        data_bytes = min(fragment.size_bytes, max_bytes) - HEADER_BYTES - len(payload_part)
+        return (header + payload_part + bytes(max(data_bytes, 0)))[:max_bytes]
 
     def _transport(self, packet: IpPacket) -> tuple[int, bytes]:
         """Return the number of the transport protocol, and the transport header."""
@@ -86,7 +86,7 @@ class IpEncoder:
             protocol, header = _UDP, _UDP_HEADER.pack(*self._udp_ports(packet), length, 0)
             checksum_offset = 6
         pseudo = self._packed[packet.source] + self._packed[packet.destination] + struct.pack(">HH", protocol, length)
-        # Zeros as data add nothing to a checksum. A sum of 0 is sent as all ones (RFC 768); for TCP both are valid.
+        # Zeros in the data do not change the sum. A sum of 0 is sent as all ones (RFC 768); for TCP both are valid.
         checksum = _checksum(pseudo + header) or 0xFFFF
         return protocol, header[:checksum_offset] + struct.pack(">H", checksum) + header[checksum_offset + 2 :]
 
@@ -96,7 +96,7 @@ class IpEncoder:
     def _udp_ports(self, packet: IpPacket) -> tuple[int, int]:
         if packet.transport == "topic":
             return _TOPIC_PORT, _DISCOVERY_PORT if packet.destination is None else _TOPIC_PORT
-        # Only with UDP itself the identity names a flow; other transports number their own packets.
+        # Only the identity of a UDP packet contains the name of a flow; other transports number their packets.
         ends = packet.transport, packet.source, packet.destination
         number = self._flow_number(packet.identity[0] if packet.transport == "udp" else ends)
         return _FIRST_EPHEMERAL_PORT + number, _FIRST_PORT + number
@@ -156,12 +156,12 @@ def _checksum(data: bytes) -> int:
 _NANOSECONDS_MAGIC: Final = 0xA1B23C4D
 _LINKTYPE_RAW: Final = 101
 """Packets begin with the IP header."""
-_FILE: Final = struct.Struct("<IHHiIII")
-_RECORD: Final = struct.Struct("<IIII")
+_FILE_HEADER: Final = struct.Struct("<IHHiIII")
+_RECORD_HEADER: Final = struct.Struct("<IIII")
 
 
 class Captures:
-    """One capture file per robot, with the packets that it sent and that arrived at it; none for robots without any.
+    """One pcap file per robot, with the packets that it sent and received; none for a robot without packets.
 
     Files grow by whole packets, so they are readable even if the run is killed.
 
@@ -184,9 +184,9 @@ class Captures:
         data = self._encoder.encode(fragment, self._snap_bytes)
         if name not in self._pending:
             self._pending[name] = bytearray(
-                _FILE.pack(_NANOSECONDS_MAGIC, 2, 4, 0, 0, self._snap_bytes, _LINKTYPE_RAW)
+                _FILE_HEADER.pack(_NANOSECONDS_MAGIC, 2, 4, 0, 0, self._snap_bytes, _LINKTYPE_RAW)
             )
-        self._pending[name] += _RECORD.pack(*divmod(at_ns, 10**9), len(data), fragment.size_bytes) + data
+        self._pending[name] += _RECORD_HEADER.pack(*divmod(at_ns, 10**9), len(data), fragment.size_bytes) + data
 
     def flush(self) -> None:
         """Write the packets that are not written yet.
@@ -209,6 +209,6 @@ class Captures:
     def _write(self, name: str, pending: bytearray) -> None:
         descriptor, at, done = self._files[name].fileno(), self._written_bytes[name], 0
         while done < len(pending):
-            # Written at an explicit position, so that an interrupt before the count is updated duplicates nothing.
+            # The position is explicit, so that an interrupt before the count is updated does not duplicate data.
             done += os.pwrite(descriptor, bytes(pending[done:]), at + done)
         self._written_bytes[name], self._pending[name] = at + done, bytearray()

@@ -26,11 +26,11 @@ _CHECKSUM: Final = "content_hash"
 
 
 class RunEnding(StrEnum):
-    """The end of a run."""
+    """The status of a run: under way, or the kind of its end."""
 
     UNDER_WAY = "under way"
     KILLED = "killed"
-    """Never in `run.json`: it says `under way`, but no process holds the lock."""
+    """`run.json` has `under way`, but no process holds the lock; this value is never written."""
     WHOLE = "whole"
     INTERRUPTED = "interrupted"
     FAILED = "failed"
@@ -68,7 +68,7 @@ class RunManifest:
         schema_version: Schema version of the recording.
         versions: Versions of fieldkit, Python and the libraries that affect the numbers of a run.
         ending: The end of the run.
-        why: The error that ended the run, or empty.
+        why: The error that ended the run; empty without an error.
         digest: Hash over all events (`EventDigest`); empty during the run.
         parts: BLAKE2b of each file of a table, by its path in the folder; empty during the run.
     """
@@ -129,20 +129,20 @@ def _is_locked(folder: Path) -> bool:
 
 
 def read_manifest(folder: Path) -> RunManifest:
-    """Read `run.json`; if it says that the run is under way, check that a process is still writing it.
+    """Read `run.json`; a run that is under way there, but that no process writes, was killed.
 
     Raises:
         EvidenceError: It does not exist, is invalid, or was changed.
     """
-    manifest = _read(folder)
+    manifest = _read_file(folder)
     if manifest.ending is RunEnding.UNDER_WAY and not _is_locked(folder):
-        manifest = _read(folder)  # the run may have ended since the first read
+        manifest = _read_file(folder)  # the run may have ended since the first read
         if manifest.ending is RunEnding.UNDER_WAY:
             return replace(manifest, ending=RunEnding.KILLED)
     return manifest
 
 
-def _read(folder: Path) -> RunManifest:
+def _read_file(folder: Path) -> RunManifest:
     path = folder / _NAME
     try:
         content = json.loads(path.read_bytes())
@@ -162,7 +162,7 @@ def _read(folder: Path) -> RunManifest:
         )
     if manifest.scenario_hash != manifest.about.scenario_hash:
         raise EvidenceError(
-            "the scenario's text is not the one that was run: its hash differs", where=str(path), remedy=RUN_AGAIN
+            "the scenario's text was changed after the run: its hash differs", where=str(path), remedy=RUN_AGAIN
         )
     if manifest.ending is RunEnding.WHOLE and not (manifest.digest and manifest.parts):
         raise EvidenceError(

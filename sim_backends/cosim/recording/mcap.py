@@ -62,12 +62,12 @@ _PACKET: Final = _object(
         "size_bytes": {"type": "integer"},
         "arrived": {
             "type": "boolean",
-            "description": "Whether it arrived; absent if that was not known at the end.",
+            "description": "True if it arrived; absent if its fate was not decided at the end.",
         },
-        "reason": {"type": "string", "description": "Why it never arrived; absent otherwise."},
+        "reason": {"type": "string", "description": "Reason why it never arrived; absent otherwise."},
         "delay_s": {
             "type": "number",
-            "description": "Time from its sending to its arrival as its receiver counts it.",
+            "description": "Time from sending to the arrival that counts for its receiver.",
         },
         "added_s": {
             "type": "number",
@@ -127,7 +127,7 @@ def _schema_of(topic: str) -> Json:
 def _states(recording: Recording) -> Iterator[Message]:
     for at_ns, agent, state in recording.states:
         time, position = _time(at_ns), _vector(state.position_m)
-        half_rad = (state.heading_rad or 0.0) / 2  # rotation about the up axis; without a heading: east
+        half_rad = (state.heading_rad or 0.0) / 2  # rotation about the up axis; without a heading, it is east
         transform = {
             "timestamp": time,
             "parent_frame_id": "world",

@@ -65,7 +65,7 @@ _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
             _field(
                 "counted_ns", pa.int64(), "ns", "time of arrival by the policy; empty if the packet never arrived"
             ),
-            _field("late_ns", pa.int64(), "ns", "time by which the receiver was already past counted_ns"),
+            _field("late_ns", pa.int64(), "ns", "time by which the receiver had already passed counted_ns"),
             _field(
                 "reason",
                 _TEXT,
@@ -108,7 +108,7 @@ _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
 }
 
 TABLES: Final = tuple(_SCHEMAS)
-"""The names of the tables, in the order in which parts are written: when the last is there, all are complete."""
+"""The names of the tables, in the order in which parts are written: if the last part exists, all are complete."""
 
 
 def part_path(table: str, number: int) -> str:
@@ -136,7 +136,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
 
 
 def checksum(path: Path) -> str:
-    """Return the BLAKE2b of a file, as `write_part` did.
+    """Return the BLAKE2b of a file, computed as by `write_part`.
 
     Raises:
         OSError: It cannot be read.

@@ -84,7 +84,7 @@ class StateSamples:
 
 _MAX_WINDOWS: Final = 50_000
 """Largest number of windows in a part, because a part is in memory until it is written."""
-_FULL: Final = {errno.ENOSPC, errno.EDQUOT}
+_DISK_FULL_ERRORS: Final = {errno.ENOSPC, errno.EDQUOT}
 _RESERVE: Final = ".reserve"
 _RESERVE_BYTES: Final = 1 << 20
 """Disk space that is allocated in advance for the last windows and the manifest, in case the disk becomes full."""
@@ -103,7 +103,7 @@ class RunRecorder:
     run that is killed therefore loses only its last seconds.
 
     Args:
-        folder: The folder; it is created at the beginning of the run, so a scenario that is refused creates none.
+        folder: The folder; it is created at the start of the run, so an invalid scenario creates none.
         about: The scenario and its settings.
         states_every_ns: Interval at which true states are recorded, at ends of windows, in simulated nanoseconds.
         part_every_s: Interval at which parts are written, in seconds of wall time.
@@ -135,7 +135,7 @@ class RunRecorder:
         self._has_failed = False
 
     def begin(self, states: Mapping[str, State]) -> None:
-        """Create the folder, and lock it.
+        """Create and lock the folder.
 
         Raises:
             ConfigurationError: There is a recording already.
@@ -230,7 +230,7 @@ class RunRecorder:
         written as fit into it.
 
         Raises:
-            RecordingError: Some of it cannot be written.
+            RecordingError: Some windows or packets cannot be written.
         """
         failure: OSError | None = None
         try:
@@ -286,7 +286,7 @@ class RunRecorder:
             os.posix_fallocate(descriptor, 0, _RESERVE_BYTES)
         except OSError as error:
             self._free_reserve()
-            if error.errno in _FULL:
+            if error.errno in _DISK_FULL_ERRORS:
                 raise
         finally:
             os.close(descriptor)
@@ -300,5 +300,5 @@ class RunRecorder:
         return RecordingError(
             f"the recording cannot be written: {error.strerror}; the parts written before remain readable",
             where=str(self._folder),
-            remedy="free some space" if error.errno in {*_FULL, errno.EFBIG} else "choose another folder",
+            remedy="free some space" if error.errno in {*_DISK_FULL_ERRORS, errno.EFBIG} else "choose another folder",
         )

@@ -1,4 +1,4 @@
-"""Replay: reads a recording back as a run, and refuses one that was changed or truncated."""
+"""Reads a recording back as a run; a recording that was changed or truncated is an error."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ class Recording:
 
     Attributes:
         manifest: The scenario and its settings, and the end of the run.
-        run: The run. If it is under way or was killed, packets are missing whose fate was not decided yet.
+        run: The run. If it is under way or was killed, the packets whose fate was not decided yet are missing.
         states: True states as they were recorded: time in nanoseconds, agent, state.
-        decided_by: What determined the length of each window; empty if the policy does not report it.
+        decided_by: Reason for the length of each window; empty if the policy does not report it.
     """
 
     manifest: RunManifest

@@ -38,7 +38,7 @@ AgentNames = Annotated[
 
 
 Point = Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=3)]
-"""Metres east and north, and up for agents that fly; without the last, the height at the start is kept."""
+"""Metres east and north, and up for agents that fly; without `up`, the agent keeps its initial height."""
 
 
 class StandingPlan(Strict):
@@ -59,7 +59,7 @@ class WayPointsPlan(Strict):
         points_m: The points after its start: metres east and north, and up for agents that fly.
         speed: Its speed.
         relative: True if the points are relative to its start.
-        wait: Time that it stays at its start before.
+        wait: Time that it stays at its start before it moves.
     """
 
     kind: Literal["way-points"]
@@ -188,7 +188,7 @@ class _Traffic(Strict, ABC):
         if self.source in self.to:
             raise schema.validation_error(f"{self.source} sends to itself", "to")
         if len(set(self.to)) < len(self.to):
-            raise schema.validation_error("an agent is named twice", "to")
+            raise schema.validation_error("an agent is listed twice", "to")
         return self
 
     @property
@@ -248,7 +248,7 @@ class StreamTraffic(_Traffic):
 
 
 class BagTraffic(_Traffic):
-    """A recorded bag is played back, each message at its own time.
+    """A recorded bag is played back, each message at its recorded time.
 
     The defaults are the paper's: 10 s of accelerometer data. The size is that of a serialized `sensor_msgs/Imu` with
     the frame `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and 72 of
@@ -259,7 +259,7 @@ class BagTraffic(_Traffic):
         length: Length of the recording.
         rate: Messages per second.
         size_bytes: Size of each message.
-        jitter: Largest random delay of the recording of a message, as clocks and load cause it.
+        jitter: Largest random delay with which a message was recorded, for example because of load.
     """
 
     kind: Literal["bag"]
@@ -313,7 +313,7 @@ class FileTraffic(_Traffic):
 
 
 class PingTraffic(_Traffic):
-    """Requests that are replied to; the replies are the flow `NAME/RECEIVER/reply`.
+    """Echo requests; the receiver replies to each of them, in the flow `NAME/RECEIVER/reply`.
 
     Attributes:
         kind: `ping`.

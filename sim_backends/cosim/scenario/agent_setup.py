@@ -10,7 +10,14 @@ from fieldkit.config.locations import names
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Program
 from sim_backends.cosim.programs.follow import FollowAtHeadway, HoldStation
-from sim_backends.cosim.programs.senders import EchoRequester, EchoResponder, Periodic, Playback, pieces, recorded
+from sim_backends.cosim.programs.senders import (
+    EchoRequester,
+    EchoResponder,
+    Periodic,
+    Playback,
+    file_pieces,
+    generated_bag,
+)
 from sim_backends.cosim.programs.way_points import PERIOD_NS, DriveThrough, FlyThrough, ProfileLeg, VelocityProfile
 from sim_backends.cosim.programs.wrappers import AgentClock, Clocked, CombinedProgram, Outage
 from sim_backends.cosim.scenario.agent_plans import (
@@ -30,8 +37,8 @@ from sim_backends.cosim.scenario.faults import ClockSkewFault, NodeLossFault
 from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
 from sim_backends.physics.body import Body, Twist, Velocity
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DifferentialDrive, DriveLimits
-from sim_backends.physics.known import BODIES, quadrotor
 from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits
+from sim_backends.physics.robot_limits import BODIES, quadrotor
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.radio.world_channel import Antenna, antenna_of
 from sim_backends.world.world import World
@@ -94,7 +101,7 @@ STATION_M_S: Final = 1.0
 """Largest speed at which an agent returns to its station."""
 
 
-def stops(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
+def stop_commands(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
     """Return the command that stops each body."""
     return {name: Velocity() if body.flies else Twist() for name, body in bodies.items()}
 
@@ -126,9 +133,9 @@ def _controller(plan: AgentPlan, body: Body[Any], phase_ns: int) -> Program | No
             return None
         case WayPointsPlan():
             begin_ns = round(motion.wait * 1e9) + phase_ns
-            return _through(path_points_m(motion, body.place_m), motion.speed, body, begin_ns)
+            return _waypoint_program(path_points_m(motion, body.place_m), motion.speed, body, begin_ns)
         case StationKeepingPlan():
-            return _through([body.place_m], STATION_M_S, body, phase_ns)
+            return _waypoint_program([body.place_m], STATION_M_S, body, phase_ns)
         case VelocityProfilePlan():
             heading_rad = math.radians(plan.heading_deg)
             return VelocityProfile([_leg(leg, body, heading_rad) for leg in motion.legs])
@@ -159,7 +166,7 @@ def _follower(motion: FollowPlan, body: Body[Any], begin_ns: int) -> Program:
     )
 
 
-def _through(points_m: list[Vector], speed_m_s: float, body: Body[Any], begin_ns: int) -> Program:
+def _waypoint_program(points_m: list[Vector], speed_m_s: float, body: Body[Any], begin_ns: int) -> Program:
     if body.flies:
         return FlyThrough(points_m, speed_m_s, begin_ns=begin_ns)
     return DriveThrough([(east_m, north_m) for east_m, north_m, _ in points_m], speed_m_s, begin_ns=begin_ns)
@@ -189,17 +196,17 @@ def programs(
         controllers: The program that steers each agent.
         stops: The command that stops each agent's body.
     """
-    parts: dict[str, list[Program]] = {name: [] for name in scenario.agents}
+    programs_by_agent: dict[str, list[Program]] = {name: [] for name in scenario.agents}
     for name, controller in controllers.items():
-        parts[name].append(controller)
+        programs_by_agent[name].append(controller)
     for traffic in scenario.traffic:
-        parts[traffic.source] += [_sender(traffic, flow, to, seed) for flow, to in traffic.flows.items()]
+        programs_by_agent[traffic.source] += [_sender(traffic, flow, to, seed) for flow, to in traffic.flows.items()]
     for name in {to for traffic in scenario.traffic if isinstance(traffic, PingTraffic) for to in traffic.to}:
-        parts[name].append(EchoResponder())
+        programs_by_agent[name].append(EchoResponder())
     combined: dict[str, Program] = {
-        name: of_agent[0] if len(of_agent) == 1 else CombinedProgram(of_agent)
-        for name, of_agent in parts.items()
-        if of_agent
+        name: agent_programs[0] if len(agent_programs) == 1 else CombinedProgram(agent_programs)
+        for name, agent_programs in programs_by_agent.items()
+        if agent_programs
     }
     return dict(_with_faults(scenario, combined, stops))
 
@@ -229,9 +236,9 @@ def _sender(traffic: Traffic, flow: str, to: str, seed: int) -> Program:
                 protocol=traffic.transport,
             )
         case FileTraffic():
-            bag = pieces(traffic.size_bytes, traffic.piece_bytes)
+            bag = file_pieces(traffic.size_bytes, traffic.piece_bytes)
         case BagTraffic():
-            bag = recorded(
+            bag = generated_bag(
                 # The stream depends on the bag only, because every receiver gets the same bag.
                 RandomStream(seed, traffic.title, "recorded"),
                 length_ns=_ns(traffic.length),

@@ -17,7 +17,7 @@ from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import QosOptions, Traffic
-from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stops
+from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.external import open_network, open_physics
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
@@ -77,7 +77,7 @@ def radio_network(
 
 
 def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFactory]:
-    """Return the transports; publish-subscribe ones only if they are used, as they send even without traffic."""
+    """Return the transports; without publish-subscribe if no flow uses it, because it sends even without traffic."""
     topics: dict[str, TopicFlow] = {}
     ros1: dict[str, Ros1Flow] = {}
     for traffic in scenario.traffic:
@@ -192,7 +192,7 @@ def build(
         measures_all: As for `Coordinator`.
 
     Raises:
-        ConfigurationError: The scenario cannot be run; the message says why.
+        ConfigurationError: The scenario cannot be run; the message states the reason.
         FederateError: An external federate failed, or has not connected or answered in time.
     """
     seed = scenario.seeds[0] if seed is None else seed
@@ -221,7 +221,7 @@ def build(
                 else:
                     network = stalled(network, stall)
         scenario_programs = programs(
-            scenario, seed, controllers(scenario, scenario_bodies, seed), stops(scenario_bodies)
+            scenario, seed, controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
         )
         agents = Agents(physics, scenario_programs)
         coordinator = Coordinator(

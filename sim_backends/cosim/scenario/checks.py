@@ -98,7 +98,7 @@ def _demands(motion: object, start_m: Vector, limits: Limits) -> Iterator[Demand
     if isinstance(motion, WayPointsPlan):
         yield Demand(("speed",), "a speed", motion.speed, limits.speed_m_s, "m/s")
         if isinstance(limits, QuadrotorLimits):
-            yield from _climbs(motion, start_m, limits)
+            yield from _climb_demands(motion, start_m, limits)
     elif isinstance(motion, VelocityProfilePlan):
         for number, leg in enumerate(motion.legs):
             for demand in _leg_demands(leg, limits):
@@ -109,21 +109,21 @@ def _leg_demands(leg: LegPlan, limits: Limits) -> Iterator[Demand]:
     yield Demand(("speed",), "a speed", abs(leg.speed), limits.speed_m_s, "m/s")
     turn_deg_s = abs(float(leg.turn_deg_s))
     if isinstance(limits, QuadrotorLimits):
-        yield _climb(("climb_m_s",), float(leg.climb_m_s), limits)
+        yield _climb_demand(("climb_m_s",), float(leg.climb_m_s), limits)
         yield Demand(("turn_deg_s",), "a rate of turn", turn_deg_s, 0.0, "deg/s")  # it keeps its heading
     else:
         yield Demand(("turn_deg_s",), "a rate of turn", turn_deg_s, math.degrees(limits.turn_rad_s), "deg/s")
         yield Demand(("climb_m_s",), "a climb rate", abs(float(leg.climb_m_s)), 0.0, "m/s")
 
 
-def _climbs(motion: WayPointsPlan, start_m: Vector, limits: QuadrotorLimits) -> Iterator[Demand]:
+def _climb_demands(motion: WayPointsPlan, start_m: Vector, limits: QuadrotorLimits) -> Iterator[Demand]:
     for here_m, there_m in pairwise([start_m, *path_points_m(motion, start_m)]):
         length_m = math.dist(here_m, there_m)
         if length_m:
-            yield _climb(("speed",), motion.speed * (there_m[2] - here_m[2]) / length_m, limits)
+            yield _climb_demand(("speed",), motion.speed * (there_m[2] - here_m[2]) / length_m, limits)
 
 
-def _climb(location: Location, up_m_s: float, limits: QuadrotorLimits) -> Demand:
+def _climb_demand(location: Location, up_m_s: float, limits: QuadrotorLimits) -> Demand:
     down_limit_m_s, up_limit_m_s = limits.climb_m_s
     if up_m_s < 0:
         return Demand(location, "a sink rate", -up_m_s, down_limit_m_s, "m/s")
@@ -134,9 +134,9 @@ class ScenarioProblem(NamedTuple):
     """A reason why a scenario cannot be run.
 
     Attributes:
-        location: Keys of the wrong value.
-        message: What is wrong.
-        remedy: How to correct it.
+        location: Keys of the invalid value.
+        message: The error.
+        remedy: The correction.
     """
 
     location: Location

@@ -26,7 +26,7 @@ class _Fault(Strict):
 
     @property
     def agents(self) -> tuple[tuple[str, str], ...]:
-        """The agents that it names, each after the key that names it."""
+        """The agents that the fault names, each as a pair of key and agent."""
         return ()
 
 
@@ -123,13 +123,12 @@ class JammerFault(_TimedFault):
 
 
 class ClockSkewFault(_TimedFault):
-    """The clock of an agent, which its programs use to wake and stamp, is wrong; at the fault's end it is set right.
+    """The clock of an agent, which its programs use for timers and time stamps, is wrong until the fault ends.
 
     Attributes:
         kind: `clock-skew`.
         agent: The agent.
-        offset_ms: How far the clock is ahead at the beginning of the fault, in milliseconds; negative if it is
-            behind.
+        offset_ms: Offset of the clock at the beginning of the fault, in milliseconds; positive if it is ahead.
         rate_ppm: Rate error of the clock from then on, in microseconds per second; positive if it is fast.
     """
 

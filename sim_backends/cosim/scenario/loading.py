@@ -60,7 +60,7 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
             "agents.husky-2.along": "40m"}`.
 
     Raises:
-        ConfigurationError: It does not exist, or is invalid; the message says where.
+        ConfigurationError: It does not exist, or is invalid; the message states the place.
     """
     path = _path(str(name_or_path))
     document = schema.read(path)
@@ -83,10 +83,10 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
 
 
 def _change(data: Any, keys: list[str], value: Any) -> None:  # noqa: ANN401 (any YAML value)
-    """Set the value of a key; missing mappings on the path to it are created.
+    """Set the value of a key; missing parent mappings are created.
 
     Raises:
-        ConfigurationError: A key on the path has a value without keys, or an index is beyond the end of a list.
+        ConfigurationError: A parent key has a value without keys, or an index is beyond the end of a list.
     """
     *parents, last = (int(key) if key.isdecimal() else key for key in keys)
     try:

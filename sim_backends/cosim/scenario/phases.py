@@ -1,4 +1,4 @@
-"""Periods that are commensurate with a window, so that a run samples only few phases of the window.
+"""Periods that are commensurate with a window, so that a run samples only a few phases of the window.
 
 The error of a method depends on the phase of the window at which a packet is sent. If b periods are a whole number of
 windows, packets are sent at b phases only, the same ones in every window, and the measured error is that of these
@@ -14,7 +14,7 @@ from sim_backends.cosim.scenario.agent_plans import BagTraffic, FollowPlan
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 MAX_PHASES: Final = 10
-"""The mean over 10 evenly distributed phases is wrong by at most a twentieth of a window."""
+"""The mean over 10 evenly distributed phases has an error of at most a twentieth of a window."""
 _MAX_STEPS: Final = 100
 
 
@@ -86,7 +86,7 @@ def incommensurate_window_s(scenario: CosimScenario, window_s: float) -> float |
 
 
 def _few_phases(event: PeriodicEvent, window_s: float) -> int | None:
-    """Return the number of phases of a window at which an event occurs; None if they are enough.
+    """Return the number of phases of a window at which an event occurs; None if there are enough.
 
     After b periods the phase has drifted by d windows, so in n periods it drifts by n d / b. The phases are 1 / b
     apart, so their number stays b if n d < 1.

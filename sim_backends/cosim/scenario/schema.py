@@ -9,7 +9,7 @@ from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length,
 from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
-from sim_backends.cosim.policies.registry import policies, unknown_policy
+from sim_backends.cosim.policies.registry import policies, unknown_policy_remedy
 from sim_backends.cosim.programs.way_points import PERIOD_NS
 from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
@@ -20,7 +20,7 @@ from sim_backends.world.obstacles import Place, Real
 
 def _check_policy_name(name: str) -> str:
     if name not in policies():
-        raise schema.validation_error(f"there is no sync policy {name!r}; {unknown_policy(name)}")
+        raise schema.validation_error(f"there is no sync policy {name!r}; {unknown_policy_remedy(name)}")
     return name
 
 
@@ -29,7 +29,7 @@ def _list_policies(json_schema: dict[str, Any]) -> None:
 
 
 class PolicyChoice(Strict):
-    """The sync policy of a scenario. Its parameters apply to every policy that has them, so also in a shootout.
+    """The sync policy of a scenario. Its parameters apply to every policy that has them, also in a shootout.
 
     Attributes:
         name: The default policy of a run.
@@ -246,7 +246,7 @@ class CosimScenario(Named):
     @schema.model_validator(mode="after")
     def _seeds_are_different(self) -> "CosimScenario":
         if len(set(self.seeds)) < len(self.seeds):
-            raise schema.validation_error("a seed is named twice, and would give the same run", "seeds")
+            raise schema.validation_error("a seed is listed twice, which would give the same run twice", "seeds")
         return self
 
     @schema.model_validator(mode="after")

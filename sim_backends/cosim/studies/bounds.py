@@ -1,4 +1,4 @@
-"""The exchanges that a bound costs, by `error_bounded` and by the longest fixed window that keeps the same bound."""
+"""The number of exchanges that keep a bound, with `error_bounded` and with the longest fixed window that keeps it."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""How well followers keep their positions, and how convoys react to the leader."""
+"""Position errors of followers, and the string stability of convoys."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -38,7 +38,7 @@ class Tracks:
 
 
 def tracks_of(states: Iterable[tuple[int, str, State]]) -> Tracks:
-    """Return the tracks of recorded states; each of their times must have the states of all agents.
+    """Return the tracks of recorded states; each time must have the states of all agents.
 
     Args:
         states: Time in nanoseconds, agent, state, in the order of time.
@@ -72,7 +72,7 @@ class SampledPhysics:
         self.limits_m_s2 = physics.limits_m_s2
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        """Advance the physics, and take the samples that are due."""
+        """Advance the physics, and store the samples that are due."""
         while self._next_ns <= to_ns:
             self._samples.append(self._physics.advance(self._next_ns, commands))
             self._next_ns += self._interval_ns
@@ -181,8 +181,7 @@ class Formation:
         station_max_m: Its maximum.
         amplification: Largest ratio of the L2 norm of the acceleration of a follower that drives to that of its
             leader: up to 1, the row was string stable for the motion of its first vehicle. Accelerations are 0 before
-                and
-            after a change of speed, so unlike with speeds, the end of the run does not matter.
+            and after a change of speed, so unlike with speeds, the end of the run does not matter.
     """
 
     spacing_mean_m: float
@@ -228,14 +227,15 @@ def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
     return Formation(*_mean_and_max(spacing), *_mean_and_max(station), max(ratios, default=math.nan))
 
 
-def mean_formation(several: Sequence[Formation]) -> Formation:
+def mean_formation(formations: Sequence[Formation]) -> Formation:
     """Return the formations of several runs as one: means, or the largest of maxima.
 
     Args:
-        several: At least one.
+        formations: At least one.
     """
     columns = {
-        field.name: np.array([getattr(formation, field.name) for formation in several]) for field in fields(Formation)
+        field.name: np.array([getattr(formation, field.name) for formation in formations])
+        for field in fields(Formation)
     }
     return Formation(
         **{name: float(values.max() if "max" in name else values.mean()) for name, values in columns.items()}

@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 
 CONFIDENCE: Final = 0.95
 POWER: Final = 0.8
-"""Probability with which an existing difference is detected, by convention."""
+"""Conventional probability of detecting an existing difference."""
 
 
 @dataclass(frozen=True)
@@ -42,25 +42,25 @@ def mean(values: Floats) -> IntervalEstimate:
     value = float(values.mean()) if count else math.nan
     if count < 2:
         return IntervalEstimate(value, math.nan, math.nan)
-    half = student(count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
+    half = t_quantile(count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
     return IntervalEstimate(value, value - half, value + half)
 
 
-def jackknife(value: float, without: Floats) -> IntervalEstimate:
+def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
     """Return a statistic of repeats with its jackknife interval.
 
     Args:
         value: The statistic of all repeats.
-        without: The statistic of all repeats but one, for each, shape (n,).
+        leave_one_out: The statistic of all repeats but one, for each, shape (n,).
 
     The variance over these is n - 1 times smaller than that of the statistic (Efron and Stein 1981, Ann. Stat.
     9:586).
     """
-    count = len(without)
-    if count < 2 or not np.isfinite(without).all():
+    count = len(leave_one_out)
+    if count < 2 or not np.isfinite(leave_one_out).all():
         return IntervalEstimate(value, math.nan, math.nan)
-    error = math.sqrt((count - 1) * float(without.var()))
-    half = student(count - 1) * error
+    error = math.sqrt((count - 1) * float(leave_one_out.var()))
+    half = t_quantile(count - 1) * error
     return IntervalEstimate(value, value - half, value + half)
 
 
@@ -81,7 +81,7 @@ def repeats_needed(difference: float, deviation: float) -> int | None:
 
 
 @lru_cache(maxsize=1024)
-def student(degrees: int) -> float:
+def t_quantile(degrees: int) -> float:
     """Return the 97.5 % quantile of Student's t distribution with at least 1 degree of freedom."""
     low, high = 0.0, 13.0  # the quantile for one degree is 12.7
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Local errors: the errors of single windows of a method that begin in the exact reference's own state.
+"""Local errors: the errors of single windows of a method that begin in the state of the exact reference.
 
 The method is that for solvers of differential equations: the reference runs exactly; at many times a fork of it runs
 one window with the method and continues exactly. Differences from the reference are then caused by that window only,
@@ -25,13 +25,13 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
-"""Error of the delivery time; how far the receiver had passed the time of an arrival; error of the network's relative
+"""Error of the delivery time; time by which the receiver had passed an arrival; error of the network's relative
 position of sender and receiver; share of packets with another fate; position error of agents at the window's end."""
 
 TAIL_NS: Final = 200_000_000
 """Time that forks continue after the window, so that the fates of the affected packets are decided."""
 _LONGEST_NS: Final = 3_600_000_000_000
-"""Longer than any window, as long as there are events."""
+"""A time that is longer than any window if there are events."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def local_errors(
     reference = make(EventDriven())
     for column, start_ns in enumerate(starts_ns):
         _delete_decided(reference.advance(start_ns))
-        exact: dict[int, _Aftermath] = {}
+        exact_by_end: dict[int, _Aftermath] = {}
         for name, method in methods.items():
             for row, parameter in enumerate(parameters):
                 fork = reference.fork()
@@ -117,13 +117,13 @@ def local_errors(
                 end_ns = fork.advance(start_ns + _LONGEST_NS, max_windows=1).windows_ns[-1]
                 if end_ns == start_ns + _LONGEST_NS:
                     continue  # there are no more events
-                if end_ns not in exact:
+                if end_ns not in exact_by_end:
                     exact_fork = reference.fork()
                     exact_fork.advance(end_ns)
-                    exact[end_ns] = _aftermath(exact_fork, end_ns, tail_ns)
+                    exact_by_end[end_ns] = _aftermath(exact_fork, end_ns, tail_ns)
                 actual = _aftermath(fork, end_ns, tail_ns)
                 results[name].window_s[row, column] = (end_ns - start_ns) / 1e9
-                for measure, values in _differences(start_ns, end_ns, exact[end_ns], actual).items():
+                for measure, values in _differences(start_ns, end_ns, exact_by_end[end_ns], actual).items():
                     results[name].sums[measure][row, column] = sum(values)
                     results[name].counts[measure][row, column] = len(values)
     _check_unchanged(make, starts_ns, reference)
@@ -149,7 +149,7 @@ class _Aftermath:
 
 
 def _aftermath(fork: Coordinator, end_ns: int, tail_ns: int) -> _Aftermath:
-    """Continue a fork exactly that has reached the end of a window."""
+    """Continue a fork that has reached the end of a window with the exact policy."""
     states = fork.situation.states
     fork.policy = EventDriven()
     return _Aftermath(fork.advance(end_ns + tail_ns).fates, states)
@@ -201,5 +201,5 @@ def _check_unchanged(
     if without_forks.run.digest != reference.run.digest:
         raise FieldkitError(
             "a fork changed the run from which it was forked, so the measured errors are wrong",
-            remedy="let copy.deepcopy copy all data of federates and programs, and use no closures",
+            remedy="make all data of federates and programs copyable by copy.deepcopy, and use no closures",
         )

@@ -13,7 +13,7 @@ import numpy as np
 from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.policies.window_policies import SlidingWindow
 from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean
-from sim_backends.cosim.studies.paper_setups import Changes, FlowSample, Setup, master_based, masterless, the_flow
+from sim_backends.cosim.studies.paper_setups import Changes, FlowSample, Setup, master_based, masterless, only_flow
 from sim_backends.cosim.studies.paper_tables import (
     CLAIMS,
     DISTANCES_M,
@@ -86,7 +86,9 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
         setups: The result of `claim_setups`.
         samples: The result of `flow_samples` for them.
     """
-    flows = {name: [of_seed[the_flow(setup)] for of_seed in samples[name]] for name, setup in setups.items()}
+    flows = {
+        name: [flow_samples[only_flow(setup)] for flow_samples in samples[name]] for name, setup in setups.items()
+    }
     all_claims: list[Claim] = []
     for than in (FIXED, MASTER):
         for lines, chosen in LINES.items():
@@ -104,20 +106,20 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
 def delay_change(ours_s: Floats, theirs_s: Floats) -> tuple[IntervalEstimate, int]:
     """Return the relative change of delays, and the number of rows that it is based on.
 
-    In each row, it compares the means over the seeds with which packets arrived in both systems, of which there must
-    be two. The total is the geometric mean over the rows, so that each has the same weight. The interval is computed
-    for the logarithm of the change.
+    In each row, it compares the means over the seeds with which packets arrived in both systems; at least two such
+    seeds are needed. The total is the geometric mean over the rows, so that each has the same weight. The interval is
+    computed for the logarithm of the change.
 
     Args:
         ours_s: Mean delay of a packet in the paper's system, shape (rows, seeds); nan if none arrived.
         theirs_s: The same for the other system.
     """
-    both = np.isfinite(ours_s) & np.isfinite(theirs_s)
+    arrived_in_both = np.isfinite(ours_s) & np.isfinite(theirs_s)
     seeds = ours_s.shape[1]
-    used = both.sum(axis=1) >= min(2, seeds)
+    used = arrived_in_both.sum(axis=1) >= min(2, seeds)
     if not used.any():
         return IntervalEstimate(math.nan, math.nan, math.nan), 0
-    ours_s, theirs_s = (np.where(both, values_s, np.nan)[used] for values_s in (ours_s, theirs_s))
+    ours_s, theirs_s = (np.where(arrived_in_both, values_s, np.nan)[used] for values_s in (ours_s, theirs_s))
 
     def log_change(columns: Sequence[int]) -> float:
         ratios = np.nanmean(ours_s[:, columns], axis=1) / np.nanmean(theirs_s[:, columns], axis=1)

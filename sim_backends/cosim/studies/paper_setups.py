@@ -42,8 +42,8 @@ class FlowSample:
     Attributes:
         sent: Number of packets.
         arrived: Number of them that arrived, or were replied to, before the run ended.
-        delay_sum_s: Sum of their delays, from sending to arrival as the receiver counts it, or of round trips; nan if
-            none arrived, so that it is not mistaken for a fast transmission.
+        delay_sum_s: Sum of their delays, from sending to the arrival that counts for the receiver, or of round trips;
+            nan if none arrived, because 0 would mean a fast transmission.
         reasons: Number of the other packets by the reason why they did not arrive.
     """
 
@@ -59,7 +59,7 @@ class FlowSample:
 
     @property
     def delay_mean_s(self) -> float:
-        """Mean delay of packets that arrived; nan if none did."""
+        """Mean delay of packets that arrived; nan if no packet arrived."""
         return self.delay_sum_s / self.arrived if self.arrived else np.nan
 
 
@@ -126,7 +126,7 @@ Changes = Mapping[str, Any]
 RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
     {"wifi": MappingProxyType({}), "1 Mbit/s": MappingProxyType({"radio": {"rate": "1Mbit/s"}})}
 )
-"""Radios of the mesh: the one in its file, and fixed links as in EMANE's model RF Pipe."""
+"""Radios of the mesh: that of the scenario file, and fixed links as in EMANE's model RF Pipe."""
 
 _DURATION: Final = "20s"
 """The run ends 9 s after the last packet of a bag; packets that are still under way then count as lost."""
@@ -175,7 +175,7 @@ def mesh(radio: Changes, changes: Changes) -> Setup:
     return Setup(load_scenario("ten_node_mesh", {**radio, **changes}), EventDriven.name)
 
 
-def the_flow(setup: Setup) -> str:
+def only_flow(setup: Setup) -> str:
     """Return the name of the only flow of a setup."""
     (traffic,) = setup.scenario.traffic
     (flow,) = traffic.flows

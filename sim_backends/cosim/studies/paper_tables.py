@@ -20,7 +20,7 @@ from sim_backends.cosim.studies.paper_setups import (
     master_based,
     masterless,
     mesh,
-    the_flow,
+    only_flow,
 )
 
 
@@ -255,7 +255,8 @@ class PaperTable:
             samples: The result of `flow_samples` for the setups.
         """
         return [
-            self._row(source, [of_seed[source.flow] for of_seed in samples[source.setup]]) for source in self.sources
+            self._row(source, [flow_samples[source.flow] for flow_samples in samples[source.setup]])
+            for source in self.sources
         ]
 
     def _row(self, source: RowSource, samples: Sequence[FlowSample]) -> PaperRow:
@@ -302,7 +303,7 @@ def _transmissions(table: str, changes: Mapping[str, Any]) -> PaperTable:
             else:
                 setups[name] = masterless(line, distance_m, changes, flying=table == "2")
             labels: Labels = {"line": str(line), "distance_m": distance_m, "protocol": _LABELS[protocol]}
-            sources.append(RowSource(labels, name, the_flow(setups[name]), (printed[0], printed[1])))
+            sources.append(RowSource(labels, name, only_flow(setups[name]), (printed[0], printed[1])))
     return PaperTable(setups, sources, lambda sample: sample.delay_sum_s)
 
 

@@ -48,7 +48,7 @@ class Satisfaction:
         satisfied: True if the loss of the last round was accepted.
         reference_loss: Loss of the exact reference.
         reference_exchanges: Number of windows of the exact reference.
-        reason: Why the loop ended without an accepted round; empty if it was satisfied.
+        reason: The reason why the loop ended without an accepted round; empty if it was satisfied.
     """
 
     rounds: Sequence[Round]
@@ -71,7 +71,7 @@ def satisfy(
     window_s: float = 0.001,
     max_rounds: int = 20,
 ) -> Satisfaction:
-    """Run rounds until one is satisfactory, or none can be.
+    """Run rounds until one is satisfactory, or further rounds cannot change the result.
 
     Args:
         run: Runs the same scenario and seed with a policy.

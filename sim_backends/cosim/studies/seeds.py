@@ -91,10 +91,10 @@ def _in_parallel(work: Callable[[Task], Result], tasks: Sequence[Task], workers:
                 yield numbers[future], future.result()
             executor.shutdown()
         except BrokenProcessPool:
-            under_way = [str(task) for task, future in zip(tasks, futures, strict=False) if _is_broken(future)]
+            broken_tasks = [str(task) for task, future in zip(tasks, futures, strict=False) if _is_broken(future)]
             raise FieldkitError(
                 "a process was killed",
-                where=" or ".join(under_way[:workers]),
+                where=" or ".join(broken_tasks[:workers]),
                 remedy="if memory ran out, use fewer workers",
             ) from None
         finally:
@@ -107,7 +107,7 @@ def _is_broken(future: Future[Result]) -> bool:
 
 
 def _exit_with_parent(stop_reader: Connection) -> None:
-    """Ignore Ctrl-C in this process, and exit when the other end of the pipe is closed, as when the parent dies."""
+    """Ignore Ctrl-C, and exit when the other end of the pipe is closed, for example because the parent has exited."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def wait() -> None:

@@ -1,4 +1,4 @@
-"""What each sync policy costs and how wrong it is, with one seed or in distribution over seeds."""
+"""The cost and the errors of each sync policy: with one seed, and the bias over seeds."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -188,10 +188,10 @@ class Row:
     Attributes:
         policy: Its name.
         by_seed: Its errors relative to the reference for each seed; empty if it could not be run.
-        formations: How well followers kept their positions, for each seed.
+        formations: Position errors of the followers, for each seed.
         growth_m: Times in seconds, and the largest distance of an agent from its position in the reference, mean over
             seeds: both of shape (times,).
-        failure: Why it could not be run with at least one seed; empty if it could.
+        failure: The reason why it could not be run with at least one seed; empty if it could.
     """
 
     policy: str
@@ -216,7 +216,7 @@ def rows(outcomes: Outcomes, formation: Callable[[Tracks], Formation] = lambda _
 
     Args:
         outcomes: The outcomes of all runs.
-        formation: Returns how well followers kept their positions in a run.
+        formation: Returns the position errors of the followers in a run.
     """
     return [
         Row(
@@ -236,4 +236,4 @@ def _growth_m(outcomes: Outcomes, policy: str) -> tuple[Floats, Floats]:
     length = min(map(len, largest_m), default=0)
     if not length:
         return np.zeros(0), np.zeros(0)
-    return pairs[0][0].times_s[:length], np.mean([of_seed[:length] for of_seed in largest_m], axis=0)
+    return pairs[0][0].times_s[:length], np.mean([distances_m[:length] for distances_m in largest_m], axis=0)

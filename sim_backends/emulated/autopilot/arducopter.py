@@ -101,9 +101,9 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("BATT_LOW_VOLT", 10.5, 0.0, 100.0),
         Parameter("DISARM_DELAY", 10.0, 0.0, 127.0, "COM_DISARM_PRFLT"),
         integer("FENCE_ACTION", 1, 0, 5),
-        of_profile("FENCE_ALT_MAX", limits.height_m, least=1.0, key="GF_MAX_VER_DIST"),
+        of_profile("FENCE_ALT_MAX", limits.height_m, minimum=1.0, key="GF_MAX_VER_DIST"),
         Parameter("FENCE_ENABLE", 1, 1, 1, integer=True),
-        of_profile("FENCE_RADIUS", limits.fence_m, least=1.0, key="GF_MAX_HOR_DIST"),
+        of_profile("FENCE_RADIUS", limits.fence_m, minimum=1.0, key="GF_MAX_HOR_DIST"),
         Parameter("FENCE_TYPE", 3, 3, 3, integer=True),
         integer("FS_GCS_ENABLE", 0, 0, 7),
         Parameter("FS_GCS_TIMEOUT", 5.0, 2.0, 120.0),
@@ -117,7 +117,7 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("WPNAV_ACCEL", 250.0, 50.0, 500.0, "MPC_ACC_HOR", _CM),
         Parameter("WPNAV_ACCEL_Z", 100.0, 50.0, 500.0, "MPC_ACC_UP_MAX", _CM),
         Parameter("WPNAV_RADIUS", 200.0, 5.0, 1000.0, "NAV_ACC_RAD", _CM),
-        of_profile("WPNAV_SPEED", limits.speed_m_s, least=0.1, key="MPC_XY_VEL_MAX", scale=_CM),
+        of_profile("WPNAV_SPEED", limits.speed_m_s, minimum=0.1, key="MPC_XY_VEL_MAX", scale=_CM),
         Parameter("WPNAV_SPEED_DN", 150.0, 10.0, 500.0, "MPC_Z_VEL_MAX_DN", _CM),
         Parameter("WPNAV_SPEED_UP", 250.0, 10.0, 1000.0, "MPC_Z_VEL_MAX_UP", _CM),
         integer("WP_YAW_BEHAVIOR", 2, 0, 3),
@@ -151,7 +151,9 @@ ARDUCOPTER: Final = Firmware(
     autopilot=_d.MAV_AUTOPILOT_ARDUPILOTMEGA,
     version=0x040600FF,
     capabilities=COMMON_CAPABILITIES | _d.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
-    base=_d.MAV_MODE_FLAG_STABILIZE_ENABLED | _d.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
+    base_mode=_d.MAV_MODE_FLAG_STABILIZE_ENABLED
+    | _d.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+    | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
     # ArduCopter/mode.h; a commanded take-off is part of GUIDED, and the descent at home is part of RTL.
     modes={
         Mode.OFFBOARD: 4,

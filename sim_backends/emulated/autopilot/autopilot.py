@@ -1,11 +1,11 @@
-"""The autopilot: its answers to messages, and the messages that it sends unasked. It has neither socket nor clock."""
+"""The autopilot: its answers to messages, and its periodic messages. It uses neither socket nor clock."""
 
 import math
 from collections.abc import Iterator, Sequence
 from typing import Final
 
 from sim_backends.emulated.autopilot import mavlink_frames, microservices
-from sim_backends.emulated.autopilot.commands import Commands, int_in
+from sim_backends.emulated.autopilot.commands import Commands, is_integer_up_to
 from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.flight import SetPoint
 from sim_backends.emulated.autopilot.mavlink_frames import (
@@ -65,7 +65,9 @@ class Autopilot:
         self._telemetry = Telemetry(self.vehicle, self._parameters)
         self._commands = Commands(self.vehicle, self._parameters)
         self._transfer = MissionTransfer(lambda: self.vehicle.mission.items, self._fault, self.vehicle.load)
-        self._parameter_service = ParameterService(firmware, self._parameters, self._set, self.vehicle.report)
+        self._parameter_service = ParameterService(
+            firmware, self._parameters, self._apply_parameter, self.vehicle.report
+        )
         self._port = MavlinkPort(system)
         self._now_ns = now_ns
         self._booted_ns = self.vehicle.estimate.booted_ns
@@ -85,7 +87,7 @@ class Autopilot:
                 continue
             if message.get_type() == "HEARTBEAT":
                 self.vehicle.failsafes.heartbeat(message.get_srcSystem(), message.type, now_ns)
-            elif self._is_for_us(message):
+            elif self._is_addressed(message):
                 yield from self._port.frames(self._answers(message, now_ns))
 
     def advance(self, now_ns: int) -> Iterator[Frame]:
@@ -95,12 +97,12 @@ class Autopilot:
         if self.vehicle.estimate.booted_ns != self._booted_ns:
             self._reboot()
         self._port.expire(now_ns)
-        made = (self._telemetry.makers[kind]() for kind in self._streams.due(now_ns))
-        messages = (*self._reports(now_ns), *self._transfer.retries(now_ns), *made)
+        telemetry = (self._telemetry.builders[kind]() for kind in self._streams.due(now_ns))
+        messages = (*self._reports(now_ns), *self._transfer.retries(now_ns), *telemetry)
         yield from self._port.frames(message for message in messages if message is not None)
 
     def next_ns(self) -> int | None:
-        """Return when `advance` has the next frame to send, or None without clients."""
+        """Return the time at which `advance` has the next frame to send, or None without clients."""
         return self._streams.next_ns if self._port.is_used else None
 
     def _reboot(self) -> None:
@@ -116,15 +118,15 @@ class Autopilot:
             rates_hz.update(dict.fromkeys(group.messages, self._parameters[group.parameter]))
         return Streams(rates_hz, self._now_ns)
 
-    def _set(self, name: str) -> None:
+    def _apply_parameter(self, name: str) -> None:
         """Apply a parameter that was set, if it is the rate of a group of messages."""
         for group in self._firmware.groups:
             if group.parameter == name:
                 for kind in group.messages:
                     self._streams.set_default(kind, self._parameters[name], self._now_ns)
 
-    def _is_for_us(self, message: Message) -> bool:
-        system, component = mavlink_frames.addressee(message)
+    def _is_addressed(self, message: Message) -> bool:
+        system, component = mavlink_frames.target_of(message)
         return system in {_ALL, self._system} and component in {_ALL, AUTOPILOT_COMPONENT}
 
     def _fault(self, item: Item) -> int:
@@ -132,11 +134,11 @@ class Autopilot:
 
     def _reports(self, now_ns: int) -> Iterator[Message]:
         """Yield the vehicle's reports since the last call, for all clients."""
-        mission, remarks = self.vehicle.mission, self.vehicle.remarks
+        mission, status_texts = self.vehicle.mission, self.vehicle.status_texts
         yield from (dialect.MAVLink_mission_item_reached_message(number) for number in mission.reached(now_ns))
-        for severity, text in remarks:
+        for severity, text in status_texts:
             yield dialect.MAVLink_statustext_message(severity, text.encode("ascii", "replace")[:_TEXT_BYTES])
-        self.vehicle.remarks.clear()
+        self.vehicle.status_texts.clear()
 
     def _answers(self, message: Message, now_ns: int) -> Iterator[Message]:
         kind = message.get_type()
@@ -164,23 +166,23 @@ class Autopilot:
         for group in self._firmware.groups:
             if message.req_stream_id in {dialect.MAV_DATA_STREAM_ALL, group.number}:
                 self._parameters.set(group.parameter, rate_hz)
-                self._set(group.parameter)
+                self._apply_parameter(group.parameter)
 
     def _command(self, message: Message, now_ns: int) -> Iterator[Message]:
         """Yield the answer to a command: COMMAND_ACK, and the message that the command requests."""
         param1, requested = message.param1, list[Message]()
         if message.command == dialect.MAV_CMD_REQUEST_MESSAGE:
             requested = self._requested(param1, message.param2)
-        elif message.command in _REQUESTS:
-            requested = self._requested(_REQUESTS[message.command], 0)
-        elif message.command == dialect.MAV_CMD_GET_MESSAGE_INTERVAL and int_in(param1, _LAST_MESSAGE_ID):
+        elif message.command in _REQUESTED_MESSAGES:
+            requested = self._requested(_REQUESTED_MESSAGES[message.command], 0)
+        elif message.command == dialect.MAV_CMD_GET_MESSAGE_INTERVAL and is_integer_up_to(param1, _LAST_MESSAGE_ID):
             interval_us = self._streams.interval_us(int(param1))
             requested = [dialect.MAVLink_message_interval_message(int(param1), interval_us)]
         if requested:
             result = int(dialect.MAV_RESULT_ACCEPTED)
         elif message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             result = self._set_interval(param1, message.param2, now_ns)
-        elif message.command in _REQUESTS or message.command in _QUESTIONS:
+        elif message.command in _REQUESTED_MESSAGES or message.command in _MESSAGE_QUERIES:
             result = self._firmware.unknown_message
         else:
             result = self._commands.run(message)
@@ -192,19 +194,19 @@ class Autopilot:
         """Return the messages of an id, empty if the autopilot does not send them on request."""
         if kind == AVAILABLE_MODES:
             return self._telemetry.available_modes(param2)
-        make = self._telemetry.makers.get(int(kind)) if int_in(kind, _LAST_MESSAGE_ID) else None
-        made = None if make is None or int(kind) in self._telemetry.streamed_only else make()
-        return [] if made is None else [made]
+        build = self._telemetry.builders.get(int(kind)) if is_integer_up_to(kind, _LAST_MESSAGE_ID) else None
+        telemetry = None if build is None or int(kind) in self._telemetry.streamed_only else build()
+        return [] if telemetry is None else [telemetry]
 
     def _set_interval(self, kind: float, interval_us: float, now_ns: int) -> int:
-        is_sent = int_in(kind, _LAST_MESSAGE_ID) and int(kind) in self._telemetry.makers
+        is_sent = is_integer_up_to(kind, _LAST_MESSAGE_ID) and int(kind) in self._telemetry.builders
         if not is_sent or not math.isfinite(interval_us):
             return self._firmware.unknown_rate
         self._streams.set_interval(int(kind), interval_us, now_ns)
         return int(dialect.MAV_RESULT_ACCEPTED)
 
     def _accept_set_point(self, message: Message) -> None:
-        """Accept a position or a velocity; if a message has both, the velocity counts."""
+        """Accept a position or a velocity; if a message has both, the velocity is used."""
         if message.get_type() == "SET_POSITION_TARGET_GLOBAL_INT":
             args = message.coordinate_frame, message.lat_int, message.lon_int, message.alt
             place = goal_m(*args, self.vehicle.home_m)
@@ -222,8 +224,8 @@ class Autopilot:
             self.vehicle.accept_set_point(SetPoint(place, is_place=True, yaw_rad=yaw_rad))
 
 
-_QUESTIONS: Final = frozenset({dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_GET_MESSAGE_INTERVAL})
-_REQUESTS: Final = {
+_MESSAGE_QUERIES: Final = frozenset({dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_GET_MESSAGE_INTERVAL})
+_REQUESTED_MESSAGES: Final = {
     dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
     dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION: mavlink_frames.PROTOCOL_VERSION,
     dialect.MAV_CMD_GET_HOME_POSITION: dialect.MAVLINK_MSG_ID_HOME_POSITION,

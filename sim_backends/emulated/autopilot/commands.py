@@ -15,7 +15,7 @@ FORCE: Final = 21196
 
 _FRAME_RELATIVE: Final = dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 
-_DONE: Final = int(dialect.MAV_RESULT_ACCEPTED)
+_ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
 _DENIED: Final = int(dialect.MAV_RESULT_DENIED)
 
 
@@ -34,8 +34,8 @@ class Commands:
             dialect.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             dialect.MAV_CMD_RUN_PREARM_CHECKS: self._check,
             dialect.MAV_CMD_NAV_TAKEOFF: self._take_off,
-            dialect.MAV_CMD_NAV_LAND: lambda _: self._mode(Mode.LAND),
-            dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._mode(Mode.RTL),
+            dialect.MAV_CMD_NAV_LAND: lambda _: self._change_mode(Mode.LAND),
+            dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._change_mode(Mode.RTL),
             dialect.MAV_CMD_MISSION_START: self._start,
             dialect.MAV_CMD_DO_SET_MODE: self._set_mode,
             dialect.MAV_CMD_DO_REPOSITION: self._reposition,
@@ -47,7 +47,7 @@ class Commands:
     def run(self, message: Message) -> int:
         """Execute the command in a COMMAND_LONG or COMMAND_INT; return its MAV_RESULT.
 
-        The reason of a refusal is added to the vehicle's remarks.
+        The reason of a refusal is added to the vehicle's status texts.
         """
         handler = self._handlers.get(message.command)
         if handler is None:
@@ -61,7 +61,7 @@ class Commands:
     def set_mode(self, custom_mode: int) -> None:
         """Execute SET_MODE, which has no answer."""
         try:
-            self._change(custom_mode)
+            self._change_custom_mode(custom_mode)
         except Refused as refusal:
             self._report_refusal(refusal)
 
@@ -73,7 +73,7 @@ class Commands:
 
     def _check(self, _: Message) -> int:
         self._vehicle.check()
-        return _DONE
+        return _ACCEPTED
 
     def _arm(self, message: Message) -> int:
         if message.param1 not in {0, 1}:
@@ -82,41 +82,44 @@ class Commands:
             self._vehicle.arm()
         else:
             self._vehicle.disarm(force=message.param2 == FORCE)
-        return _DONE
+        return _ACCEPTED
 
     def _take_off(self, message: Message) -> int:
         """Take off to a height above home (COMMAND_LONG) or in the named frame; NaN or 0 is the default height."""
-        height_m, home_m = _z(message), self._vehicle.home_m
+        height_m, home_m = _seventh_parameter(message), self._vehicle.home_m
         if not math.isfinite(height_m) or height_m == 0:
             self._vehicle.take_off()
-            return _DONE
+            return _ACCEPTED
         frame = getattr(message, "frame", _FRAME_RELATIVE)
         goal = goal_m(frame, 0, 0, height_m, home_m)
         if goal is None:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
         self._vehicle.take_off(goal[2])
-        return _DONE
+        return _ACCEPTED
 
-    def _mode(self, mode: Mode) -> int:
+    def _change_mode(self, mode: Mode) -> int:
         self._vehicle.change_mode(mode)
-        return _DONE
+        return _ACCEPTED
 
     def _start(self, message: Message) -> int:
         if message.param1 > 0 and not self._select_item(message.param1):
             return _DENIED
-        return self._mode(Mode.MISSION)
+        return self._change_mode(Mode.MISSION)
 
     def _set_mode(self, message: Message) -> int:
-        if not int_in(message.param1, 255) or not int(message.param1) & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+        if (
+            not is_integer_up_to(message.param1, 255)
+            or not int(message.param1) & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        ):
             return int(dialect.MAV_RESULT_UNSUPPORTED)
-        if not int_in(message.param2, 255) or not int_in(message.param3, 255):
+        if not is_integer_up_to(message.param2, 255) or not is_integer_up_to(message.param3, 255):
             return _DENIED
         number, sub = int(message.param2), int(message.param3)
         if self._vehicle.firmware.autopilot == dialect.MAV_AUTOPILOT_PX4:
             number = number << 16 | sub << 24
-        return _DONE if self._change(number) else self._vehicle.firmware.unknown_mode
+        return _ACCEPTED if self._change_custom_mode(number) else self._vehicle.firmware.unknown_mode
 
-    def _change(self, custom_mode: int) -> bool:
+    def _change_custom_mode(self, custom_mode: int) -> bool:
         """Change to the mode of a number; return True if the firmware has it."""
         mode = self._vehicle.firmware.mode_of(custom_mode)
         if mode is not None:
@@ -132,7 +135,7 @@ class Commands:
         if self._vehicle.armed:
             return self._vehicle.firmware.refused
         self._vehicle.boot(self._vehicle.body.now_ns)
-        return _DONE
+        return _ACCEPTED
 
     def _reposition(self, message: Message) -> int:
         """Fly to a position; NaN, or the largest integer, keeps a coordinate (MAV_CMD_DO_REPOSITION)."""
@@ -144,22 +147,22 @@ class Commands:
             goal = goal_m(_FRAME_RELATIVE, message.x, message.y, here_m[2], self._vehicle.home_m)
         if goal is None:
             return int(dialect.MAV_RESULT_COMMAND_UNSUPPORTED_MAV_FRAME)
-        if _CURRENT_PLACE in {message.x, message.y}:
+        if _CURRENT_COORDINATE in {message.x, message.y}:
             goal = (*here_m[:2], goal[2])
         self._vehicle.go_to(goal)
-        return _DONE
+        return _ACCEPTED
 
     def _change_speed(self, message: Message) -> int:
         key = _SPEEDS.get(message.param1, "MPC_XY_VEL_MAX")
-        return _DONE if self._parameters.change(key, message.param2) else _DENIED
+        return _ACCEPTED if self._parameters.change(key, message.param2) else _DENIED
 
     def _set_current(self, message: Message) -> int:
-        return _DONE if self._select_item(message.param1) else _DENIED
+        return _ACCEPTED if self._select_item(message.param1) else _DENIED
 
     def _select_item(self, number: float) -> bool:
         """Make an item the current one; return True if there is one of this number."""
         mission = self._vehicle.mission
-        if not int_in(number, len(mission.items) - 1):
+        if not is_integer_up_to(number, len(mission.items) - 1):
             return False
         mission.set_current(int(number))
         return True
@@ -167,14 +170,14 @@ class Commands:
 
 _SPEEDS: Final = {2: "MPC_Z_VEL_MAX_UP", 3: "MPC_Z_VEL_MAX_DN"}
 """Parameter that MAV_CMD_DO_CHANGE_SPEED sets, by SPEED_TYPE; other types set the ground speed."""
-_CURRENT_PLACE: Final = 0x7FFFFFFF
+_CURRENT_COORDINATE: Final = 0x7FFFFFFF
 
 
-def int_in(value: float, most: int) -> bool:
-    """Return True if a float field, which may be NaN, holds an integer from 0 to `most`."""
-    return math.isfinite(value) and value == int(value) and 0 <= value <= most
+def is_integer_up_to(value: float, maximum: int) -> bool:
+    """Return True if a float field, which may be NaN, holds an integer from 0 to `maximum`."""
+    return math.isfinite(value) and value == int(value) and 0 <= value <= maximum
 
 
-def _z(message: Message) -> float:
+def _seventh_parameter(message: Message) -> float:
     """Return the seventh parameter of a command in either message."""
     return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

@@ -63,7 +63,7 @@ class Failsafes(Protocol):
 
     Attributes:
         active: True if a fail-safe is triggered; HEARTBEAT then has MAV_STATE_CRITICAL.
-        arming_errors: Reasons for which they prevent arming.
+        arming_errors: Reasons why they prevent arming.
     """
 
     @property
@@ -72,18 +72,18 @@ class Failsafes(Protocol):
 
     @property
     def arming_errors(self) -> list[str]:
-        """Reasons for which they prevent arming."""
+        """Reasons why they prevent arming."""
 
     def heartbeat(self, system: int, kind: int, now_ns: int) -> None:
         """Process a heartbeat: system id and MAV_TYPE of its sender."""
 
     def mode_changed(self, now_ns: int) -> None:
-        """Note that a client has changed the mode, or that the vehicle was disarmed."""
+        """Record that a client has changed the mode, or that the vehicle was disarmed."""
 
     def set_points_lost(self) -> None:
-        """Note that the vehicle has changed its mode because set-points are missing, which only PX4 does."""
+        """Record that the vehicle has changed its mode because set-points are missing, which only PX4 does."""
 
-    def advance(self, now: VehicleState) -> Iterator[Reaction]:
+    def advance(self, state: VehicleState) -> Iterator[Reaction]:
         """Yield the reactions that are due; call it periodically."""
 
 
@@ -126,51 +126,55 @@ class ArduCopterFailsafes:
     def set_points_lost(self) -> None:
         """Implement `Failsafes.set_points_lost`: ArduCopter has no such fail-safe."""
 
-    def advance(self, now: VehicleState) -> Iterator[Reaction]:
+    def advance(self, state: VehicleState) -> Iterator[Reaction]:
         """Implement `Failsafes.advance`."""
-        yield from self._battery(now)
-        yield from self._gcs(now)
+        yield from self._battery(state)
+        yield from self._gcs(state)
 
-    def _battery(self, now: VehicleState) -> Iterator[Reaction]:
-        get = self._parameters
-        for stage, (name, words) in enumerate(self._STAGES, 1):
-            volt, charge_mah = get[f"BATT_{name}_VOLT"], get[f"BATT_{name}_MAH"]
-            left_mah = get["BATT_CAPACITY"] - now.battery.used_mah
+    def _battery(self, state: VehicleState) -> Iterator[Reaction]:
+        parameters = self._parameters
+        for stage, (name, level_text) in enumerate(self._STAGES, 1):
+            volt, charge_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
+            left_mah = parameters["BATT_CAPACITY"] - state.battery.used_mah
             low = charge_mah > 0 and left_mah < charge_mah
-            if volt > 0 and now.battery.voltage_v < volt:
-                since_ns = self._below_ns.setdefault(name, now.now_ns)
-                low = low or now.now_ns - since_ns > get["BATT_LOW_TIMER"] * 1e9
+            if volt > 0 and state.battery.voltage_v < volt:
+                since_ns = self._below_ns.setdefault(name, state.now_ns)
+                low = low or state.now_ns - since_ns > parameters["BATT_LOW_TIMER"] * 1e9
             else:
                 self._below_ns.pop(name, None)
             if not low or stage <= self._stage:
                 continue
             self._stage = stage
-            battery = now.battery
-            yield Reaction(f"Battery 1 {words} {battery.voltage_v:.2f}V used {battery.used_mah:.0f} mAh")
-            yield from self._act(int(get[f"BATT_FS_{name}_ACT"]), _BATTERY_ACTIONS, "Battery Failsafe", now)
+            battery = state.battery
+            yield Reaction(f"Battery 1 {level_text} {battery.voltage_v:.2f}V used {battery.used_mah:.0f} mAh")
+            yield from self._action_reactions(
+                int(parameters[f"BATT_FS_{name}_ACT"]), _BATTERY_ACTIONS, "Battery Failsafe", state
+            )
 
-    def _gcs(self, now: VehicleState) -> Iterator[Reaction]:
-        get = self._parameters
-        if not get["FS_GCS_ENABLE"] or self._gcs_heartbeat_ns is None:
+    def _gcs(self, state: VehicleState) -> Iterator[Reaction]:
+        parameters = self._parameters
+        if not parameters["FS_GCS_ENABLE"] or self._gcs_heartbeat_ns is None:
             if self._gcs_lost:
                 self._gcs_lost = False
                 yield Reaction("GCS Failsafe Cleared")
             return
-        lost = now.now_ns - self._gcs_heartbeat_ns > get["FS_GCS_TIMEOUT"] * 1e9
+        lost = state.now_ns - self._gcs_heartbeat_ns > parameters["FS_GCS_TIMEOUT"] * 1e9
         if lost and not self._gcs_lost:
             self._gcs_lost = True
-            yield from self._act(int(get["FS_GCS_ENABLE"]), _GCS_ACTIONS, "GCS Failsafe", now)
+            yield from self._action_reactions(int(parameters["FS_GCS_ENABLE"]), _GCS_ACTIONS, "GCS Failsafe", state)
         elif self._gcs_lost and not lost:
             self._gcs_lost = False
             yield Reaction("GCS Failsafe Cleared")
 
-    def _act(self, action: int, modes: dict[int, Mode], text: str, now: VehicleState) -> Iterator[Reaction]:
+    def _action_reactions(
+        self, action: int, modes: dict[int, Mode], text: str, state: VehicleState
+    ) -> Iterator[Reaction]:
         mode = modes.get(action)
-        if not now.armed or mode is None:
+        if not state.armed or mode is None:
             yield Reaction(text)
-        elif now.landed:
+        elif state.landed:
             yield Reaction(text, disarm=True)
-        elif now.mode in LANDING:
+        elif state.mode in LANDING:
             yield Reaction(f"{text} - Continuing Landing")
         else:
             yield Reaction(text, mode=mode)
@@ -223,45 +227,50 @@ class Px4Failsafes:
         """Implement `Failsafes.set_points_lost`: the fail-safe lasts until a client changes the mode."""
         self._active = True
 
-    def advance(self, now: VehicleState) -> Iterator[Reaction]:
+    def advance(self, state: VehicleState) -> Iterator[Reaction]:
         """Implement `Failsafes.advance`."""
-        yield from self._data_link(now)
-        yield from self._battery(now)
-        if self._next is not None and now.now_ns >= self._next[0]:
+        yield from self._data_link(state)
+        yield from self._battery(state)
+        if self._next is not None and state.now_ns >= self._next[0]:
             mode, self._next = self._next[1], None
             yield Reaction("Failsafe activated", _CRITICAL, mode)
 
-    def _data_link(self, now: VehicleState) -> Iterator[Reaction]:
+    def _data_link(self, state: VehicleState) -> Iterator[Reaction]:
         if self._gcs_heartbeat_ns is None:
             return
-        lost = now.now_ns - self._gcs_heartbeat_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
+        lost = state.now_ns - self._gcs_heartbeat_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
         if lost and not self._gcs_lost:
             self._gcs_lost = True
             yield Reaction("Connection to ground station lost", _INFO)
-            yield from self._trigger(_DATA_LINK_ACTIONS.get(int(self._parameters["NAV_DLL_ACT"])), now)
+            yield from self._trigger(_DATA_LINK_ACTIONS.get(int(self._parameters["NAV_DLL_ACT"])), state)
         elif self._gcs_lost and not lost:
             self._gcs_lost = False
             yield Reaction("Connection to ground station regained", _INFO)
 
-    def _battery(self, now: VehicleState) -> Iterator[Reaction]:
-        get, left = self._parameters, now.battery.left
-        warning = sum(left < get[name] for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
+    def _battery(self, state: VehicleState) -> Iterator[Reaction]:
+        parameters, left = self._parameters, state.battery.left
+        warning = sum(left < parameters[name] for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
         if warning <= self._warning:
             return
         self._warning = warning
         text = ("Low battery", "Critical battery", "Emergency battery level")[warning - 1]
         yield Reaction(text, _WARNING if warning == 1 else _CRITICAL)
-        yield from self._trigger(_BATTERY_LEVELS.get((int(get["COM_LOW_BAT_ACT"]), warning)), now)
+        yield from self._trigger(_BATTERY_LEVELS.get((int(parameters["COM_LOW_BAT_ACT"]), warning)), state)
 
-    def _trigger(self, mode: Mode | None, now: VehicleState) -> Iterator[Reaction]:
-        if mode is None or not now.armed or now.landed or now.mode in (LANDING if mode is Mode.LAND else RETURNING):
+    def _trigger(self, mode: Mode | None, state: VehicleState) -> Iterator[Reaction]:
+        if (
+            mode is None
+            or not state.armed
+            or state.landed
+            or state.mode in (LANDING if mode is Mode.LAND else RETURNING)
+        ):
             return
         self._active = True
         hold_s = self._parameters["COM_FAIL_ACT_T"]
         if mode is Mode.LOITER or hold_s < 1:
             yield Reaction("Failsafe activated", _CRITICAL, mode)
             return
-        self._next = now.now_ns + round(hold_s * 1e9), mode
+        self._next = state.now_ns + round(hold_s * 1e9), mode
         yield Reaction(f"Failsafe activated: entering Hold for {hold_s:.0f} seconds", _CRITICAL, Mode.LOITER)
 
 
@@ -278,7 +287,7 @@ _BATTERY_LEVELS: Final = {
 """Mode by COM_LOW_BAT_ACT and the warning: 2 is critical, 3 emergency."""
 
 
-_ACTIONS: Final = {0: None, 1: Mode.RTL, 2: Mode.LAND, 3: Mode.RTL, 4: Mode.BRAKE, 5: Mode.LAND}
+_FENCE_ACTIONS: Final = {0: None, 1: Mode.RTL, 2: Mode.LAND, 3: Mode.RTL, 4: Mode.BRAKE, 5: Mode.LAND}
 """Mode after a breach, by FENCE_ACTION."""
 
 
@@ -305,11 +314,11 @@ class Fence:
     def nearest_inside(self, place_m: Vector) -> Vector:
         """Return the position itself, or the point where the line from home to it crosses the fence."""
         (east, north, up), (radius_m, height_m) = place_m, self.limits_m
-        part = radius_m / max(math.hypot(east, north), radius_m)
-        return part * east, part * north, min(up, height_m)
+        share = radius_m / max(math.hypot(east, north), radius_m)
+        return share * east, share * north, min(up, height_m)
 
     def is_crossed(self, here_m: Vector, rest_m: Vector) -> bool:
-        """Return True if a vehicle that brakes now comes to rest outside, and farther out than it is."""
+        """Return True if a vehicle that brakes now stops outside the fence, and farther from home than it is."""
         radius_m, height_m = self.limits_m
         out_m = math.hypot(*rest_m[:2])
         return out_m > max(radius_m, math.hypot(*here_m[:2])) or rest_m[2] > max(height_m, here_m[2])
@@ -318,15 +327,15 @@ class Fence:
         """Treat the vehicle as inside, after it was armed or carried to another place."""
         self._is_breached = False
 
-    def advance(self, now: VehicleState, place_m: Vector) -> Reaction | None:
+    def advance(self, state: VehicleState, place_m: Vector) -> Reaction | None:
         """Return ArduCopter's reaction to a new breach in flight, or None."""
         (east, north, up), (radius_m, height_m) = place_m, self.limits_m
         fences = ["Max Alt"] * (up > height_m) + ["Circle"] * (math.hypot(east, north) > radius_m)
         is_new, self._is_breached = bool(fences) and not self._is_breached, bool(fences)
-        if not is_new or not now.armed or now.landed:
+        if not is_new or not state.armed or state.landed:
             return None
         text = f"{' and '.join(fences)} fence{'s' * (len(fences) > 1)} breached"
-        mode = None if now.mode in LANDING else _ACTIONS[int(self._parameters["FENCE_ACTION"])]
+        mode = None if state.mode in LANDING else _FENCE_ACTIONS[int(self._parameters["FENCE_ACTION"])]
         return Reaction(text, dialect.MAV_SEVERITY_NOTICE, mode)
 
 

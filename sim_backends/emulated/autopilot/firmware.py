@@ -27,7 +27,7 @@ class StreamGroup:
 
 @dataclass(frozen=True)
 class ModeConditions:
-    """The state of a vehicle on which it depends whether a firmware changes the mode.
+    """The state of a vehicle that determines if a firmware accepts a change of mode.
 
     Attributes:
         armed: True if its motors turn.
@@ -64,17 +64,17 @@ class Firmware:
         autopilot: MAV_AUTOPILOT.
         version: AUTOPILOT_VERSION.flight_sw_version: major, minor, patch, type.
         capabilities: MAV_PROTOCOL_CAPABILITY.
-        base: Constant MAV_MODE_FLAG bits of its heartbeat.
+        base_mode: Constant MAV_MODE_FLAG bits of its heartbeat.
         modes: Custom mode of each mode.
         names: Name of each mode in AVAILABLE_MODES.
-        starting_flags: Flags of its position estimate before that has an origin.
+        starting_flags: Flags of its position estimate before the estimate has an origin.
         boot_mode: Mode after power-on.
         unarmable: Modes in which it cannot be armed.
         refused: MAV_RESULT of a command that it refuses now.
         unknown_mode: MAV_RESULT of a change to a mode that it does not have.
         unknown_rate: MAV_RESULT of MAV_CMD_SET_MESSAGE_INTERVAL for a message that it does not send.
         unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for such a message.
-        mode_refusal: Returns the refusal of a change of mode; None if it changes.
+        mode_refusal: Returns the refusal of a change of mode; None if it is accepted.
         prearm: Prefixes of the texts with the reasons against arming: on request, and on arming.
         arming_errors: Returns the reasons against arming.
         parameters: Its parameters, within the limits of a profile.
@@ -92,7 +92,7 @@ class Firmware:
     autopilot: int
     version: int
     capabilities: int
-    base: int
+    base_mode: int
     modes: Mapping[Mode, int]
     names: Mapping[Mode, str]
     starting_flags: int

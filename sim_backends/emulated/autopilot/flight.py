@@ -155,16 +155,16 @@ def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vect
     distance_m = math.hypot(east, north)
     along_per_s, climb_per_s = limits.gains_per_s
     speed_m_s = min(limits.speed_m_s, _approach(distance_m, limits.acceleration_m_s2, along_per_s))
-    part = speed_m_s / distance_m if distance_m > 0 else 0.0
+    share = speed_m_s / distance_m if distance_m > 0 else 0.0
     down, rise = limits.climb_m_s2
     climb_m_s = math.copysign(_approach(abs(up), rise if up < 0 else down, climb_per_s), up)
-    return east * part, north * part, climb_m_s
+    return east * share, north * share, climb_m_s
 
 
 def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
     """Return the position at which it can stop, relative to home, not below it.
 
-    First the distance that attitude lag and velocity gain cost at the current speed, then v^2 / 2a.
+    It is the sum of the distance during the lags of attitude and velocity control, and of v^2 / 2a.
     """
     (x, y, z), (east, north, up) = body.position_m, body.velocity_m_s
     brake_s = limits.lag_s + 1 / limits.gains_per_s[0] + math.hypot(east, north) / 2 / limits.acceleration_m_s2
@@ -205,7 +205,7 @@ class Guidance:
         parameters: Its parameters.
 
     Attributes:
-        goal_m: Goal in modes that follow no set-points; a goal below home is a landing.
+        goal_m: Goal in modes that follow no set-points; a goal below home means landing.
         set_point: The last set-point.
         set_point_ns: Time of the last set-point; None before the first one.
     """

@@ -2,8 +2,8 @@
 
 The only module that imports `pymavlink` for the emulated autopilot. Constants and messages have the names of the
 dialect (https://mavlink.io/en/messages/common.html). The port is behind a router: one stream of frames for several
-clients, with its own sequence numbers and message rates. As in mavlink-router, a frame with a target goes only to the
-clients that have sent frames of this system and component, so that other clients see gaps in the sequence numbers.
+clients, with its own sequence numbers and message rates. As in mavlink-router, a frame with a target is sent only to
+the clients that have sent frames of this system and component, so other clients receive gaps in the sequence numbers.
 """
 
 import struct
@@ -25,13 +25,13 @@ __all__ = [
     "PROTOCOL_VERSION",
     "Message",
     "Writer",
-    "addressee",
     "available_modes",
     "component_metadata",
     "dialect",
     "ekf_status_report",
     "protocol_version",
     "read",
+    "target_of",
 ]
 
 AUTOPILOT_COMPONENT: Final[int] = dialect.MAV_COMP_ID_AUTOPILOT1
@@ -108,8 +108,8 @@ def read(datagram: bytes) -> Iterator[Message]:
             yield message
 
 
-def addressee(message: Message) -> tuple[int, int]:
-    """Return target system and component of a message; 0, also without these fields, is a broadcast."""
+def target_of(message: Message) -> tuple[int, int]:
+    """Return target system and component of a message; 0 is a broadcast, as is a message without these fields."""
     return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 
@@ -193,14 +193,14 @@ class MavlinkPort:
     def expire(self, now_ns: int) -> None:
         """Remove silent clients."""
         self._clients = {
-            at: client for at, client in self._clients.items() if now_ns - client.received_ns < SILENT_NS
+            address: client for address, client in self._clients.items() if now_ns - client.received_ns < SILENT_NS
         }
 
     def frames(self, messages: Iterable[Message]) -> Iterator[Frame]:
         """Yield each message as a frame, once per client that receives it."""
         for message in messages:
             frame = self._writer.frame(message)
-            target = addressee(message)
+            target = target_of(message)
             for address, client in self._clients.items():
                 if client.is_addressed(*target):
                     yield address, frame

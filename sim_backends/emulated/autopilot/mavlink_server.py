@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sim_backends.emulated.ros.own_motion import Helm
+from sim_backends.emulated.ros.own_motion import MotionReporter
 
 if TYPE_CHECKING:
     from sim_backends.emulated.autopilot.autopilot import Autopilot
@@ -53,12 +53,12 @@ class Drone:
 
 
 def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
-    """Serve forever.
+    """Serve until the process is killed.
 
     Args:
         drone: Settings of the drone.
         motion: The file of the paths that the lab assigns (`own_motion.append_path`).
-        steered: The file in which the robot records its motion (`own_motion.Helm`).
+        steered: The file in which the robot records its motion (`own_motion.MotionReporter`).
         ready: Created when the port is open.
 
     Raises:
@@ -71,26 +71,26 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
         power_on_ns = time.monotonic_ns()
         ready.touch()
         selector.select()
-        autopilot, helm = _load(drone, motion, steered, power_on_ns)
+        autopilot, reporter = _load(drone, motion, steered, power_on_ns)
         while True:
-            helm.read_placement(time.monotonic_ns())
+            reporter.read_placement(time.monotonic_ns())
             _exchange(autopilot, endpoint)
-            helm.write_motion()
+            reporter.write_motion()
             selector.select(_wait_s(autopilot))
 
 
-def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple[Autopilot, DroneHelm]":
+def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple[Autopilot, DroneMotionReporter]":
     """Return the autopilot, which has been on since `power_on_ns`.
 
-    It is loaded when a client appears: the dialect needs 50 ms and 40 MB, the world as much, and most trials never
-    connect to the drone.
+    It is loaded when a client appears: the dialect needs 50 ms and 40 MB, the world needs as much again, and in most
+    trials no client connects to the drone.
     """
     from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER  # noqa: PLC0415
     from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
     from sim_backends.emulated.autopilot.parameters import DEFAULT_M, FlightLimits  # noqa: PLC0415
     from sim_backends.emulated.autopilot.px4 import PX4  # noqa: PLC0415
     from sim_backends.physics.ground import Ground  # noqa: PLC0415
-    from sim_backends.physics.known import quadrotor  # noqa: PLC0415
+    from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
     from sim_backends.world.world import World  # noqa: PLC0415
 
     world = World.model_validate_json(drone.world) if drone.world else None
@@ -103,41 +103,43 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
         now_ns=power_on_ns,
         boot_s=drone.boot_s,
     )
-    return autopilot, DroneHelm(autopilot, Helm(motion, steered, time.monotonic_ns()), drone.antenna_m)
+    return autopilot, DroneMotionReporter(
+        autopilot, MotionReporter(motion, steered, time.monotonic_ns()), drone.antenna_m
+    )
 
 
-class DroneHelm:
-    """Reads where the lab puts the drone, and records where it flies.
+class DroneMotionReporter:
+    """Reads the placements of the drone by the lab, and records its motion.
 
     Args:
         autopilot: The autopilot of the drone.
-        helm: Helm of the robot.
+        reporter: Motion reporter of the robot.
         antenna_m: Height of the antenna above the lowest point of the drone.
     """
 
-    def __init__(self, autopilot: "Autopilot", helm: Helm, antenna_m: float) -> None:
+    def __init__(self, autopilot: "Autopilot", reporter: MotionReporter, antenna_m: float) -> None:
         self._vehicle = autopilot.vehicle
-        self._helm = helm
+        self._reporter = reporter
         self._antenna_m = antenna_m
-        self._flew = False
+        self._was_flying = False
 
     def read_placement(self, now_ns: int) -> None:
-        """Restart at the place where the lab has put the drone, if it has."""
-        placement = self._helm.poll_placement(now_ns)
+        """Restart the drone at its new place if the lab has moved it."""
+        placement = self._reporter.poll_placement(now_ns)
         if placement is not None:
             east_m, north_m, up_m = placement.place_m
             self._vehicle.place((east_m, north_m, up_m - self._antenna_m), placement.heading_rad, now_ns)
-            self._flew = False
+            self._was_flying = False
 
     def write_motion(self) -> None:
-        """Record where the drone is while it flies, and once after it has come to rest."""
+        """Record the motion of the drone while it flies, and once after it has come to rest."""
         body = self._vehicle.body
-        if body.on_ground and not self._flew:
+        if body.on_ground and not self._was_flying:
             return
-        self._flew = not body.on_ground
+        self._was_flying = not body.on_ground
         east_m, north_m, up_m = body.place_m
         antenna_m = (east_m, north_m, up_m + self._antenna_m)
-        self._helm.write(
+        self._reporter.write(
             body.now_ns, antenna_m, body.velocity_m_s, heading_rad=body.yaw_rad, turn_rad_s=body.turn_rad_s
         )
 

@@ -22,11 +22,11 @@ _WARNING: Final = dialect.MAV_SEVERITY_WARNING
 _FTP_HEADER: Final = struct.Struct("<HBBBBBxI")
 _FTP_BYTES: Final = 251
 _ACK, _NAK = 128, 129
-_OPENS: Final = frozenset({4, 11, 14})
+_OPEN_OPCODES: Final = frozenset({4, 11, 14})
 """Opcodes that open a file or compute its checksum: OpenFileRO, OpenFileWO, CalcFileCRC32."""
-_CLOSES: Final = frozenset({1, 2})
+_CLOSE_OPCODES: Final = frozenset({1, 2})
 """TerminateSession, ResetSessions."""
-_LISTS: Final = 3
+_LIST_DIRECTORY: Final = 3
 _END_OF_FILE, _UNKNOWN_COMMAND, _NOT_FOUND = 6, 7, 10
 
 
@@ -61,7 +61,7 @@ class ParameterService:
         if kind == "PARAM_REQUEST_LIST":
             yield from (self.value(name) for name in names)
         elif kind in {"PARAM_REQUEST_READ", "PARAM_SET"}:
-            name = text(message.param_id)
+            name = decoded_name(message.param_id)
             number = getattr(message, "param_index", _NO_NUMBER)
             if number != _NO_NUMBER:
                 name = names[number] if 0 <= number < len(names) else ""
@@ -88,7 +88,7 @@ class ParameterService:
     def value(self, name: str) -> Message:
         """Return PARAM_VALUE of a parameter."""
         parameters = self._parameters
-        value, is_integer = parameters.listed(name), parameters.is_integer(name)
+        value, is_integer = parameters.firmware_value(name), parameters.is_integer(name)
         if is_integer and not self._firmware.is_ardupilot:
             (value,) = struct.unpack("<f", struct.pack("<i", round(value)))
         return dialect.MAVLink_param_value_message(
@@ -122,11 +122,11 @@ def _file_answer(message: Message) -> Message:
     request = bytes(message.payload)[:_FTP_BYTES]
     number, session, opcode, _, _, _, offset = _FTP_HEADER.unpack_from(request)
     result, data = _NAK, bytes([_UNKNOWN_COMMAND])
-    if opcode in _CLOSES:
+    if opcode in _CLOSE_OPCODES:
         result, data = _ACK, b""
-    elif opcode in _OPENS:
+    elif opcode in _OPEN_OPCODES:
         data = bytes([_NOT_FOUND])
-    elif opcode == _LISTS:
+    elif opcode == _LIST_DIRECTORY:
         data = bytes([_END_OF_FILE])
     header = _FTP_HEADER.pack((number + 1) % 65_536, session, result, len(data), opcode, 0, offset)
     payload = list((header + data).ljust(_FTP_BYTES, b"\0"))
@@ -135,7 +135,7 @@ def _file_answer(message: Message) -> Message:
     )
 
 
-def text(name: str | bytes) -> str:
+def decoded_name(name: str | bytes) -> str:
     """Return a name in a message: it ends at the first zero byte, and bytes that are not printable become "?"."""
     raw = name if isinstance(name, bytes) else name.encode("utf-8", "replace")
     return "".join(
@@ -234,7 +234,7 @@ class MissionTransfer:
         self._check = check
         self._load = load
         self._upload: _Upload | None = None
-        self._ended: tuple[tuple[int, int], int, int] | None = None  # client, last item, result
+        self._last_upload: tuple[tuple[int, int], int, int] | None = None  # client, last item, result
 
     def handle(self, message: Message, now_ns: int) -> Iterator[Message]:
         """Yield the answers to a message of the protocol; empty for other messages."""
@@ -243,7 +243,7 @@ class MissionTransfer:
         if getattr(message, "mission_type", _MISSION) != _MISSION:
             yield from self._other_plan(message, kind, client)
         elif kind == "MISSION_COUNT":
-            yield self._begin(message.count, client, now_ns)
+            yield self._start_upload(message.count, client, now_ns)
         elif kind == "MISSION_ITEM_INT":
             yield from self._accept_item(message, client, now_ns)
         elif kind == "MISSION_REQUEST_LIST":
@@ -269,10 +269,10 @@ class MissionTransfer:
         upload.tries, upload.requested_ns = upload.tries + 1, now_ns
         yield _request(upload)
 
-    def _begin(self, count: int, client: tuple[int, int], now_ns: int) -> Message:
+    def _start_upload(self, count: int, client: tuple[int, int], now_ns: int) -> Message:
         if self._upload is not None and self._upload.client != client:
             return _ack(client, dialect.MAV_MISSION_DENIED)
-        self._ended = None
+        self._last_upload = None
         if count > MAX_ITEMS:
             return _ack(client, dialect.MAV_MISSION_NO_SPACE)
         if count == 0:
@@ -286,15 +286,18 @@ class MissionTransfer:
     def _accept_item(self, message: Message, client: tuple[int, int], now_ns: int) -> Iterator[Message]:
         upload = self._upload
         if upload is None or upload.client != client:
-            if self._ended is not None and self._ended[:2] == (client, message.seq):  # the answer was lost
-                yield _ack(client, self._ended[2])
+            if self._last_upload is not None and self._last_upload[:2] == (
+                client,
+                message.seq,
+            ):  # the answer was lost
+                yield _ack(client, self._last_upload[2])
             return
         if message.seq != len(upload.items):
             return  # late, or a duplicate
         item = item_of(message)
         fault = self._check(item)
         if fault != dialect.MAV_MISSION_ACCEPTED:
-            self._upload, self._ended = None, (client, message.seq, fault)
+            self._upload, self._last_upload = None, (client, message.seq, fault)
             yield _ack(client, fault)
             return
         upload.items.append(item)
@@ -302,7 +305,7 @@ class MissionTransfer:
         if len(upload.items) < upload.count:
             yield _request(upload)
             return
-        self._upload, self._ended = None, (client, message.seq, dialect.MAV_MISSION_ACCEPTED)
+        self._upload, self._last_upload = None, (client, message.seq, dialect.MAV_MISSION_ACCEPTED)
         self._load(tuple(upload.items))
         yield _ack(client, dialect.MAV_MISSION_ACCEPTED)
 
@@ -317,7 +320,7 @@ class MissionTransfer:
         )
 
     def _other_plan(self, message: Message, kind: str, client: tuple[int, int]) -> Iterator[Message]:
-        """Yield the answers about fences and rally points, which the vehicle does not have."""
+        """Yield the answers to messages about fences and rally points, which the vehicle does not have."""
         if kind == "MISSION_REQUEST_LIST":
             yield dialect.MAVLink_mission_count_message(*client, 0, message.mission_type)
         elif kind in {"MISSION_COUNT", "MISSION_CLEAR_ALL"}:

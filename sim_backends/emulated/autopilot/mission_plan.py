@@ -1,4 +1,4 @@
-"""Mission of a vehicle: the uploaded items, the current one, and what the vehicle must do for it."""
+"""Mission of a vehicle: the uploaded items, the current one, and the goal to which the vehicle must fly for it."""
 
 import math
 from collections.abc import Iterator
@@ -14,9 +14,11 @@ from sim_backends.emulated.ros.messages import EAST_RADIUS_M, NORTH_RADIUS_M
 
 MAX_ITEMS: Final = 500
 
-WAITS: Final = frozenset({dialect.MAV_CMD_NAV_WAYPOINT, dialect.MAV_CMD_NAV_LOITER_TIME, dialect.MAV_CMD_NAV_DELAY})
+WITH_HOLD_TIME: Final = frozenset(
+    {dialect.MAV_CMD_NAV_WAYPOINT, dialect.MAV_CMD_NAV_LOITER_TIME, dialect.MAV_CMD_NAV_DELAY}
+)
 """Commands whose first parameter is the time to stay in seconds."""
-PLACED: Final = frozenset(
+WITH_POSITION: Final = frozenset(
     {
         dialect.MAV_CMD_NAV_WAYPOINT,
         dialect.MAV_CMD_NAV_LOITER_TIME,
@@ -24,8 +26,10 @@ PLACED: Final = frozenset(
         dialect.MAV_CMD_NAV_LAND,
     }
 )
-FLOWN: Final = WAITS | PLACED | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, dialect.MAV_CMD_DO_CHANGE_SPEED}
-PASSED: Final = frozenset(
+SUPPORTED: Final = (
+    WITH_HOLD_TIME | WITH_POSITION | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, dialect.MAV_CMD_DO_CHANGE_SPEED}
+)
+SKIPPED: Final = frozenset(
     {
         dialect.MAV_CMD_DO_MOUNT_CONTROL,
         dialect.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE,
@@ -95,10 +99,10 @@ def fault(item: Item, home_m: Vector, fence_m: tuple[float, float]) -> int:
         home_m: Home in the world.
         fence_m: Maximum horizontal distance from home, and maximum height.
     """
-    if item.command not in FLOWN | PASSED:
+    if item.command not in SUPPORTED | SKIPPED:
         return int(dialect.MAV_MISSION_UNSUPPORTED)
     has_no_position = item.command == dialect.MAV_CMD_NAV_LAND and item.x == item.y == 0
-    if item.command not in PLACED or has_no_position:
+    if item.command not in WITH_POSITION or has_no_position:
         return int(dialect.MAV_MISSION_ACCEPTED)
     goal = goal_m(item.frame, item.x, item.y, item.z, home_m)
     if goal is None:
@@ -139,9 +143,9 @@ class Mission:
         self.speed_m_s: float | None = None
         self._done = False
         self._reached: list[int] = []
-        self._again: Iterator[int] = iter(())
-        self._again_ns = 0
-        self._from_m: Vector | None = None  # position at the start of the current item
+        self._repeated_reports: Iterator[int] = iter(())
+        self._next_repeat_ns = 0
+        self._start_m: Vector | None = None  # position at the start of the current item
         self._rises = False
         self._arrived_ns: int | None = None
 
@@ -157,20 +161,20 @@ class Mission:
         self._enter()
 
     def set_current(self, number: int) -> None:
-        """Make an item of this number the current one, as far as there is one."""
+        """Make the item of this number the current one, or the nearest item if there is none."""
         self.current, self._done = max(number, min(self._first, len(self.items) - 1), 0), False
-        self._reached, self._again = [], iter(())
+        self._reached, self._repeated_reports = [], iter(())
         self._enter()
 
     def reached(self, now_ns: int) -> Iterator[int]:
         """Yield the numbers of completed items that must be reported now; times must not decrease."""
         if self._reached:
             yield from self._reached
-            self._again, self._again_ns = repeat(self._reached[-1], REPEATS), now_ns + REPEAT_NS
+            self._repeated_reports, self._next_repeat_ns = repeat(self._reached[-1], REPEATS), now_ns + REPEAT_NS
             self._reached = []
-        elif now_ns >= self._again_ns:
-            yield from islice(self._again, 1)
-            self._again_ns = now_ns + REPEAT_NS
+        elif now_ns >= self._next_repeat_ns:
+            yield from islice(self._repeated_reports, 1)
+            self._next_repeat_ns = now_ns + REPEAT_NS
 
     def fly(self, body: Airframe, home_m: Vector, near_m: float) -> Vector | str:
         """Return the point to fly to, relative to home (below it to land), or the name of the mode to change to.
@@ -187,10 +191,10 @@ class Mission:
                 return "RTL"
             if item.command == dialect.MAV_CMD_DO_CHANGE_SPEED:
                 self.speed_m_s = item.parameters[1] if item.parameters[1] > 0 else None
-            elif item.command not in PASSED:
-                if self._from_m is None:
-                    self._from_m, self._rises = body.position_m, body.on_ground
-                goal = self._goal_m(item, self._from_m, body, home_m, near_m)
+            elif item.command not in SKIPPED:
+                if self._start_m is None:
+                    self._start_m, self._rises = body.position_m, body.on_ground
+                goal = self._goal_m(item, self._start_m, body, home_m, near_m)
                 if not self._is_complete(item, body, goal, near_m):
                     return goal
             self._next()
@@ -223,7 +227,7 @@ class Mission:
             if self._rises or math.dist(goal, body.position_m) > near_m:
                 return False
             self._arrived_ns = body.now_ns
-        must_wait = item.command in WAITS and wait_s > 0
+        must_wait = item.command in WITH_HOLD_TIME and wait_s > 0
         return not must_wait or body.now_ns - self._arrived_ns >= wait_s * 1e9
 
     def _next(self) -> None:
@@ -235,4 +239,4 @@ class Mission:
         self._enter()
 
     def _enter(self) -> None:
-        self._from_m, self._rises, self._arrived_ns = None, False, None
+        self._start_m, self._rises, self._arrived_ns = None, False, None

@@ -1,4 +1,4 @@
-"""Estimates on board of the emulated drone: its position, whether it has landed, and the charge of its battery."""
+"""Estimates on board the emulated drone: its position, its landed state, and the charge of its battery."""
 
 from typing import Final
 
@@ -23,7 +23,7 @@ class Battery:
         current_a: Current.
         full_v: Voltage of the full battery (SIM_BATT_VOLTAGE of ArduPilot's simulator).
         flight_s: Flight time of a full charge (SIM_BAT_DRAIN of PX4's simulator).
-        least: Minimum of `left` (SIM_BAT_MIN_PCT as a fraction).
+        min_charge: Minimum of `left` (SIM_BAT_MIN_PCT as a fraction).
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -32,13 +32,13 @@ class Battery:
         self.current_a = _REST_A
         self.full_v = FULL_V
         self.flight_s = float(FLIGHT_S)
-        self.least = 0.0
+        self.min_charge = 0.0
 
     def advance(self, now_ns: int, *, driven: bool) -> None:
         """Use up the charge of the time since the last call."""
         self.current_a = _HOVER_A if driven else _REST_A
         used = (now_ns - self._last_ns) / 1e9 / self.flight_s * self.current_a / _HOVER_A
-        self.left, self._last_ns = max(min(self.least, self.left), self.left - used), now_ns
+        self.left, self._last_ns = max(min(self.min_charge, self.left), self.left - used), now_ns
 
     @property
     def used_mah(self) -> float:
@@ -52,7 +52,7 @@ class Battery:
         return self.full_v * (empty + (full - empty) * self.left) / full
 
 
-_GOOD: Final = 831
+_GOOD_FLAGS: Final = 831
 """Flags of a good estimate: EKF_STATUS_FLAGS of ArduPilot, ESTIMATOR_STATUS_FLAGS of PX4; the bits are the same."""
 
 
@@ -90,7 +90,7 @@ class PositionEstimate:
         return now_ns - self.booted_ns < self._boot_ns
 
     def has_fix(self, now_ns: int) -> bool:
-        """Return True if the GPS receiver has a fix, after half of that time."""
+        """Return True if the GPS receiver has a fix, which it gets in half of the time until there is an origin."""
         return self.origin_m is not None or now_ns - self.booted_ns >= self._boot_ns / 2
 
     @property
@@ -101,7 +101,7 @@ class PositionEstimate:
     @property
     def flags(self) -> int:
         """The flags that it reports."""
-        return self._starting_flags if self.origin_m is None else _GOOD
+        return self._starting_flags if self.origin_m is None else _GOOD_FLAGS
 
     def to_local(self, world_m: Vector) -> Vector | None:
         """Return a position in the world relative to the origin; None before there is an origin."""
@@ -147,7 +147,7 @@ class LandDetector:
         self.grounded_ns = self.armed_ns = now_ns
 
     def advance(self, now_ns: int, *, on_ground: bool) -> None:
-        """Record whether the drone is on the ground now."""
+        """Update the state by the present contact with the ground."""
         if not on_ground:
             self.flew, self.landed, self.grounded_ns = True, False, now_ns
         elif now_ns - self.grounded_ns >= self._landed_s * 1e9:

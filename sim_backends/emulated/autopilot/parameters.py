@@ -14,8 +14,8 @@ class Parameter:
     Attributes:
         name: Name in the firmware; empty for an internal constant that is not listed.
         value: Value at power-on.
-        least: Minimum.
-        most: Maximum.
+        minimum: Minimum.
+        maximum: Maximum.
         key: PX4's name, by which the vehicle reads it; empty if it equals `name`.
         scale: Number of its units per SI unit.
         integer: True if it is an integer (MAV_PARAM_TYPE_INT32); otherwise a float (REAL32).
@@ -23,8 +23,8 @@ class Parameter:
 
     name: str
     value: float
-    least: float
-    most: float
+    minimum: float
+    maximum: float
     key: str = ""
     scale: float = 1.0
     integer: bool = False
@@ -49,9 +49,9 @@ class FlightLimits:
     fence_m: float
 
 
-def of_profile(name: str, most: float, *, least: float, key: str = "", scale: float = 1.0) -> Parameter:
+def of_profile(name: str, maximum: float, *, minimum: float, key: str = "", scale: float = 1.0) -> Parameter:
     """Return a parameter whose value is its maximum, given by a profile in SI units."""
-    return Parameter(name, most * scale, min(least, most) * scale, most * scale, key, scale)
+    return Parameter(name, maximum * scale, min(minimum, maximum) * scale, maximum * scale, key, scale)
 
 
 def fixed(name: str, value: float, key: str = "") -> Parameter:
@@ -59,16 +59,17 @@ def fixed(name: str, value: float, key: str = "") -> Parameter:
     return Parameter(name, value, value, value, key)
 
 
-def integer(name: str, value: int, least: int, most: int, key: str = "") -> Parameter:
+def integer(name: str, value: int, minimum: int, maximum: int, key: str = "") -> Parameter:
     """Return an integer parameter."""
-    return Parameter(name, value, least, most, key, integer=True)
+    return Parameter(name, value, minimum, maximum, key, integer=True)
 
 
 def stored(**values: float) -> tuple[Parameter, ...]:
     """Return parameters that ground stations read and write, without effect on the emulated vehicle."""
-    big = 1e9
+    limit = 1e9
     return tuple(
-        Parameter(name, value, -big, big, integer=isinstance(value, int)) for name, value in sorted(values.items())
+        Parameter(name, value, -limit, limit, integer=isinstance(value, int))
+        for name, value in sorted(values.items())
     )
 
 
@@ -97,7 +98,7 @@ class Parameters:
         """Return True if there is a parameter of this key."""
         return key in self._values
 
-    def listed(self, name: str) -> float:
+    def firmware_value(self, name: str) -> float:
         """Return a value in the units of the firmware, by the firmware's name."""
         return self._values[self._key_of[name]]
 
@@ -115,7 +116,7 @@ class Parameters:
 
     def _store(self, key: str, value: float) -> bool:
         parameter = self._by_key[key]
-        if not math.isfinite(value) or not parameter.least <= value <= parameter.most:
+        if not math.isfinite(value) or not parameter.minimum <= value <= parameter.maximum:
             return False
         self._values[key] = round(value) if parameter.integer else value
         return True

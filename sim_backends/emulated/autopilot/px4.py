@@ -71,8 +71,8 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         integer("COM_LOW_BAT_ACT", 0, 0, 3),
         integer("COM_OBL_RC_ACT", 0, 0, 7),
         Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0),
-        of_profile("GF_MAX_HOR_DIST", limits.fence_m, least=1.0),
-        of_profile("GF_MAX_VER_DIST", limits.height_m, least=1.0),
+        of_profile("GF_MAX_HOR_DIST", limits.fence_m, minimum=1.0),
+        of_profile("GF_MAX_VER_DIST", limits.height_m, minimum=1.0),
         integer("MAV_SYS_ID", 1, 1, 250),
         Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 80.0),
         Parameter("MPC_ACC_DOWN_MAX", 3.0, 0.5, 15.0),
@@ -80,7 +80,7 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("MPC_ACC_UP_MAX", 4.0, 0.5, 15.0),
         Parameter("MPC_LAND_ALT2", 5.0, 1.0, 80.0),
         Parameter("MPC_LAND_SPEED", 0.7, 0.1, 2.0),
-        of_profile("MPC_XY_VEL_MAX", limits.speed_m_s, least=0.1),
+        of_profile("MPC_XY_VEL_MAX", limits.speed_m_s, minimum=0.1),
         Parameter("MPC_Z_VEL_MAX_DN", 1.5, 0.1, 4.0),
         Parameter("MPC_Z_VEL_MAX_UP", 3.0, 0.1, 8.0),
         Parameter("NAV_ACC_RAD", 0.5, 0.05, 200.0),
@@ -95,8 +95,8 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
 
 
 def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
-    least = parameters["COM_ARM_BAT_MIN"]
-    return ["Low battery"] if battery.left < (least if least >= 0 else _CRITICAL) else []
+    minimum = parameters["COM_ARM_BAT_MIN"]
+    return ["Low battery"] if battery.left < (minimum if minimum >= 0 else _CRITICAL) else []
 
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
@@ -115,7 +115,7 @@ PX4: Final = Firmware(
     autopilot=_d.MAV_AUTOPILOT_PX4,
     version=0x011000FF,
     capabilities=COMMON_CAPABILITIES | _d.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE,
-    base=_d.MAV_MODE_FLAG_STABILIZE_ENABLED | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
+    base_mode=_d.MAV_MODE_FLAG_STABILIZE_ENABLED | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
     # Main and sub mode (px4_custom_mode.h).
     modes={
         Mode.TAKEOFF: _custom(4, 2),

@@ -35,7 +35,7 @@ _SENSORS: Final = (
 
 
 class Telemetry:
-    """Makes messages with the state of a vehicle.
+    """Builds messages with the state of a vehicle.
 
     Args:
         vehicle: The vehicle.
@@ -48,7 +48,7 @@ class Telemetry:
         self._pings = 0
         d = dialect
         ardupilot = vehicle.firmware.is_ardupilot
-        self.makers: Final[Mapping[int, Callable[[], Message | None]]] = {
+        self.builders: Final[Mapping[int, Callable[[], Message | None]]] = {
             d.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
             d.MAVLINK_MSG_ID_SYS_STATUS: self._sys_status,
             d.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps_raw_int,
@@ -64,20 +64,20 @@ class Telemetry:
             d.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             d.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink_frames.PROTOCOL_VERSION: mavlink_frames.protocol_version,
-            **(self._ardupilot_makers() if ardupilot else self._px4_makers()),
+            **(self._ardupilot_builders() if ardupilot else self._px4_builders()),
         }
-        """Maker per message id; a maker returns None while its message is not available."""
+        """Builder per message id; a builder returns None while its message is not available."""
         self.streamed_only: Final = frozenset({mavlink_frames.EKF_STATUS_REPORT})
         """Messages that have a rate, but are not sent on request."""
 
-    def _ardupilot_makers(self) -> dict[int, Callable[[], Message | None]]:
+    def _ardupilot_builders(self) -> dict[int, Callable[[], Message | None]]:
         return {
             dialect.MAVLINK_MSG_ID_RAW_IMU: self._raw_imu,
             dialect.MAVLINK_MSG_ID_TIMESYNC: self._timesync,
             mavlink_frames.EKF_STATUS_REPORT: lambda: mavlink_frames.ekf_status_report(self._vehicle.estimate.flags),
         }
 
-    def _px4_makers(self) -> dict[int, Callable[[], Message | None]]:
+    def _px4_builders(self) -> dict[int, Callable[[], Message | None]]:
         return {
             dialect.MAVLINK_MSG_ID_ALTITUDE: self._altitude,
             dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._estimator_status,
@@ -113,7 +113,7 @@ class Telemetry:
 
     def _heartbeat(self) -> Message:
         vehicle, firmware = self._vehicle, self._vehicle.firmware
-        base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | firmware.base
+        base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | firmware.base_mode
         px4 = not firmware.is_ardupilot
         is_automatic = vehicle.mode not in {Mode.OFFBOARD, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD}
         base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if px4 and is_automatic else 0

@@ -15,7 +15,7 @@ from sim_backends.emulated.autopilot.flight import NEAR_M, STEP_NS, SetPoint, st
 from sim_backends.emulated.autopilot.mavlink_frames import dialect
 from sim_backends.emulated.autopilot.mission_plan import Item
 from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode, reported_mode
-from sim_backends.emulated.autopilot.vehicle_parts import VehicleParts
+from sim_backends.emulated.autopilot.vehicle_base import VehicleBase
 
 _INFO: Final = dialect.MAV_SEVERITY_INFO
 _CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
@@ -30,8 +30,8 @@ class Refused(Exception):  # noqa: N818 (an answer of the autopilot, not an erro
     """The vehicle refuses a command; the text is for people, and empty if the firmware sends none."""
 
 
-class Vehicle(VehicleParts):
-    """One drone; its arguments and attributes are those of `VehicleParts`."""
+class Vehicle(VehicleBase):
+    """One drone; its arguments and attributes are those of `VehicleBase`."""
 
     def check(self) -> None:
         """Report the reasons why it cannot be armed.
@@ -72,7 +72,7 @@ class Vehicle(VehicleParts):
         """Stop the motors.
 
         Args:
-            force: Also in the air, where it falls.
+            force: True to stop them also in the air, so that it falls.
 
         Raises:
             Refused: It is flying.
@@ -83,7 +83,7 @@ class Vehicle(VehicleParts):
             self.report(_INFO, "Disarming motors")
         self.armed = False
         self.failsafes.mode_changed(self.body.now_ns)
-        if not self.firmware.is_ardupilot:  # ArduCopter's mode stays
+        if not self.firmware.is_ardupilot:  # ArduCopter keeps its mode
             self.mode = Mode.LOITER
 
     def take_off(self, height_m: float | None = None) -> None:
@@ -139,7 +139,7 @@ class Vehicle(VehicleParts):
         """Change the mode at the request of a client; the current mode is kept if it is requested again.
 
         Raises:
-            Refused: The mode needs a mission, set-points or flight, which are missing.
+            Refused: The mission, the set-points or the flight that the mode requires is missing.
         """
         self._switch(mode)
         self.failsafes.mode_changed(self.body.now_ns)
@@ -152,10 +152,9 @@ class Vehicle(VehicleParts):
 
     def advance(self, now_ns: int) -> None:
         """Fly until this time, in whole steps."""
-        get = self._parameters
-        battery = self.battery
-        battery.full_v, battery.flight_s = get["SIM_BATT_VOLTAGE"], get["SIM_BAT_DRAIN"]
-        battery.least = get["SIM_BAT_MIN_PCT"] / 100
+        parameters, battery = self._parameters, self.battery
+        battery.full_v, battery.flight_s = parameters["SIM_BATT_VOLTAGE"], parameters["SIM_BAT_DRAIN"]
+        battery.min_charge = parameters["SIM_BAT_MIN_PCT"] / 100
         battery.advance(now_ns, driven=self.armed)
         while self.body.now_ns + STEP_NS <= now_ns:
             if not self.armed and self.body.on_ground:
@@ -166,10 +165,10 @@ class Vehicle(VehicleParts):
             self.body.driven = self.armed
             target_m_s = self._target_m_s()  # it may change the mode
             self.body.step(target_m_s, self.limits, self.guidance.yaw_rad(self.mode, self.body))
-        self._watch_boot()
-        self._watch_failsafes()
+        self._update_boot_state()
+        self._run_failsafes()
 
-    def _watch_boot(self) -> None:
+    def _update_boot_state(self) -> None:
         """Set the origin once the position estimate is good; until then report the reasons against arming."""
         now_ns, estimate = self.body.now_ns, self.estimate
         if self.firmware.is_ardupilot and not self.armed and now_ns >= self._prearm_ns:
@@ -185,7 +184,7 @@ class Vehicle(VehicleParts):
             self.report(_INFO, "EKF3 IMU0 origin set")
             self.report(_INFO, "EKF3 IMU0 is using GPS")
 
-    def _watch_failsafes(self) -> None:
+    def _run_failsafes(self) -> None:
         for reaction in self.failsafes.advance(self._state):
             self._react(reaction)
 
@@ -198,7 +197,7 @@ class Vehicle(VehicleParts):
             self._switch_automatically(reaction.mode)
 
     def _switch_automatically(self, mode: Mode) -> None:
-        """Change the mode without a client's request; if it cannot change, the mode stays."""
+        """Change the mode without a client's request; if that is refused, it keeps the mode."""
         with suppress(Refused):
             self._switch(mode)
 
@@ -253,7 +252,7 @@ class Vehicle(VehicleParts):
         if ardupilot and (breach := self.fence.advance(self._state, self.body.position_m)):
             self._react(breach)
         if self.mode is Mode.OFFBOARD:
-            self._watch_set_points()
+            self._check_set_points()
 
     def _idle_s(self) -> float:
         """Return the time on the ground after which its motors stop; ArduCopter stops them early in landing modes."""
@@ -261,7 +260,7 @@ class Vehicle(VehicleParts):
         landed = (self.land_detector.flew and stops) or self.mode in LANDING
         return self._parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]
 
-    def _watch_set_points(self) -> None:
+    def _check_set_points(self) -> None:
         """React to missing set-points (hold, or COM_OBL_RC_ACT), and hold if they lead outside PX4's fence."""
         has_recent_set_point = self.guidance.has_recent_set_point(self.body.now_ns)
         if self.firmware.is_ardupilot:
@@ -275,7 +274,7 @@ class Vehicle(VehicleParts):
             self.report(_CRITICAL, "Geofence: hold")
             self._switch_automatically(Mode.LOITER)
 
-    def _stays_down(self) -> bool:
+    def _cannot_lift_off(self) -> bool:
         """Return True if it cannot lift off now: its motors spool up, or its mode does not lift off."""
         spools_up = self.body.now_ns - self.land_detector.armed_ns < self.firmware.spool_s * 1e9
         follows_set_points = self.mode is Mode.OFFBOARD and not self.firmware.lifts_off
@@ -283,9 +282,9 @@ class Vehicle(VehicleParts):
 
     def _target_m_s(self) -> Vector:
         """Return the target velocity, after the changes of mode that are due."""
-        if not self._stays_down():
+        if not self._cannot_lift_off():
             self._advance_mode()
-        if self._stays_down():
+        if self._cannot_lift_off():
             return 0.0, 0.0, 0.0
         limits = self.limits
         if self.mode is Mode.MISSION:

@@ -19,11 +19,11 @@ from sim_backends.radio.frames import TransmissionAttempt
 PCAP: Final = "air.pcap"
 CSV: Final = "air.csv"
 LIMIT_BYTES: Final = 64 << 20
-"""Maximum size of both files together; later attempts are left out."""
+"""Maximum size of both files together; later attempts are omitted."""
 
 _SNAP_BYTES: Final = 160
 _PCAP_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, _SNAP_BYTES, 105)
-_RECORD: Final = struct.Struct("<IIII")
+_RECORD_HEADER: Final = struct.Struct("<IIII")
 # Frame control, duration, receiver, transmitter, BSSID, sequence control: as in an ad hoc network (IBSS).
 _MAC: Final = struct.Struct("<BBH6s6s6sH")
 _DATA, _RETRY = 0x08, 0x08
@@ -63,15 +63,15 @@ class AirLog:
             name: _BSSID[:4] + struct.pack(">H", number) for number, name in enumerate(sorted(names), 1)
         }
         self._utc_ns = time.time_ns() - time.monotonic_ns()
-        self._left_bytes = limit_bytes - len(_PCAP_HEADER) - len(_COLUMNS)
+        self._remaining_bytes = limit_bytes - len(_PCAP_HEADER) - len(_COLUMNS)
         self._pcap.write(_PCAP_HEADER)
         self._table.write(_COLUMNS)
 
     def write(self, attempt: TransmissionAttempt) -> None:
         """Write one attempt."""
         record, line = self._record(attempt), self._line(attempt)
-        self._left_bytes -= len(record) + len(line)
-        if self._left_bytes >= 0:
+        self._remaining_bytes -= len(record) + len(line)
+        if self._remaining_bytes >= 0:
             self._pcap.write(record)
             self._table.write(line)
 
@@ -82,12 +82,12 @@ class AirLog:
 
     def _record(self, attempt: TransmissionAttempt) -> bytes:
         receiver = _BROADCAST if attempt.receiver is None else self._addresses[attempt.receiver]
-        frame = self._data(attempt, receiver) if attempt.number else _ACK.pack(_ACK_CONTROL, 0, 0, receiver)
+        frame = self._data_frame(attempt, receiver) if attempt.number else _ACK.pack(_ACK_CONTROL, 0, 0, receiver)
         seconds, rest_ns = divmod(attempt.start_ns + self._utc_ns, 1_000_000_000)
         snapshot = frame[:_SNAP_BYTES]
-        return _RECORD.pack(seconds, rest_ns, len(snapshot), len(frame)) + snapshot
+        return _RECORD_HEADER.pack(seconds, rest_ns, len(snapshot), len(frame)) + snapshot
 
-    def _data(self, attempt: TransmissionAttempt, receiver: bytes) -> bytes:
+    def _data_frame(self, attempt: TransmissionAttempt, receiver: bytes) -> bytes:
         retry = _RETRY if attempt.number > 1 else 0
         mac = _MAC.pack(_DATA, retry, 0, receiver, self._addresses[attempt.transmitter], _BSSID, 0)
         packet = attempt.payload[self._framing.header_bytes :]

@@ -67,10 +67,10 @@ def _receiver_by_ip(packet: bytes, routes: Routes) -> str | None:
     return None if robot == NO_ROBOT and address[0] >> 4 == 0xE and routes else robot
 
 
-def _ip_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Routes:
+def _ip_routes(own_address: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Routes:
     routes: dict[bytes, str | None] = {address.packed: name for name, address in others.items()}
     if others:
-        routes[_LIMITED_BROADCAST] = routes[own.network.broadcast_address.packed] = None
+        routes[_LIMITED_BROADCAST] = routes[own_address.network.broadcast_address.packed] = None
     return routes
 
 
@@ -86,7 +86,7 @@ def _receiver_by_mac(frame: bytes, routes: Routes) -> str | None:
     return routes.get(frame[:6], NO_ROBOT)
 
 
-def _mac_routes(own: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Routes:  # noqa: ARG001 (same signature as `_ip_routes`)
+def _mac_routes(own_address: IPv4Interface, others: Mapping[str, IPv4Interface]) -> Routes:  # noqa: ARG001 (same signature as `_ip_routes`)
     return {mac_of(address.ip): name for name, address in others.items()}
 
 

@@ -22,8 +22,9 @@ from sim_backends.world.world import World
 class MediumClient:
     """Starts the medium and sends it the robots' TUN or TAP devices and places; use as a context manager.
 
-    The process starts when the object is made, and the first request waits until it is up. It stops as a `Worker`
-    does, so make the object in a thread that lives as long as the lab.
+    The process starts when the object is created, and the first request waits until the process is ready. The kernel
+    kills the process when the thread that created the object ends, so create it in a thread that exists as long as
+    the lab.
 
     Args:
         options: Options of the radio.
@@ -82,7 +83,7 @@ class MediumClient:
     ) -> None:
         """Place the robots; later packets cross the obstacles between these places.
 
-        Places stay until the next call. A velocity moves no robot; it only sets the speed of the fading.
+        Places are valid until the next call. A velocity moves no robot; it only sets the speed of the fading.
 
         Args:
             positions_m: Position of each antenna, metres east, north, up. Robots that are not named are off the air.

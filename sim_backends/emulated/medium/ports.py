@@ -21,7 +21,7 @@ FlowKey = bytes
 class FlowDelays:
     """Delay sums of the flows that were requested, each since its first request.
 
-    For other flows the cost is one look-up in `counted`, which is empty until the first request.
+    For other flows the cost is one lookup in `counted`, which is empty until the first request.
 
     Attributes:
         counted: Sum of the delays of each requested flow.
@@ -45,7 +45,7 @@ class FlowDelays:
         return delay_parts(self.counted.setdefault(key, 0))
 
     def note_first_fragment(self, packet: bytes) -> None:
-        """Remember the flow of a datagram when its first fragment is sent; other packets are ignored.
+        """Store the flow of a datagram when its first fragment is sent; other packets are ignored.
 
         Call it for each packet when it is sent, because the first fragment may be lost.
         """
@@ -70,8 +70,8 @@ class FlowDelays:
 
 
 def _key(packet: bytes) -> FlowKey:
-    port_at = 4 * (packet[0] & 15) + 2
-    return packet[9:10] + packet[12:20] + packet[port_at : port_at + 2]
+    port_offset = 4 * (packet[0] & 15) + 2
+    return packet[9:10] + packet[12:20] + packet[port_offset : port_offset + 2]
 
 
 def _datagram(packet: bytes) -> bytes:
@@ -158,7 +158,7 @@ def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
 
 
 def rounded_up(late_ns: int) -> int:
-    """Return the least number above `late_ns` with only its first four bits set: at most 1/8 more."""
+    """Return the smallest number above `late_ns` with only its first four bits set: at most 1/8 more."""
     shift = late_ns.bit_length() - _KEPT_BITS
     return late_ns + 1 if shift <= 0 else ((late_ns >> shift) + 1) << shift
 

@@ -1,7 +1,8 @@
 """The medium: one process that carries every packet between the robots' TUN or TAP devices through the radio model.
 
-Run by `client` as `python -m sim_backends.emulated.medium.process FD SEED FRAMING`; FD is one end of a socket pair.
-The process exits when the other end closes. The devices then vanish, because only it holds their descriptors.
+`medium_client` runs it as `python -m sim_backends.emulated.medium.process FD SEED FRAMING`; FD is one end of a socket
+pair. The process exits when the other end closes. The kernel then removes the devices, because only this process
+holds their descriptors.
 """
 
 import gc
@@ -100,7 +101,7 @@ class Medium:
         self._by_fd: dict[int, Port] = {}
         self._late: Counter[int] = Counter()
         self._flows = FlowDelays()
-        # A device with packets was empty at the earlier time, if the round before read all of them.
+        # A device with packets was empty at the earlier time, if the previous round read all of them.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._armed_ns: int | None = None
         self._scheduling = _raise_priority()
@@ -124,7 +125,7 @@ class Medium:
                     self._read(by_fd[fd])
                 elif fd == control and not self._serve():
                     return
-            self._hand_over()
+            self._deliver()
             if self._sample_ns is not None and time.monotonic_ns() >= self._sample_ns:
                 self._sample()
 
@@ -178,7 +179,7 @@ class Medium:
             send(now_ns, name, packet, len(packet) - header_bytes, destination, before=waited + now_ns)
         port.backlog -= _BURST
 
-    def _hand_over(self) -> None:
+    def _deliver(self) -> None:
         """Write arrived packets to the robots, and set the timer to the next arrival."""
         now_ns = time.monotonic_ns()
         arrived = self._model.deliveries(now_ns)
@@ -238,8 +239,8 @@ class Medium:
                 return {}
             case "links":
                 return self._links(continue_sampling=request["continue_sampling"])
-            case "delays" | "stats" as topic:
-                return self._delays(request) if topic == "delays" else pack_stats(self._stats())
+            case "delays" | "stats" as kind:
+                return self._delays(request) if kind == "delays" else pack_stats(self._stats())
             case other:
                 raise ValueError(f"unknown request {other!r}")
 
@@ -266,7 +267,9 @@ class Medium:
 
     def _place(self) -> None:
         """Place the robots that are on the air; if the access point is off the air, no station has a place."""
-        positions_m = {name: at for name, at in self._layout.positions_m.items() if name in self._on_air_robots}
+        positions_m = {
+            name: place_m for name, place_m in self._layout.positions_m.items() if name in self._on_air_robots
+        }
         relay = self._layout.relay
         if relay is not None and relay not in positions_m:
             positions_m, relay = {}, None
@@ -301,7 +304,7 @@ class Medium:
         self._model.log_attempts(None if self._air_log is None else self._air_log.write)
 
     def _sample(self) -> None:
-        """Sample the links of all radios; packets that arrive meanwhile are delivered in the next round."""
+        """Sample the links of all radios; packets that arrive during the sampling are delivered in the next round."""
         now_ns = time.monotonic_ns()
         self._sample_ns = now_ns + _SAMPLE_NS
         self._sampled.append(self._model.sample(now_ns, time.time_ns()))

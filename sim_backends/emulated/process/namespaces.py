@@ -26,12 +26,13 @@ _FIRST_SUBORDINATE: Final = 100_000
 _OPTION_OF: Final = {"/etc/subuid": "--add-subuids", "/etc/subgid": "--add-subgids"}
 """Option of usermod for each file of subordinate ids."""
 
-_SWITCHES: Final = {
+_KERNEL_SETTINGS: Final = {
     "kernel.unprivileged_userns_clone": ("0", "1"),
     "kernel.apparmor_restrict_unprivileged_userns": ("1", "0"),
     "user.max_user_namespaces": ("0", "10000"),
 }
-"""Kernel settings of Debian, of Ubuntu and of any system: the value that forbids user namespaces, one that allows."""
+"""Kernel settings of Debian, of Ubuntu and of any system: a value that forbids user namespaces, one that allows
+them."""
 
 _TIMEOUT_S: Final = 10.0
 
@@ -85,7 +86,7 @@ def check() -> None:
 def forbidding_settings(settings: Path) -> dict[str, str]:
     """Return the remedy for each kernel setting below `settings` that forbids user namespaces, as `name = value`."""
     remedies = {}
-    for name, (forbids, allows) in _SWITCHES.items():
+    for name, (forbids, allows) in _KERNEL_SETTINGS.items():
         path = settings / name.replace(".", "/")
         if path.exists() and path.read_text(encoding="ascii").strip() == forbids:
             remedies[f"{name} = {forbids}"] = f"sudo sysctl {name}={allows}"
@@ -106,12 +107,12 @@ def _check_subordinates(user: str, uid: int) -> None:
     }
     if all(has_enough.values()):
         return
-    lacking = [path for path in ranges_by_file if not has_enough[path]]
+    insufficient = [path for path in ranges_by_file if not has_enough[path]]
     next_free = (ids.first + ids.count for ranges in ranges_by_file.values() for ids in ranges)
     first = max((_FIRST_SUBORDINATE, *next_free))
-    options = " ".join(f"{_OPTION_OF[path]} {first}-{first + _USUAL_SUBORDINATES - 1}" for path in lacking)
+    options = " ".join(f"{_OPTION_OF[path]} {first}-{first + _USUAL_SUBORDINATES - 1}" for path in insufficient)
     raise ConfigurationError(
-        f"{user} has no {_SUBORDINATES} subordinate ids in {' and '.join(lacking)}",
+        f"{user} has no {_SUBORDINATES} subordinate ids in {' and '.join(insufficient)}",
         remedy=f"sudo usermod {options} {user}",
     )
 

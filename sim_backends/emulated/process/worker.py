@@ -77,10 +77,10 @@ def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[i
 
 REPLY_S: Final = 15.0
 
-_END_S: Final = 2.0
-_ENDING_S: Final = 0.5
+_EXIT_S: Final = 2.0
+_EXIT_STATUS_S: Final = 0.5
 """Time from when a process has closed its descriptors until its exit status is available."""
-_ENDED: Final = "it exited"
+_EXITED: Final = "it exited"
 PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
@@ -88,8 +88,8 @@ class Worker:
     """Process that runs a module of this package and serves requests over a socket pair.
 
     The process exits when this object is closed or this process exits for any reason: the control socket closes, and
-    the kernel kills the process when the thread that made this object ends. So make it in a thread that lives as long
-    as the lab. The methods may be called from any thread.
+    the kernel kills the process when the thread that created this object ends. Create it in a thread that exists as
+    long as the lab. The methods may be called from any thread.
 
     Args:
         name: Name for messages.
@@ -107,14 +107,14 @@ class Worker:
     ) -> None:
         self.name = name
         self._lock = threading.Lock()
-        self._channel, theirs = socket.socketpair()
+        self._channel, worker_end = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process; `close` closes it)
         python = command(module)
-        argv = ["setpriv", "--pdeathsig", "KILL", "--", *within, *python, str(theirs.fileno()), *words]
+        argv = ["setpriv", "--pdeathsig", "KILL", "--", *within, *python, str(worker_end.fileno()), *words]
         try:
             self._process = subprocess.Popen(
                 argv,
-                pass_fds=[theirs.fileno()],
+                pass_fds=[worker_end.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
@@ -134,7 +134,7 @@ class Worker:
             self._log.close()
             raise ConfigurationError(f"cannot start {name}: {error}", remedy="apt-get install util-linux") from error
         finally:
-            theirs.close()
+            worker_end.close()
 
     @property
     def pid(self) -> int:
@@ -160,11 +160,11 @@ class Worker:
             received = receive(self._channel, deadline)
         except (OSError, ValueError) as error:
             self._channel.close()
-            raise self._exit_error(_ENDED if isinstance(error, ConnectionError) else str(error)) from error
+            raise self._exit_error(_EXITED if isinstance(error, ConnectionError) else str(error)) from error
         finally:
             self._lock.release()
         if received is None:
-            raise self._exit_error(_ENDED)
+            raise self._exit_error(_EXITED)
         reply, _ = received
         if "error" in reply:
             raise RobotError(reply["error"], where=self.name, remedy=reply.get("remedy", ""))
@@ -177,7 +177,7 @@ class Worker:
             TestbedLostError: It has exited, or did not answer a request in time.
         """
         if self._channel.fileno() == -1 or self._process.poll() is not None:
-            raise self._exit_error(_ENDED)
+            raise self._exit_error(_EXITED)
 
     def request_exit(self) -> None:
         """Request that the process exits, without waiting for it; requests under way fail immediately."""
@@ -190,7 +190,7 @@ class Worker:
         with self._lock:
             self._channel.close()
         try:
-            self._process.wait(_END_S)
+            self._process.wait(_EXIT_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -202,7 +202,7 @@ class Worker:
         else:
             last_line = os.pread(self._log.fileno(), 1 << 16, 0).decode(errors="replace").strip().rsplit("\n", 1)[-1]
         with suppress(subprocess.TimeoutExpired):
-            if (code := self._process.wait(_ENDING_S if cause == _ENDED else 0)) < 0:
+            if (code := self._process.wait(_EXIT_STATUS_S if cause == _EXITED else 0)) < 0:
                 cause = f"it was killed by {signal.Signals(-code).name}"
         return TestbedLostError(
             f"does not answer: {cause}" + (f"; its last output: {last_line}" if last_line else ""),

@@ -50,12 +50,12 @@ class BaseController:
 
     @property
     def is_idle(self) -> bool:
-        """True if the robot is at rest and no velocity is in force."""
+        """True if the robot is at rest and no commanded velocity is active."""
         return self._commanded_ns is None and not (self._pose.speed_m_s or self._pose.turn_rad_s)
 
     @property
-    def wheels(self) -> tuple[float, float, float]:
-        """Odometry; see `Steered.wheels`."""
+    def odometry(self) -> tuple[float, float, float]:
+        """Odometry; see `Steered.odometry`."""
         start, (east_m, north_m, _) = self._start, self._pose.place_m
         x_m, y_m = east_m - start.place_m[0], north_m - start.place_m[1]
         turned_rad = start.yaw_rad - start.heading_rad

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from sim_backends.emulated.robot.spec import STATE, Base
-from sim_backends.emulated.ros.own_motion import Helm
+from sim_backends.emulated.ros.own_motion import MotionReporter
 
 if TYPE_CHECKING:
     from sim_backends.emulated.robot.base_controller import BaseController
@@ -22,12 +22,12 @@ _TICK_S: Final = 0.02
 
 
 def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
-    """Serve forever; while the robot is idle, the process sleeps.
+    """Serve until the process is killed; while the robot is idle, the process sleeps.
 
     Args:
         base: Settings of the robot's base.
         motion: The file of the paths that the lab assigns (`own_motion.append_path`).
-        steered: The file in which the robot records its motion (`own_motion.Helm`).
+        steered: The file in which the robot records its motion (`own_motion.MotionReporter`).
         ready: Created when the base serves.
 
     Raises:
@@ -37,21 +37,21 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
         channel.bind(str(CHANNEL))
         channel.setblocking(False)
-        helm = Helm(motion, steered, time.monotonic_ns())
+        reporter = MotionReporter(motion, steered, time.monotonic_ns())
         ready.touch()
         select.select([channel], [], [])
-        # The physics need numpy, which takes 20 MB; most robots of most trials are never driven.
+        # The physics need numpy, which uses 20 MB; most robots of most trials are never driven.
         from sim_backends.emulated.robot.base_controller import BaseController  # noqa: PLC0415
 
         controller = BaseController(base, time.monotonic_ns())
         while True:
             select.select([channel], [], [], None if controller.is_idle else _TICK_S)
             now_ns = time.monotonic_ns()
-            if (placement := helm.poll_placement(now_ns)) is not None:
+            if (placement := reporter.poll_placement(now_ns)) is not None:
                 controller.reset(placement)
             _receive_velocities(channel, controller, now_ns)
             controller.advance(now_ns)
-            _write_motion(helm, controller, now_ns)
+            _write_motion(reporter, controller, now_ns)
 
 
 def _receive_velocities(channel: socket.socket, controller: "BaseController", now_ns: int) -> None:
@@ -62,15 +62,15 @@ def _receive_velocities(channel: socket.socket, controller: "BaseController", no
                 controller.set_velocity(now_ns, *velocity)
 
 
-def _write_motion(helm: Helm, controller: "BaseController", now_ns: int) -> None:
+def _write_motion(reporter: MotionReporter, controller: "BaseController", now_ns: int) -> None:
     pose = controller.pose
-    helm.write(
+    reporter.write(
         now_ns,
         pose.place_m,
         pose.velocity_m_s,
         heading_rad=pose.heading_rad,
         turn_rad_s=pose.turn_rad_s,
-        wheels=controller.wheels,
+        odometry=controller.odometry,
     )
 
 
@@ -86,9 +86,9 @@ def pack(*values: float) -> bytes:
     return _TWIST.pack(*values)
 
 
-def unpack(words: bytes) -> tuple[float, float] | None:
+def unpack(datagram: bytes) -> tuple[float, float] | None:
     """Return forward speed and turn rate to the left, or None if the datagram has the wrong length."""
-    if len(words) != BYTES:
+    if len(datagram) != BYTES:
         return None
-    ahead_m_s, _, _, _, _, turn_rad_s = _TWIST.unpack(words)
+    ahead_m_s, _, _, _, _, turn_rad_s = _TWIST.unpack(datagram)
     return ahead_m_s, turn_rad_s

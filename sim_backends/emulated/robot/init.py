@@ -42,7 +42,7 @@ class Supervisor:
     def __init__(self) -> None:
         self._running: dict[int, Service] = {}
         self._exit_codes: dict[str, int] = {}
-        self._due: list[tuple[float, Service]] = []
+        self._restarts: list[tuple[float, Service]] = []
 
     def start(self, service: Service) -> None:
         """Start a service.
@@ -80,7 +80,7 @@ class Supervisor:
             service = self._running.pop(pid, None)
             if service is not None:
                 self._exit_codes[service.name] = os.waitstatus_to_exitcode(status)
-                self._due.append((time.monotonic() + RESTART_S, service))
+                self._restarts.append((time.monotonic() + RESTART_S, service))
 
     def restart(self) -> float | None:
         """Restart each service that is due; return the seconds until the next one is due, or None.
@@ -88,9 +88,9 @@ class Supervisor:
         Raises:
             OSError: The program is missing.
         """
-        while self._due and self._due[0][0] <= time.monotonic():
-            self.start(self._due.pop(0)[1])
-        return max(0.0, self._due[0][0] - time.monotonic()) if self._due else None
+        while self._restarts and self._restarts[0][0] <= time.monotonic():
+            self.start(self._restarts.pop(0)[1])
+        return max(0.0, self._restarts[0][0] - time.monotonic()) if self._restarts else None
 
     def halt(self) -> None:
         """Kill every process of the robot except this one; services are not restarted.
@@ -107,7 +107,7 @@ class Supervisor:
                 raise RobotError("a process does not exit", remedy="start the lab again")
             time.sleep(_POLL_S)
         self._exit_codes.clear()
-        self._due.clear()
+        self._restarts.clear()
 
 
 def _has_children() -> bool:
@@ -197,7 +197,7 @@ class Init:
                 switch = network.switch_on if action == "switch on" else network.switch_off
                 switch(request["interface"])
             case "move":
-                own_motion.append_path(services.MOTION, AssignedPath(**request["way"]))
+                own_motion.append_path(services.MOTION, AssignedPath(**request["path"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":
@@ -217,7 +217,7 @@ class Init:
             self._supervisor.wait_ready(service, deadline)
 
     def _halt(self, interface: str) -> None:
-        # First off the air: a robot that loses power closes no connection.
+        # The radio is switched off first, because a robot that loses power closes no connection.
         network.switch_off(interface)
         self._supervisor.halt()
         lose_memory()
@@ -266,7 +266,7 @@ def kill_processes(process: str) -> None:
     """Kill every process of the robot that has this name, except init.
 
     Raises:
-        RobotError: There is none.
+        RobotError: There is no such process.
     """
     pids = [pid for pid in _pids() if pid != os.getpid() and _process_name(pid) == process]
     if not pids:

@@ -41,7 +41,7 @@ OWN_FOLDERS: Final = {
 def isolate(*, replaced: Iterable[str] = ()) -> None:
     """Mount the robot's own folders in this process's mount namespace, and make everything of the host read-only.
 
-    What the robot needs of the host stays visible: this Python, this package, and everything in `/opt`.
+    All that the robot needs from the host remains visible: this Python, this package, and everything in `/opt`.
 
     Args:
         replaced: Files that the robot writes itself. Children of `/opt` that contain them are hidden; a top-level
@@ -109,13 +109,13 @@ def clear(folder: Path, keep: Iterable[str] = ()) -> None:
 def _pivot_root(folders: Iterable[str]) -> None:
     """Change to a new root with the content of the old one, a new `/proc`, and `folders`, which the old one lacks.
 
-    The new root is built at `/proc`, so that it hides nothing else meanwhile.
+    The new root is built at `/proc`, so that it hides nothing else until the change.
     """
     root = Path("/proc")
     _mirror(Path("/"), root, without={root.name})
     for folder in (str(root), *folders):
         (root / folder.lstrip("/")).mkdir()
-    # While the old `/proc` exists, because otherwise a user namespace may not mount a new one (mnt_already_visible in
+    # This needs the old `/proc`: without it a user namespace may not mount a new one (mnt_already_visible in
     # fs/namespace.c).
     _mount_proc(root / "proc")
     os.chdir(root)
@@ -151,7 +151,7 @@ def rewritten(folder: Path, at: Path, *, without: Container[str] = ()) -> Iterat
     Args:
         folder: A folder of the host.
         at: An empty folder of the robot in which the mirror is built.
-        without: Names that the mirror leaves out.
+        without: Names that the mirror omits.
 
     Raises:
         OSError: The kernel refused a mount.
@@ -177,7 +177,7 @@ def _python_folders() -> list[Path]:
 
 
 def _outermost(paths: Iterable[Path]) -> list[Path]:
-    """Return those of `paths` that the robot's own folders hide, without those inside another one."""
+    """Return the paths that the robot's own folders hide, without paths inside another of them."""
     hidden = {path for path in paths if any(Path(folder) in path.parents for folder in OWN_FOLDERS)}
     return [path for path in hidden if not any(parent in hidden for parent in path.parents)]
 

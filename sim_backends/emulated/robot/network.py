@@ -68,7 +68,7 @@ _NLM_F_REQUEST_ACK: Final = 0x1 | 0x4
 _RTM_NEWLINK: Final = 16
 _IFLA_TXQLEN: Final = 13
 _HEADER_BYTES: Final = 16
-_ANSWER_BYTES: Final = 4096
+_REPLY_BYTES: Final = 4096
 _NAME_BYTES: Final = 15
 
 MTU_BYTES: Final = 1500
@@ -113,14 +113,14 @@ def open_device() -> int:
 
 
 def _set_queue(index: int) -> None:
-    # By netlink: the ioctl, which busybox's ip uses too, needs a capability that a user namespace never grants.
+    # Netlink is used, because the ioctl, also of busybox's ip, needs a capability that no user namespace grants.
     link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)
     length = struct.pack("=HHI", 8, _IFLA_TXQLEN, QUEUE_PACKETS)
     size_bytes = _HEADER_BYTES + len(link) + len(length)
     header = struct.pack("=IHHII", size_bytes, _RTM_NEWLINK, _NLM_F_REQUEST_ACK, 0, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as kernel:
         kernel.send(header + link + length)
-        (number,) = struct.unpack_from("=i", kernel.recv(_ANSWER_BYTES), _HEADER_BYTES)
+        (number,) = struct.unpack_from("=i", kernel.recv(_REPLY_BYTES), _HEADER_BYTES)
     if number != 0:
         raise OSError(-number, os.strerror(-number))
 
@@ -192,13 +192,13 @@ def switch_on(interface: str) -> None:
 
 
 def _routes(interface: str) -> tuple[str, ...]:
-    # These routes vanish whenever the link goes down, unlike the route that comes with the address.
+    # The kernel removes these routes whenever the link goes down, unlike the route that comes with the address.
     return (f"route replace 224.0.0.0/4 dev {interface}", f"route replace 255.255.255.255/32 dev {interface}")
 
 
 def _ip(*commands: str) -> None:
     for command in commands:
-        # Command by command, because busybox's ip, which a robot may have, has no batch mode.
+        # Each command runs separately, because busybox's ip, which a robot may have, has no batch mode.
         result = subprocess.run(
             ["ip", *command.split()],  # noqa: S607 (found on the robot's own PATH)
             capture_output=True,

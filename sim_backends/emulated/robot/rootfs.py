@@ -95,7 +95,7 @@ def write_files(spec: RobotSpec) -> None:
     (state / "etc").mkdir(mode=0o755, parents=True)
     _write(Path(ssh_server.HOST_KEY), spec.host_key, mode=0o600)
     _write(Path(HOME, ".ssh", "authorized_keys"), f"{spec.authorized_key}\n", mode=0o600)
-    files = _etc(spec)
+    files = _etc_files(spec)
     for name, content in files.items():
         _write(state / "etc" / name, content, mode=0o640 if name == "shadow" else 0o644)
     # Mounted file by file, because a user namespace may not mount over a folder with mounts in it, as Docker has. If
@@ -186,7 +186,7 @@ def _ros_packages(setup: Path) -> Path:
     return setup.parent / "lib" / "python3" / "dist-packages"
 
 
-def _etc(spec: RobotSpec) -> dict[str, str]:
+def _etc_files(spec: RobotSpec) -> dict[str, str]:
     names = "".join(f"{address}\t{name}\n" for name, address in spec.hosts.items())
     return {
         "passwd": _ACCOUNTS.format(shell="/bin/sh" if spec.userland == "busybox" else "/bin/bash"),
@@ -204,7 +204,7 @@ def _write(path: Path, content: str, *, mode: int = 0o644) -> None:
 
 
 def unsupported_paths(paths: Iterable[str]) -> list[str]:
-    """Return those of `paths` at which a robot cannot have a file: in kernel folders or in the root directory."""
+    """Return the paths at which a robot cannot have a file: in kernel folders or in the root directory."""
     return [path for path in paths if path.startswith(_KERNEL_FOLDERS) or path.count("/") == 1]
 
 

@@ -1,10 +1,10 @@
 """Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or runs a Zenoh router.
 
 Arguments: `route` and the robot's address; or `relay`, the address, the node's name, the topic of velocities for the
-base (may be empty), and as JSON the ROS 2 settings (`Ros2Spec`) and the type of each topic. The sensors process makes
-each message. The relay converts it to CDR as the robot's distribution defines the type, and publishes it while the
-topic has subscribers anywhere on the radio; `/tf_static` always, for late subscribers. Velocities go in the other
-direction. The node logs on `/rosout`.
+base (may be empty), and as JSON the ROS 2 settings (`Ros2Spec`) and the type of each topic. The sensors process
+creates each message. The relay converts it to CDR as the robot's distribution defines the type, and publishes it
+while the topic has subscribers anywhere on the radio; `/tf_static` always, for late subscribers. Velocities go in the
+other direction. The node logs on `/rosout`.
 """
 
 import contextlib
@@ -42,17 +42,19 @@ class Ros2Relay:
     """Publishes the messages of the sensors process.
 
     Args:
-        network: How the robot takes part in the ROS 2 network.
-        over: `dds` or `zenoh`.
+        network: Settings of the robot in the ROS 2 network.
+        middleware_name: `dds` or `zenoh`.
         distribution: ROS 2 distribution.
         types: ROS 1 type of each topic, by its name.
     """
 
-    def __init__(self, network: Network, over: str, distribution: Distribution, types: Mapping[str, str]) -> None:
+    def __init__(
+        self, network: Network, middleware_name: str, distribution: Distribution, types: Mapping[str, str]
+    ) -> None:
         self._types = MessageTypes(distribution)
         self._network = network
         self._listener = Listener()
-        self._middleware = middleware.adapter(over)(network)
+        self._middleware = middleware.adapter(middleware_name)(network)
         self._publishers: dict[str, Publisher] = {}
         self._conversions: dict[str, Callable[[bytes], bytes]] = {}
         self._endpoints = 0
@@ -128,11 +130,13 @@ class Ros2Relay:
 
 
 def _network(address: str, node: str, spec: Ros2Spec) -> Network:
-    """Return the settings by which a robot's node takes part in the ROS 2 network."""
-    # With peers the node must use the default port, which the peers know. Otherwise it uses any free port, because
+    """Return the settings of a robot's node in the ROS 2 network."""
+    # With peers the node must use the default port, which the peers use. Otherwise it uses any free port, because
     # another program of the robot may have the default one.
     settings = (
-        {"listen/endpoints": json.dumps([f"tcp/{address}:0"])} if spec.over == "zenoh" and not spec.peers else {}
+        {"listen/endpoints": json.dumps([f"tcp/{address}:0"])}
+        if spec.middleware == "zenoh" and not spec.peers
+        else {}
     )
     return Network(
         address,
@@ -160,7 +164,7 @@ def _relay(address: str, node: str, velocities: str, ros2_json: str, types_json:
     services.name_process(services.ROS2_RELAY)
     types = json.loads(types_json)
     spec = Ros2Spec.from_json(json.loads(ros2_json))
-    relay = Ros2Relay(_network(address, node, spec), spec.over, Distribution.of(spec.distribution), types)
+    relay = Ros2Relay(_network(address, node, spec), spec.middleware, Distribution.of(spec.distribution), types)
     if velocities:
         relay.relay_velocities(velocities)
     relay.log(f"publishing {', '.join(types)}" + (f"; driven by {velocities}" if velocities else ""))
@@ -170,8 +174,8 @@ def _relay(address: str, node: str, velocities: str, ros2_json: str, types_json:
 
 def main(argv: Sequence[str]) -> None:
     """Run a Zenoh router, or relay topics; returns only after a signal."""
-    verb, *words = argv
-    if verb == "route":
+    command, *words = argv
+    if command == "route":
         _route(*words)
     else:
         _relay(*words)

@@ -1,7 +1,7 @@
 """Publishes an emulated robot's sensors to its ROS master; runs under Debian's Python, which has rospy.
 
 Arguments: the node's name, the topic of velocities for the base (may be empty), and the topics to publish. The master
-may run on another robot, over the radio. The sensors process makes and serializes each message; the relay publishes
+may run on another robot, over the radio. The sensors process creates and serializes each message; the relay publishes
 it unchanged while the topic has subscribers. It also sends received velocities to the base.
 """
 
@@ -55,7 +55,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
             self._start()
 
     def peer_subscribe(self, *_: object) -> None:
-        """Start with the first subscriber; called by rospy."""
+        """Start when the first subscriber connects; called by rospy."""
         self._start()
 
     def _start(self) -> None:
@@ -67,7 +67,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
                 ).start()
 
     def peer_unsubscribe(self, _topic: str, subscribers: int) -> None:
-        """Stop with the last subscriber, except for a latched topic, whose message rospy keeps; called by rospy."""
+        """Stop when the last subscriber disconnects, unless the topic is latched; called by rospy."""
         with self._lock:
             if subscribers == 0 and self._stream is not None and not self._latched:
                 with contextlib.suppress(OSError):  # the sensors process has exited
@@ -99,9 +99,9 @@ def _relay_velocities(topic: str) -> None:
 
     def send(message: Any) -> None:  # noqa: ANN401 (rospy has no types)
         linear, angular = message.linear, message.angular
-        words = base_process.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+        datagram = base_process.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
         with contextlib.suppress(OSError):
-            channel.sendto(words, str(base_process.CHANNEL))
+            channel.sendto(datagram, str(base_process.CHANNEL))
 
     rospy.Subscriber(topic, roslib.message.get_message_class("geometry_msgs/Twist"), send, queue_size=1)
 

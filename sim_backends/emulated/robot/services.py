@@ -1,4 +1,4 @@
-"""Services of an emulated robot, and how they are started: as a program or as a fork of init."""
+"""Services of an emulated robot, and their start: as a program or as a fork of init."""
 
 import gc
 import json
@@ -111,7 +111,7 @@ class Service:
     Attributes:
         name: Name, also of its log in `/run/robot`.
         launch: Starts it with its output in a log; returns its process id.
-        ready: Returns True if it serves.
+        ready: Returns True if it is ready.
     """
 
     name: str

@@ -48,7 +48,7 @@ class Ros2Spec:
     """ROS 2 of a robot over the radio.
 
     Attributes:
-        over: Middleware, `dds` or `zenoh`.
+        middleware: `dds` or `zenoh`.
         distribution: ROS 2 distribution, which determines types and default behaviour.
         discovery: `multicast`, `peers` or `router`.
         peers: Addresses of the other robots, for `peers`.
@@ -56,7 +56,7 @@ class Ros2Spec:
         domain: ROS domain.
     """
 
-    over: str
+    middleware: str
     distribution: str
     discovery: str
     peers: tuple[str, ...]
@@ -86,7 +86,7 @@ class RobotSpec:
         setup: Setup files that its profile names.
         ros_master: Address of its ROS master: `LOOPBACK`, or a radio address, its own or another robot's.
         sensors: Its sensors, one per published topic.
-        registered: The topics of these that it registers at that master.
+        registered: Published topics that it registers at that master.
         definitions: Definitions of the message types of its sensors.
         mavlink_port: UDP port of its autopilot; None without an autopilot.
         autopilot: Firmware that the autopilot emulates, `px4` or `ardupilot`.
@@ -97,7 +97,7 @@ class RobotSpec:
         fence_m: Maximum distance from home in flight; None if its profile does not limit it.
         profile: Name of its profile, which determines its body.
         world: World that a drone flies in, as JSON; empty for other robots.
-        laser_targets: What its laser detects of its world; empty without a laser.
+        laser_targets: Shapes of its world that its laser detects; empty without a laser.
         neighbours: The bodies of the other robots, which reflect its laser; empty without a laser.
         base: Its base controller; None if no program in it drives it.
         ssh: Its SSH server.

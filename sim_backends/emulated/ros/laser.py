@@ -1,7 +1,8 @@
-"""Ranges of a planar laser scanner, and the positions of all robots of a lab, in shared memory, for it.
+"""Ranges of a planar laser scanner, and the shared memory with the positions of the robots that it detects.
 
 Horizontal beams end at the first surface. Only the standard library is used, as in all modules of the sensors
-process. Each surface is intersected only with the beams in its direction, so a scan costs about as much as its noise.
+process. Each surface is intersected only with the beams in its direction, so computing a scan takes about as long as
+its noise.
 
 The lab writes the positions to anonymous shared memory, which each robot maps read-only before it starts its
 programs. Two slots are written in turn, each with its CRC, so that a reader always finds a complete one.
@@ -90,8 +91,8 @@ class _Scan:
             return
         first_rad = math.atan2(y, x)
         # An edge that does not contain the scanner covers less than half a turn.
-        covers_rad = math.remainder(math.atan2(y + along_y, x + along_x) - first_rad, 2 * math.pi)
-        for beam, angle_rad in self._beams(min(first_rad, first_rad + covers_rad), abs(covers_rad)):
+        arc_rad = math.remainder(math.atan2(y + along_y, x + along_x) - first_rad, 2 * math.pi)
+        for beam, angle_rad in self._beams(min(first_rad, first_rad + arc_rad), abs(arc_rad)):
             divisor = math.cos(angle_rad) * along_y - math.sin(angle_rad) * along_x
             if divisor:
                 self._hit(beam, across / divisor)
@@ -105,15 +106,15 @@ class _Scan:
         half_rad = math.asin(radius_m / distance_m)
         centre_rad = math.atan2(y, x)
         for beam, angle_rad in self._beams(centre_rad - half_rad, 2 * half_rad):
-            off_m = distance_m * math.sin(angle_rad - centre_rad)
+            offset_m = distance_m * math.sin(angle_rad - centre_rad)
             nearest_m = distance_m * math.cos(angle_rad - centre_rad)
-            self._hit(beam, nearest_m - math.sqrt(max(radius_m**2 - off_m**2, 0.0)))
+            self._hit(beam, nearest_m - math.sqrt(max(radius_m**2 - offset_m**2, 0.0)))
 
-    def _beams(self, from_rad: float, covers_rad: float) -> Iterator[tuple[int, float]]:
+    def _beams(self, from_rad: float, arc_rad: float) -> Iterator[tuple[int, float]]:
         """Yield number and direction of each beam within an arc."""
         start = (from_rad - self._heading_rad) / self._step_rad
         first = math.ceil(start - _SLACK_BEAMS)
-        last = math.floor(start + covers_rad / self._step_rad + _SLACK_BEAMS)
+        last = math.floor(start + arc_rad / self._step_rad + _SLACK_BEAMS)
         for number in range(first, last + 1):
             yield number % len(self.ranges_m), self._heading_rad + number * self._step_rad
 
@@ -134,8 +135,8 @@ class Neighbour(NamedTuple):
     Attributes:
         number: Its position among the robots of the lab, from 0.
         radius_m: Radius of the cylinder.
-        below_m: How far the cylinder extends below the antenna.
-        above_m: How far it extends above the antenna.
+        below_m: Height of the antenna above the bottom of the cylinder.
+        above_m: Height of the top above the antenna.
     """
 
     number: int
@@ -205,7 +206,7 @@ class Neighbourhood:
         self._places_m = [_ABSENT] * robots
 
     def targets(self, neighbours: Sequence[Neighbour]) -> list[LaserTarget]:
-        """Return the laser targets of other robots at their current positions; those without a place are left out."""
+        """Return the laser targets of other robots at their current positions; those without a place are omitted."""
         self._read()
         targets = []
         for body in neighbours:

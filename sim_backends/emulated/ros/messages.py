@@ -2,12 +2,12 @@
 
 ROS 1 serializes a message's fields in order without padding, little-endian; a string or sequence has its length in 4
 bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type with the standard library alone,
-because the libraries that know all types would cost each robot 20 MB of memory.
+because the libraries that support all types would cost each robot 20 MB of memory.
 
 The motion of the robot comes from `own_motion`. Frames and units follow REP 103 and REP 105: metres, radians, x
 ahead, y to the left; in frames fixed to the world x is east and y north, as in the orientation of an IMU by REP 145.
 Covariances are those that the drivers of such robots report. The laser casts its beams at the world. Numbers that
-vary in a real sensor carry noise, so that they compress no better than real ones.
+vary in a real sensor contain noise, so that they compress no better than real ones.
 """
 
 import math
@@ -117,7 +117,7 @@ class Source:
     Args:
         sensor: The sensor.
         targets: Laser targets in the robot's world.
-        moving: Returns the laser targets that move: other robots, where they are now.
+        moving: Returns the laser targets that move: the other robots at their current positions.
 
     Raises:
         ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
@@ -128,20 +128,25 @@ class Source:
     ) -> None:
         check(sensor)
         self._sensor = sensor
-        self._generate = _filled(sensor.template) if sensor.template else GENERATORS[sensor.type]
+        self._generate = _template_generator(sensor.template) if sensor.template else GENERATORS[sensor.type]
         if sensor.type == LASER_SCAN:
             self._generate = partial(_laser_scan, targets=targets, moving=moving)
         self._stamped = sensor.template is None or sensor.template.stamped
-        self._lead = _ONE_TRANSFORM if sensor.type == "tf2_msgs/TFMessage" else b""
+        self._prefix = _ONE_TRANSFORM if sensor.type == "tf2_msgs/TFMessage" else b""
         # Seeded by the topic, so that equal robots publish equal values whenever they start.
         self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
-    def message(self, number: int, stamp_ns: int, now: OwnMotion = AT_REST) -> bytes:
+    def message(self, number: int, stamp_ns: int, motion: OwnMotion = AT_REST) -> bytes:
         """Return message `number`, serialized, for a motion and a time stamp in nanoseconds since the epoch."""
         if not self._stamped:
-            return self._generate(self._sensor, self._noise, now)
+            return self._generate(self._sensor, self._noise, motion)
         stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
-        return self._lead + stamp + packed_string(self._sensor.frame) + self._generate(self._sensor, self._noise, now)
+        return (
+            self._prefix
+            + stamp
+            + packed_string(self._sensor.frame)
+            + self._generate(self._sensor, self._noise, motion)
+        )
 
 
 def check(sensor: Sensor) -> None:
@@ -167,7 +172,7 @@ def check(sensor: Sensor) -> None:
         )
 
 
-def _filled(template: Template) -> Generator:
+def _template_generator(template: Template) -> Generator:
     """Return a generator that fills the list with incompressible noise, or with normally distributed floats."""
     head, tail, size_bytes = bytes.fromhex(template.head), bytes.fromhex(template.tail), template.size_bytes
     pool = b""
@@ -177,7 +182,7 @@ def _filled(template: Template) -> Generator:
         if not template.floats:
             return head + noise.randbytes(size_bytes) + tail
         if not pool:  # drawn once and read from varying offsets, because a large cloud takes longer than its period
-            pool = 2 * struct.pack(f"<{size_bytes // 4}f", *_around(noise, 1.0, *[0.0] * (size_bytes // 4)))
+            pool = 2 * struct.pack(f"<{size_bytes // 4}f", *_gaussian(noise, 1.0, *[0.0] * (size_bytes // 4)))
         start = _FLOATS_BYTES * noise.randrange(max(1, size_bytes // _FLOATS_BYTES))
         return head + pool[start : start + size_bytes] + tail
 
@@ -207,7 +212,7 @@ def _diagonal(*variances: float) -> list[float]:
     ]
 
 
-def _around(noise: Random, deviation: float, *means: float) -> list[float]:
+def _gaussian(noise: Random, deviation: float, *means: float) -> list[float]:
     return [noise.gauss(mean, deviation) for mean in means]
 
 
@@ -226,14 +231,14 @@ def _within(value_m: float, low_m: float, high_m: float) -> float:
 def _laser_scan(
     sensor: Sensor,
     noise: Random,
-    now: OwnMotion,
+    motion: OwnMotion,
     targets: Sequence[LaserTarget] = (),
     moving: Callable[[], Sequence[LaserTarget]] = tuple,
 ) -> bytes:
     points = sensor.points or 0
     step = 2 * math.pi / points
     low_m, high_m = LASER_RANGE_M
-    true_m = ranges_m(chain(targets, moving()), now.place_m, now.heading_rad, points, high_m)
+    true_m = ranges_m(chain(targets, moving()), motion.place_m, motion.heading_rad, points, high_m)
     turn_s = 1 / sensor.rate_hz
     angles = (0.0, step * (points - 1), step)
     scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
@@ -243,12 +248,14 @@ def _laser_scan(
     return scalars + _float32s(ranges) + _float32s(echoes)
 
 
-def _imu(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
+def _imu(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     # On an assigned path the robot turns and accelerates in zero time, which gyroscope and accelerometer cannot show.
-    of_orientation, of_turning, of_acceleration = (_diagonal(*[variance] * 3) for variance in IMU_VARIANCES)
-    orientation = _float64s(_heading(now.heading_rad), of_orientation)
-    angular_velocity = _float64s(_around(noise, 0.002, 0.0, 0.0, now.turn_rad_s), of_turning)
-    acceleration = _float64s(_around(noise, 0.02, 0.0, 0.0, GRAVITY_M_S2), of_acceleration)
+    orientation_covariance, angular_covariance, acceleration_covariance = (
+        _diagonal(*[variance] * 3) for variance in IMU_VARIANCES
+    )
+    orientation = _float64s(_heading(motion.heading_rad), orientation_covariance)
+    angular_velocity = _float64s(_gaussian(noise, 0.002, 0.0, 0.0, motion.turn_rad_s), angular_covariance)
+    acceleration = _float64s(_gaussian(noise, 0.02, 0.0, 0.0, GRAVITY_M_S2), acceleration_covariance)
     return orientation + angular_velocity + acceleration
 
 
@@ -256,20 +263,20 @@ def _child(sensor: Sensor) -> bytes:
     return packed_string(sensor.child_frame or "base_link")
 
 
-def _odometry(sensor: Sensor, noise: Random, now: OwnMotion) -> bytes:
+def _odometry(sensor: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     covariance = _diagonal(*ODOMETRY_VARIANCES)
-    angular = (0.0, 0.0, noise.gauss(now.turn_rad_s, 1e-3))
-    pose = _float64s((now.x_m, now.y_m, 0.0), _heading(now.yaw_rad), covariance)
-    twist = _float64s((now.speed_m_s, 0.0, 0.0), angular, covariance)
+    angular = (0.0, 0.0, noise.gauss(motion.turn_rad_s, 1e-3))
+    pose = _float64s((motion.x_m, motion.y_m, 0.0), _heading(motion.yaw_rad), covariance)
+    twist = _float64s((motion.speed_m_s, 0.0, 0.0), angular, covariance)
     return _child(sensor) + pose + twist
 
 
-def _transforms(sensor: Sensor, _: Random, now: OwnMotion) -> bytes:
+def _transforms(sensor: Sensor, _: Random, motion: OwnMotion) -> bytes:
     """Return one transform, from the odometry frame to the robot's frame: the robot's pose in odometry (REP 105)."""
-    return _child(sensor) + _float64s((now.x_m, now.y_m, 0.0), _heading(now.yaw_rad))
+    return _child(sensor) + _float64s((motion.x_m, motion.y_m, 0.0), _heading(motion.yaw_rad))
 
 
-def _battery_state(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
+def _battery_state(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
     voltage, design_capacity, percentage = noise.gauss(11.1, 0.01), 1.8, 0.8
     unknown = math.nan  # sensor_msgs/BatteryState: "if unmeasured NaN"
     discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
@@ -279,42 +286,42 @@ def _battery_state(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
     return measured + state + no_cells + packed_string("") * 2  # its place and serial number
 
 
-def _range(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
+def _range(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     infrared = 1  # sensor_msgs/Range.INFRARED
     low_m, high_m = 0.02, 4.0
-    down_m = max(STANDING_M, now.place_m[2]) + abs(noise.gauss(0.0, 0.005))
+    down_m = max(STANDING_M, motion.place_m[2]) + abs(noise.gauss(0.0, 0.005))
     return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, _within(down_m, low_m, high_m))
 
 
-def _nav_sat_fix(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
+def _nav_sat_fix(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     fix, gps, diagonal_known = 0, 1, 2  # NavSatStatus.STATUS_FIX, .SERVICE_GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
-    east_m, north_m, up_m = now.place_m
+    east_m, north_m, up_m = motion.place_m
     latitude, longitude = math.degrees(north_m / NORTH_RADIUS_M), math.degrees(east_m / EAST_RADIUS_M)
     across, up = FIX_NOISE_M
     across_deg = math.degrees(across / EAST_RADIUS_M)
-    place = (*_around(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
+    place = (*_gaussian(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
     covariance = _diagonal(across**2, across**2, up**2)
     return struct.pack("<bH", fix, gps) + _float64s(place, covariance) + struct.pack("<B", diagonal_known)
 
 
-def _magnetic_field(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
+def _magnetic_field(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     north_t, up_t = FIELD_T
-    ahead_t, left_t = north_t * math.sin(now.heading_rad), north_t * math.cos(now.heading_rad)
-    return _float64s(_around(noise, 1e-7, ahead_t, left_t, up_t), _diagonal(*[1e-14] * 3))
+    ahead_t, left_t = north_t * math.sin(motion.heading_rad), north_t * math.cos(motion.heading_rad)
+    return _float64s(_gaussian(noise, 1e-7, ahead_t, left_t, up_t), _diagonal(*[1e-14] * 3))
 
 
-def _fluid_pressure(_: Sensor, noise: Random, now: OwnMotion) -> bytes:
+def _fluid_pressure(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     # Standard atmosphere, ISO 2533, at a height above the sea; then the variance.
-    pressure_pa = 101_325.0 * (1 - 0.0065 * now.place_m[2] / 288.15) ** 5.25588
+    pressure_pa = 101_325.0 * (1 - 0.0065 * motion.place_m[2] / 288.15) ** 5.25588
     return _float64s((noise.gauss(pressure_pa, 3.0), 9.0))
 
 
-def _temperature(_: Sensor, noise: Random, _now: OwnMotion) -> bytes:
+def _temperature(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
     return _float64s((noise.gauss(20.0, 0.1), 0.01))  # then the variance
 
 
-def _pose_stamped(_: Sensor, __: Random, now: OwnMotion) -> bytes:
-    return _float64s(now.place_m, _heading(now.heading_rad))  # in the world's frame, `map` of REP 105
+def _pose_stamped(_: Sensor, __: Random, motion: OwnMotion) -> bytes:
+    return _float64s(motion.place_m, _heading(motion.heading_rad))  # in the world's frame, `map` of REP 105
 
 
 GENERATORS: Final[dict[str, Generator]] = {

@@ -1,12 +1,12 @@
-"""Motion of an emulated robot for its sensors: wheel odometry and position, and the helm that records it.
+"""Motion of an emulated robot for its sensors: wheel odometry and position; also if the robot steers itself.
 
 The lab sends each path when it starts, and the robot computes its motion on it, so that no message can be late. The
 wheels do not turn when the lab puts a robot back to its place: its odometry continues from its last value.
 
-For a robot that steers itself, the process that steers it (a base controller or an autopilot) reads from its `Helm`
-where the lab put the robot last, computes the motion from there, and writes it to a record, which the lab passes to
-the medium and the robot's sensors read. The lab may put the robot elsewhere at any time; records that refer to an
-earlier path are then ignored.
+For a robot that steers itself, the process that steers it (a base controller or an autopilot) uses a
+`MotionReporter`: it reads where the lab put the robot last, computes the motion from there, and writes it to a
+record, which the lab passes to the medium and the robot's sensors read. The lab may put the robot elsewhere at any
+time; records that refer to an earlier path are then ignored.
 """
 
 import json
@@ -72,12 +72,12 @@ def append_path(file_path: Path, path: AssignedPath) -> None:
 
 
 class Odometer:
-    """Odometry of a robot, which starts at 0 when the object is made.
+    """Odometry of a robot, which starts at 0 when the object is created.
 
     Args:
         path: The file of assigned paths, which may be missing.
         now_ns: Time of the start, by the monotonic clock.
-        steered: The file in which the robot records how it steers itself; None if it cannot.
+        steered: The file in which a robot that steers itself records its motion; None for other robots.
     """
 
     def __init__(self, path: Path, now_ns: int, steered: Path | None = None) -> None:
@@ -109,9 +109,9 @@ class Odometer:
         last = None if self._record is None else self._record.read()
         if last is None or last.path_start_ns != self.path_start_ns:
             return None
-        now = last.at(now_ns)
-        speed_m_s = last.speed_m_s if now.moves else 0.0  # `at` turns the heading and not the velocity
-        return OwnMotion(*now.wheels, speed_m_s, now.place_m, now.heading_rad, now.turn_rad_s)
+        current = last.at(now_ns)
+        speed_m_s = last.speed_m_s if current.moves else 0.0  # `at` turns the heading and not the velocity
+        return OwnMotion(*current.odometry, speed_m_s, current.place_m, current.heading_rad, current.turn_rad_s)
 
     def _assigned(self, now_ns: int) -> OwnMotion:
         """Return the motion on the last assigned path."""
@@ -174,8 +174,10 @@ def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
     return cos * x - sin * y, sin * x + cos * y
 
 
-class Helm:
-    """Steers one robot; only one process of a robot may have it.
+class MotionReporter:
+    """Reads the placements of a robot by the lab, and records the motion of the robot.
+
+    Only the process that steers the robot may have one.
 
     Args:
         paths: The file of the paths that the lab assigns (`own_motion.append_path`).
@@ -194,7 +196,7 @@ class Helm:
     def poll_placement(self, now_ns: int) -> OwnMotion | None:
         """Return the place at which the lab has put the robot since the last call, or None if it has not.
 
-        The first call returns where the robot is, also after the process has been restarted.
+        The first call returns the place of the robot, also after the process has been restarted.
 
         Args:
             now_ns: Time by the monotonic clock; must not decrease from call to call.
@@ -213,7 +215,7 @@ class Helm:
         *,
         heading_rad: float = 0.0,
         turn_rad_s: float = 0.0,
-        wheels: Vector = (0.0, 0.0, 0.0),
+        odometry: Vector = (0.0, 0.0, 0.0),
     ) -> None:
         """Record the robot's position and motion; see `Steered`.
 
@@ -224,4 +226,4 @@ class Helm:
             OSError: There is no space for it.
         """
         path_start_ns = self._path_start_ns or 0
-        self._record.write(Steered(now_ns, path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, wheels))
+        self._record.write(Steered(now_ns, path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, odometry))

@@ -37,13 +37,13 @@ from sim_backends.emulated.ros.tcpros import Header, Listener, type_of
 # Polling interval of the original for new publishers.
 _TICK_S: Final = 0.1
 # The default format of rosbag2 is MCAP since Iron (ros2/rosbag2#1160).
-_SQLITE3_ALONE: Final = {"dashing", "eloquent", "foxy"}
-_SQLITE3_IS_DEFAULT: Final = _SQLITE3_ALONE | {"galactic", "humble"}
+_SQLITE3_ONLY: Final = {"dashing", "eloquent", "foxy"}
+_SQLITE3_IS_DEFAULT: Final = _SQLITE3_ONLY | {"galactic", "humble"}
 # Format 9 (Jazzy) has the QoS profiles as a list with named values. An older rosbag2 reads them as text with numbers,
 # as in format 8, the oldest that rosbags writes (rosbags.rosbag2.metadata).
 _BEFORE_JAZZY: Final = _SQLITE3_IS_DEFAULT | {"iron"}
 # Until rosbag2 0.10 KeyboardInterrupt reached the command line, which returned exit code 2 (ros2/rosbag2#787).
-_SIGINT_IS_2: Final = _SQLITE3_ALONE | {"galactic"}
+_SIGINT_EXITS_2: Final = _SQLITE3_ONLY | {"galactic"}
 
 
 class Rosbag2Recorder:
@@ -148,7 +148,7 @@ def _log(logger: str, text: str) -> None:
 
 
 def _parser(distribution: str) -> argparse.ArgumentParser:
-    sqlite3_only = distribution in _SQLITE3_ALONE
+    sqlite3_only = distribution in _SQLITE3_ONLY
     parser = argparse.ArgumentParser(prog="ros2", description="ros2 is an extensible command-line tool for ROS 2.")
     commands = parser.add_subparsers(required=True, metavar="command")
     verbs = commands.add_parser("bag", help="Various rosbag related sub-commands").add_subparsers(
@@ -183,7 +183,7 @@ def main(argv: Sequence[str], distribution: str) -> int | str:
         signal_number = Rosbag2Recorder(topics, folder, StoragePlugin[options.storage.upper()], distribution).run()
     except (WriterError, OSError) as error:
         return f"[ERROR] [ros2bag]: {error}"
-    return 2 if signal_number == signal.SIGINT and distribution in _SIGINT_IS_2 else 0
+    return 2 if signal_number == signal.SIGINT and distribution in _SIGINT_EXITS_2 else 0
 
 
 if __name__ == "__main__":

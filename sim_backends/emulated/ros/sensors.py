@@ -34,12 +34,12 @@ class Subscriber:
 
     Attributes:
         is_subscribed: True if it has requested the topic.
-        gone: True if it has disconnected, or was disconnected because it violates the protocol.
+        is_disconnected: True if it has disconnected, or was disconnected because it violates the protocol.
     """
 
     def __init__(self, stream: socket.socket, greeting: bytes, selector: selectors.BaseSelector) -> None:
         self.is_subscribed = False
-        self.gone = False
+        self.is_disconnected = False
         self._stream = stream
         self._greeting = greeting
         self._selector = selector
@@ -50,7 +50,7 @@ class Subscriber:
 
     def send(self, packet: bytes) -> None:
         """Send a packet as soon as the socket is writable; drop it if too much data is unsent."""
-        if not self.gone and len(self._unsent) < QUEUE_BYTES:
+        if not self.is_disconnected and len(self._unsent) < QUEUE_BYTES:
             self._unsent += packet
             self._flush()
 
@@ -58,7 +58,7 @@ class Subscriber:
         """Handle the events of the socket."""
         if events & selectors.EVENT_WRITE:
             self._flush()
-        if events & selectors.EVENT_READ and not self.gone:
+        if events & selectors.EVENT_READ and not self.is_disconnected:
             self._read()
 
     def _flush(self) -> None:
@@ -77,15 +77,15 @@ class Subscriber:
             data = self._stream.recv(_CHUNK_BYTES)
             if not self.is_subscribed:
                 self._packets.feed(data)
-                self._answer()
+                self._send_greeting()
         except BlockingIOError:
             return
         except (OSError, ValueError):
             data = b""
-        if not data and not self.gone:
+        if not data and not self.is_disconnected:
             self._disconnect()
 
-    def _answer(self) -> None:
+    def _send_greeting(self) -> None:
         """Answer the connection header once it is complete; anything after it is ignored."""
         for packet in self._packets:
             tcpros.unpack_header(packet)
@@ -94,7 +94,7 @@ class Subscriber:
             return
 
     def _disconnect(self) -> None:
-        self.gone = True
+        self.is_disconnected = True
         self._selector.unregister(self._stream)
         self._stream.close()
 
@@ -127,12 +127,12 @@ class TopicSocket:
 
     def subscribers(self) -> list[Subscriber]:
         """Return the subscribers that have requested the topic and are still connected."""
-        self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.gone]
+        self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.is_disconnected]
         return [subscriber for subscriber in self._subscribers if subscriber.is_subscribed]
 
     def _accept(self, _events: int) -> None:
         stream, _ = self._socket.accept()
-        self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.gone]
+        self._subscribers = [subscriber for subscriber in self._subscribers if not subscriber.is_disconnected]
         self._subscribers.append(Subscriber(stream, self._greeting, self._selector))
 
 
@@ -146,7 +146,7 @@ class Publication:
         odometer: Source of the robot's motion.
         selector: Selector of the process; each key's data is the function to call with the events.
         targets: Laser targets in the robot's world.
-        moving: Returns the laser targets that move: other robots, where they are now.
+        moving: Returns the laser targets that move: the other robots at their current positions.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class Publication:
         self._topic_socket = TopicSocket(sensor.topic, _header(sensor.topic, sensor.type, definition), selector)
 
     def publish(self) -> float:
-        """Publish the next message if it is due; return the seconds until the next one, infinite if unsubscribed."""
+        """Publish the next message if it is due; return the seconds until the next, infinite without subscribers."""
         subscribers = self._topic_socket.subscribers()
         if not subscribers:
             self._number = None
@@ -196,16 +196,16 @@ def publish(
     steered: Path,
     ready: Path,
 ) -> None:
-    """Publish forever.
+    """Publish until the process is killed.
 
     Args:
         sensors: The sensors.
         definitions: Definitions of their message types, and of `static_frames.TYPE` if there are frames.
         frames: Links in `/tf_static`, published once and latched; empty for a robot without them.
         targets: Laser targets in the robot's world.
-        moving: Returns the laser targets that move: other robots, where they are now.
+        moving: Returns the laser targets that move: the other robots at their current positions.
         motion: The file of the paths that the lab assigns (`own_motion.append_path`).
-        steered: The file in which the robot records how it steers itself (`own_motion.Helm`).
+        steered: The file in which a robot that steers itself records its motion (`own_motion.MotionReporter`).
         ready: Created when every topic can be subscribed to.
 
     Raises:

@@ -1,6 +1,6 @@
 """Static transforms of an emulated robot: the content of `/tf_static` (REP 105, tf2_ros.StaticTransformBroadcaster).
 
-All its sensors measure at the robot's position, for any name of their frame, so every transform is the identity.
+All its sensors measure at the robot's position, with any frame name, so every transform is the identity.
 """
 
 import struct
@@ -18,11 +18,11 @@ _WORLDS: Final = frozenset({"", "map", "odom", "earth"})
 Link = tuple[str, str]
 """Parent frame and child frame."""
 
-_IN_PLACE: Final = struct.pack("<7d", *[0.0] * 6, 1.0)
+_IDENTITY: Final = struct.pack("<7d", *[0.0] * 6, 1.0)
 
 
 def links(sensors: Iterable[Sensor]) -> tuple[Link, ...]:
-    """Return the links from the child frame of odometry over `base_link` to the frames of the sensors.
+    """Return the links from the child frame of odometry via `base_link` to the frames of the sensors.
 
     Empty for a robot whose profile lists `/tf_static` among its topics.
     """
@@ -41,5 +41,5 @@ def message(links: Sequence[Link], stamp_ns: int) -> bytes:
     """Return a `tf2_msgs/TFMessage` with these links in ROS 1 serialization, stamped in ns since the epoch."""
     stamp = struct.pack("<3I", 0, *divmod(stamp_ns, 10**9))
     return struct.pack("<I", len(links)) + b"".join(
-        stamp + packed_string(parent) + packed_string(child) + _IN_PLACE for parent, child in links
+        stamp + packed_string(parent) + packed_string(child) + _IDENTITY for parent, child in links
     )

@@ -29,14 +29,14 @@ class Steered(NamedTuple):
 
     Attributes:
         time_ns: The time, by the monotonic clock.
-        path_start_ns: Start of the assigned path (`AssignedPath.began_ns`) that put the robot where it set out; 0
-            without one. If the lab has assigned another path since, the record is void.
+        path_start_ns: Start of the assigned path (`AssignedPath.began_ns`) that put the robot at the start of this
+            motion; 0 without one. If the lab has assigned another path since, the record is invalid.
         place_m: Position, metres east, north, up.
         velocity_m_s: Velocity, east, north, up.
         heading_rad: Heading, from east towards north.
         turn_rad_s: Turn rate to the left.
-        wheels: Odometry: metres ahead from where the robot was switched on, metres to the left of that, and the angle
-            turned to the left since, in radians.
+        odometry: Metres ahead from where the robot was switched on, metres to the left of that, and the angle turned
+            to the left since, in radians.
     """
 
     time_ns: int
@@ -45,7 +45,7 @@ class Steered(NamedTuple):
     velocity_m_s: Vector = STILL
     heading_rad: float = 0.0
     turn_rad_s: float = 0.0
-    wheels: Vector = (0.0, 0.0, 0.0)
+    odometry: Vector = (0.0, 0.0, 0.0)
 
     @property
     def speed_m_s(self) -> float:
@@ -67,13 +67,13 @@ class Steered(NamedTuple):
         """Return the motion at a later time by dead reckoning; a robot stops `SILENT_NS` after its last record."""
         is_silent = now_ns - self.time_ns >= SILENT_NS
         elapsed_s = min(max(now_ns - self.time_ns, 0), SILENT_NS) / 1e9
-        x_m, y_m, yaw_rad = self.wheels
+        x_m, y_m, yaw_rad = self.odometry
         ahead_m = self.speed_m_s * elapsed_s
         later = self._replace(
             time_ns=max(now_ns, self.time_ns),
-            place_m=_along(self.place_m, self.velocity_m_s, elapsed_s),
+            place_m=_moved(self.place_m, self.velocity_m_s, elapsed_s),
             heading_rad=self.heading_rad + self.turn_rad_s * elapsed_s,
-            wheels=(
+            odometry=(
                 x_m + ahead_m * math.cos(yaw_rad),
                 y_m + ahead_m * math.sin(yaw_rad),
                 yaw_rad + self.turn_rad_s * elapsed_s,
@@ -119,7 +119,7 @@ class SteeredRecord:
             *motion.velocity_m_s,
             motion.heading_rad,
             motion.turn_rad_s,
-            *motion.wheels,
+            *motion.odometry,
         )
         os.pwrite(self._fd, slot + _CRC.pack(zlib.crc32(slot)), self._number % 2 * _SLOT_BYTES)
 
@@ -143,13 +143,13 @@ class SteeredRecord:
     def _accept(self, number: int, time_ns: int, path_start_ns: int, *values: float) -> None:
         """Store a slot if it is newer than the last one."""
         if number > self._number:
-            place, velocity, wheels = (_vector(values[at : at + 3]) for at in (0, 3, 8))
+            place, velocity, odometry = (_vector(values[index : index + 3]) for index in (0, 3, 8))
             heading_rad, turn_rad_s = values[6:8]
             self._number = number
-            self._last = Steered(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, wheels)
+            self._last = Steered(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, odometry)
 
 
-def _along(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
+def _moved(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
     (east, north, up), (e, n, u) = place_m, velocity_m_s
     return east + e * for_s, north + n * for_s, up + u * for_s
 

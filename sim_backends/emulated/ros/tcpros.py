@@ -126,7 +126,7 @@ class _Subscription:
 class Listener:
     """Subscribes to wanted topics once they are published; SIGINT and SIGTERM interrupt its waits.
 
-    A publisher that violates TCPROS is disconnected for good; the other topics continue.
+    A publisher that violates TCPROS is disconnected permanently; the other topics continue.
 
     Attributes:
         wanted: Topics to subscribe to.

@@ -1,4 +1,4 @@
-"""Messages of any ROS 1 type from its definition: constant bytes, and the position of the one large list.
+"""Messages of any ROS 1 type from its definition: constant bytes, and the position of one large list.
 
 The lab parses the definition with rosbags; a robot gets only bytes, and fills the list in each message. Numbers are 0
 and strings empty; quaternions are the identity. The fields that describe an image, a compressed image or a point
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _HEADER: Final = "std_msgs/msg/Header"
 _QUATERNION: Final = "geometry_msgs/msg/Quaternion"
 # Format characters of `struct`; times have two fields, and rosbags treats them as types with fields.
-_FORMS: Final = {
+_STRUCT_FORMATS: Final = {
     "bool": "?",
     "byte": "B",
     "char": "B",
@@ -57,25 +57,25 @@ def template_of(topic: PublishedTopic) -> Template:
     Raises:
         ConfigurationError: The definition is missing or cannot be parsed, or no list can have the required size.
     """
-    packed = _Packed(_types(topic.type, topic.definition), topic.payload_bytes, _values(topic))
+    packed = _SerializedFields(_types(topic.type, topic.definition), topic.payload_bytes, _values(topic))
     try:
         stamped = packed.add_message(_full_name(topic.type))
     except KeyError as error:
         raise _unknown(topic) from error
-    if topic.payload_bytes and packed.filling is None:
+    if topic.payload_bytes and packed.list_type is None:
         raise ConfigurationError(
             f"{topic.type} has no list of numbers whose size can be {topic.payload_bytes} bytes",
             where=f"topic {topic.name}",
             remedy="remove size, or make it a multiple of a number's bytes",
         )
-    floats = packed.filling == "float32" or topic.type == "sensor_msgs/PointCloud2"
+    floats = packed.list_type == "float32" or topic.type == "sensor_msgs/PointCloud2"
     head, tail = (part.hex() for part in packed.parts)
     return Template(stamped, head, tail, topic.payload_bytes, floats)
 
 
 def _values(topic: PublishedTopic) -> Values:
-    make_values = _VALUES.get(topic.type)
-    return make_values(topic) if make_values else {}
+    values_of = _VALUES.get(topic.type)
+    return values_of(topic) if values_of else {}
 
 
 def _full_name(kind: str) -> str:
@@ -113,7 +113,7 @@ def _unknown(topic: PublishedTopic) -> ConfigurationError:
     )
 
 
-class _Packed:
+class _SerializedFields:
     """Serialized fields in order, with a gap for the first list of numbers.
 
     Args:
@@ -124,7 +124,7 @@ class _Packed:
 
     def __init__(self, store: "Typestore", size_bytes: int, values: Values) -> None:
         self.parts: tuple[bytearray, bytearray] = (bytearray(), bytearray())
-        self.filling: str | None = None
+        self.list_type: str | None = None
         self._store = store
         self._size_bytes = size_bytes
         self._values = values
@@ -141,12 +141,14 @@ class _Packed:
         return stamped
 
     def _add(self, data: bytes) -> None:
-        self.parts[self.filling is not None].extend(data)
+        self.parts[self.list_type is not None].extend(data)
 
     def _add_field(self, node: Any, argument: Any) -> None:  # noqa: ANN401 (rosbags' own tuples)
         match node.name:
             case "BASE":
-                self._add(bytes(4) if argument[0] == "string" else bytes(struct.calcsize(_FORMS[argument[0]])))
+                self._add(
+                    bytes(4) if argument[0] == "string" else bytes(struct.calcsize(_STRUCT_FORMATS[argument[0]]))
+                )
             case "NAME" if argument == _QUATERNION:
                 self._add(struct.pack("<4d", 0, 0, 0, 1))
             case "NAME":
@@ -159,15 +161,15 @@ class _Packed:
                 self._add_list(*argument[0])
 
     def _add_list(self, node: Any, argument: Any) -> None:  # noqa: ANN401 (as above)
-        if self.filling is not None or not self._size_bytes or node.name != "BASE" or argument[0] == "string":
+        if self.list_type is not None or not self._size_bytes or node.name != "BASE" or argument[0] == "string":
             self._add(bytes(4))
             return
-        each_bytes = struct.calcsize(_FORMS[argument[0]])
-        if self._size_bytes % each_bytes:
+        item_bytes = struct.calcsize(_STRUCT_FORMATS[argument[0]])
+        if self._size_bytes % item_bytes:
             self._add(bytes(4))
             return
-        self._add(struct.pack("<I", self._size_bytes // each_bytes))
-        self.filling = argument[0]
+        self._add(struct.pack("<I", self._size_bytes // item_bytes))
+        self.list_type = argument[0]
 
 
 def _image(topic: PublishedTopic) -> Values:
@@ -183,7 +185,7 @@ def _compressed_image(_: PublishedTopic) -> Values:
 def _point_cloud(topic: PublishedTopic) -> Values:
     points = topic.points or 0
     names = ("x", "y", "z", "intensity")
-    fields = [packed_string(name) + struct.pack("<IBI", 4 * at, _FLOAT32, 1) for at, name in enumerate(names)]
+    fields = [packed_string(name) + struct.pack("<IBI", 4 * index, _FLOAT32, 1) for index, name in enumerate(names)]
     numbers = {"height": 1, "width": points, "point_step": _POINT_BYTES, "row_step": _POINT_BYTES * points}
     values = {name: struct.pack("<I", value) for name, value in numbers.items()}
     return values | {"fields": struct.pack("<I", len(fields)) + b"".join(fields), "is_dense": b"\x01"}

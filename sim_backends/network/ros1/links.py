@@ -23,7 +23,7 @@ _UDPROS_HEADER_BYTES: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """A query whether a connection is alive, or its response.
+    """A keep-alive probe of a connection, or the response to it.
 
     Attributes:
         flow: Flow of the connection.

@@ -18,7 +18,7 @@ REGISTER_PUBLISHER_BYTES: Final = 513
 PUBLISHER_REGISTERED_BYTES: Final = 425
 REGISTER_SUBSCRIBER_BYTES: Final = 516
 SUBSCRIBER_REGISTERED_BYTES: Final = 402
-"""Without a publisher; captured with one."""
+"""Without a publisher; the captured response contained one."""
 PUBLISHER_UPDATE_BYTES: Final = 425
 """Without a publisher, as captured."""
 PUBLISHER_UPDATED_BYTES: Final = 364
@@ -26,12 +26,12 @@ GET_KEEPALIVE_BYTES: Final = 370
 KEEPALIVE_BYTES: Final = 402
 """A call of `getParam`, and its response that the parameter does not exist."""
 PUBLISHER_BYTES: Final = 56
-"""Size of a publisher's address in either of these."""
+"""Size of a publisher's address in the response to a subscriber and in a publisher update."""
 REQUEST_TOPIC_BYTES: Final = 508
 TOPIC_REQUESTED_BYTES: Final = 518
 REQUEST_UDPROS_BYTES: Final = 508 + 288
 UDPROS_REQUESTED_BYTES: Final = 518 + 246
-"""Derived from those for TCPROS: the connection header of 110 bytes in base 64, address, and datagram size."""
+"""Sizes for TCPROS, plus the connection header of 110 bytes in base 64, the address, and the datagram size."""
 
 _REGISTER: Final = CallRetry(50 * _MS, 50 * _MS)
 _REQUEST: Final = CallRetry(500 * _MS, 32 * _SECOND)
@@ -67,7 +67,7 @@ class Ros1Options:
         starts_ns: Start times of the nodes of an agent, by its name; others start at 0.
         register: Retries of calls to the master (roscpp, `master.cpp`).
         update: Retries of the master's calls to a subscriber; None for no retry, as in rosmaster (`master_api.py`): a
-            subscriber that such a call does not reach never learns of its publisher.
+            subscriber that such a call does not reach never receives the address of its publisher.
         request: Retries of calls to a publisher, and of calls needed for a connection to it (rospy,
             `tcpros_pubsub.py`).
         reconnect: Times for reopening a lost connection to a publisher (roscpp, `transport_publisher_link.cpp`).

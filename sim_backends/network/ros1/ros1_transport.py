@@ -8,7 +8,7 @@ from sim_backends.network.packets import Packet
 from sim_backends.network.ros1 import ros1_options as sizes
 from sim_backends.network.ros1.links import TRANSPORT, Block, Probe, TcprosLink, UdprosLink
 from sim_backends.network.ros1.ros1_options import Ros1Flow, Ros1Options
-from sim_backends.network.ros1.streams import CallAnswer, RemoteCalls, TcpStreams
+from sim_backends.network.ros1.streams import CallResponse, RemoteCalls, TcpStreams
 from sim_backends.network.wire import IpPacket, Wire
 
 
@@ -19,14 +19,14 @@ class Ros1:
     publisher's address to the subscriber, in its response or by a separate call. The subscriber requests the
     connection parameters from the publisher and connects: by TCPROS, or by UDPROS, for which the request is
     sufficient. Before its first TCPROS connection it queries the master for the keep-alive setting, as rospy does.
-    Messages published before are dropped. If the master cannot be reached, no new connection is opened, and existing
-    connections continue.
+    Messages that are published before the connection is open are dropped. If the master cannot be reached, no new
+    connection is opened, and existing connections continue.
 
     An agent keeps its connection to the master, as rospy does, while each request to a publisher has a separate
-    connection. Between hosts with the delay d, and an open connection to the master, registration to first message
-    takes 12 d: 2 for the response of the master, 4 for that of the publisher, 2 for the keep-alive query, 4 for
-    connection and headers. This is the time of rospy 1.15.15 for messages that fill a segment or subscribers that
-    request `tcp_nodelay`; smaller messages wait for an ACK (Nagle), which takes 2 d more.
+    connection. Between hosts with the delay d, and an open connection to the master, the time from registration to
+    first message is 12 d: 2 for the response of the master, 4 for that of the publisher, 2 for the keep-alive query,
+    4 for connection and headers. This is the time of rospy 1.15.15 for messages that fill a segment or subscribers
+    that request `tcp_nodelay`; smaller messages wait for an ACK (Nagle), which takes 2 d more.
 
     Every flow is registered separately, as a topic with one publisher and one subscriber. Other traffic of nodes
     (other parameters, services, `/rosout`) is not modelled.
@@ -92,22 +92,22 @@ class Ros1:
         self._wire.at(max(starts_ns, self._wire.now_ns), agent, call)
 
     def _register_publisher(self, name: str) -> None:
-        def serve() -> CallAnswer:
+        def serve() -> CallResponse:
             self._published.add(name)
             if name in self._subscribed:
                 self._update(name)
-            return CallAnswer(sizes.PUBLISHER_REGISTERED_BYTES, _nothing)
+            return CallResponse(sizes.PUBLISHER_REGISTERED_BYTES, _nothing)
 
         publisher = self._flows[name].publisher
         self._calls.call(publisher, self._master, sizes.REGISTER_PUBLISHER_BYTES, serve, self._options.register)
 
     def _register_subscriber(self, name: str) -> None:
-        def serve() -> CallAnswer:
+        def serve() -> CallResponse:
             self._subscribed.add(name)
             if name not in self._published:
-                return CallAnswer(sizes.SUBSCRIBER_REGISTERED_BYTES, _nothing)
+                return CallResponse(sizes.SUBSCRIBER_REGISTERED_BYTES, _nothing)
             size_bytes = sizes.SUBSCRIBER_REGISTERED_BYTES + sizes.PUBLISHER_BYTES
-            return CallAnswer(size_bytes, partial(self._request_topic, name))
+            return CallResponse(size_bytes, partial(self._request_topic, name))
 
         subscriber = self._flows[name].subscriber
         self._calls.call(subscriber, self._master, sizes.REGISTER_SUBSCRIBER_BYTES, serve, self._options.register)
@@ -115,9 +115,9 @@ class Ros1:
     def _update(self, name: str) -> None:
         """Send the publisher's address to a subscriber, at the master."""
 
-        def serve() -> CallAnswer:
+        def serve() -> CallResponse:
             self._request_topic(name)
-            return CallAnswer(sizes.PUBLISHER_UPDATED_BYTES, _nothing)
+            return CallResponse(sizes.PUBLISHER_UPDATED_BYTES, _nothing)
 
         size_bytes = sizes.PUBLISHER_UPDATE_BYTES + sizes.PUBLISHER_BYTES
         self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
@@ -130,15 +130,15 @@ class Ros1:
         flow, link = self._flows[name], self._links[name]
         udp = flow.protocol == "udpros"
 
-        def serve() -> CallAnswer:
+        def serve() -> CallResponse:
             link.accept()
             if udp:
-                return CallAnswer(sizes.UDPROS_REQUESTED_BYTES, link.connect)
-            return CallAnswer(sizes.TOPIC_REQUESTED_BYTES, partial(self._connect, name))
+                return CallResponse(sizes.UDPROS_REQUESTED_BYTES, link.connect)
+            return CallResponse(sizes.TOPIC_REQUESTED_BYTES, partial(self._connect, name))
 
         size_bytes = sizes.REQUEST_UDPROS_BYTES if udp else sizes.REQUEST_TOPIC_BYTES
         request = self._options.request
-        self._calls.call(flow.subscriber, flow.publisher, size_bytes, serve, request, about=name)
+        self._calls.call(flow.subscriber, flow.publisher, size_bytes, serve, request, topic=name)
 
     def _connect(self, name: str) -> None:
         """Open a connection, at a subscriber; before the first one, query the master for the keep-alive setting."""
@@ -151,8 +151,8 @@ class Ros1:
             self._has_keepalive.add(subscriber)
             link.connect()
 
-        def serve() -> CallAnswer:
-            return CallAnswer(sizes.KEEPALIVE_BYTES, on_keepalive)
+        def serve() -> CallResponse:
+            return CallResponse(sizes.KEEPALIVE_BYTES, on_keepalive)
 
         self._calls.call(subscriber, self._master, sizes.GET_KEEPALIVE_BYTES, serve, self._options.request)
 

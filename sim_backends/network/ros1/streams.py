@@ -56,7 +56,7 @@ class TcpStreams:
             size_bytes: Size of the message.
             on_delivered: Called when the message is complete at the destination.
             on_lost: Called when the connection was given up before that.
-            reverse: True if the message goes to the host that opened the connection.
+            reverse: True if the message is sent to the host that opened the connection.
         """
         source, destination = ends
         if source == destination:
@@ -108,7 +108,7 @@ class TcpStreams:
 
 
 @dataclass(frozen=True, slots=True)
-class CallAnswer:
+class CallResponse:
     """The response to a call.
 
     Attributes:
@@ -150,10 +150,10 @@ class RemoteCalls:
         caller: str,
         callee: str,
         size_bytes: int,
-        serve: Callable[[], CallAnswer],
+        serve: Callable[[], CallResponse],
         retry: CallRetry | None,
         *,
-        about: str = "",
+        topic: str = "",
     ) -> None:
         """Call from one host to another.
 
@@ -164,20 +164,20 @@ class RemoteCalls:
             serve: Executes the call at the callee and returns the response; a call that is repeated may be executed
                 twice.
             retry: Times of retries; None for no retry.
-            about: Topic of the call if it has a separate connection, else empty.
+            topic: Topic of the call if it has a separate connection, else empty.
         """
-        connection = f"xmlrpc {caller} {callee} {about}".rstrip()
+        connection = f"xmlrpc {caller} {callee} {topic}".rstrip()
 
         def on_lost(reason: str) -> None:  # noqa: ARG001 (see Lost)
             if retry is not None:
                 next_retry = CallRetry(min(2 * retry.first_ns, retry.longest_ns), retry.longest_ns)
-                call_again = partial(self.call, caller, callee, size_bytes, serve, next_retry, about=about)
+                call_again = partial(self.call, caller, callee, size_bytes, serve, next_retry, topic=topic)
                 self._wire.at(self._wire.now_ns + retry.first_ns, caller, call_again)
 
         def on_request() -> None:
-            answer = serve()
+            response = serve()
             self._streams.send(
-                (callee, caller), connection, answer.size_bytes, answer.on_received, on_lost, reverse=True
+                (callee, caller), connection, response.size_bytes, response.on_received, on_lost, reverse=True
             )
 
         self._streams.send((caller, callee), connection, size_bytes, on_request, on_lost)

@@ -91,8 +91,8 @@ class NewReno:
     def _increase(self, numerator: int) -> None:
         """Increase the window by `numerator` / window, and keep the fraction of a byte for later."""
         self._credit += numerator
-        more_bytes, self._credit = divmod(self._credit, self.window_bytes)
-        self.window_bytes += more_bytes
+        growth_bytes, self._credit = divmod(self._credit, self.window_bytes)
+        self.window_bytes += growth_bytes
 
     def _reduced_threshold(self, flight_bytes: int) -> int:
         """Return the threshold after a loss (RFC 5681, equation 4)."""
@@ -210,8 +210,8 @@ class Cubic(NewReno):
         # Above the window before the reduction, W_est grows as fast as Reno's window.
         alpha = (1, 1) if self._reno_bytes >= self._cwnd_prior_bytes else _ALPHA
         self._reno_credit += alpha[0] * self._segment_bytes * acked_bytes
-        more_bytes, self._reno_credit = divmod(self._reno_credit, alpha[1] * self.window_bytes)
-        self._reno_bytes += more_bytes
+        growth_bytes, self._reno_credit = divmod(self._reno_credit, alpha[1] * self.window_bytes)
+        self._reno_bytes += growth_bytes
 
     def _reduced_threshold(self, flight_bytes: int) -> int:
         """Return the window multiplied by beta (equation of 4.6)."""

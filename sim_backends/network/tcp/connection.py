@@ -146,7 +146,7 @@ class TcpConnection:
     def _transmit(self, source: str, destination: str, kind: str, segment: Segment) -> None:
         # Draws are keyed by the number of earlier transmissions; an ACK is identified by the segment that it
         # acknowledges.
-        stream = f"{self._name.flow} {self._name.number} {kind} {segment.times}"
+        stream = f"{self._name.flow} {self._name.number} {kind} {segment.earlier_transmissions}"
         identity = stream, segment.number
         body = self._name, segment
         self._wire.transmit(IpPacket(source, destination, "tcp", segment.size_bytes, identity, body))

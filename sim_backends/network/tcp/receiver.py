@@ -117,6 +117,6 @@ class Receiver:
                 sent_ns=self._wire.now_ns,
                 echoes_ns=self._echo_ns,
                 number=self._last_segment.number,
-                times=self._last_segment.times,
+                earlier_transmissions=self._last_segment.earlier_transmissions,
             )
         )

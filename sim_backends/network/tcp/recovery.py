@@ -30,7 +30,7 @@ class RoundTrips:
         self._options = options
         self.smoothed_ns: int | None = None
         self.variation_ns = 0
-        self.timeout_ns = options.first_timeout_ns
+        self.timeout_ns = options.initial_timeout_ns
 
     def sample(self, round_trip_ns: int) -> None:
         """Record a measured round trip; this also cancels the exponential backoff of the timeout."""
@@ -43,12 +43,12 @@ class RoundTrips:
             self.variation_ns = (3 * self.variation_ns + abs(self.smoothed_ns - round_trip_ns)) // 4
             self.smoothed_ns = (7 * self.smoothed_ns + round_trip_ns) // 8
         options = self._options
-        timeout_ns = self.smoothed_ns + max(options.clock_ns, 4 * self.variation_ns)
-        self.timeout_ns = min(max(timeout_ns, options.least_timeout_ns), options.longest_timeout_ns)
+        timeout_ns = self.smoothed_ns + max(options.clock_granularity_ns, 4 * self.variation_ns)
+        self.timeout_ns = min(max(timeout_ns, options.min_timeout_ns), options.max_timeout_ns)
 
     def back_off(self) -> None:
         """Double the timeout (RFC 6298, 5.5)."""
-        self.timeout_ns = min(2 * self.timeout_ns, self._options.longest_timeout_ns)
+        self.timeout_ns = min(2 * self.timeout_ns, self._options.max_timeout_ns)
 
 
 _REORDERING_SHARE = 4
@@ -70,13 +70,13 @@ class RackScoreboard(Scoreboard):
     def send(self, now_ns: int, length: int, number: int) -> SentSegment:
         """Record a new segment and the time of its transmission."""
         segment = super().send(now_ns, length, number)
-        self._transmissions.append((segment, segment.times))
+        self._transmissions.append((segment, segment.transmissions))
         return segment
 
     def send_again(self, now_ns: int, segment: SentSegment) -> None:
         """Record a retransmitted segment and the time of its transmission."""
         super().send_again(now_ns, segment)
-        self._transmissions.append((segment, segment.times))
+        self._transmissions.append((segment, segment.transmissions))
 
     def detect_losses(self, now_ns: int, *, recovering: bool) -> int | None:
         """Mark segments as lost that were sent before one that arrived, and more than the time limit ago.
@@ -86,8 +86,10 @@ class RackScoreboard(Scoreboard):
         limit_ns = self._round_trip_ns + self._reordering_window_ns(recovering=recovering)
         transmissions, undecided, due_ns = self._transmissions, list[tuple[SentSegment, int]](), None
         while transmissions:
-            segment, times = transmissions[0]
-            is_current = segment.copies and segment.times == times and segment.end > self.acknowledged
+            segment, transmission_count = transmissions[0]
+            is_current = (
+                segment.copies and segment.transmissions == transmission_count and segment.end > self.acknowledged
+            )
             if is_current and (segment.sent_ns, segment.end) >= self._latest_delivered:
                 break
             transmissions.popleft()
@@ -96,7 +98,7 @@ class RackScoreboard(Scoreboard):
             if segment.sent_ns + limit_ns <= now_ns:
                 self._mark_lost(segment)
             else:
-                undecided.append((segment, times))
+                undecided.append((segment, transmission_count))
                 due_ns = segment.sent_ns + limit_ns
         transmissions.extendleft(reversed(undecided))
         return due_ns
@@ -107,10 +109,14 @@ class RackScoreboard(Scoreboard):
     def _count_delivered(self, now_ns: int, segment: SentSegment) -> None:
         super()._count_delivered(now_ns, segment)
         round_trip_ns = now_ns - segment.sent_ns
-        if segment.times > 1 and self._min_round_trip_ns is not None and round_trip_ns < self._min_round_trip_ns:
+        if (
+            segment.transmissions > 1
+            and self._min_round_trip_ns is not None
+            and round_trip_ns < self._min_round_trip_ns
+        ):
             # It was an earlier transmission that arrived (RFC 8985, 6.2, step 2).
             return
-        if segment.times == 1:
+        if segment.transmissions == 1:
             self._min_round_trip_ns = min(round_trip_ns, self._min_round_trip_ns or round_trip_ns)
         self._round_trip_ns = round_trip_ns
         self._latest_delivered = max(self._latest_delivered, (segment.sent_ns, segment.end))

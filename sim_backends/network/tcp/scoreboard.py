@@ -24,7 +24,7 @@ class SentSegment:
         end: Sequence number after its last byte.
         number: Its number in the stream, for random draws.
         sent_ns: Time of its last transmission.
-        times: Number of transmissions.
+        transmissions: Number of transmissions.
         copies: Number of transmissions that are assumed to be in flight.
         arrived: True if a SACK reports that it arrived.
         lost: True if it is marked as lost.
@@ -34,7 +34,7 @@ class SentSegment:
     end: int
     number: int
     sent_ns: int
-    times: int = 1
+    transmissions: int = 1
     copies: int = 1
     arrived: bool = False
     lost: bool = False
@@ -85,7 +85,7 @@ class Scoreboard:
     def send_again(self, now_ns: int, segment: SentSegment) -> None:
         """Record a segment that is sent again."""
         segment.sent_ns = now_ns
-        segment.times += 1
+        segment.transmissions += 1
         segment.copies += 1
         self.pipe_bytes += segment.end - segment.first
 
@@ -109,8 +109,8 @@ class Scoreboard:
         for block in sacks:
             first = max(block[0], self.acknowledged)
             if first < block[1]:
-                for new in self._arrived.add(first, block[1]):
-                    self._mark_arrived(now_ns, new)
+                for new_range in self._arrived.add(first, block[1]):
+                    self._mark_arrived(now_ns, new_range)
 
     def detect_losses(self, now_ns: int, *, recovering: bool) -> int | None:  # noqa: ARG002 (see RackScoreboard)
         """Mark segments as lost that three later ones have overtaken.
@@ -148,7 +148,7 @@ class Scoreboard:
         """
         last = max(self._latest_sacked, default=-1) - self._removed_count
         for segment in self._sent[max(self._examined - self._removed_count, self._acked_count) : max(last, 0)]:
-            if not segment.arrived and segment.times == 1:
+            if not segment.arrived and segment.transmissions == 1:
                 return segment
         return None
 

@@ -28,23 +28,23 @@ class Ranges:
         return len(self._firsts)
 
     def add(self, first: int, end: int) -> list[Range]:
-        """Add the numbers from `first` up to, but without, `end`; return the parts that are new, in order."""
+        """Add the numbers from `first` to `end`, exclusive; return the ranges that are new, in order."""
         begin = bisect_left(self._ends, first)
         after = bisect_right(self._firsts, end)
-        new = []
+        new_ranges = []
         position = first
         for known_first, known_end in zip(self._firsts[begin:after], self._ends[begin:after], strict=True):
             if position < known_first:
-                new.append((position, known_first))
+                new_ranges.append((position, known_first))
             position = max(position, known_end)
         if position < end:
-            new.append((position, end))
+            new_ranges.append((position, end))
         if begin < after:
             first = min(first, self._firsts[begin])
             end = max(end, self._ends[after - 1])
         self._firsts[begin:after] = [first]
         self._ends[begin:after] = [end]
-        return new
+        return new_ranges
 
     def containing(self, number: int) -> Range | None:
         """Return the range that contains `number`, or None."""
@@ -84,7 +84,7 @@ class Segment:
         sent_ns: Transmission time: the timestamp's value (TSval).
         echoes_ns: The echoed timestamp (TSecr); None in the first SYN.
         number: Its number in the stream; for an ACK the number of the acknowledged segment.
-        times: Number of earlier transmissions of that segment.
+        earlier_transmissions: Number of earlier transmissions of that segment.
     """
 
     syn: bool
@@ -96,7 +96,7 @@ class Segment:
     sent_ns: int
     echoes_ns: int | None
     number: int
-    times: int
+    earlier_transmissions: int
 
     @property
     def end(self) -> int:

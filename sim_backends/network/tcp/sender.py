@@ -24,7 +24,7 @@ class Sender:
     Losses are detected by RFC 6675, or by RFC 8985 with Linux's congestion control. A loss starts a recovery: the
     window is reduced once; then lost segments are sent again, followed by new data, as far as the rate reduction of
     RFC 6937 allows. After a timeout all segments that have not arrived count as lost, and slow start begins (RFC
-    5681, 3.1). Segments reported by SACK count as arrived for good, because the receiver never discards them.
+    5681, 3.1). Segments reported by SACK count as arrived permanently, because the receiver never discards them.
 
     Args:
         wire: Provides the clock.
@@ -111,7 +111,7 @@ class Sender:
         self._reordering_timer.stop()
 
     def _send_syn(self) -> None:
-        self._emit(0, 0, number=0, times=self._timeouts, syn=True)
+        self._emit(0, 0, number=0, earlier_transmissions=self._timeouts, syn=True)
         self._timer.set(self._wire.now_ns + self.round_trips.timeout_ns)
 
     def _on_syn_ack(self, segment: Segment) -> None:
@@ -125,7 +125,7 @@ class Sender:
             self._receive_window_bytes = segment.window_bytes
             self._sample_round_trip(segment)
         self._echo_ns = segment.sent_ns
-        self._emit(1, 0, number=segment.number, times=segment.times)
+        self._emit(1, 0, number=segment.number, earlier_transmissions=segment.earlier_transmissions)
         self._send()
 
     def _sample_round_trip(self, segment: Segment) -> None:
@@ -269,13 +269,18 @@ class Sender:
 
     def _send_new(self, length: int) -> None:
         segment = self.scoreboard.send(self._wire.now_ns, length, self._stream.number(self.scoreboard.next))
-        self._emit(segment.first, length, number=segment.number, times=0)
+        self._emit(segment.first, length, number=segment.number, earlier_transmissions=0)
         self._record_sent(length)
         if self._timer.due_ns is None:
             self._restart_timer()
 
     def _send_again(self, segment: SentSegment) -> None:
-        self._emit(segment.first, segment.end - segment.first, number=segment.number, times=segment.times)
+        self._emit(
+            segment.first,
+            segment.end - segment.first,
+            number=segment.number,
+            earlier_transmissions=segment.transmissions,
+        )
         self.scoreboard.send_again(self._wire.now_ns, segment)
         self._record_sent(segment.end - segment.first)
         # RFC 6675, 6: each retransmission restarts the timer, so that a long recovery causes no needless timeout.
@@ -293,7 +298,7 @@ class Sender:
         else:
             self._timer.stop()
 
-    def _emit(self, first: int, length: int, *, number: int, times: int, syn: bool = False) -> None:
+    def _emit(self, first: int, length: int, *, number: int, earlier_transmissions: int, syn: bool = False) -> None:
         acknowledges = None if syn else 1
         self._transmit(
             Segment(
@@ -306,6 +311,6 @@ class Sender:
                 sent_ns=self._wire.now_ns,
                 echoes_ns=self._echo_ns,
                 number=number,
-                times=times,
+                earlier_transmissions=earlier_transmissions,
             )
         )

@@ -26,10 +26,10 @@ class TcpOptions:
         congestion: Congestion control and loss recovery; `cubic` is Linux's default.
         receive_window_bytes: Bytes that a receiver can buffer while earlier data is missing. 3 MiB is the limit of
             Linux's autotuning: half of the maximum of 6 MiB in `tcp_rmem`, by `tcp_adv_win_scale`.
-        least_timeout_ns: Minimum retransmission timeout: 200 ms in Linux, 1 s in RFC 6298.
-        longest_timeout_ns: Maximum retransmission timeout (Linux: TCP_RTO_MAX).
-        first_timeout_ns: Timeout before the first round trip was measured (RFC 6298, 2.1).
-        clock_ns: Clock granularity G of RFC 6298: the minimum of the variance term of a timeout.
+        min_timeout_ns: Minimum retransmission timeout: 200 ms in Linux, 1 s in RFC 6298.
+        max_timeout_ns: Maximum retransmission timeout (Linux: TCP_RTO_MAX).
+        initial_timeout_ns: Timeout before the first round trip was measured (RFC 6298, 2.1).
+        clock_granularity_ns: Clock granularity G of RFC 6298: the minimum of the variance term of a timeout.
         syn_retries: Maximum number of SYN retransmissions (Linux: tcp_syn_retries).
         retries: Maximum number of consecutive retransmission timeouts without progress before the connection is given
             up (Linux: tcp_retries2).
@@ -43,17 +43,17 @@ class TcpOptions:
             acknowledged bytes, as in Linux. RFC 5681 has 1, RFC 3465 up to 2.
 
     Raises:
-        ConfigurationError: A value with which no connection could work.
+        ConfigurationError: With one of the values no connection can work.
     """
 
     mtu_bytes: int = 1500
     initial_window_segments: int = 10
     congestion: Congestion = "cubic"
     receive_window_bytes: int = 3 << 20
-    least_timeout_ns: int = 200 * _MS
-    longest_timeout_ns: int = 120 * _SECOND
-    first_timeout_ns: int = _SECOND
-    clock_ns: int = _MS
+    min_timeout_ns: int = 200 * _MS
+    max_timeout_ns: int = 120 * _SECOND
+    initial_timeout_ns: int = _SECOND
+    clock_granularity_ns: int = _MS
     syn_retries: int = 6
     retries: int = 15
     delayed_ack_ns: int = 40 * _MS
@@ -68,10 +68,10 @@ class TcpOptions:
             "mtu_bytes": 576,
             "initial_window_segments": 1,
             "receive_window_bytes": self.segment_bytes,
-            "least_timeout_ns": 1,
-            "longest_timeout_ns": max(self.least_timeout_ns, self.first_timeout_ns),
-            "first_timeout_ns": 1,
-            "clock_ns": 1,
+            "min_timeout_ns": 1,
+            "max_timeout_ns": max(self.min_timeout_ns, self.initial_timeout_ns),
+            "initial_timeout_ns": 1,
+            "clock_granularity_ns": 1,
             "syn_retries": 0,
             "retries": 0,
             "delayed_ack_ns": 0,

@@ -24,14 +24,14 @@ SPDP_BYTES: Final = 436
 """Size of an announcement with the IP header: INFO_DST, INFO_TS, and DATA of 360 bytes."""
 _BUILTIN_TOPICS: Final = 5
 """Number of built-in topics with heartbeats and acknowledgements in a message: two kinds of endpoints, liveliness,
-and look-up of types.
+and type lookup.
 """
 _LIVELINESS_BYTES: Final = 28
 _WRITER_BYTES: Final = 200
 _READER_BYTES: Final = 212
 """Sizes of the SEDP data of a writer and of a reader, without the names of topic and type."""
-_DIRECTED: Final = 4
-_LEASE: Final = "the subscriber's lease ran out"
+_DIRECTED_RESPONSES: Final = 4
+_LEASE_EXPIRED: Final = "the subscriber's lease ran out"
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,14 @@ class DiscoveryTiming:
 
     Attributes:
         lease_ns: Time without messages after which a participant is removed.
-        second_ns: Time from a participant's first announcement to its second.
+        second_announcement_ns: Time from a participant's first announcement to its second.
         period_ns: Interval of later announcements; in CycloneDDS the lease minus 2 s.
         directed_ns: Interval of the four responses to the announcement of a new participant.
         starts_ns: Start times of participants, by name; others start at 0.
     """
 
     lease_ns: int = 10 * SECOND
-    second_ns: int = 100 * MS
+    second_announcement_ns: int = 100 * MS
     period_ns: int = 8 * SECOND
     directed_ns: int = SECOND
     starts_ns: Mapping[str, int] = field(default_factory=dict)
@@ -98,7 +98,7 @@ class TopicDiscovery:
         flows: All flows, by name.
         sessions: Their sessions, by the same names; sessions of the discovery's built-in topics are added.
         timing: Times of the protocol.
-        times: Times of the discovery.
+        discovery_timing: Times of the discovery.
     """
 
     def __init__(
@@ -107,21 +107,21 @@ class TopicDiscovery:
         flows: Mapping[str, TopicFlow],
         sessions: dict[str, TopicSession],
         timing: RtpsTiming,
-        times: DiscoveryTiming,
+        discovery_timing: DiscoveryTiming,
     ) -> None:
         self._wire = wire
         self._flows = dict(sorted(flows.items()))
         self._sessions = sessions
         self._user_sessions = dict(sessions)
         self._timing = timing
-        self._times = times
+        self._discovery_timing = discovery_timing
         self._remotes: dict[tuple[str, str], _Remote] = {}
         self._announcement_counts: dict[tuple[str, str], int] = {}
         self._collected_heartbeats: dict[str, dict[str, Heartbeat]] = {}
         self._shared_counts: dict[str, int] = {}
         self._participants = sorted({end for flow in flows.values() for end in (flow.publisher, flow.subscriber)})
         for participant in self._participants:
-            starts_ns = max(times.starts_ns.get(participant, 0), wire.now_ns)
+            starts_ns = max(discovery_timing.starts_ns.get(participant, 0), wire.now_ns)
             wire.at(starts_ns, participant, partial(self._start, participant))
 
     def renew_lease(self, host: str, peer: str) -> None:
@@ -138,7 +138,7 @@ class TopicDiscovery:
             self._sedp_session(peer, host).reader.on_message(heartbeat)
 
     def _on_announcement(self, host: str, peer: str, *, directed: bool) -> None:
-        if self._wire.now_ns < self._times.starts_ns.get(host, 0) or host not in self._participants:
+        if self._wire.now_ns < self._discovery_timing.starts_ns.get(host, 0) or host not in self._participants:
             return
         remote = self._remotes.get((host, peer))
         if remote is None:
@@ -149,16 +149,18 @@ class TopicDiscovery:
             return
         remote.alive = True
         remote.renewed_ns = self._wire.now_ns
-        remote.lease.bring_forward(self._wire.now_ns + self._times.lease_ns)
+        remote.lease.bring_forward(self._wire.now_ns + self._discovery_timing.lease_ns)
         if not directed:
-            self._respond(host, peer, _DIRECTED)
+            self._respond(host, peer, _DIRECTED_RESPONSES)
         self._start_sedp(host, peer)
 
     def _start(self, participant: str) -> None:
-        now_ns, times = self._wire.now_ns, self._times
+        now_ns, timing = self._wire.now_ns, self._discovery_timing
         self._announce(participant)
-        self._wire.at(now_ns + times.second_ns, participant, partial(self._announce, participant))
-        self._wire.at(now_ns + times.second_ns + times.period_ns, participant, partial(self._repeat, participant))
+        self._wire.at(now_ns + timing.second_announcement_ns, participant, partial(self._announce, participant))
+        self._wire.at(
+            now_ns + timing.second_announcement_ns + timing.period_ns, participant, partial(self._repeat, participant)
+        )
 
     def _repeat(self, participant: str) -> None:
         """Announce a participant and assert its liveliness periodically."""
@@ -167,7 +169,9 @@ class TopicDiscovery:
             if (remote := self._remotes.get((participant, peer))) is not None and remote.alive:
                 writer = self._sedp_session(participant, peer).writer
                 writer.write(Sample(_LIVELINESS_BYTES, writer.last + 1))
-        self._wire.at(self._wire.now_ns + self._times.period_ns, participant, partial(self._repeat, participant))
+        self._wire.at(
+            self._wire.now_ns + self._discovery_timing.period_ns, participant, partial(self._repeat, participant)
+        )
 
     def _announce(self, participant: str, peer: str = "") -> None:
         """Announce a participant to all participants, or to one peer."""
@@ -178,11 +182,11 @@ class TopicDiscovery:
         body = Announcement(directed=bool(peer))
         self._wire.transmit(IpPacket(participant, peer or None, TRANSPORT, SPDP_BYTES, key, body))
 
-    def _respond(self, host: str, peer: str, times: int) -> None:
-        if times and self._remotes[host, peer].alive:
+    def _respond(self, host: str, peer: str, count: int) -> None:
+        if count and self._remotes[host, peer].alive:
             self._announce(host, peer)
-            next_ns = self._wire.now_ns + self._times.directed_ns
-            self._wire.at(next_ns, host, partial(self._respond, host, peer, times - 1))
+            next_ns = self._wire.now_ns + self._discovery_timing.directed_ns
+            self._wire.at(next_ns, host, partial(self._respond, host, peer, count - 1))
 
     def _start_sedp(self, host: str, peer: str) -> None:
         """Start to send the endpoints of `host` to `peer`, and to receive the peer's endpoints."""
@@ -246,16 +250,16 @@ class TopicDiscovery:
 
     def _check_lease(self, host: str, peer: str) -> None:
         remote = self._remotes[host, peer]
-        expires_ns = remote.renewed_ns + self._times.lease_ns
+        expires_ns = remote.renewed_ns + self._discovery_timing.lease_ns
         if self._wire.now_ns < expires_ns:
             remote.lease.bring_forward(expires_ns)
             return
         remote.alive = False
-        self._sedp_session(host, peer).writer.remove_reader(_LEASE)
+        self._sedp_session(host, peer).writer.remove_reader(_LEASE_EXPIRED)
         self._sedp_session(peer, host).unmatch_reader()
         for name, flow in self._flows.items():
             if (flow.publisher, flow.subscriber) == (host, peer):
-                self._user_sessions[name].writer.remove_reader(_LEASE)
+                self._user_sessions[name].writer.remove_reader(_LEASE_EXPIRED)
             elif (flow.subscriber, flow.publisher) == (host, peer):
                 self._user_sessions[name].unmatch_reader()
 

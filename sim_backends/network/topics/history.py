@@ -29,7 +29,7 @@ class WriterHistory:
         self._depth = qos.depth if qos.history == "keep_last" else None
         self._low_bytes = timing.low_bytes
         self._high_bytes = timing.high_bytes
-        self._most_high_bytes = timing.most_high_bytes
+        self._max_high_bytes = timing.max_high_bytes
         self._grew_ns = 0
         self._resending = False
         self.samples: dict[int, Sample] = {}
@@ -71,7 +71,7 @@ class WriterHistory:
         """Return True if a writer may write now; raise the high watermark if it prevents that."""
         if self._depth is not None or self.unacknowledged_bytes <= self._high_bytes:
             return True
-        headroom_bytes = self._most_high_bytes - self._high_bytes
+        headroom_bytes = self._max_high_bytes - self._high_bytes
         if not self._resending and headroom_bytes > 0 and now_ns >= self._grew_ns + _GROWTH_PAUSE_NS:
             self._high_bytes += headroom_bytes // 32 or headroom_bytes
             self._grew_ns = now_ns

@@ -71,37 +71,37 @@ class RtpsTiming:
     Attributes:
         fragment_bytes: Size of a sample's fragments (`FragmentSize`); a message contains an integer number of them.
         message_bytes: Maximum size of a message of new data (`MaxMessageSize`).
-        answer_bytes: Maximum size of a message of retransmitted data (`MaxRexmitMessageSize`).
+        retransmit_bytes: Maximum size of a message of retransmitted data (`MaxRexmitMessageSize`).
         heartbeat_ns: Time from the last write to a separate heartbeat, and interval of these (`HeartbeatInterval`).
         first_heartbeat_ns: Time from matching a reader to the first heartbeat.
         heartbeat_min_ns: Minimum heartbeat interval, used while much data is unacknowledged.
         heartbeat_max_ns: Maximum heartbeat interval, reached if the reader does not respond.
-        heartbeat_ask_ns: Minimum interval of heartbeats that require a response while much data is unacknowledged.
+        ack_request_min_ns: Minimum interval of heartbeats that require a response while much data is unacknowledged.
         heartbeat_response_ns: Time from a heartbeat to its response (Fast DDS 5 ms).
         nack_delay_ns: Minimum interval of two requests for the same data (`NackDelay`).
         ack_delay_ns: Minimum interval of two acknowledgements of the same data (`AckDelay`).
         nack_repeat_ns: Time from a request to the next if no heartbeat arrives (`AutoReschedNackDelay`).
-        begin_ns: Time from matching a writer to the reader's first ACKNACK (`PreEmptiveAckDelay`).
-        begin_repeat_ns: Initial interval of its repetitions.
+        first_acknack_ns: Time from matching a writer to the reader's first ACKNACK (`PreEmptiveAckDelay`).
+        first_acknack_repeat_ns: Initial interval of its repetitions.
         low_bytes: Low watermark: unacknowledged data below which a blocked writer resumes (`WhcLow`).
         high_bytes: Initial high watermark, above which a writer blocks (`WhcHighInit`).
-        most_high_bytes: Maximum high watermark, reached while nothing is lost (`WhcHigh`).
+        max_high_bytes: Maximum high watermark, reached while nothing is lost (`WhcHigh`).
     """
 
     fragment_bytes: int = 1344
     message_bytes: int = 14_720
-    answer_bytes: int = 1456
+    retransmit_bytes: int = 1456
     heartbeat_ns: int = 100 * MS
     first_heartbeat_ns: int = MS
     heartbeat_min_ns: int = 20 * MS
     heartbeat_max_ns: int = 8 * SECOND
-    heartbeat_ask_ns: int = 5 * MS
+    ack_request_min_ns: int = 5 * MS
     heartbeat_response_ns: int = 0
     nack_delay_ns: int = 100 * MS
     ack_delay_ns: int = 10 * MS
     nack_repeat_ns: int = 3 * SECOND
-    begin_ns: int = 10 * MS
-    begin_repeat_ns: int = SECOND
+    first_acknack_ns: int = 10 * MS
+    first_acknack_repeat_ns: int = SECOND
     low_bytes: int = 1024
     high_bytes: int = 30_720
-    most_high_bytes: int = 512_000
+    max_high_bytes: int = 512_000

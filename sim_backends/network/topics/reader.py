@@ -110,7 +110,7 @@ class TopicReader:
         self._heartbeat_seen = not request_heartbeat
         self._matched_ns = self._wire.now_ns
         if self._reliable and request_heartbeat:
-            self._response_timer.bring_forward(self._wire.now_ns + self._timing.begin_ns)
+            self._response_timer.bring_forward(self._wire.now_ns + self._timing.first_acknack_ns)
 
     def remove_writer(self) -> list[Sample]:
         """Remove the writer; return the complete samples that were waiting for an earlier one.
@@ -171,7 +171,7 @@ class TopicReader:
             self._response_timer.bring_forward(self._requested_ns + self._timing.nack_delay_ns)
 
     def _skip(self, first: int, end: int) -> None:
-        """Stop waiting for samples from `first` up to, but without, `end`."""
+        """Stop waiting for samples from `first` to `end`, exclusive."""
         if first > self._next:
             return
         for number in [number for number in self._fragments if number < end]:
@@ -264,7 +264,7 @@ class TopicReader:
         """Send an ACKNACK that requests a heartbeat, and repeat it until a heartbeat arrives."""
         age_ns = self._wire.now_ns - self._matched_ns
         factor = next((factor for until_ns, factor in _INITIAL_BACKOFF if age_ns <= until_ns), 10)
-        self._response_timer.bring_forward(self._wire.now_ns + factor * self._timing.begin_repeat_ns)
+        self._response_timer.bring_forward(self._wire.now_ns + factor * self._timing.first_acknack_repeat_ns)
         # CycloneDDS sends the count 0, for which its writers have an exception; a normal count needs none.
         acknack = AckNack(self._next, (), self._next_count(), final=False)
         self._transmit((acknack,), ("acknack", self._response_count))

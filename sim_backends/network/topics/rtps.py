@@ -32,7 +32,7 @@ class Sample:
         times_sent: Number of transmissions of each fragment.
         in_flight: Number of messages with a part of it that have neither arrived nor been lost.
         held: True if its reader has it complete, possibly waiting for an earlier one.
-        given_up: Reason for which its writer will not send it again; empty while it may.
+        given_up: Reason why its writer will not send it again; empty while the writer may send it.
         settled: True if it was delivered or dropped.
         endpoint_flow: For a sample of the discovery, the flow whose endpoint it describes.
     """
@@ -106,7 +106,7 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class AckNack:
-    """ACKNACK: the samples that a reader has, and those that it misses (8.3.8.1).
+    """ACKNACK: the samples that a reader has, and those that it lacks (8.3.8.1).
 
     Attributes:
         base: It has all samples before this one.
@@ -128,7 +128,7 @@ class AckNack:
 
 @dataclass(frozen=True, slots=True)
 class NackFrag:
-    """NACK_FRAG: the fragments of a sample that a reader misses (8.3.8.11).
+    """NACK_FRAG: the fragments of a sample that a reader lacks (8.3.8.11).
 
     Attributes:
         number: Number of the sample.

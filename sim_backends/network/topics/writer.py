@@ -216,7 +216,7 @@ class TopicWriter:
         """Return True if so much data is unacknowledged that a response is required now."""
         return (
             self._history.fill_level > 0
-            and self._wire.now_ns >= self._ack_requested_ns + self._timing.heartbeat_ask_ns
+            and self._wire.now_ns >= self._ack_requested_ns + self._timing.ack_request_min_ns
         )
 
     def _reset_heartbeat_rate(self) -> None:
@@ -231,7 +231,7 @@ class TopicWriter:
         for number in nack.missing:
             sample = self._history.samples.get(number)
             if sample is not None:
-                # The reader requests the other fragments of a larger sample when it knows their number.
+                # The reader requests the other fragments of a larger sample when it has received their number.
                 submessages.append(self._data(sample, 0, 1))
         self._respond(submessages)
 
@@ -249,7 +249,7 @@ class TopicWriter:
             self._history.on_resend()
         message: tuple[Submessage, ...] = ()
         for submessage in (*submessages, self._new_heartbeat(final=False, directed=True)):
-            if message and ip_bytes((*message, submessage)) > self._timing.answer_bytes:
+            if message and ip_bytes((*message, submessage)) > self._timing.retransmit_bytes:
                 self._transmit(message, self._key_of(message))
                 message = ()
             message += (submessage,)

@@ -206,7 +206,7 @@ class Answers:
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (Answers([Arrival(2, "b", 2 * MS)]), "reported the fate of packet 2, which it never got"),
+        (Answers([Arrival(2, "b", 2 * MS)]), "reported the fate of packet 2, which never entered it"),
         (Answers([Arrival(1, "b", 2 * MS)] * 2), "packet 1, which was reported before"),
         (Answers([Arrival(1, "b", 2 * MS)], [Drop(1, "lost")]), "packet 1, which was reported before"),
         (Answers([Arrival(1, "a", 2 * MS)]), "delivered packet 1 for b to a"),

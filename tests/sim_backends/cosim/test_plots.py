@@ -6,7 +6,7 @@ import re
 import pytest
 
 from fieldkit.report.theme import FORMATS, Format
-from sim_backends.cosim.plot_layout import Curve, FlowTrace, LogPanel, ObstacleOutline, last_heading, outlines
+from sim_backends.cosim.plot_layout import Curve, FlowTrace, LogPanel, ObstacleOutline, direction_arrow, outlines
 from sim_backends.cosim.plots import log_figure, run_figure
 from sim_backends.world.world import load_world
 
@@ -67,9 +67,9 @@ def test_obstacles_are_drawn_and_paths_have_an_arrow() -> None:
 
 def test_arrows_have_the_last_direction_of_travel() -> None:
     there_and_back = [(0.0, 0.0), (0.0, 5.0), (0.0, 10.0), (0.0, 9.0), (0.0, 6.0)]
-    assert last_heading(there_and_back) == ((0.0, 9.0), (0.0, 6.0))
-    assert last_heading([*there_and_back, (0.0, 6.0)]) == ((0.0, 9.0), (0.0, 6.0)), "it does not move at the end"
-    assert last_heading([(1.0, 1.0)]) is last_heading([(1.0, 1.0)] * 3) is None
+    assert direction_arrow(there_and_back) == ((0.0, 9.0), (0.0, 6.0))
+    assert direction_arrow([*there_and_back, (0.0, 6.0)]) == ((0.0, 9.0), (0.0, 6.0)), "it does not move at the end"
+    assert direction_arrow([(1.0, 1.0)]) is direction_arrow([(1.0, 1.0)] * 3) is None
 
 
 def test_the_park_has_light_outlines_below_roofs_and_dark_ones_of_boxes() -> None:

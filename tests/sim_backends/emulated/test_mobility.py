@@ -265,7 +265,7 @@ def test_a_driving_robot_stays_on_the_ground_and_a_silent_one_stops(medium: Reco
 
 def test_lasers_detect_robots_in_place_and_not_those_out_of_range(medium: RecordingMedium) -> None:
     shown: list[Mapping[str, Vector]] = []
-    mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, show=shown.append)
+    mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, write_positions=shown.append)
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
     assert shown[-1] == medium.calls[-1][0]
     mobility.set_out_of_range(Role.RELAY)  # no radio reaches another one, but the others are where they were

@@ -318,7 +318,7 @@ def test_the_built_in_ros_stays_off_the_air() -> None:
 def test_a_router_outside_the_cast_is_rejected() -> None:
     robots = {role: robot for role, robot in cast(sender="zenoh").items() if role is not Role.RELAY}
     with pytest.raises(
-        ConfigurationError, match=r"emulated\.ros2\.router is duckiedrone-1, which does not take part"
+        ConfigurationError, match=r"emulated\.ros2\.router is duckiedrone-1, which is not in this trial"
     ):
         specs(robots, ROUTER)
 
@@ -326,8 +326,8 @@ def test_a_router_outside_the_cast_is_rejected() -> None:
 @pytest.mark.parametrize(
     ("ros2", "message"),
     [
-        ("{discovery: router}", "go together"),
-        ("{router: duckiedrone-1}", "go together"),
+        ("{discovery: router}", "require each other"),
+        ("{router: duckiedrone-1}", "require each other"),
         ("{discovery: router, router: drone}", "emulated.ros2.router names 'drone', which the lab does not have"),
         ("{discovery: magic}", "emulated.ros2.discovery"),
     ],

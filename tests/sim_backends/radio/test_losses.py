@@ -101,7 +101,7 @@ def losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
 def test_exhausted_retries_are_reported_at_the_sender_and_the_relay() -> None:
     for unheard_link, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
         wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[unheard_link]), 1)
-        wifi.relay("r")
+        wifi.set_relay("r")
         lost = losses(wifi)
         wifi.send(0, "a", 1, 100, "b")
         assert wifi.deliveries(10**9) == []

@@ -129,7 +129,7 @@ def test_the_parts_add_up_to_the_time_from_sending_to_arrival(
 @pytest.mark.parametrize("destination", ["b", None])
 def test_the_delay_includes_an_earlier_delay(relay: str | None, destination: str | None) -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("abr", G_MODES[-1]), 1)
-    wifi.relay(relay)
+    wifi.set_relay(relay)
     fixed = engine(LinkParameters(delay_ns=MS), relay)
     for model in (wifi, fixed):
         model.send(0, "a", 0, 1000, destination, before=PACKET + 7 * PROCESSING_NS)

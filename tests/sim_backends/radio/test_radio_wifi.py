@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from sim_backends.radio.contention import BLIND_NS
+from sim_backends.radio.contention import CCA_TIME_NS
 from sim_backends.radio.frames import HEADER_BYTES, TransmissionAttempt
 from sim_backends.radio.links import (
     Delivery,
@@ -121,7 +121,7 @@ def test_a_broadcast_is_sent_once_at_the_basic_rate_without_ack() -> None:
 
 def test_a_broadcast_through_an_access_point_reaches_each_station_once() -> None:
     wifi: Wifi[bytes] = Wifi(FixedPowers("abr", G54), 1)
-    wifi.relay("r")
+    wifi.set_relay("r")
     wifi.send(0, "a", b"hello", 100, None)
     assert sorted(name for _, name, _, _, _ in wifi.deliveries(10**9)) == ["b", "r"]
 
@@ -273,13 +273,13 @@ def test_no_station_starts_while_it_detects_a_frame(seed: int, deaf: set[tuple[i
             if second.start_ns >= first.end_ns:
                 break
             if (first.transmitter, second.transmitter) not in hidden:
-                assert second.start_ns - first.start_ns <= BLIND_NS
+                assert second.start_ns - first.start_ns <= CCA_TIME_NS
 
 
 @pytest.mark.parametrize("relay", [None, "r"])
 def test_the_parts_of_the_delay_add_up_to_the_elapsed_time(relay: str | None) -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("abr", G54), 1)
-    wifi.relay(relay)
+    wifi.set_relay(relay)
     for number in range(100):
         wifi.send(number * 1000, "a", number * 1000, 1000, "b")
     arrived = wifi.deliveries(10**9)
@@ -315,7 +315,7 @@ def test_a_missing_packet_does_not_change_the_others(missing: set[int], relayed:
         log: list[TransmissionAttempt] = []
         wifi: Wifi[int] = Wifi(channel, 1)
         wifi.log_attempts(log.append)
-        wifi.relay("r" if relayed else None)
+        wifi.set_relay("r" if relayed else None)
         for number in numbers:
             wifi.send(number * 100_000_000, "a", number, 1000, "b", packet=(f"flow {number % 3}", number // 3))
         wifi.deliveries(10**12)

@@ -38,7 +38,9 @@ def test_the_result_of_a_flow_follows_from_its_packets() -> None:
     assert (flow.sent, flow.arrived, flow.under_way, flow.sent_bytes, flow.arrived_bytes) == (4, 3, 1, 400, 300)
     assert flow.loss == pytest.approx(0.25)
     delay_s = flow.delay_s
-    assert (delay_s.least, delay_s.median, delay_s.mean, delay_s.most) == pytest.approx((0.001, 0.002, 0.002, 0.003))
+    assert (delay_s.minimum, delay_s.median, delay_s.mean, delay_s.maximum) == pytest.approx(
+        (0.001, 0.002, 0.002, 0.003)
+    )
     assert flow.added_s == pytest.approx(0.007), "2 ms before the network, 5 ms after it"
     assert flow.first_to_last_s == pytest.approx(0.031)
     assert flow.distances_m == pytest.approx((4.0, 4.0, 4.06, 4.12))
@@ -79,7 +81,7 @@ def test_a_round_trip_is_the_time_in_the_network_and_counts_when_it_is_decided()
     assert trips is not None
     assert (trips.sent, trips.answered) == (4, 2)
     spread_s = trips.network_s
-    assert (spread_s.least, spread_s.mean, spread_s.most) == pytest.approx((0.004, 0.0055, 0.007))
+    assert (spread_s.minimum, spread_s.mean, spread_s.maximum) == pytest.approx((0.004, 0.0055, 0.007))
     assert trips.jitter_s == pytest.approx(0.003)
     assert reply_flow.round_trips is None
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.cosim.commands.sheets import FORMS, Sheet, SheetColumn, SheetPart, number
+from sim_backends.cosim.commands.sheets import FORMS, Sheet, SheetColumn, SheetPart, number_text
 
 SHEET = Sheet(
     (
@@ -51,4 +51,4 @@ def test_a_table_without_rows_is_not_an_error(capsys: pytest.CaptureFixture[str]
 
 @given(st.floats(allow_nan=False, allow_infinity=False, width=32))
 def test_a_number_is_rounded_to_three_digits(value: float) -> None:
-    assert float(number(value).replace(",", "")) == pytest.approx(value, rel=0.005)
+    assert float(number_text(value).replace(",", "")) == pytest.approx(value, rel=0.005)

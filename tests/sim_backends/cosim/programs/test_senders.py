@@ -15,8 +15,8 @@ from sim_backends.cosim.programs.senders import (
     Periodic,
     PingRequest,
     Playback,
-    pieces,
-    recorded,
+    file_pieces,
+    generated_bag,
 )
 from sim_backends.cosim.programs.wrappers import CombinedProgram, Outage
 from sim_backends.cosim.scenario.agent_plans import BagTraffic
@@ -40,7 +40,7 @@ def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
 def test_a_recorded_bag_has_the_length_of_its_rate_and_delays_up_to_its_jitter(
     jitter_ns: int, rate_hz: float, seed: int
 ) -> None:
-    bag = recorded(
+    bag = generated_bag(
         RandomStream(seed, "bag"), length_ns=500 * MS, rate_hz=rate_hz, size_bytes=320, jitter_ns=jitter_ns
     )
     assert len(bag) == round(0.5 * rate_hz)
@@ -87,7 +87,7 @@ def test_playback_sends_each_message_at_its_time() -> None:
 
 @given(st.integers(1, 10**6), st.integers(500, 65_000))
 def test_a_file_in_pieces_is_complete(size_bytes: int, piece_bytes: int) -> None:
-    sizes = [piece.size_bytes for piece in pieces(size_bytes, piece_bytes)]
+    sizes = [piece.size_bytes for piece in file_pieces(size_bytes, piece_bytes)]
     assert sum(sizes) == size_bytes
     assert set(sizes[:-1]) <= {piece_bytes}
     assert 0 < sizes[-1] <= piece_bytes

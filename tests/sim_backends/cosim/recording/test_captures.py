@@ -201,7 +201,7 @@ def test_sequence_numbers_wrap_as_on_the_wire() -> None:
         sent_ns=(2**32 + 3) * MS,
         echoes_ns=(2**32 + 4) * MS,
         number=0,
-        times=0,
+        earlier_transmissions=0,
     )
     body = ConnectionName("alpha", "bravo", "stream", 0), segment
     packet = IpPacket("alpha", "bravo", "tcp", segment.size_bytes, ("stream", 0), body)

@@ -9,7 +9,7 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.scenario import checks
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
-from sim_backends.physics import known
+from sim_backends.physics import robot_limits
 from sim_backends.physics.differential_drive import HUSKY_A200
 
 SCENARIO = """\
@@ -84,7 +84,7 @@ WRONG = [
     ("from: one, to: two", "from: one, to: tow", 18, "no agent 'tow'; did you mean 'two'"),
     ("from: one, to: two", "from: one, to: one", 18, "one sends to itself"),
     ("from: one, to: two", "from: one, to: []", 18, "at least 1 item"),
-    ("from: one, to: two", "from: one, to: [two, two]", 18, "named twice"),
+    ("from: one, to: two", "from: one, to: [two, two]", 18, "listed twice"),
     ("to: [one]", "to: [three]", 16, "three sends, receives or relays and has no radio"),
     ("to: two, rate", "to: two, protocol: dds, rate", 18, "'udp', 'tcp', 'topic', 'ros1' or 'ros1-udp'"),
     ("to: two, rate", "to: two, protocol: ros1, rate", 18, "ros1 needs a master: name its host by relay: AGENT"),
@@ -112,7 +112,7 @@ WRONG = [
 @pytest.fixture(autouse=True)
 def _a_body_without_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
     """Add a body without a profile; every shipped body has a profile, and with it a radio."""
-    monkeypatch.setitem(known.BODIES, "cart", HUSKY_A200)
+    monkeypatch.setitem(robot_limits.BODIES, "cart", HUSKY_A200)
 
 
 def refused(text: str, folder: Path) -> ConfigurationError:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean, repeats_needed, student
+from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean, repeats_needed, t_quantile
 
 
 def normal(*shape: int) -> Floats:
@@ -15,7 +15,7 @@ def normal(*shape: int) -> Floats:
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 4, 7, 19, 20, 99, 1000])
 def test_students_quantile_equals_scipys(degrees: int) -> None:
-    assert student(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-9)
+    assert t_quantile(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-9)
 
 
 def test_a_mean_has_students_interval_and_a_single_value_has_none() -> None:

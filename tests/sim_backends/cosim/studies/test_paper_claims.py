@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fieldkit.core.model import Scenario as Sight
-from sim_backends.cosim.studies.intervals import student
+from sim_backends.cosim.studies.intervals import t_quantile
 from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims, delay_change
-from sim_backends.cosim.studies.paper_setups import FlowSample, the_flow
+from sim_backends.cosim.studies.paper_setups import FlowSample, only_flow
 from sim_backends.cosim.studies.paper_tables import Agreement
 
 NAN = math.nan
@@ -20,7 +20,7 @@ def claims_of(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -
     samples = {}
     for name, setup in SETUPS.items():
         system = name.partition(",")[0]
-        flow = the_flow(setup)
+        flow = only_flow(setup)
         samples[name] = [
             {flow: FlowSample(100, count, count * delay_s if count else NAN, {})}
             for delay_s, count in zip(delays_s[system], arrived[system], strict=True)
@@ -37,8 +37,8 @@ def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:
     assert rows == 2
     # Without either seed the factors are 1.5 and 8, or 0.5 and 2, whose mean logarithms are log(12) / 2 and 0.
     error = math.log(12) / 4
-    assert change.low == pytest.approx(math.expm1(math.log(2) - student(1) * error))
-    assert change.high == pytest.approx(math.expm1(math.log(2) + student(1) * error))
+    assert change.low == pytest.approx(math.expm1(math.log(2) - t_quantile(1) * error))
+    assert change.high == pytest.approx(math.expm1(math.log(2) + t_quantile(1) * error))
 
 
 def test_only_rows_and_seeds_count_in_which_packets_arrived_in_both_systems() -> None:

@@ -20,7 +20,7 @@ from sim_backends.cosim.studies.paper_setups import (
     master_based,
     masterless,
     mesh,
-    the_flow,
+    only_flow,
 )
 from sim_backends.cosim.studies.paper_tables import DISTANCES_M, TABLES, Agreement, Printed, agreement, paper_table
 
@@ -110,7 +110,7 @@ def test_windows_change_by_the_amounts_that_the_paper_states() -> None:
 
 def test_samples_count_the_packets_of_a_run() -> None:
     setup = masterless(Sight.LOS, 20, SHORT)
-    flow = the_flow(setup)
+    flow = only_flow(setup)
     run = build(setup.scenario, policy=setup.policy, seed=2).run()
     fates = [fate for (name, _), fate in run.fates.items() if name == flow]
     delays_s = [(fate.counted_ns - fate.packet.sent_ns) / 1e9 for fate in fates if fate.counted_ns is not None]
@@ -145,11 +145,11 @@ def test_the_delays_of_pings_are_round_trips() -> None:
 
 def test_a_row_has_the_mean_over_seeds_and_the_printed_number() -> None:
     study = paper_table("1", SHORT)
-    flow = the_flow(study.setups["los 40 m topic"])
+    flow = only_flow(study.setups["los 40 m topic"])
     some = FlowSample(500, 490, 0.1, {"pushed out": 6, UNDER_WAY: 4})
     none = FlowSample(500, 0, math.nan, {"not matched yet": 500})
     seeds = [some, replace(some, delay_sum_s=0.3), none]
-    samples = {name: [{the_flow(setup): sample} for sample in seeds] for name, setup in study.setups.items()}
+    samples = {name: [{only_flow(setup): sample} for sample in seeds] for name, setup in study.setups.items()}
     row = study.rows(samples)[1]
     assert row.labels == {"line": "los", "distance_m": 40, "protocol": "topic"}
     assert row.delay.seeds == 2

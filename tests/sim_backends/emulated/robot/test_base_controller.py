@@ -29,10 +29,10 @@ def test_any_velocities_stay_within_limits_and_odometry_follows(
         controller.advance(now_ns)
         controller.set_velocity(now_ns, ahead_m_s, turn_rad_s)
         for _ in range(20):
-            before, (x0, y0, yaw0) = controller.pose, controller.wheels
+            before, (x0, y0, yaw0) = controller.pose, controller.odometry
             now_ns += STEP_NS
             controller.advance(now_ns)
-            after, (x_m, y_m, yaw_rad) = controller.pose, controller.wheels
+            after, (x_m, y_m, yaw_rad) = controller.pose, controller.odometry
             assert abs(after.speed_m_s) <= BASE.speed_m_s + 1e-9
             assert abs(after.turn_rad_s) <= BASE.turn_rad_s + 1e-9
             assert abs(after.speed_m_s - before.speed_m_s) <= BASE.acceleration_m_s2 * 2 * STEP_NS / S + 1e-9
@@ -64,7 +64,7 @@ def test_it_drives_while_velocities_arrive_and_then_stops() -> None:
     assert math.dist(stopped_m, START.place_m) == pytest.approx(far_m, abs=0.02)
     along = math.atan2(stopped_m[1] - START.place_m[1], stopped_m[0] - START.place_m[0])
     assert along == pytest.approx(START.heading_rad)
-    x_m, y_m, _ = controller.wheels
+    x_m, y_m, _ = controller.odometry
     assert math.atan2(y_m - START.y_m, x_m - START.x_m) == pytest.approx(START.yaw_rad)
 
 
@@ -75,7 +75,7 @@ def test_a_reset_robot_is_at_rest_at_the_new_place() -> None:
     assert not controller.is_idle
     controller.reset(START)
     assert controller.is_idle
-    assert (controller.pose.place_m, controller.wheels) == (START.place_m, (START.x_m, START.y_m, START.yaw_rad))
+    assert (controller.pose.place_m, controller.odometry) == (START.place_m, (START.x_m, START.y_m, START.yaw_rad))
 
 
 def test_velocities_are_packed_exactly_and_other_datagrams_are_ignored() -> None:

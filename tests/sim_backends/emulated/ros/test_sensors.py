@@ -59,7 +59,7 @@ class Peer:
 
     def serve_all(self) -> None:
         """Serve the subscriber until it would block."""
-        while not self.subscriber.gone and (ready := self.selector.select(0)):
+        while not self.subscriber.is_disconnected and (ready := self.selector.select(0)):
             for key, events in ready:
                 key.data(events)
 
@@ -86,7 +86,7 @@ def peer() -> Iterator[Peer]:
     peer = Peer()
     yield peer
     peer.stream.close()
-    if not peer.subscriber.gone:
+    if not peer.subscriber.is_disconnected:
         peer.serve_all()
 
 
@@ -107,7 +107,7 @@ def test_a_subscriber_is_answered_once_its_request_is_complete(peer: Peer) -> No
 def test_a_subscriber_with_another_protocol_is_disconnected(peer: Peer, data: bytes) -> None:
     peer.stream.send(data)
     peer.serve_all()
-    assert peer.subscriber.gone
+    assert peer.subscriber.is_disconnected
     assert peer.stream.recv(1) == b""
 
 
@@ -116,14 +116,14 @@ def test_a_closed_subscriber_is_removed_and_gets_nothing(peer: Peer) -> None:
     peer.serve_all()
     peer.stream.close()
     peer.serve_all()
-    assert peer.subscriber.gone
+    assert peer.subscriber.is_disconnected
     peer.subscriber.send(HEADER)
 
 
 def test_a_closed_subscriber_is_detected_while_sending(peer: Peer) -> None:
     peer.stream.close()
     peer.subscriber.send(HEADER)
-    assert peer.subscriber.gone
+    assert peer.subscriber.is_disconnected
 
 
 def test_a_slow_subscriber_loses_whole_messages_without_blocking(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.emulated.ros import own_motion
-from sim_backends.emulated.ros.own_motion import AssignedPath, Helm, Odometer
+from sim_backends.emulated.ros.own_motion import AssignedPath, MotionReporter, Odometer
 from sim_backends.emulated.ros.steered import SILENT_NS, Steered, SteeredRecord
 
 S = 10**9
@@ -19,7 +19,7 @@ FLOATS = st.floats(-1e3, 1e3)
 VECTORS = st.tuples(FLOATS, FLOATS, FLOATS)
 TIMES = st.integers(0, 10**18)
 MOTIONS = st.builds(
-    Steered, TIMES, TIMES, VECTORS, VECTORS, heading_rad=FLOATS, turn_rad_s=st.floats(-3, 3), wheels=VECTORS
+    Steered, TIMES, TIMES, VECTORS, VECTORS, heading_rad=FLOATS, turn_rad_s=st.floats(-3, 3), odometry=VECTORS
 )
 
 
@@ -81,8 +81,8 @@ def test_motion_is_extrapolated_until_the_timeout(motion: Steered, late_ns: int)
     assert now.heading_rad == pytest.approx(motion.heading_rad + motion.turn_rad_s * for_s)
     assert now.moves == (motion.moves and late_ns < SILENT_NS)
     assert motion.at(motion.time_ns - late_ns).place_m == motion.place_m, "never extrapolated into the past"
-    x, y, _ = now.wheels
-    assert math.hypot(x - motion.wheels[0], y - motion.wheels[1]) == pytest.approx(
+    x, y, _ = now.odometry
+    assert math.hypot(x - motion.odometry[0], y - motion.odometry[1]) == pytest.approx(
         abs(motion.speed_m_s) * for_s, abs=1e-6
     )
 
@@ -90,13 +90,13 @@ def test_motion_is_extrapolated_until_the_timeout(motion: Steered, late_ns: int)
 def test_the_helm_gets_its_place_and_sensors_follow_it(tmp_path: Path) -> None:
     paths, record = tmp_path / "motion", tmp_path / "steered"
     own_motion.append_path(paths, AssignedPath(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
-    helm, odometer = Helm(paths, record, 6 * S), Odometer(paths, 6 * S, record)
-    placement = helm.poll_placement(6 * S)
+    reporter, odometer = MotionReporter(paths, record, 6 * S), Odometer(paths, 6 * S, record)
+    placement = reporter.poll_placement(6 * S)
     assert placement is not None
     assert (placement.place_m, placement.heading_rad, placement.x_m) == ((3.0, 6.0, 0.2), math.pi / 2, 0.0)
-    assert helm.poll_placement(7 * S) is None
-    helm.write(
-        7 * S, (3.0, 7.0, 0.2), (0.0, 0.5, 0.0), heading_rad=math.pi / 2, turn_rad_s=0.1, wheels=(1.0, 0.0, 0.0)
+    assert reporter.poll_placement(7 * S) is None
+    reporter.write(
+        7 * S, (3.0, 7.0, 0.2), (0.0, 0.5, 0.0), heading_rad=math.pi / 2, turn_rad_s=0.1, odometry=(1.0, 0.0, 0.0)
     )
     now = odometer.at(7 * S + S // 10)
     assert now.place_m == pytest.approx((3.0, 7.05, 0.2))
@@ -105,9 +105,9 @@ def test_the_helm_gets_its_place_and_sensors_follow_it(tmp_path: Path) -> None:
     back = odometer.at(9 * S)
     assert back.place_m == (3.0, 6.0, 0.2)
     assert back.x_m > 1.0, "odometry continues"
-    helm.write(9 * S, (3.0, 9.0, 0.2), wheels=(1.25, 0.0, 0.05))
+    reporter.write(9 * S, (3.0, 9.0, 0.2), odometry=(1.25, 0.0, 0.05))
     assert odometer.at(9 * S).place_m == (3.0, 6.0, 0.2), "the lab has moved it since"
-    again = helm.poll_placement(9 * S)
+    again = reporter.poll_placement(9 * S)
     assert again is not None
     assert again.place_m == back.place_m
     assert again.x_m == pytest.approx(back.x_m, abs=0.01)
@@ -116,11 +116,11 @@ def test_the_helm_gets_its_place_and_sensors_follow_it(tmp_path: Path) -> None:
 def test_a_restarted_helm_continues_where_it_was(tmp_path: Path) -> None:
     paths, record = tmp_path / "motion", tmp_path / "steered"
     own_motion.append_path(paths, AssignedPath(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
-    helm = Helm(paths, record, 2 * S)
-    helm.poll_placement(2 * S)
-    helm.write(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), wheels=(4.0, 0.0, 0.0))
+    reporter = MotionReporter(paths, record, 2 * S)
+    reporter.poll_placement(2 * S)
+    reporter.write(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), odometry=(4.0, 0.0, 0.0))
     late_ns = 60 * S
-    motion = Helm(paths, record, late_ns).poll_placement(late_ns)
+    motion = MotionReporter(paths, record, late_ns).poll_placement(late_ns)
     assert motion is not None
     assert motion.place_m == pytest.approx((4.0 + SILENT_NS / 1e9, 0.0, 0.2))
     assert motion.speed_m_s == 0.0
@@ -141,7 +141,7 @@ def test_extrapolated_odometry_agrees_with_the_helm(folder: Path, driven: list[t
         record.write(motion)
         read = record.read()
         assert read is not None
-        assert read.at(after.time_ns).wheels == pytest.approx(after.wheels, abs=1e-9)
+        assert read.at(after.time_ns).odometry == pytest.approx(after.odometry, abs=1e-9)
     record.close()
 
 

@@ -32,7 +32,7 @@ def test_the_timeout_follows_the_equations() -> None:
 
 
 def test_the_variance_term_is_at_least_the_clock_granularity() -> None:
-    round_trips = RoundTrips(TcpOptions(clock_ns=10 * MS))
+    round_trips = RoundTrips(TcpOptions(clock_granularity_ns=10 * MS))
     for _ in range(100):
         round_trips.sample(300 * MS)
     assert round_trips.timeout_ns == 310 * MS
@@ -59,7 +59,7 @@ def test_the_timeout_doubles_until_the_next_sample() -> None:
 
 @given(st.lists(st.integers(1, 10**10), min_size=1, max_size=50))
 def test_integer_arithmetic_stays_close_to_the_real_equations(samples_ns: list[int]) -> None:
-    round_trips = RoundTrips(TcpOptions(least_timeout_ns=1, clock_ns=1))
+    round_trips = RoundTrips(TcpOptions(min_timeout_ns=1, clock_granularity_ns=1))
     smoothed, variation = float(samples_ns[0]), samples_ns[0] / 2
     for count, sample_ns in enumerate(samples_ns):
         round_trips.sample(sample_ns)

@@ -53,7 +53,8 @@ class Transfer:
         return [
             (transmission.at_ns, transmission.packet.body[1].number)
             for transmission in self.wire.transmitted
-            if transmission.packet.body[1].length and times in {None, transmission.packet.body[1].times}
+            if transmission.packet.body[1].length
+            and times in {None, transmission.packet.body[1].earlier_transmissions}
         ]
 
     def events(self, event: str) -> list[TcpSample]:
@@ -65,7 +66,7 @@ def losing_data(numbers: Collection[int], *, times: int = 1) -> Script:
 
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         segment: Segment = packet.body[1]
-        return () if segment.length and segment.number in numbers and segment.times < times else (0,)
+        return () if segment.length and segment.number in numbers and segment.earlier_transmissions < times else (0,)
 
     return script
 
@@ -175,7 +176,7 @@ def test_a_repeatedly_lost_segment_waits_for_another_timeout() -> None:
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         segment: Segment = packet.body[1]
         times = 2 if segment.number == 31 else 1 if segment.number in lost else 0
-        return () if segment.length and segment.times < times else (0,)
+        return () if segment.length and segment.earlier_transmissions < times else (0,)
 
     transfer = Transfer(70, ACK_EACH_SEGMENT, script=script)
     assert len(transfer.events("timeout")) == 2
@@ -293,7 +294,7 @@ def test_renos_sawtooth_has_the_throughput_of_mathis(period: int) -> None:
     # segments and do not grow in the round trip of a recovery, which is one of about W/2 + 1.
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         segment: Segment = packet.body[1]
-        is_first_transmission = segment.length and not segment.times
+        is_first_transmission = segment.length and not segment.earlier_transmissions
         return () if is_first_transmission and segment.number % period == period - 1 else (0,)
 
     expected = math.sqrt(1.5 * period)
@@ -348,7 +349,7 @@ def integer_sawtooth(period: int) -> float:
 def test_linux_cubic_has_the_throughput_of_its_reno_estimate(period: int) -> None:
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         segment: Segment = packet.body[1]
-        is_first_transmission = segment.length and not segment.times
+        is_first_transmission = segment.length and not segment.earlier_transmissions
         return () if is_first_transmission and segment.number % period == period - 1 else (0,)
 
     transfer = Transfer(100 * period, TcpOptions(segments_per_ack=1), script=script, delay_ns=20 * MS)

@@ -225,7 +225,7 @@ def test_as_many_samples_arrive_as_with_cyclonedds(qos: Qos, loss: float, cyclon
 def test_a_blocked_writer_drops_samples_after_max_blocking_time() -> None:
     """Nothing is acknowledged; 10 samples fit below the watermark of 30,720 bytes, and the 11th exceeds it."""
     qos = Qos(history="keep_all", max_blocking_ns=50 * MS)
-    timing = RtpsTiming(most_high_bytes=30_720)
+    timing = RtpsTiming(max_high_bytes=30_720)
     wire = publish_samples(qos, 40, script=lambda packet, *_: (), timing=timing, until_ns=SECOND)
     reason = "the writer was blocked for longer than max_blocking_time"
     assert Counter(wire.dropped.values()) == {reason: 40 - 11}

@@ -1,4 +1,4 @@
-"""The parts of a vehicle: its airframe, estimates, fence, fail-safes and mission; its home and its local frame."""
+"""Base class of the vehicle: its airframe, estimates, fence, fail-safes and mission; its home and its local frame."""
 
 import math
 from collections.abc import Sequence
@@ -15,15 +15,15 @@ from sim_backends.physics.collisions import Footprint
 from sim_backends.physics.quadrotor import QuadrotorLimits
 
 
-class Remark(NamedTuple):
+class StatusText(NamedTuple):
     """A text for people: STATUSTEXT."""
 
     severity: int
     text: str
 
 
-class VehicleParts:
-    """The parts of one drone, and its state.
+class VehicleBase:
+    """The components of one drone, and its state.
 
     Args:
         firmware: Family of its autopilot.
@@ -45,7 +45,7 @@ class VehicleParts:
         guidance: Its goal and set-points.
         home_m: Home in the world, metres east, north, up: where it was armed last, or else where it booted.
         failsafes: Its fail-safes.
-        remarks: Texts that are not sent yet; the reader clears the list.
+        status_texts: Texts that are not sent yet; the reader clears the list.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class VehicleParts:
         self.fence = Fence(parameters)
         self.guidance = Guidance(firmware, parameters)
         self.mission = Mission(firmware.first_item)
-        self.remarks: list[Remark] = []
+        self.status_texts: list[StatusText] = []
         self.home_m: Vector = (0.0, 0.0, 0.0)
         self.place(self.home_m, math.pi / 2, now_ns)
         self.boot(now_ns)
@@ -82,7 +82,7 @@ class VehicleParts:
         self.failsafes = self.firmware.failsafes(self._parameters)
 
     def place(self, place_m: Vector, facing_rad: float, now_ns: int) -> None:
-        """Put it on the ground at another place in the world, as if a person carried it. Its mode stays."""
+        """Put it on the ground at another place in the world, as if a person carried it. It keeps its mode."""
         self.body = Airframe(self._limits, place_m, facing_rad, self._obstacles, now_ns)
         if self.estimate.origin_m is None:
             self.home_m = place_m
@@ -121,7 +121,7 @@ class VehicleParts:
 
     def report(self, severity: int, text: str) -> None:
         """Add a text for people."""
-        self.remarks.append(Remark(severity, text))
+        self.status_texts.append(StatusText(severity, text))
 
     @property
     def _state(self) -> VehicleState:

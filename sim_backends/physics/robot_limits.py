@@ -1,4 +1,4 @@
-"""Limits of the robots of known profiles, by profile name."""
+"""Limits of the robots that the physics supports, by the name of their robot profile."""
 
 from typing import Final
 
