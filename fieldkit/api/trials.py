@@ -203,7 +203,7 @@ class Trials:
             )
         selected = transfers if step is None else {step: transfers[step]}
         return table.of_packets(
-            {name: fates.read_crossings(attempt, transfer) for name, transfer in selected.items()}
+            {name: fates.read_sent_packets(attempt, transfer) for name, transfer in selected.items()}
         )
 
     def __len__(self) -> int:

@@ -17,10 +17,10 @@ _HARD_LINK_REASON: Final = "it has a second hard link, and writing would change 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that atomically replaces `path` at the end of the body; after a crash one of the two is complete.
+    """Open a file that atomically replaces `path` at the end of the body; a crash leaves the old or the new file.
 
-    The mode of an existing file is kept, and the file stays if the body raises. An existing symbolic link is
-    replaced, and its target is not changed. A device (as /dev/null for root), a pipe or a socket is not replaced.
+    The mode of an existing file is kept, and the file is unchanged if the body raises. An existing symbolic link is
+    replaced, and its target is not changed. A device (such as /dev/null), a pipe or a socket is not replaced.
 
     Raises:
         OSError: The file cannot be written; an existing file is unchanged.

@@ -236,7 +236,7 @@ class MotionOrigin:
     Attributes:
         frame: Frame of the coordinates: `odometry`, or `local` for MAVLink's LOCAL_POSITION_NED.
         frame_id: Identifies one instance of that frame, for example by the boot ID of the robot. A frame that was
-            lost and created again has another one.
+            lost and created again has another ID.
         x_m: x of `nav_msgs/Odometry`, or metres north.
         y_m: y of `nav_msgs/Odometry`, or metres east.
         heading_rad: Heading from x towards y: counterclockwise in `odometry`, clockwise in `local`.

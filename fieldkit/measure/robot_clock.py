@@ -14,7 +14,7 @@ class Exchange:
 
     Attributes:
         asked_ns: The laptop's clock before the request, nanoseconds since 1970 UTC.
-        robot_ns: The robot's clock at some moment in between.
+        robot_ns: The robot's clock at some time between them.
         answered_ns: The laptop's clock when the answer had arrived.
         resolution_ns: Resolution of `robot_ns`: the robot's clock was at most this much later. 0 if it is exact.
     """
@@ -80,7 +80,7 @@ def job_end_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
         role: Role of the robot that ran the job.
         job: The job's name.
     """
-    before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
+    before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file))
     if before is None or after is None or before.boot != after.boot:
         return None
     if before.clock is None or after.clock is None or clock.step_description(before.clock, after.clock):

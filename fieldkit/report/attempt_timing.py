@@ -112,7 +112,7 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> M
             (role, name): (start_ns - ahead_ns[role], stop_ns - ahead_ns[role])
             for role in plan.cast
             for name, (start_ns, stop_ns) in (
-                evidence.read_or_none(host.job_times_ns, host.after(role)) or {}
+                evidence.read_or_none(host.job_times_ns, host.after_file(role)) or {}
             ).items()
         },
     )

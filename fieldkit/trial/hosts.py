@@ -24,8 +24,10 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> I
     restarted_roles = restarted(procedure)
     for role in sorted(procedure.roles()):
         name = scene.robot(role).name
-        before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
-        for file, state in ((host.before(role), before), (host.after(role), after)):
+        before, after = (
+            evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)
+        )
+        for file, state in ((host.before_file(role), before), (host.after_file(role), after)):
             if state is None:
                 yield f"{name}: {file} is missing, or cannot be read"
         if before is not None and after is not None:

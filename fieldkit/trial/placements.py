@@ -48,7 +48,7 @@ def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
 def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
     places_m = scene.places_m
     try:
-        accounts = position_columns.position_accounts(evidence).robots
+        accounts = position_columns.read_position_sources(evidence).robots
     except EvidenceError:
         return
     for ends in combinations([role for role in sort_roles(accounts) if role in places_m], 2):
@@ -70,7 +70,7 @@ def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
 def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) -> Ints:
     """Return the times at which the distance of two robots is compared, by the laptop's clock."""
     times_ns = np.unique(np.concatenate([trajectory.times_ns for trajectory in trajectories]))
-    states = [evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after)]
+    states = [evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)]
     clocks = [state.clock for state in states if state is not None and state.clock is not None]
     if len(clocks) < len(states):
         return times_ns

@@ -126,7 +126,9 @@ class Procedure(catalog.Named):
     @schema.model_validator(mode="after")
     def _can_be_measured(self) -> "Procedure":
         """Reject steps that would be measured incorrectly or not at all."""
-        robot_files = (name(role) for role in self.roles() for name in (host.before, host.after, link_samples.file))
+        robot_files = (
+            name(role) for role in self.roles() for name in (host.before_file, host.after_file, link_samples.file)
+        )
         claimed, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
         filled = set[str]()
         for placed in self.walk():

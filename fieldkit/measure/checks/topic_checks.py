@@ -117,7 +117,7 @@ def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
 
 
 def _publisher_problems(plan: TopicPlan, sent: TopicLog) -> Iterator[str]:
-    """Yield properties of a log that no publisher writes."""
+    """Yield the properties of a log that no publisher can produce."""
     samples, numbers = sent.samples, sent.numbers
     if (numbers != np.arange(len(numbers))).any():
         yield "the publisher's log does not number its samples from 0 on without a gap"

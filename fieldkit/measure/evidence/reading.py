@@ -154,7 +154,7 @@ _END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
 
 
 def numbered_lines_problem(path: Path) -> str | None:
-    """Return why a log is not complete; None if it is, or if its lines have no numbers, as in older versions.
+    """Return the reason why a log is not complete; None if it is, or if its lines have no numbers.
 
     Raises:
         EvidenceError: As `reading.text`.

@@ -14,13 +14,13 @@ from fieldkit.core import plugins
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import bag, reading
 from fieldkit.measure.evidence.sandbox import ReaderError, SandboxedReader
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import MAX_SAMPLES, PLACED, WGS84, Samples, read_csv, require_increasing
 
 MAX_STALE_S: Final = 10.0
 """If stamps and reception times differ by more than this, the stamps are from another clock."""
 
-PositionReader = Callable[[Path, Account], Samples]
+PositionReader = Callable[[Path, PositionSource], Samples]
 """Returns the samples of a source in a file, with the errors of `read_bag`."""
 
 _GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
@@ -62,7 +62,7 @@ def _read_gpx(path: Path) -> Samples:
     return Samples(np.array([at_ns for at_ns, *_ in points]), values, WGS84)
 
 
-def read_topic(path: Path, account: Account) -> Samples:
+def read_topic(path: Path, position_source: PositionSource) -> Samples:
     """Return the samples in a topic of a bag, or of a message type in a telemetry log, by the recorder's clock.
 
     Raises:
@@ -70,7 +70,7 @@ def read_topic(path: Path, account: Account) -> Samples:
     """
     point = _readers().get(path.suffix)
     reader: PositionReader = read_bag if point is None else plugins.load(point)
-    return reader(path, account)
+    return reader(path, position_source)
 
 
 @cache
@@ -79,7 +79,7 @@ def _readers() -> Mapping[str, EntryPoint]:
     return {f".{point.name}": point for point in plugins.entry_points(plugins.POSITIONS)}
 
 
-def read_bag(path: Path, account: Account) -> Samples:
+def read_bag(path: Path, position_source: PositionSource) -> Samples:
     """Return the samples in a topic of a bag, by the robot's clock.
 
     If several messages have the same time, the first is used.
@@ -88,8 +88,8 @@ def read_bag(path: Path, account: Account) -> Samples:
         EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or its stamps
             are from another clock.
     """
-    topic = account.topic
-    topic_data = bag.positions(path, topic, account.child)
+    topic = position_source.topic
+    topic_data = bag.positions(path, topic, position_source.child)
     if not topic_data["rows"]:
         raise EvidenceError(
             f"no position in {topic}", where=str(path), remedy="check that a node publishes the topic"
@@ -103,7 +103,7 @@ def read_bag(path: Path, account: Account) -> Samples:
         )
     times = np.array([row[:2] for row in topic_data["rows"]], dtype=np.int64)
     values = np.array([row[2:] for row in topic_data["rows"]], dtype=float)
-    stamped = account.stamps == "header"
+    stamped = position_source.stamps == "header"
     stale_s = abs(np.median(times[:, 0] - times[:, 1])) / 1e9
     if stamped and stale_s > MAX_STALE_S:
         raise EvidenceError(
@@ -118,24 +118,28 @@ def read_bag(path: Path, account: Account) -> Samples:
     return Samples(times_ns, values[first, :3], frames.get(kind, f"frame {frame}"), yaws_rad)
 
 
-def to_placement_frame(samples: Samples, account: Account) -> Samples:
+def to_placement_frame(samples: Samples, position_source: PositionSource) -> Samples:
     """Transform odometry to the frame of the placement, with the robot's place and heading at the start of the step.
 
     Args:
         samples: Odometry with times by the laptop's clock.
-        account: Has the start time, place and heading.
+        position_source: Has the start time, place and heading.
 
     Raises:
         EvidenceError: The heading is unknown, or odometry has no sample at the start.
     """
     assert samples.yaws_rad is not None
-    if account.heading_rad is None:
-        raise EvidenceError(f"{account.topic} has no absolute direction, and the robot's initial heading is unknown")
-    at = int(np.searchsorted(samples.times_ns, account.began_utc_ns, side="right")) - 1
+    if position_source.heading_rad is None:
+        raise EvidenceError(
+            f"{position_source.topic} has no absolute direction, and the robot's initial heading is unknown"
+        )
+    at = int(np.searchsorted(samples.times_ns, position_source.began_utc_ns, side="right")) - 1
     if at < 0:
-        late_s = (int(samples.times_ns[0]) - account.began_utc_ns) / 1e9
-        raise EvidenceError(f"{account.topic} begins {late_s:.1f} s after the step started, so the start is unknown")
-    turn_rad = account.heading_rad - float(samples.yaws_rad[at])
+        late_s = (int(samples.times_ns[0]) - position_source.began_utc_ns) / 1e9
+        raise EvidenceError(
+            f"{position_source.topic} begins {late_s:.1f} s after the step started, so the start is unknown"
+        )
+    turn_rad = position_source.heading_rad - float(samples.yaws_rad[at])
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     from_start_m = samples.values - samples.values[at]
     turned = np.column_stack(
@@ -145,4 +149,4 @@ def to_placement_frame(samples: Samples, account: Account) -> Samples:
             from_start_m[:, 2],
         )
     )
-    return replace(samples, values=turned + np.array(account.start))
+    return replace(samples, values=turned + np.array(position_source.start))

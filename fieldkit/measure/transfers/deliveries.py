@@ -143,7 +143,7 @@ def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Deliv
         return delivery
     if is_complete:
         return replace(delivery, end_ns=None)
-    # A receiver that knows the size waits for the rest until it is terminated.
+    # A receiver of a known number of bytes waits for the rest until it is terminated.
     return (
         delivery
         if expected.size_bytes is None or expected.until_ns is None

@@ -207,7 +207,7 @@ def measure(
     recoveries_s = [stream.recovery_s for stream in streams if stream.recovery_s is not None]
     if recoveries_s and len(recoveries_s) == len(streams):
         values[_column_name(recovery, any(stream.recovery_open for stream in streams))] = max(recoveries_s)
-    reason = "the end of the cause is unknown, or the value is in the other column: with or without recovery"
+    reason = "the end of the cause is unknown, or the other column of the pair has the value"
     return Measured(values, {column.name: reason for column in declared_columns if column.name not in values})
 
 

@@ -6,12 +6,12 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.positions.position_files import MAX_STALE_S
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import PLACED, WGS84, Samples, require_increasing
 from fieldkit.motion.logs import tlog
 
 
-def read_tlog(path: Path, account: Account) -> Samples:
+def read_tlog(path: Path, account: PositionSource) -> Samples:
     """Return the samples of a message type in a telemetry log. Times are the recorder's.
 
     With `stamps` set to `header`, the differences between times are those of the autopilot's time since boot. The

@@ -16,7 +16,7 @@ from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.positions import position_checks, position_sources, samples
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.kinds import follow
@@ -69,12 +69,14 @@ class Spot(Strict):
         return self
 
     @property
-    def account(self) -> Account:
+    def account(self) -> PositionSource:
         """The position as a source of positions."""
         if self.frame is not None:
-            return Account(place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}")
+            return PositionSource(
+                place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}"
+            )
         up_m = None if self.alt is None else float(self.alt)
-        return Account(place=(float(self.lat or 0), float(self.lon or 0), up_m), frame=samples.WGS84)
+        return PositionSource(place=(float(self.lat or 0), float(self.lon or 0), up_m), frame=samples.WGS84)
 
 
 class TrackedRobot(Strict):
@@ -189,7 +191,7 @@ class TrackStep(Nest):
         )
         return math.ceil(_PERIODS / min(rates_hz, default=1.0))
 
-    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
+    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
         """Return the sources of the robots' positions in an attempt."""
         places_m = scene.places_m
         sources = dict(follow.stationary_robots(self, scene))
@@ -197,7 +199,7 @@ class TrackStep(Nest):
             if tracked.at is not None:
                 sources[role] = tracked.at.account
             elif tracked.topic is not None:
-                sources[role] = Account(
+                sources[role] = PositionSource(
                     file=self._recorders(1.0)[role].bag(scene.robot(role)),
                     topic=tracked.topic,
                     child=tracked.child or "",
@@ -207,7 +209,7 @@ class TrackStep(Nest):
                     heading_rad=None if tracked.facing is None else geometry.heading_rad(role, tracked.facing),
                     began_utc_ns=began_utc_ns,
                 )
-        return Accounts(sources, offsets, self.heights)
+        return PositionSources(sources, offsets, self.heights)
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
