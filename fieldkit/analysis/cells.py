@@ -153,7 +153,7 @@ def aggregate(
             estimates[cell][quantity.name] = replace(estimate, missing=valid[cell] - estimate.n)
     _correct_p_values(estimates)
     tallies_by_cell: list[dict[str, Tally]] = [{} for _ in keys]
-    for column in repeats.worded if words is None else words:
+    for column in repeats.word_columns if words is None else words:
         words_with_cell = zip(cells[rows].tolist(), repeats.texts[column.name][rows], strict=True)
         for cell, tally in tallies(column, words_with_cell):
             tallies_by_cell[cell][column.name] = tally

@@ -1,4 +1,4 @@
-"""Conversion of CSV lines to columns by pyarrow; if it fails, the lines are read in order to find the error."""
+"""Conversion of CSV lines to columns by pyarrow. If it fails, the lines are read sequentially to find the error."""
 
 import csv
 import io

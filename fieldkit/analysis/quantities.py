@@ -76,7 +76,7 @@ class Quantity:
         return self.label.removeprefix(f"{self.step}: ")
 
     @property
-    def is_own(self) -> bool:
+    def is_builtin(self) -> bool:
         """Whether it is a built-in quantity, instead of one that another package or a lab declares."""
         return not FIRST_OF_OTHERS <= self.rank < BACKGROUND
 
@@ -206,7 +206,7 @@ class Tally:
         return f"{self.name}{_SEPARATOR}{word}"
 
 
-def worded(columns: Iterable[Column]) -> tuple[Column, ...]:
+def word_columns(columns: Iterable[Column]) -> tuple[Column, ...]:
     """Return the columns whose words are counted, in their order."""
     return tuple(column for column in columns if column.figure is not None and column.figure.kind is Kind.WORDS)
 

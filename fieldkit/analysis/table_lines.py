@@ -124,10 +124,10 @@ def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -
 
 def _quantity_lines(quantity: Quantity, cells: Sequence[Cell]) -> Iterator[TableLine]:
     label = wording.label(quantity)
-    concerned = [
+    cells_with_quantity = [
         cell for cell in cells if quantity.name in cell.estimates or quantity in cell.quantities_without_value
     ]
-    sizes = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in concerned})
+    sizes = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in cells_with_quantity})
     if not any(sizes):
         yield TableLine(label, (quantity,))
         return
@@ -159,7 +159,7 @@ def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> lis
 
 def _is_for_operator(quantity: Quantity, expected: Collection[str]) -> bool:
     name = plain_name(quantity.name)
-    return name in _OPERATOR or not quantity.is_own or name.endswith(_FAULT_ENDINGS) or quantity.name in expected
+    return name in _OPERATOR or not quantity.is_builtin or name.endswith(_FAULT_ENDINGS) or quantity.name in expected
 
 
 def _operator_rank(quantity: Quantity) -> int:
@@ -206,5 +206,5 @@ def _trial_count(cell: Cell, names: Sequence[str]) -> str:
 
 
 def _with_step(step: str, label: str) -> str:
-    """Return a label with the name of its step as prefix, as in `columns.named`."""
+    """Return a label with the name of its step as prefix, as in `columns.with_step_name`."""
     return f"{step}: {label}" if step else label

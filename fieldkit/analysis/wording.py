@@ -74,7 +74,7 @@ def interval(scale: Scale, estimate: Estimate) -> str:
 
 
 def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
-    """Return the value to quote without its unit, as `>= 2.30` if it is a lower bound.
+    """Return the value of an estimate without its unit, as `>= 2.30` if it is a lower bound.
 
     Args:
         scale: Scale of the number.
@@ -87,7 +87,7 @@ def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
 
 
 def amount(scale: Scale, estimate: Estimate) -> str:
-    """Return the value to quote with its unit, as `>= 2.30 s` if it is a lower bound."""
+    """Return the value of an estimate with its unit, as `>= 2.30 s` if it is a lower bound."""
     return f"{_at_least(estimate.is_lower_bound)}{scale.amount(estimate.value)}"
 
 
@@ -216,7 +216,7 @@ def time_scale(time_s: float) -> Scale:
 
 
 def label(quantity: Quantity) -> str:
-    """Return the label of the estimate to quote."""
+    """Return the label of the estimates of a quantity."""
     return f"{quantity.label}, median" if quantity.kind is Kind.MEDIAN else quantity.label
 
 
@@ -253,7 +253,7 @@ def counts(cell: Cell) -> str:
     return status_counts({Status.VALID: cell.n_valid, Status.VOID: cell.n_void, Status.FAILED: cell.n_failed})
 
 
-def worded(cells: Sequence[Cell]) -> dict[str, str]:
+def word_labels(cells: Sequence[Cell]) -> dict[str, str]:
     """Return the labels of the word columns that any of the cells has, by name and in order."""
     return {name: tally.label for cell in cells for name, tally in cell.tallies.items()}
 

@@ -54,7 +54,7 @@ class TrialCell:
 
     Attributes:
         condition: The condition, by column.
-        n_valid: Number of valid repeats; all figures are of these.
+        n_valid: Number of valid repeats, from which all figures are computed.
         n_void: Number of attempts whose evidence was incomplete.
         n_failed: Number of attempts that failed.
     """

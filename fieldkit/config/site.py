@@ -51,8 +51,8 @@ class SiteRobot(Strict):
         port: SSH port.
         user: SSH user; required by the field backend.
         key: Path of the private key; without it, keys of the SSH agent are used.
-        password: In place of a key: `ask` for it at the terminal once per run, or read it from the `keyring`. The
-            password itself is never written into the file.
+        password: In place of a key: `ask` requests it at the terminal once per run, `keyring` reads it from the
+            system's keyring. The password itself is never written into the file.
         host_key: Pinned host key, `ssh-ed25519 AAAA...`; required by the field backend. `fieldkit enroll` writes it.
         address: Its IPv4 address on the radio under test; without it, `host`.
     """

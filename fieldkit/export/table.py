@@ -48,7 +48,7 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def of_repeats(repeats: Repeats) -> Table:
-    """Return all columns but the source, those of every trial first, with units and meanings as metadata."""
+    """Return all columns except the source, those of every trial first, with units and meanings as metadata."""
     arrays = [
         _texts(repeats.texts[column.name])
         if column.name in repeats.texts

@@ -65,7 +65,7 @@ class EdgeMark:
 
 @dataclass(frozen=True)
 class Span:
-    """A stretch of time in a lane.
+    """A time interval in a lane.
 
     Attributes:
         lane: Number of the lane, from 0.

@@ -55,7 +55,7 @@ class _Lane:
 
 
 def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
-    """Yield the dot plot of all quantities that no curve shows, if there are any."""
+    """Yield the dot plot of all quantities without a chart against distance, if there are any."""
     ranking = Ranking(evidence)
     quantities = measured(cells)
     first = ranking.first(quantities)
@@ -172,7 +172,7 @@ def _series(identity: Identity, placed: Sequence[tuple[float, Point]], aside: fl
 def _caption(drawn: Sequence[Panel]) -> str:
     parts = [
         _HOW,
-        "The axis is logarithmic where values differ more than 30 times."
+        "The axis is logarithmic if values differ by a factor of more than 30."
         if any(panel.x_log for panel in drawn)
         else "",
         "Hollow, with an arrow: a lower bound, because something had not ended."

@@ -41,7 +41,7 @@ class Ranking:
         by_name = {quantity.name: quantity for quantity in quantities}
         return [by_name[name] for name in dict.fromkeys((*self._expected, *self._lab_columns)) if name in by_name]
 
-    def is_own(self, name: str) -> bool:
+    def is_lab_declared(self, name: str) -> bool:
         """Return True if a lab declares this column."""
         return name in self._lab_columns
 
@@ -64,7 +64,7 @@ def _lab_columns(plan: Plan) -> Iterator[str]:
 
 _OF_PROTOCOLS: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
 _OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
-"""Quantities of trials that stream topics, in which pings and transfers only serve clocks and load."""
+"""Quantities of trials that stream topics, in which pings and transfers only provide clock offset and load."""
 _MAX_FIRST: Final = 6
 """Maximum number of headlines of expected quantities and of a lab's quantities."""
 _MAX_PLACES: Final = 3
@@ -178,14 +178,14 @@ class _HeadlineWriter:
             ends.append(Extreme("", f"{total} not run", "", _first_places(unmeasured), is_missing=True))
         return Headline("Repeats", ends)
 
-    def quantity(self, subject: str, same: Sequence[Quantity], cells: Sequence[Cell]) -> Iterator[Headline]:
-        """Yield the headline of a quantity, or of the same one of several steps; one per payload size of pings."""
-        if len(same) > 1 or plain_name(same[0].name) != "rtt_median_s":
-            sizes = {size: None for quantity in same for size in self._sizes(quantity, cells)}
-            yield self._headline(", ".join((subject, *sizes)), same, cells)
+    def quantity(self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]) -> Iterator[Headline]:
+        """Yield the headline of a quantity, or of its variants in several steps; one per payload size of pings."""
+        if len(variants) > 1 or plain_name(variants[0].name) != "rtt_median_s":
+            sizes = {size: None for quantity in variants for size in self._sizes(quantity, cells)}
+            yield self._headline(", ".join((subject, *sizes)), variants, cells)
             return
-        step = same[0].step
-        for size in self._sizes(same[0], cells) or [""]:
+        step = variants[0].step
+        for size in self._sizes(variants[0], cells) or [""]:
             protocols = {cell.key["protocol"] for cell in cells if self.evidence.payload(cell, step) == size}
             # Cells without any reply have an unknown size, and are assigned by their protocol.
             matching = [
@@ -193,29 +193,31 @@ class _HeadlineWriter:
                 for cell in cells
                 if self.evidence.payload(cell, step) in {size, ""} and cell.key["protocol"] in protocols
             ]
-            yield self._headline(", ".join(filter(None, (subject, size))), same, matching)
+            yield self._headline(", ".join(filter(None, (subject, size))), variants, matching)
 
     def _sizes(self, quantity: Quantity, cells: Sequence[Cell]) -> list[str]:
         is_rtt = plain_name(quantity.name) == "rtt_median_s"
         return self.evidence.payloads(cells, quantity.step) if is_rtt else []
 
-    def _headline(self, subject: str, same: Sequence[Quantity], cells: Sequence[Cell]) -> Headline:
+    def _headline(self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]) -> Headline:
         values = [
             (cell, cell.estimates[quantity.name])
-            for quantity in same
+            for quantity in variants
             for cell in cells
             if quantity.name in cell.estimates
         ]
-        values.sort(key=lambda pair: pair[1].value, reverse=self.ranking.more_is_worse(same[0]) is not False)
+        values.sort(key=lambda pair: pair[1].value, reverse=self.ranking.more_is_worse(variants[0]) is not False)
         missing = [
-            (quantity, absence) for quantity in same for absence in coverage.absences(cells, quantity, self.evidence)
+            (quantity, absence)
+            for quantity in variants
+            for absence in coverage.absences(cells, quantity, self.evidence)
         ]
         has_protocols = len({cell.key["protocol"] for cell in cells}) > 1
 
         def place(cell: Cell, quantity: Quantity) -> str:
             describe = wording.condition if has_protocols else wording.place
             return ", ".join(
-                filter(None, (quantity.step if len(same) > 1 else "", describe(cell, differing=self.differing)))
+                filter(None, (quantity.step if len(variants) > 1 else "", describe(cell, differing=self.differing)))
             )
 
         return Headline(subject, [*_missing(missing, place), *_ends(values, place, is_whole=not missing)])
@@ -248,7 +250,7 @@ def _ends(
 
 
 def _end(values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Cell, Quantity], str]) -> Extreme:
-    """Return a value with all conditions that have it, and its interval if only one has."""
+    """Return a value with all conditions that have it, and its interval if only one condition has it."""
     same = [(cell, estimate) for cell, estimate in values if wording.value(estimate) == text]
     interval = wording.interval(same[0][1]) if len(same) == 1 else ""
     return Extreme("", text, interval, _first_places([place(cell, estimate.quantity) for cell, estimate in same]))
@@ -260,9 +262,9 @@ def _first_places(places: Sequence[str]) -> str:
     return "; ".join((*places[:_MAX_PLACES], *([f"{more} more"] if more > 0 else [])))
 
 
-def _subject(same: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
-    first = same[0]
-    label = first.label if len(same) == 1 else first.plain_label
+def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
+    first = variants[0]
+    label = first.label if len(variants) == 1 else first.plain_label
     names_protocol = has_topics or first.plain_label.startswith(protocol.upper())
     return label if names_protocol else f"{label} with {protocol.upper()}"
 

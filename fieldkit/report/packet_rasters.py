@@ -64,10 +64,10 @@ class RasterGroup:
 def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
     """Yield the rasters of all cells whose captures are available."""
     differing = wording.differing(cells) - {"topology"}
-    share = min(MAX_LINES, max(1, MAX_REPEATS // max(1, len(cells))))
-    for title, cells_of in panels(cells).items():
+    max_lines = min(MAX_LINES, max(1, MAX_REPEATS // max(1, len(cells))))
+    for title, group in panels(cells).items():
         drawn = {
-            wording.place(cell, differing=differing): _marked_packets(cell, evidence, share) for cell in cells_of
+            wording.place(cell, differing=differing): _marked_packets(cell, evidence, max_lines) for cell in group
         }
         for transfer in dict.fromkeys(name for lines in drawn.values() for name in lines):
             marked = {place: lines.get(transfer, []) for place, lines in drawn.items()}
@@ -80,7 +80,7 @@ def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
             )
 
 
-def _marked_packets(cell: Cell, evidence: Evidence, share: int) -> dict[tuple[str, Protocol], list[Mask]]:
+def _marked_packets(cell: Cell, evidence: Evidence, max_lines: int) -> dict[tuple[str, Protocol], list[Mask]]:
     """Return the mask of marked packets of each of the first valid repeats, by name and protocol of the transfer."""
     masks: dict[tuple[str, Protocol], list[Mask]] = {}
     for row in evidence.rows(cell).tolist():
@@ -90,7 +90,7 @@ def _marked_packets(cell: Cell, evidence: Evidence, share: int) -> dict[tuple[st
         for transfer in plan.transfers(Protocol(evidence.repeats.texts["protocol"][row])):
             if (packets := fates.read(attempt, transfer)) is not None:
                 masks.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
-        if max(map(len, masks.values()), default=0) == share:
+        if max(map(len, masks.values()), default=0) == max_lines:
             break
     return masks
 

@@ -51,7 +51,7 @@ def distance(cell: Cell) -> str:
 
 
 def scenario(cell: Cell) -> str:
-    """Return a cell's scenario, `LOS` or `NLOS`, or the procedure without one."""
+    """Return a cell's scenario, `LOS` or `NLOS`, or its procedure if it has no scenario."""
     return text(cell, "scenario").upper() or text(cell, "procedure") or "no scenario"
 
 

@@ -72,13 +72,13 @@ def set_positions(
         problem = f"the evidence is not what was measured: {manifest.summarize(changes)}"
         raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
     with journal.claimed(folder):
-        accounts_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
-        if accounts_by_role:
-            text = position_sources.text(PositionSources(accounts_by_role, heights=heights))
+        sources_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
+        if sources_by_role:
+            text = position_sources.text(PositionSources(sources_by_role, heights=heights))
             files.write(folder / position_sources.FILE, text.encode())
         else:
             (folder / position_sources.FILE).unlink(missing_ok=True)
-        _remove_others(folder, {account.file for account in accounts_by_role.values()})
+        _remove_others(folder, {source.file for source in sources_by_role.values()})
         if (folder / store.MANIFEST_FILE).exists():
             manifest.Manifest(folder).renew_positions()
     return rebuild(folder)
@@ -101,7 +101,7 @@ def _demand_file(path: Path) -> None:
 
 
 def _stored(folder: Path, role: Role, source: Path | PositionSource, offset_s: float, gap_s: float) -> PositionSource:
-    """Copy the position file of a robot into the trial's folder and return its account."""
+    """Copy the position file of a robot into the trial's folder and return it as a position source."""
     if isinstance(source, PositionSource):
         return source
     name = f"{store.POSITIONS}{role}{source.suffix.lower()}"

@@ -145,12 +145,12 @@ def _read_bag(data: bytes, place: Path) -> None:
     path = place / "track.bag"
     path.write_bytes(data)
     for stamps in ("header", "received"):
-        account = PositionSource(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
+        position_source = PositionSource(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
         with suppress(EvidenceError):
-            found = position_files.read_topic(path, account)
+            found = position_files.read_topic(path, position_source)
             _check_samples(found)
             if found.yaws_rad is not None:
-                _check_samples(position_files.to_placement_frame(found, account))
+                _check_samples(position_files.to_placement_frame(found, position_source))
 
 
 def _read_positions_file(ending: str, data: bytes, place: Path) -> None:

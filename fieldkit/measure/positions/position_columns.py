@@ -46,8 +46,8 @@ def measure(
         return Measured.all_missing(declared, error.what)
     if not len(times_ns):
         return Measured.all_missing(declared, "no packet has a time")
-    ahead_ns = _offset_ns(sources, ends[0])
-    start_ns, end_ns = int(min(times_ns)) - ahead_ns, int(max(times_ns)) - ahead_ns
+    offset_ns = _offset_ns(sources, ends[0])
+    start_ns, end_ns = int(min(times_ns)) - offset_ns, int(max(times_ns)) - offset_ns
     for role, trajectory in zip(ends, (source, destination), strict=True):
         if problem := trajectory.coverage_problem(start_ns, end_ns):
             reason = f"the positions of the {role} from {sources.robots[role].description} {problem}"
@@ -71,12 +71,12 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
         source, destination = trajectories_of_pair(evidence, ends)
     except EvidenceError:
         return ()
-    ahead_ns, distances = _offset_ns(sources, ends[0]), list[tuple[int, float | None]]()
+    offset_ns, distances = _offset_ns(sources, ends[0]), list[tuple[int, float | None]]()
     for at_ns, metres in zip(*trajectories.distances_m(source, destination), strict=True):
-        since_ns = distances[-1][0] - ahead_ns if distances else int(at_ns)
+        since_ns = distances[-1][0] - offset_ns if distances else int(at_ns)
         if any(trajectory.coverage_problem(since_ns, int(at_ns)) for trajectory in (source, destination)):
-            distances.append((since_ns + ahead_ns + 1, None))
-        distances.append((int(at_ns) + ahead_ns, float(metres)))
+            distances.append((since_ns + offset_ns + 1, None))
+        distances.append((int(at_ns) + offset_ns, float(metres)))
     return distances
 
 
@@ -204,8 +204,8 @@ def _offset_ns(sources: PositionSources, role: Role) -> int:
     return round(sources.clocks[role].offset_s * 1e9) if role in sources.clocks else 0
 
 
-def ahead_ns(evidence: AttemptEvidence, role: Role) -> int:
-    """Return the offset of a robot's clock from the laptop's, or 0 if unknown. Errors as for `read_position_sources`."""
+def clock_offset_ns(evidence: AttemptEvidence, role: Role) -> int:
+    """Return the offset of a robot's clock from the laptop's, or 0; raises as `read_position_sources`."""
     return _offset_ns(read_position_sources(evidence), role)
 
 
@@ -289,7 +289,8 @@ def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: f
     places_m = ecef_m(north, east, np.zeros(len(up_m))) if on_earth else samples.values
     other_m = _from_first_m(places_m)
     if farthest_m - other_m > (SATELLITE_M if on_earth else PLACE_M) + DRIFT * farthest_m:
-        return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_m:.1f} m by {position_source.description}"
+        other_text = f"{other_m:.1f} m by {position_source.description}"
+        return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_text}"
     return None
 
 

@@ -11,9 +11,9 @@ measurements of packet transit times", SIGMETRICS 1998).
 A single wrong time stamp can exclude the true line. Therefore a line counts as possible if it violates the bound of
 at most one packet: the true line is one of them if one time stamp is wrong, by any amount. This is the intersection
 algorithm of Marzullo and Owicki ("Maintaining the time in a distributed system", PODC 1983; RFC 5905, section
-11.2.1) with at most one faulty source, where each packet is a source. The lines are those of the polygons that result if one packet
-is left out; only packets on the convex hulls change the polygon. No smaller set has this property, because each of
-these lines is the true one if the time stamp of the packet that was left out is wrong.
+11.2.1) with at most one faulty source, where each packet is a source. The lines are those of the polygons that result
+if one packet is left out; only packets on the convex hulls change the polygon. No smaller set has this property,
+because each of these lines is the true one if the time stamp of the packet that was left out is wrong.
 """
 
 from collections.abc import Sequence
@@ -104,13 +104,13 @@ class Clocks:
 def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     """Return the offset between the clocks, or None if no line fits all packets because a clock was set.
 
-    The chosen skew maximizes the shortest round-trip time without the fastest packet of hull direction: if both
+    The chosen skew maximizes the shortest round-trip time without the fastest packet of each direction: if both
     directions were undelayed early and late, any other skew shortens one of them. Among equally good skews the
     smallest is chosen. If the packets leave more than `QUARTZ_SKEW` undetermined, the smallest possible skew is
     chosen. The offset is the middle of the range that is possible with this skew.
 
     Args:
-        forward: Packets from sender to receiver, at least one, hull frame in one pair only.
+        forward: Packets from sender to receiver, at least one, each frame in one pair only.
         reverse: Packets from receiver to sender, likewise.
     """
     times = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
@@ -214,7 +214,7 @@ class _Hull:
         points = sorted(zip(x[lowest].tolist(), y[lowest].tolist(), strict=True))
         outer = _lower_hull(points)
         on_hull = set(outer)
-        # Without a point of this hull, only points of the hull of all inner_points can be on the hull in addition.
+        # Without a point of this hull, only points of the hull of all others can be on the hull in addition.
         inner_points = [point for index, point in enumerate(points) if index not in on_hull]
         inner_hull = [inner_points[index] for index in _lower_hull(inner_points)]
         hulls = [[points[index] for index in outer]]

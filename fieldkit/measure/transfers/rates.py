@@ -124,7 +124,7 @@ def of_tcp(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts:
 def _closed_ns(sent: Packets, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> int | None:
     """Return the time at which the receiver closed the connection after it acknowledged every byte, or None.
 
-    Netcat exits after it has read until the end of the connection. Its kernel's FIN shows that it received every byte.
+    Netcat exits after it has read to the end of the connection. Its kernel's FIN shows that it received every byte.
     """
     is_syn = sent.tcp_flags & SYN != 0
     if len(np.unique(sent.sport)) != 1 or len(isn := np.unique(sent.tcp_seq[is_syn])) != 1:

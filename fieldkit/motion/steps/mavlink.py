@@ -183,7 +183,7 @@ class MavlinkStep(Nest):
 
     def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
         """Return the sources of the robots' positions in an attempt."""
-        account = PositionSource(
+        position_source = PositionSource(
             file=self._file,
             topic=_POSITIONS[self.positions or "local"],
             stamps=self.times,
@@ -194,7 +194,9 @@ class MavlinkStep(Nest):
             clock="" if self.recorder == self.robot else self.recorder,
             system=self.system,
         )
-        return PositionSources({**follow.stationary_robots(self, scene), self.robot: account}, offsets, self.heights)
+        return PositionSources(
+            {**follow.stationary_robots(self, scene), self.robot: position_source}, offsets, self.heights
+        )
 
     @override
     def roles(self) -> frozenset[Role]:

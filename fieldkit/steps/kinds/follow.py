@@ -146,10 +146,15 @@ def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
 
 def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
     """Yield a reason for each robot whose fixed position or start differs from its placement."""
-    for role, account in sources.robots.items():
+    for role, position_source in sources.robots.items():
         planned_m = view.scene.places_m.get(role)
-        recorded_m = account.place if account.place is not None else account.start
-        if planned_m is None or account.frame != PLACED or account.offset_s or not (account.place or account.topic):
+        recorded_m = position_source.place if position_source.place is not None else position_source.start
+        if (
+            planned_m is None
+            or position_source.frame != PLACED
+            or position_source.offset_s
+            or not (position_source.place or position_source.topic)
+        ):
             continue
         deviation_m = math.dist(planned_m, [metres or 0.0 for metres in recorded_m])
         if deviation_m > _ROUNDING_M:

@@ -69,7 +69,7 @@ class Spot(Strict):
         return self
 
     @property
-    def account(self) -> PositionSource:
+    def position_source(self) -> PositionSource:
         """The position as a source of positions."""
         if self.frame is not None:
             return PositionSource(
@@ -197,7 +197,7 @@ class TrackStep(Nest):
         sources = dict(follow.stationary_robots(self, scene))
         for role, tracked in self.robots.items():
             if tracked.at is not None:
-                sources[role] = tracked.at.account
+                sources[role] = tracked.at.position_source
             elif tracked.topic is not None:
                 sources[role] = PositionSource(
                     file=self._recorders(1.0)[role].bag(scene.robot(role)),

@@ -160,10 +160,10 @@ def test_odometry_is_transformed_to_the_robots_place_and_heading(tmp_path: Path)
     began = (5.0, 5.0, math.pi / 2)
     messages = [odometry(BEGAN_NS, *began), odometry(BEGAN_NS + S, 5.0, 7.0, math.pi / 2)]
     odometry_samples = position_files.read_bag(written(tmp_path, messages), PositionSource(topic="/where"))
-    account = PositionSource(
+    position_source = PositionSource(
         topic="/where", start=(10.0, 0.0, 0.0), heading_rad=math.pi, began_utc_ns=BEGAN_NS + S // 2
     )
-    samples = position_files.to_placement_frame(odometry_samples, account)
+    samples = position_files.to_placement_frame(odometry_samples, position_source)
     assert samples.values == pytest.approx(np.array([[10, 0, 0], [8, 0, 0]]), abs=1e-9), "2 m ahead, facing back"
     late = PositionSource(topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS - 3 * S)
     with pytest.raises(EvidenceError, match=r"/where begins 3\.0 s after the step started"):
