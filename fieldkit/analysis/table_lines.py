@@ -85,14 +85,14 @@ class TableLine:
         estimate = self.estimate(cell)
         if estimate is None:
             return self._no_value(cell)
-        return wording.quoted(wording.number(scale, estimate), scale, estimate)
+        return wording.with_interval(wording.number(scale, estimate), scale, estimate)
 
     def amount(self, cell: Cell, scale: wording.Scale, between: str = " ") -> str:
         """Return a cell's figure with its unit and interval; `between` separates the parts."""
         estimate = self.estimate(cell)
         if estimate is None:
             return self._no_value(cell)
-        return wording.quoted(wording.amount(scale, estimate), scale, estimate, between)
+        return wording.with_interval(wording.amount(scale, estimate), scale, estimate, between)
 
     def _no_value(self, cell: Cell) -> str:
         return f"none, 0 of {cell.n_valid}" if self.is_lacking(cell) else ""
@@ -187,7 +187,7 @@ def _with_radio_loss(chosen: Sequence[TableLine], cells: Sequence[Cell]) -> Iter
             yield TableLine(_with_step(step, "radio loss"), tuple(loss.quantities[0] for loss in losses))
 
 
-def sent(cells: Sequence[Cell]) -> dict[str, list[str]]:
+def sent_counts(cells: Sequence[Cell]) -> dict[str, list[str]]:
     """Return the number of items that the valid repeats of each cell sent, by label; an empty text if unknown."""
     steps = dict.fromkeys(estimate.quantity.step for cell in cells for estimate in cell.estimates.values())
     counts_by_label: dict[str, list[str]] = {}

@@ -105,7 +105,7 @@ def incomplete(estimate: Estimate) -> str:
     return ", ".join(parts)
 
 
-def quoted(figure: str, scale: Scale, estimate: Estimate, between: str = " ") -> str:
+def with_interval(figure: str, scale: Scale, estimate: Estimate, between: str = " ") -> str:
     """Return a figure with its interval, and with the number of repeats unless all have a value.
 
     Args:
@@ -220,7 +220,7 @@ def label(quantity: Quantity) -> str:
     return f"{quantity.label}, median" if quantity.kind is Kind.MEDIAN else quantity.label
 
 
-def shown(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantity]:
+def with_estimates(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantity]:
     """Return the quantities that any of the cells has."""
     return [quantity for quantity in quantities if any(quantity.name in cell.estimates for cell in cells)]
 
@@ -267,7 +267,7 @@ def tally(cell: Cell, name: str, between: str = ", ") -> str:
     return between.join((*_word_counts(words), *([f"{without} without"] if without else [])))
 
 
-def tallied(words: Tally) -> str:
+def tally_text(words: Tally) -> str:
     """Return the number of repeats for each word: `wet 12, dry 7`."""
     return ", ".join(_word_counts(words))
 

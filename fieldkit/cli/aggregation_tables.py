@@ -98,7 +98,7 @@ def _require_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) 
 
 
 def _require_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
-    if not wording.shown(cells, quantities):
+    if not wording.with_estimates(cells, quantities):
         names = " or ".join(quantity.name for quantity in quantities)
         raise EvidenceError(
             f"no valid repeat has a value of {names}, so the table would be empty",

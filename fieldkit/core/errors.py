@@ -94,7 +94,7 @@ class EvidenceError(FieldkitError):
     exit_code = 4
 
 
-def raised(error: BaseException) -> str:
+def describe_exception(error: BaseException) -> str:
     """Return an exception in one line with the place in the code: `KeyError: 'a' (hops_step.py, line 28)`.
 
     The place is the last traceback entry in the outermost file that is not part of fieldkit, because a step or policy

@@ -143,7 +143,7 @@ def _sync(path: Path, flags: int = os.O_RDONLY) -> None:
         os.close(descriptor)
 
 
-def existing(folder: Path) -> Path:
+def nearest_existing(folder: Path) -> Path:
     """Return the folder, or its closest parent that exists."""
     absolute = folder.absolute()
     return next(path for path in (absolute, *absolute.parents) if path.is_dir())
@@ -151,4 +151,4 @@ def existing(folder: Path) -> Path:
 
 def free_bytes(folder: Path) -> int:
     """Return the number of free bytes on the disk of `folder`, which need not exist yet."""
-    return shutil.disk_usage(existing(folder)).free
+    return shutil.disk_usage(nearest_existing(folder)).free

@@ -135,7 +135,7 @@ def _matched(sender: Capture, receiver: Capture, same_path: Sequence[Transfer]) 
     is_tcp = any(transfer.protocol is Protocol.TCP for transfer in same_path)
     if is_tcp and (_is_offloaded(sent) or _is_offloaded(received)):
         return None
-    if any(altered_packets.reason(sent, received, transfer) for transfer in same_path):
+    if any(altered_packets.incomparability_reason(sent, received, transfer) for transfer in same_path):
         return None
     try:
         return match(sent, received)

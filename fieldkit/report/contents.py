@@ -35,7 +35,7 @@ _ALWAYS_VISIBLE: Final = frozenset(
 """Quantities that are always visible in tables. The others are collapsed."""
 
 
-_FIRST: Final = "expected and own figures"
+_FIRST: Final = "expected and lab-defined figures"
 """Quantities with an expectation, and quantities that a lab declares."""
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
 _MAX_FURTHER: Final = 12

@@ -12,7 +12,7 @@ from fieldkit.report import wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.coverage import Absence, absences
 from fieldkit.report.headlines import Ranking
-from fieldkit.report.series import Identities, Identity, Point, ends, panels, point
+from fieldkit.report.series import Identities, Identity, Point, axis_limits, panels, point
 from fieldkit.report.trial_folders import Evidence
 
 LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "topic_loss", "iperf3_loss", "iperf3_captured_loss")
@@ -135,7 +135,7 @@ class _CurveDrawing:
         y_label = f"{label} [{unit}]" if unit else label
         points = [place.content for places in groups.values() for place in places if isinstance(place.content, Point)]
         of_protocols = {
-            protocol: ends([point for point in points if point.protocol == protocol], scale.unit)
+            protocol: axis_limits([point for point in points if point.protocol == protocol], scale.unit)
             for protocol in {point.protocol for point in points}
         }
         missing = [place for places in groups.values() for place in places if isinstance(place.content, Absence)]

@@ -13,7 +13,7 @@ from fieldkit.report import distance, wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.coverage import absences
 from fieldkit.report.headlines import Ranking
-from fieldkit.report.series import Identities, Identity, Point, ends, needs_log, panels, point
+from fieldkit.report.series import Identities, Identity, Point, axis_limits, needs_log, panels, point
 from fieldkit.report.trial_folders import Evidence
 
 _DODGE: Final = 0.7
@@ -82,7 +82,7 @@ def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
             drawing.panel(title if len(places) == 1 else f"{title}, {place}", unit, lanes)
             for (title, place, unit), lanes in ranked
         ]
-        yield Chart("quantities", f"All quantities at {wording.listed(places)}", _caption(drawn), drawn)
+        yield Chart("quantities", f"All quantities at {wording.join_words(places)}", _caption(drawn), drawn)
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _with_limits(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
     values = list(chain.from_iterable((point.value, *point.repeats) for point in points))
     if needs_log(values):
         return replace(panel, x_log=True, left=min(values) / _LOG_ROOM, right=max(values) * _LOG_ROOM)
-    left, right = ends(points, unit)
+    left, right = axis_limits(points, unit)
     return replace(panel, left=left, right=right)
 
 

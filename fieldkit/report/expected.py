@@ -45,7 +45,9 @@ def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence
 def _verdict(judgement: Judgement, differing: Collection[str]) -> JudgementRow:
     place = wording.condition(judgement.cell, differing=differing) if judgement.cell else ""
     _, _, value, interval, _ = judgement_texts(judgement)
-    return JudgementRow(place, wording.unbroken(value), wording.unbroken(interval), judgement.ruling, judgement.why)
+    return JudgementRow(
+        place, wording.without_breaks(value), wording.without_breaks(interval), judgement.ruling, judgement.why
+    )
 
 
 def _expectations_of(cell: Cell, evidence: Evidence) -> Iterator[Expectation]:

@@ -78,7 +78,7 @@ _COUNT_TEXTS: Final = {
 
 
 @dataclass(frozen=True)
-class Extreme:
+class HeadlineLine:
     """One line of a headline.
 
     Attributes:
@@ -102,11 +102,11 @@ class Headline:
 
     Attributes:
         subject: Its title.
-        ends: Its lines, the worst first.
+        lines: Its lines, the worst first.
     """
 
     subject: str
-    ends: Sequence[Extreme]
+    lines: Sequence[HeadlineLine]
 
 
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
@@ -130,8 +130,8 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
         of_protocol = [cell for cell in cells if cell.key["protocol"] == protocol]
         with_topics = [cell for cell in of_protocol if with_plain_name(measured([cell]), _OF_TOPICS[0])]
         others = [cell for cell in of_protocol if cell not in with_topics]
-        for own_cells, wanted in ((with_topics, _OF_TOPICS), (others, names)):
-            for quantities_of_name in _chosen(measured(own_cells), wanted):
+        for own_cells, quantity_names in ((with_topics, _OF_TOPICS), (others, names)):
+            for quantities_of_name in _chosen(measured(own_cells), quantity_names):
                 if quantities_of_name[0] not in first:
                     yield from writer.quantity(
                         _subject(quantities_of_name, protocol, own_cells is with_topics),
@@ -160,7 +160,7 @@ class _HeadlineWriter:
         counted = [(cell, coverage.repeat_counts(cell, self.evidence, silent)) for cell in cells]
         planned, valid = (sum(getattr(counts, name) for _, counts in counted) for name in ("planned", "valid"))
         is_missing = valid < planned or bool(unmeasured)
-        ends = [Extreme("", wording.unbroken(f"{valid} of {planned} valid"), "", "", is_missing)]
+        lines = [HeadlineLine("", wording.without_breaks(f"{valid} of {planned} valid"), "", "", is_missing)]
         for name, text in _COUNT_TEXTS.items():
             affected = [
                 (cell, getattr(counts, name), counts.planned) for cell, counts in counted if getattr(counts, name)
@@ -172,11 +172,11 @@ class _HeadlineWriter:
             ]
             if affected:
                 total = format_count(sum(count for _, count, _ in affected), "repeat")
-                ends.append(Extreme("", text.format(total), "", _first_places(places), is_missing=True))
+                lines.append(HeadlineLine("", text.format(total), "", _first_places(places), is_missing=True))
         if unmeasured:
             total = format_count(len(unmeasured), "condition")
-            ends.append(Extreme("", f"{total} not run", "", _first_places(unmeasured), is_missing=True))
-        return Headline("Repeats", ends)
+            lines.append(HeadlineLine("", f"{total} not run", "", _first_places(unmeasured), is_missing=True))
+        return Headline("Repeats", lines)
 
     def quantity(self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]) -> Iterator[Headline]:
         """Yield the headline of a quantity, or of its variants in several steps; one per payload size of pings."""
@@ -220,12 +220,12 @@ class _HeadlineWriter:
                 filter(None, (quantity.step if len(variants) > 1 else "", describe(cell, differing=self.differing)))
             )
 
-        return Headline(subject, [*_missing(missing, place), *_ends(values, place, is_whole=not missing)])
+        return Headline(subject, [*_missing(missing, place), *_worst_and_best(values, place, is_whole=not missing)])
 
 
 def _missing(
     lacking: Sequence[tuple[Quantity, Absence]], place: Callable[[Cell, Quantity], str]
-) -> Iterator[Extreme]:
+) -> Iterator[HeadlineLine]:
     """Yield a line per reason for missing values, with the conditions; those without any value come first."""
     ordered = sorted(lacking, key=lambda pair: -pair[1].count / pair[1].of)
     for reason in dict.fromkeys(absence.reason for _, absence in ordered):
@@ -234,26 +234,30 @@ def _missing(
             for quantity, absence in ordered
             if absence.reason == reason
         ]
-        yield Extreme("", reason, "", _first_places(places), is_missing=True)
+        yield HeadlineLine("", reason, "", _first_places(places), is_missing=True)
 
 
-def _ends(
+def _worst_and_best(
     values: Sequence[tuple[Cell, Estimate]], place: Callable[[Cell, Quantity], str], *, is_whole: bool
-) -> list[Extreme]:
+) -> list[HeadlineLine]:
     """Return the worst and the best of values that are sorted from worst to best, or the value that all have."""
     worst, best = (wording.value(values[index][1]) for index in (0, -1))
     if worst == best and len(values) > 1:
-        return [Extreme("in all conditions" if is_whole else "in all others", worst, "", "")]
+        return [HeadlineLine("in all conditions" if is_whole else "in all others", worst, "", "")]
     end_names = ("least", "most") if values[0][1].value < values[-1][1].value else ("most", "least")
-    lines = [_end(values, text, place) for text in dict.fromkeys((worst, best))]
+    lines = [_line_of_value(values, text, place) for text in dict.fromkeys((worst, best))]
     return [replace(line, which=end if len(values) > 1 else "") for line, end in zip(lines, end_names, strict=False)]
 
 
-def _end(values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Cell, Quantity], str]) -> Extreme:
+def _line_of_value(
+    values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Cell, Quantity], str]
+) -> HeadlineLine:
     """Return a value with all conditions that have it, and its interval if only one condition has it."""
     same = [(cell, estimate) for cell, estimate in values if wording.value(estimate) == text]
     interval = wording.interval(same[0][1]) if len(same) == 1 else ""
-    return Extreme("", text, interval, _first_places([place(cell, estimate.quantity) for cell, estimate in same]))
+    return HeadlineLine(
+        "", text, interval, _first_places([place(cell, estimate.quantity) for cell, estimate in same])
+    )
 
 
 def _first_places(places: Sequence[str]) -> str:

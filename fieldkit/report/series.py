@@ -175,7 +175,7 @@ def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> 
     )
 
 
-def ends(points: Sequence[Point], unit: str) -> tuple[float, float]:
+def axis_limits(points: Sequence[Point], unit: str) -> tuple[float, float]:
     """Return the ends of an axis for these points. It starts at 0 unless a value is negative, as in dBm."""
     if min(point.bottom for point in points) < 0:
         values = [value for point in points for value in (point.value, *point.repeats)]

@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Measured, Value
-from fieldkit.core.errors import EvidenceError, RobotError, raised
+from fieldkit.core.errors import EvidenceError, RobotError, describe_exception
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import host, program_output
 from fieldkit.remote import jobs
@@ -109,7 +109,7 @@ class ProgramStep(Step):
         except EvidenceError as error:
             return Measured.all_missing(columns, error.what)
         except (ValueError, LookupError, ArithmeticError) as error:
-            return Measured.all_missing(columns, f"the output is not as expected: {raised(error)}")
+            return Measured.all_missing(columns, f"the output is not as expected: {describe_exception(error)}")
         return Measured.from_optional(
             {column.name: values.get(column.name) for column in columns}, "the program did not print it"
         )

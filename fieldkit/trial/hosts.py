@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from fieldkit.core.errors import raised
+from fieldkit.core.errors import describe_exception
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import clock, endings, host
@@ -77,7 +77,7 @@ def _job_problems(
         try:
             planned_jobs = () if placed.disturbed else tuple(placed.step.own_jobs(scene))
         except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
-            yield f"the commands of {placed.called} cannot be derived: {raised(error)}"
+            yield f"the commands of {placed.called} cannot be derived: {describe_exception(error)}"
             continue
         for planned in planned_jobs:
             if planned.role is not role:

@@ -316,7 +316,7 @@ def read_procedure(path: Path) -> Procedure:
     Raises:
         ConfigurationError: The file cannot be read, or has an error.
     """
-    return catalog.named(schema.read(path), Procedure, path.stem)
+    return catalog.validate_named(schema.read(path), Procedure, path.stem)
 
 
 def with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:

@@ -69,7 +69,7 @@ def test_a_median_of_open_gaps_is_a_lower_bound() -> None:
     estimate = gaps([0.2] * 4, [2.0, 2.5, 2.8, 2.9, 3.0, 3.1]).estimates["rtt_gap_s"]
     assert (estimate.value, estimate.is_lower_bound) == (2.25, True)
     scale = wording.scale_of(estimate.quantity, [estimate.value])
-    shown = wording.quoted(wording.amount(scale, estimate), scale, estimate)
+    shown = wording.with_interval(wording.amount(scale, estimate), scale, estimate)
     assert shown == ">= 2250 ms [200, ...) (6 of 10 not ended)"
 
 

@@ -254,7 +254,7 @@ def test_text_answers_are_counted_in_all_outputs(lab_results: Mapping[str, LabRe
         r"^ grass +wet 2 +dry 2 +words are counted, not judged$", results.outputs["compare"], re.MULTILINE
     )
     assert re.search(
-        r"TCP, expected and own figures condition repeats wind, median people, median grass 5m 2 valid "
+        r"TCP, expected and lab-defined figures condition repeats wind, median people, median grass 5m 2 valid "
         r"3\.75 m/s \[[^]]+\]\* 1\.00 \[[^]]+\]\* wet 2 15m 2 valid 1\.50 m/s \[[^]]+\]\* 1\.00 \(1 of 2\) dry 2 ",
         results.page,
     )

@@ -289,7 +289,7 @@ def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> 
 
 def ends(headline: headlines.Headline) -> list[str]:
     """Return one text per end of a headline."""
-    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.ends)
+    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.lines)
     return [plain(" ".join(parts)) for parts in lines]
 
 

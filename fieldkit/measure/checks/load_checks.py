@@ -256,7 +256,7 @@ def _datagrams(
         yield f"iperf3 sent {written} datagrams, but {captured} are in the sender's capture"
     refused = evidence.sender_counters.udp_send_errors or 0
     tail, missed = max(written - expected, 0), max(captured - arrived, 0)
-    # A sender's queue that drops datagrams before the capture causes gaps in the numbers that the receiver gets.
+    # A sender's queue that drops datagrams before the capture causes gaps in the numbers that the receiver reads.
     is_plausible = captured + refused >= written or tail <= missed + _TAIL_SHARE * written + _TAIL_DATAGRAMS
     if not is_plausible:
         yield (f"iperf3 sent {written} datagrams, but the receiver expected {expected}, and {captured} were captured")

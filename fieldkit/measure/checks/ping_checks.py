@@ -1,7 +1,7 @@
 """Contradictions within the output of ping, and between the output and captures.
 
 Round-trip times of iputils' ping differed from captured ones by -0.03 to 0.9 ms, the median by less than 0.1 ms, on a
-busy machine with 2 cores. busybox reads the time of a reply when its process resumes, iputils gets it from the
+busy machine with 2 cores. busybox reads the time of a reply when its process resumes, iputils reads it from the
 kernel.
 """
 

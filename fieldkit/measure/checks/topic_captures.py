@@ -241,7 +241,7 @@ def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
 
 
 def _contiguous_ns(subscriber: SampleFlow, end: Ints) -> Ints | None:
-    """Return when a TCP connection had delivered every byte before `end`, from the first copy of each segment."""
+    """Return the times at which a TCP connection had delivered every byte before `end`; None if it is unknown."""
     if (connection := subscriber.connection()) is None:
         return None
     data, _ = connection

@@ -25,7 +25,7 @@ _DUPLICATE_NS: Final = 1_000_000
 """No sender retransmits a packet within this time with the same IP id."""
 
 
-def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
+def incomparability_reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
     """Return the reason why two complete captures cannot be compared, or None if they can.
 
     Args:

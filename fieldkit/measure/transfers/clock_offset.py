@@ -80,19 +80,19 @@ class Clocks:
         """Maximum error of `skew`."""
         return float(max(self.skews[-1] - self.skew, self.skew - self.skews[0]))
 
-    def ahead_s(self, receiver_ns: Ints) -> Floats:
+    def offset_at_s(self, receiver_ns: Ints) -> Floats:
         """Return the offset relative to `base_ns` at times of the receiver's clock."""
         return self.offset_s + self.skew * self._elapsed_s(receiver_ns)
 
     def delays_s(self, sender_ns: Ints, receiver_ns: Ints) -> Floats:
         """Return the one-way delays of packets from sender to receiver; each time is by the end's own clock."""
-        return (receiver_ns - sender_ns - self.base_ns) / 1e9 - self.ahead_s(receiver_ns)
+        return (receiver_ns - sender_ns - self.base_ns) / 1e9 - self.offset_at_s(receiver_ns)
 
     def error_s(self, receiver_ns: Ints) -> float:
         """Return the maximum error of the offset at these times of the receiver's clock."""
         # The possible range widens with the distance from the middle, so the error is largest at the ends.
         ends = np.array((receiver_ns.min(), receiver_ns.max()))
-        best, drift = self.ahead_s(ends), np.outer(self.skews, self._elapsed_s(ends))
+        best, drift = self.offset_at_s(ends), np.outer(self.skews, self._elapsed_s(ends))
         above, below = self.highest_s[:, None] + drift - best, best - self.lowest_s[:, None] - drift
         return float(max(above.max(), below.max()))
 

@@ -53,7 +53,7 @@ def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets
     sender, receiver = (capture.packets for capture in captures if capture is not None)
     if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
         raise EvidenceError("a capture lacks times", where=str(evidence.folder))
-    if why := altered_packets.reason(sender, receiver, transfer):
+    if why := altered_packets.incomparability_reason(sender, receiver, transfer):
         raise EvidenceError(f"the captures of the transfer cannot be compared: {why}", where=str(evidence.folder))
     return sender, receiver
 

@@ -109,7 +109,11 @@ def incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str
 
 def _incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     sender, receiver = map(evidence.whole_capture, transfer.captures)
-    if sender and receiver and (why := altered_packets.reason(sender.packets, receiver.packets, transfer)):
+    if (
+        sender
+        and receiver
+        and (why := altered_packets.incomparability_reason(sender.packets, receiver.packets, transfer))
+    ):
         return f"the captures of the transfer cannot be compared: {why}"
     if evidence.read_or_none(reading.size, transfer.received_file):
         for role, capture in ((transfer.source, sender), (transfer.destination, receiver)):
