@@ -160,13 +160,15 @@ def aggregate(
     named_keys = (dict(zip(by, key, strict=True)) for key in keys)
     chosen = repeats.quantities if quantities is None else quantities
     ends = np.searchsorted(cells[rows], np.arange(1, len(keys)))  # the rows of a cell are adjacent
-    parts = np.split(rows, ends) if keys else []
-    payloads = [_payload_sizes(repeats, chosen, part) for part in parts]
-    lacking = [
-        _quantities_without_value(repeats, chosen, part, of_cell)
-        for part, of_cell in zip(parts, estimates, strict=True)
+    rows_by_cell = np.split(rows, ends) if keys else []
+    payloads = [_payload_sizes(repeats, chosen, cell_rows) for cell_rows in rows_by_cell]
+    without_value = [
+        _quantities_without_value(repeats, chosen, cell_rows, of_cell)
+        for cell_rows, of_cell in zip(rows_by_cell, estimates, strict=True)
     ]
-    cell_fields = zip(named_keys, valid, void, failed, estimates, tallies_by_cell, payloads, lacking, strict=True)
+    cell_fields = zip(
+        named_keys, valid, void, failed, estimates, tallies_by_cell, payloads, without_value, strict=True
+    )
     return tuple(Cell(*fields) for fields in cell_fields)
 
 

@@ -144,7 +144,7 @@ def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[
 def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:
     of_a, of_b = _values(name, a), _values(name, b)
     unknown = UNKNOWN in {of_a, of_b}
-    # A column that is missing in both runs is no difference, unless it identifies robots or procedure.
+    # A column that is missing in both runs is not a difference, unless it identifies robots or procedure.
     if of_a != of_b or (unknown and name in _IDENTITY):
         yield Concern(name, of_a, of_b, (), refuses and (not unknown or name in _IDENTITY))
 

@@ -35,7 +35,7 @@ class Judgement:
         estimate: The estimate; None if no valid repeat has a value.
         why: Reason that the numbers do not show: repeats without a value, or the number of repeats that are needed.
         met: Number of single repeats that meet it; None if it is not about single repeats.
-        limit: The decisive 95 % bound, of the share of repeats that meet it or of the loss; None without one.
+        limit: The decisive 95 % bound, of the share of repeats that meet it or of the loss; None if there is none.
     """
 
     expectation: Expectation

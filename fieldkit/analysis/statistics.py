@@ -1,7 +1,7 @@
 """Statistics over repeats with 95 % intervals: shares, means and medians, and differences of two samples.
 
-Each repeat is one independent sampling unit, with any dependence within it. All formulas are in closed form and
-vectorized over cells. There is no resampling, so no result depends on a seed. Coverage: docs/method-intervals.md.
+Each repeat is one independent sampling unit, whose items may depend on each other. All formulas are in closed form
+and vectorized over cells. There is no resampling, so no result depends on a seed. Coverage: docs/method-intervals.md.
 """
 
 import math

@@ -142,7 +142,7 @@ def _payload_label(quantity: Quantity, sizes: Sequence[int]) -> str:
 
 
 def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> list[TableLine]:
-    """Return the lines for an operator during a trial, in order; all lines if there are none of these.
+    """Return the lines for an operator during a trial, in order; all lines if none of these exists.
 
     These are losses, delays, throughput and signal; quantities with an expectation; and quantities that the lab added
     to a procedure.

@@ -68,7 +68,7 @@ class Scale:
 
 
 def interval(scale: Scale, estimate: Estimate) -> str:
-    """Return the interval of an estimate with the marks `*` and `!` that `cautions` explains; empty without one."""
+    """Return the interval of an estimate with the marks `*` and `!` (see `cautions`); empty if it has no interval."""
     text = scale.interval(estimate.low, estimate.high)
     return text and text + ("*" if assumes_normal(estimate) else "") + ("!" if is_dependent(estimate) else "")
 

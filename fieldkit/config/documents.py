@@ -200,7 +200,7 @@ class Document:
 
 
 def read(path: Path) -> Document:
-    """Read one YAML file; errors as `parse`, and a file that cannot be read."""
+    """Read one YAML file; raises as `parse`, and if the file cannot be read."""
     return parse(_text(path), source=str(path))
 
 

@@ -314,7 +314,7 @@ def validate(document: Document, model: type[Model]) -> Model:
 
 
 def folder() -> Path:
-    """Return the folder of the file that is being validated, or the current directory without one."""
+    """Return the folder of the file that is being validated, or the current directory if there is no file."""
     return _FOLDER.get()
 
 

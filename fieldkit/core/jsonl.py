@@ -1,4 +1,4 @@
-"""An append-only file of JSON lines: each line is on disk before the caller continues, and a crash is tolerated."""
+"""Append-only file of JSON lines: `append` returns when its lines are on disk; `read` omits an incomplete last line."""
 
 import errno
 import fcntl

@@ -22,7 +22,7 @@ class Series:
         style: Colour, marker and line.
         x: Positions.
         y: Values.
-        low: Lower ends of their intervals, None for a point without one; empty if no point has one.
+        low: Lower ends of their intervals, None for a point without interval; empty if no point has one.
         high: Upper ends.
         join: Type of line between the points.
         behind: Single values behind the points, as (x, y), drawn faintly.

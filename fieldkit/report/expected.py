@@ -16,9 +16,9 @@ class JudgementRow:
     """The judgement of an expectation under one condition, as texts.
 
     Attributes:
-        place: The condition; empty without one.
+        place: The condition; empty if no repeat has ended.
         value: The measured value.
-        interval: Its 95 % interval, empty without one.
+        interval: Its 95 % interval; empty if it has none.
         ruling: The ruling on the expectation.
         why: Reason for a failure other than the numbers, or empty.
     """

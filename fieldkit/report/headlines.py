@@ -84,7 +84,7 @@ class HeadlineLine:
     Attributes:
         which: `least`, `most`; empty if there is nothing to compare.
         value: The figure with its unit, or the missing result.
-        interval: Its 95 % interval, and the number of repeats that have it if not all; empty without either.
+        interval: Its 95 % interval, and the number of repeats with a value if not all have one; may be empty.
         place: The condition.
         is_missing: True if it reports something missing or lost.
     """

@@ -19,15 +19,15 @@ MAX_REPEATS: Final = 400
 MAX_LINES: Final = 20
 """Maximum number of lines of a cell."""
 MAX_COLUMNS: Final = 300
-"""Maximum number of columns of a line. A line with more packets combines several in a column, which is marked if any
-of them is."""
+"""Maximum number of columns of a line. If a line has more packets, each column represents several packets and is
+marked if any of them is marked."""
 
-_WHAT: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments sent again"}
+_MARK_MEANING: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments retransmitted"}
 
 
 @dataclass(frozen=True)
 class Raster:
-    """A line per repeat, a column per packet.
+    """A raster with a line per repeat and a column per packet.
 
     Attributes:
         place: The condition, as far as it differs from the others of its group.
@@ -72,7 +72,7 @@ def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
         for transfer in dict.fromkeys(name for lines in drawn.values() for name in lines):
             marked = {place: lines.get(transfer, []) for place, lines in drawn.items()}
             width = -(-max(len(line) for lines in marked.values() for line in lines) // MAX_COLUMNS)
-            what = _WHAT[transfer[1]]
+            what = _MARK_MEANING[transfer[1]]
             yield RasterGroup(
                 title=", ".join(filter(None, (transfer[0], title))),
                 what=what if width == 1 else f"{what}; a column is {width} packets, marked if any of them is",

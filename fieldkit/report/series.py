@@ -104,8 +104,8 @@ class Point:
     Attributes:
         cell: The condition.
         value: The figure.
-        low: Lower end of its 95 % interval, None without one.
-        high: Upper end, None without one.
+        low: Lower end of its 95 % interval; None if it has none.
+        high: Upper end; None if it has no interval.
         repeats: Values of single repeats, some of them if there are many.
         bounds: True for each of these that is only a lower bound.
         is_bound: True if the figure is only a lower bound because of them.

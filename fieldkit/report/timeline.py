@@ -22,7 +22,7 @@ from fieldkit.report.trial_folders import Evidence
 MAX_PACKETS: Final = 1500
 """Maximum number of packets of each kind in a panel; of more packets, every k-th is drawn."""
 
-_MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "sent again"}
+_MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "retransmitted"}
 _SENT: Final = Style("blue", "o", "none")
 _RECEIVED: Final = Style("green", "^", "none")
 _MARK: Final = Style("lost", "x", "none")

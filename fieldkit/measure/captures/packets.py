@@ -36,10 +36,10 @@ _TRANSPORT: Final = layout(
 )
 
 NO_PORT: Final = -1
-"""Port of a packet without one: a later fragment, or another protocol."""
+"""Port of a packet that has no port: a later fragment, or another protocol."""
 
 NO_STAMP: Final = -1
-"""TCP time stamp of a packet without one, or truncated before it."""
+"""TCP time stamp of a packet that has none, or was truncated before it."""
 
 NO_ECHO: Final = -1
 """Identifier of a packet that is not an ICMP echo, or was truncated before it."""
@@ -85,10 +85,10 @@ class Packets(Table):
         tcp_seq: TCP sequence number; 0 without a TCP header.
         tcp_ack: TCP acknowledgment number; 0 without a TCP header.
         tcp_flags: TCP flags; 0 without a TCP header.
-        tcp_stamp: TSval of the TCP time stamp option, which is larger in a retransmission; `NO_STAMP` without one.
-        tcp_mss: Maximum segment size option of a SYN; 0 without one.
-        tcp_payload_bytes: Length after the TCP header; 0 without one.
-        udp_bytes: Length field of the UDP header, which includes the header; 0 without one.
+        tcp_stamp: TSval of the TCP time stamp option, which is larger in a retransmission; `NO_STAMP` if it has none.
+        tcp_mss: Maximum segment size option of a SYN; 0 if it has none.
+        tcp_payload_bytes: Length after the TCP header; 0 without a TCP header.
+        udp_bytes: Length field of the UDP header, which includes the header; 0 without a UDP header.
         echo: Identifier of an ICMP echo request, which differs between ping processes; `ECHO_REPLY` is added in a
             reply. `NO_ECHO` for other packets.
         echo_seq: Sequence number of an ICMP echo request or reply; `NO_ECHO` for other packets.

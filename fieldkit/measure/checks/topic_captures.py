@@ -138,7 +138,7 @@ def withheld(
         arrived: Samples that arrived, each once.
         captured: The topic in both captures.
         reliable: As in `TopicPlan`.
-        deadline_s: Deadline of the topic; None without one.
+        deadline_s: Deadline of the topic; None if it has no deadline.
     """
     if captured.subscriber is None or not len(arrived):
         return {}

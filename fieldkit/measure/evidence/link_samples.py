@@ -7,7 +7,7 @@ output of that time: `link`, `survey` and `station` of iw, `wireless` of the ker
 boot; the host state before the attempt gives the time of boot. A testbed's `link.csv` has a line per time and peer
 station.
 
-The lines of iw are those of its station.c, link.c and survey.c, equal in versions 3 to 6 except for later additions.
+The lines of iw are documented by its station.c, link.c and survey.c; versions 3 to 6 differ only in added lines.
 Drivers omit values that they do not support. A received power of 0 dBm or more is invalid: some drivers print 0, or a
 percentage.
 """

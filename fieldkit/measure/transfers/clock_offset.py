@@ -111,7 +111,7 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
 
     Args:
         forward: Packets from sender to receiver, at least one, each frame in one pair only.
-        reverse: Packets from receiver to sender, likewise.
+        reverse: Packets from receiver to sender, under the same conditions.
     """
     times = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
     middle_ns = (int(times.min()) + int(times.max())) // 2
