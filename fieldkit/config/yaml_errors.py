@@ -74,7 +74,7 @@ SHAPES: Final[dict[str, str]] = {}
 
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
 _MAX_SHOWN: Final = 60
-_NOTHING: Final = ", and there are none; indent the keys that belong to this line more than this line"
+_NO_KEYS_HINT: Final = ", and there are none; indent the keys that belong to this line more than this line"
 _MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 
 
@@ -154,7 +154,7 @@ def _message(problem: Mapping[str, Any]) -> str:
     value, context = problem["input"], problem.get("ctx", {})
     match problem["type"]:
         case "model_type" | "dict_type":
-            message = f"keys with values are needed here{_NOTHING * (value is None)}"
+            message = f"keys with values are needed here{_NO_KEYS_HINT * (value is None)}"
         case "value_error":
             message = str(context["error"])
         case "union_tag_not_found":

@@ -1,4 +1,4 @@
-"""Append-only file of JSON lines: `append` returns when its lines are on disk; `read` omits an incomplete last line."""
+"""Append-only file of JSON lines: `append` waits until its lines are on disk; `read` omits an incomplete last one."""
 
 import errno
 import fcntl

@@ -124,19 +124,19 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
     first = writer.ranking.first(measured(cells))[:_MAX_FIRST]
     for quantity in first:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
-        own_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
-        yield from writer.quantity(quantity.label, [quantity], own_cells)
+        group_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
+        yield from writer.quantity(quantity.label, [quantity], group_cells)
     for protocol, names in _OF_PROTOCOLS.items():
         of_protocol = [cell for cell in cells if cell.key["protocol"] == protocol]
         with_topics = [cell for cell in of_protocol if with_plain_name(measured([cell]), _OF_TOPICS[0])]
         others = [cell for cell in of_protocol if cell not in with_topics]
-        for own_cells, quantity_names in ((with_topics, _OF_TOPICS), (others, names)):
-            for quantities_of_name in _chosen(measured(own_cells), quantity_names):
+        for group_cells, quantity_names in ((with_topics, _OF_TOPICS), (others, names)):
+            for quantities_of_name in _existing_quantities(measured(group_cells), quantity_names):
                 if quantities_of_name[0] not in first:
                     yield from writer.quantity(
-                        _subject(quantities_of_name, protocol, own_cells is with_topics),
+                        _subject(quantities_of_name, protocol, group_cells is with_topics),
                         quantities_of_name,
-                        own_cells,
+                        group_cells,
                     )
 
 
@@ -273,11 +273,11 @@ def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> s
     return label if names_protocol else f"{label} with {protocol.upper()}"
 
 
-def _chosen(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
-    """Return the quantities called `names`, else the first ones, each with the same quantity of other steps."""
-    chosen = [same for name in names if (same := _quantities_named(quantities, name))]
+def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
+    """Return the quantities called `names`, or the first ones if none exists, with variants in other steps."""
+    existing = [same for name in names if (same := _quantities_named(quantities, name))]
     others = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)
-    return chosen or [_quantities_named(quantities, name) for name in list(others)[: len(names)]]
+    return existing or [_quantities_named(quantities, name) for name in list(others)[: len(names)]]
 
 
 def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:

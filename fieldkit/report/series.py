@@ -94,7 +94,7 @@ _MARGIN: Final = 0.25
 """Margins of an axis that does not start at 0, as a share of the range of values."""
 _LOG_FROM_DECADES: Final = 1.5
 _VAGUE_FROM: Final = 0.5
-"""Width from which an interval is too wide for a curve, as a share of the axis."""
+"""Minimum width at which an interval is too wide for a curve, as a share of the axis."""
 
 
 @dataclass(frozen=True)

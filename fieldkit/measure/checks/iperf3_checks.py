@@ -16,8 +16,8 @@ _ROUNDING_S: Final = 0.002
 """iperf3 prints times with 6 digits, some versions print `seconds` with more."""
 _SUMMARY_DELAY_S: Final = 0.02
 """Allowed difference: the clock is read for the last interval and again, later, for the summary."""
-_EMPTY_S: Final = 1.1
-"""Version 3.17 omits a last interval in which nothing arrived."""
+_MAX_OMITTED_S: Final = 1.1
+"""Maximum length of a last interval that version 3.17 omits because nothing arrived in it."""
 _ROUNDING: Final = 1e-3
 _EARLY_S: Final = 0.1
 """A timer of the client may end a test this much before its duration."""
@@ -99,9 +99,9 @@ def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
         ("bytes", totals.sent_bytes if sends else totals.received_bytes, _sum(intervals, "payload_bytes")),
         ("retransmits", totals.retransmits if sends else None, _sum(intervals, "retransmits")),
     )
-    for quantity, total, added in sums:
-        if total is not None and added is not None and total != added:
-            yield f"the sum of {quantity} over its intervals is {added}, but its summary has {total}"
+    for quantity, total, interval_sum in sums:
+        if total is not None and interval_sum is not None and total != interval_sum:
+            yield f"the sum of {quantity} over its intervals is {interval_sum}, but its summary has {total}"
     end_s = intervals[-1].end_s if intervals else None
     if end_s is not None and totals.ends_s and not any(_ends_near(end_s, total_s) for total_s in totals.ends_s):
         yield f"its last interval ends at {end_s:.3f} s, but its summary at {max(totals.ends_s):.3f} s"
@@ -110,7 +110,7 @@ def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
 
 
 def _ends_near(last_s: float, total_s: float) -> bool:
-    return -_SUMMARY_DELAY_S < total_s - last_s < _EMPTY_S
+    return -_SUMMARY_DELAY_S < total_s - last_s < _MAX_OMITTED_S
 
 
 def _gaps(intervals: tuple[IperfInterval, ...]) -> Iterator[str]:
@@ -202,9 +202,9 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, settings:
         ("datagrams lost", totals.lost, (_sum(receiver.intervals, "lost"),)),
     )
     for quantity, total, candidates in comparisons:
-        added = [count for count in candidates if count is not None]
-        if total is not None and added and total not in added:
-            yield f"the client's summary has {total} {quantity}, but the intervals have {added[0]}"
+        known_counts = [count for count in candidates if count is not None]
+        if total is not None and known_counts and total not in known_counts:
+            yield f"the client's summary has {total} {quantity}, but the intervals have {known_counts[0]}"
     if settings.protocol is Protocol.TCP:
         return
     jitters_s = [test.totals.jitter_s for test in (client, receiver) if test.totals.jitter_s is not None]

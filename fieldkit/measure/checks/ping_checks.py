@@ -171,12 +171,12 @@ def _summary(output: Ping) -> Iterator[str]:
     if output.summary_s is None or not times_s:
         return
     line_times_s = min(times_s), sum(times_s) / len(times_s), max(times_s)
-    for name, summed_s, printed_s in zip(
+    for name, summary_s, printed_s in zip(
         ("shortest", "mean", "longest"), output.summary_s, line_times_s, strict=True
     ):
-        if abs(summed_s - printed_s) > _ROUNDING * max(summed_s, printed_s) + 2e-6:
+        if abs(summary_s - printed_s) > _ROUNDING * max(summary_s, printed_s) + 2e-6:
             in_lines = f"but its lines {1e3 * printed_s:.3f} ms"
-            yield f"ping's summary has {1e3 * summed_s:g} ms as the {name} time, {in_lines}"
+            yield f"ping's summary has {1e3 * summary_s:g} ms as the {name} time, {in_lines}"
 
 
 def compare_with_capture(

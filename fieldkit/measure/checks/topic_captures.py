@@ -32,7 +32,7 @@ MIN_SAMPLES: Final = 20
 than `MIN_SAMPLES` samples. A program on a busy robot delays single samples for longer, but not all of them."""
 
 SLOW_S: Final = 0.02
-"""A delay of which the subscriber's program caused more than this, and more than a tenth, is withheld: such a program
+"""A delay is withheld if the subscriber's program caused more than this and more than a tenth of it: such a program
 cannot be distinguished from a log with wrong times. On two idle hosts the largest of 100 was 0.3 to 13 ms."""
 
 PROGRAM_DELAY_FIGURES: Final = {

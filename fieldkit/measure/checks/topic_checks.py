@@ -17,7 +17,7 @@ from fieldkit.measure.transfers import topic_samples
 from fieldkit.measure.transfers.topic_samples import TopicLog
 
 MAX_SLEW_NS: Final = 1_000_000
-"""Largest difference by which two consecutive times of one program may be reversed by a slewed clock."""
+"""A slewed clock may reverse two consecutive times of one program by at most this."""
 
 SETTLES_NS: Final = 500_000_000
 """Minimum time between the record of the match and the first sample (`fieldkit.agent.stream.SETTLES_S`)."""

@@ -71,7 +71,7 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
 def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
     """Return a description of packets of an earlier transfer, or None; in one transfer each netcat has one port.
 
-    Such packets arrive with payload from a port from which nothing was sent; or they were delayed in the sender, and
+    Such packets arrive with payload from a port that sent nothing; or they were delayed in the sender, and
     are sent from another port than that of the last start. A retransmission of an aborted connection is not a start.
     """
     sent, received = (

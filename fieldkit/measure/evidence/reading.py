@@ -21,7 +21,7 @@ MAX_TEXT_BYTES: Final = 64 << 20
 
 _CHUNK_BYTES: Final = 1 << 20
 _MAX_READ_BYTES: Final = 1 << 24
-"""Size up to which a file is read into memory instead of mapped; most captures are smaller."""
+"""Files up to this size are read into memory, larger ones are mapped; most captures are smaller."""
 
 
 def size(path: Path) -> int:

@@ -214,7 +214,7 @@ def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
 
 
 def _require_times(sent_ns: Ints, received_ns: Ints) -> None:
-    """Raise an error for captures from which durations cannot be computed."""
+    """Raise an error if durations cannot be computed from the times of the captures."""
     if not len(sent_ns):
         raise EvidenceError("no packet of the flow is in the sender's capture")
     for times_ns in (sent_ns, received_ns):
