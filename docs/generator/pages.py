@@ -121,7 +121,7 @@ def procedure() -> str:
                 ("`during`", "required", "Steps to repeat for each combination of values."),
             ),
         ),
-        f"A file has at most {loops.MOST:,} steps after expansion.",
+        f"A file has at most {loops.MAX_STEPS:,} steps after expansion.",
     )
 
 

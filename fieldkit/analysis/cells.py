@@ -44,8 +44,8 @@ class Estimate:
     Attributes:
         quantity: The quantity.
         n: Number of valid repeats that have a value.
-        value: The estimate to quote, by the quantity's kind: share of all counted items, mean or median.
-        low: Lower end of the 95 % interval to quote, with repeats as sampling units; None for a single repeat.
+        value: The point estimate, by the quantity's kind: share of all counted items, mean or median.
+        low: Lower end of the 95 % interval, with repeats as sampling units; None for a single repeat.
         high: Upper end; None for a single repeat, and if censored repeats leave it open.
         assured: Coverage of the interval for any distribution of the repeats; None unless it is a median of at least
             two repeats.
@@ -64,7 +64,7 @@ class Estimate:
         n_censored: Number of repeats among `n` with a right-censored value.
         is_lower_bound: Whether `value` is a lower bound because of them.
         missing: Number of valid repeats of the cell without a value.
-        high_of_sent: Upper end of the interval if lost items count as later than all received ones; None if it is
+        high_of_sent: Upper end of the interval if the value of lost items is infinite; None if it is
             open. It equals `high` for quantities that are not computed from received items only.
         sample: Values of the single repeats; None for an estimate that was not computed from repeats.
     """
@@ -103,7 +103,7 @@ class Cell:
 
     Attributes:
         key: Value of each column that identifies the condition, in the requested order; "" or None if missing.
-        n_valid: Number of valid repeats; all estimates are of these.
+        n_valid: Number of valid repeats, from which all estimates are computed.
         n_void: Number of attempts with incomplete evidence.
         n_failed: Number of attempts that failed.
         estimates: Estimates by name of the quantity, in the order of quantities; only those that any valid repeat
@@ -153,21 +153,23 @@ def aggregate(
             estimates[cell][quantity.name] = replace(estimate, missing=valid[cell] - estimate.n)
     _correct_p_values(estimates)
     tallies_by_cell: list[dict[str, Tally]] = [{} for _ in keys]
-    for column in repeats.worded if words is None else words:
+    for column in repeats.word_columns if words is None else words:
         words_with_cell = zip(cells[rows].tolist(), repeats.texts[column.name][rows], strict=True)
         for cell, tally in tallies(column, words_with_cell):
             tallies_by_cell[cell][column.name] = tally
     named_keys = (dict(zip(by, key, strict=True)) for key in keys)
     chosen = repeats.quantities if quantities is None else quantities
     ends = np.searchsorted(cells[rows], np.arange(1, len(keys)))  # the rows of a cell are adjacent
-    parts = np.split(rows, ends) if keys else []
-    payloads = [_payload_sizes(repeats, chosen, part) for part in parts]
-    lacking = [
-        _quantities_without_value(repeats, chosen, part, of_cell)
-        for part, of_cell in zip(parts, estimates, strict=True)
+    rows_by_cell = np.split(rows, ends) if keys else []
+    payloads = [_payload_sizes(repeats, chosen, cell_rows) for cell_rows in rows_by_cell]
+    without_value = [
+        _quantities_without_value(repeats, chosen, cell_rows, of_cell)
+        for cell_rows, of_cell in zip(rows_by_cell, estimates, strict=True)
     ]
-    columns_of = zip(named_keys, valid, void, failed, estimates, tallies_by_cell, payloads, lacking, strict=True)
-    return tuple(Cell(*fields) for fields in columns_of)
+    cell_fields = zip(
+        named_keys, valid, void, failed, estimates, tallies_by_cell, payloads, without_value, strict=True
+    )
+    return tuple(Cell(*fields) for fields in cell_fields)
 
 
 def _payload_sizes(repeats: Repeats, quantities: Sequence[Quantity], rows: Indices) -> dict[str, tuple[int, ...]]:
@@ -261,13 +263,13 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, chosen: Indices) 
     if counts is not None:
         lost, sent = (count.sum(axis=1) for count in counts)
         pooled = wilsons(lost, sent)
-        quoted = shares(*counts) if quantity.kind is Kind.COUNTED else pooled
+        point_estimates = shares(*counts) if quantity.kind is Kind.COUNTED else pooled
         counted = [column.astype(np.int64).tolist() for column in (lost, sent)]
     else:
-        quoted = _mean_or_median(quantity, values, upper)
-        pooled = Intervals(quoted.value, *np.full((2, len(values)), np.nan))
+        point_estimates = _mean_or_median(quantity, values, upper)
+        pooled = Intervals(point_estimates.value, *np.full((2, len(values)), np.nan))
         counted = [[None] * len(values)] * 2
-    high_of_sent = quoted.high if of_sent is upper else _mean_or_median(quantity, values, of_sent).high
+    high_of_sent = point_estimates.high if of_sent is upper else _mean_or_median(quantity, values, of_sent).high
     n = values.shape[1]
     coverage = assured(n) if quantity.kind is Kind.MEDIAN and n > 1 else None
     samples = [
@@ -277,8 +279,8 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, chosen: Indices) 
         for cell in range(len(values))
     ]
     for row in zip(
-        quoted.value.tolist(),
-        *map(_or_none, (quoted.low, quoted.high)),
+        point_estimates.value.tolist(),
+        *map(_or_none, (point_estimates.low, point_estimates.high)),
         [coverage] * len(values),
         _or_none(_p_order(repeats, quantity, chosen)),
         *map(_or_none, (pooled.low, pooled.high)),
@@ -297,7 +299,7 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, chosen: Indices) 
 def _upper_of_sent(
     repeats: Repeats, quantity: Quantity, chosen: Indices, upper: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return upper bounds of the values if lost items count as later than all received ones; infinity if unknown."""
+    """Return upper bounds of the values if lost items have an infinite value; infinity if unknown."""
     if quantity.of_sent is None:
         return upper
     column = repeats.numbers.get(quantity.of_sent)  # missing in tables of earlier versions

@@ -43,7 +43,7 @@ _MIXED: Final = (
     ("profiles_sha256", "topology", "The robots or their profiles differ between trials of the same topology."),
     ("procedure_sha256", "procedure", "A procedure differs between its trials."),
 )
-"""Column, column within whose values it must be unique, and message if it is not."""
+"""Column, grouping column, and message if a group has several values of the column."""
 
 _PAYLOAD: Final = "rtt_payload_bytes"
 
@@ -115,8 +115,8 @@ def mixtures(repeats: Repeats, by: Sequence[str] = DEFAULT_BY) -> Iterator[str]:
         if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
             yield message
     for name in (column for column in repeats.numbers if plain_name(column) == _PAYLOAD):
-        pinged = repeats.where(np.isfinite(repeats.numbers[name]))
-        if len(set(pinged.keys((*by, name)))) > len(set(pinged.keys(by))):
+        with_payload = repeats.where(np.isfinite(repeats.numbers[name]))
+        if len(set(with_payload.keys((*by, name)))) > len(set(with_payload.keys(by))):
             yield "A condition has echo requests of different sizes, whose round-trip times are not comparable."
             return
 
@@ -144,7 +144,7 @@ def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[
 def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:
     of_a, of_b = _values(name, a), _values(name, b)
     unknown = UNKNOWN in {of_a, of_b}
-    # A column that is missing in both runs is no difference, unless it identifies robots or procedure.
+    # A column that is missing in both runs is not a difference, unless it identifies robots or procedure.
     if of_a != of_b or (unknown and name in _IDENTITY):
         yield Concern(name, of_a, of_b, (), refuses and (not unknown or name in _IDENTITY))
 

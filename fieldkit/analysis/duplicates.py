@@ -21,16 +21,16 @@ def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
     attempts[unnamed] = len(repeats) + np.flatnonzero(unnamed)
     _, index, inverse = np.unique(attempts, return_index=True, return_inverse=True)
     firsts = index[inverse]
-    again = np.flatnonzero(firsts != np.arange(len(repeats)))
-    if not len(again):
+    duplicates = np.flatnonzero(firsts != np.arange(len(repeats)))
+    if not len(duplicates):
         return repeats, ()
-    _check_equal(repeats.where(firsts[again]), repeats.where(again))
-    pairs = Counter(zip(repeats.texts[SOURCE][again], repeats.texts[SOURCE][firsts[again]], strict=True))
+    _check_equal(repeats.where(firsts[duplicates]), repeats.where(duplicates))
+    pairs = Counter(zip(repeats.texts[SOURCE][duplicates], repeats.texts[SOURCE][firsts[duplicates]], strict=True))
     notes = tuple(
-        f"{source}: {format_count(rows, 'row')} of {kept} again, counted once"
+        f"{source}: {format_count(rows, 'row')} also in {kept}, counted once"
         for (source, kept), rows in pairs.items()
     )
-    return repeats.where(np.setdiff1d(firsts, again)), notes
+    return repeats.where(np.setdiff1d(firsts, duplicates)), notes
 
 
 def _check_equal(kept: Repeats, other: Repeats) -> None:
@@ -43,5 +43,5 @@ def _check_equal(kept: Repeats, other: Repeats) -> None:
                 f"{kept.name(index)} of {kept.texts['trial'][index]} has another {name} "
                 f"than in {kept.texts[SOURCE][index]}",
                 where=other.texts[SOURCE][index],
-                remedy="name one of the two",
+                remedy="give only one of the two",
             )

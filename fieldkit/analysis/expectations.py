@@ -19,7 +19,7 @@ _TEXT: Final = re.compile(
 )
 _FORMS: Final = "ip_loss < 2 %; every rtt_gap_s < 300 ms; 90 % of rtt_gap_s < 300 ms; ip_loss < 2 % of all packets"
 MAX_SHARE: Final = 0.9999
-"""Largest share of all repeats that an expectation may demand."""
+"""Largest share of all repeats that an expectation may require."""
 _MIN_LOSS: Final = 1e-9
 
 
@@ -71,9 +71,9 @@ def parse(text: str, known: Iterable[Quantity]) -> Expectation:
     """Parse the text of an expectation.
 
     Args:
-        text: `NAME < AMOUNT`, with `<`, `<=`, `>` or `>=`. The prefix `every` means each repeat (or `max` with `<`,
-            `min` with `>`), the prefix `90 % of` a share of all repeats, the suffix `of all packets` all packets
-            together. `tcp` or `udp` at the start restricts it to one protocol.
+        text: `NAME < AMOUNT`, with `<`, `<=`, `>` or `>=`. The prefix `every` (or `max` with `<`, `min`
+            with `>`) refers to each repeat. The prefix `90 % of` refers to a share of all repeats, and the suffix `of
+            all packets` to all packets together. `tcp` or `udp` at the start restricts it to one protocol.
         known: The possible figures.
 
     Raises:

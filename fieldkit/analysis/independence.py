@@ -94,9 +94,9 @@ def _upper_tail(statistic: Floats, variance: Floats) -> Floats:
     The coefficient is converted to Student's t with 1/variance - 1 degrees of freedom, whose tail is approximated by
     that of a normal distribution after Wallace's transformation (1959, Ann. Math. Stat. 30:1121).
     """
-    free = 1 / variance - 1
+    freedom = 1 / variance - 1
     size = np.minimum(np.abs(statistic), 1 - 1e-12)
-    deviate = np.sqrt(-free * np.log1p(-(size**2))) * (8 * free + 1) / (8 * free + 3)
+    deviate = np.sqrt(-freedom * np.log1p(-(size**2))) * (8 * freedom + 1) / (8 * freedom + 3)
     tail = np.asarray(_erfc(deviate / sqrt(2)), dtype=np.float64) / 2
     return np.where(statistic >= 0, tail, 1 - tail)
 

@@ -13,7 +13,7 @@ from fieldkit.analysis import one_sided_bounds
 from fieldkit.analysis.cells import Cell, Estimate, RepeatValues
 from fieldkit.analysis.expectations import Expectation, Scope
 
-_LOST_AS_LATE: Final = "if lost items count as late, the interval extends beyond it"
+_LOST_AS_LATE: Final = "if lost items count as infinitely late, the interval extends beyond the bound"
 
 
 class Ruling(StrEnum):
@@ -35,7 +35,7 @@ class Judgement:
         estimate: The estimate; None if no valid repeat has a value.
         why: Reason that the numbers do not show: repeats without a value, or the number of repeats that are needed.
         met: Number of single repeats that meet it; None if it is not about single repeats.
-        limit: The decisive 95 % bound, of the share of repeats that meet it or of the loss; None without one.
+        limit: The decisive 95 % bound, of the share of repeats that meet it or of the loss; None if there is none.
     """
 
     expectation: Expectation
@@ -81,34 +81,35 @@ def judge_by_trial(cells: Iterable[tuple[Cell, Iterable[Expectation]]]) -> tuple
             cells_by_expectation.setdefault(expectation, []).append(cell)
     return tuple(
         judgement
-        for expectation, concerned in cells_by_expectation.items()
-        for judgement in _judge_cells(expectation, concerned)
+        for expectation, matching_cells in cells_by_expectation.items()
+        for judgement in _judge_cells(expectation, matching_cells)
     )
 
 
 def _judge_cells(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Judgement]:
-    concerned = [cell for cell in cells if expectation.protocol in {None, cell.key.get("protocol")}]
-    for cell in concerned:
+    matching_cells = [cell for cell in cells if expectation.protocol in {None, cell.key.get("protocol")}]
+    for cell in matching_cells:
         estimate = cell.estimates.get(expectation.quantity)
         if estimate is None:
             why = f"0 of {cell.n_valid} repeats have a value" if cell.n_valid else "no repeat is valid"
             yield Judgement(expectation, cell, Ruling.OPEN, None, why)
             continue
         decision = _decide(expectation, estimate)
-        flaws = list(_flaws(expectation, estimate, cell.n_valid))
-        ruling = Ruling.OPEN if flaws and decision.ruling is Ruling.HOLDS else decision.ruling
-        why = "; ".join((*flaws, *([decision.why] if decision.why else [])))
+        limitations = list(_limitations(expectation, estimate, cell.n_valid))
+        ruling = Ruling.OPEN if limitations and decision.ruling is Ruling.HOLDS else decision.ruling
+        why = "; ".join((*limitations, *([decision.why] if decision.why else [])))
         yield Judgement(expectation, cell, ruling, estimate, why, decision.met, decision.limit)
-    if not concerned:
+    if not matching_cells:
         yield Judgement(expectation, None, Ruling.OPEN, None, "no repeat has ended")
 
 
-def _flaws(expectation: Expectation, estimate: Estimate, valid: int) -> Iterator[str]:
+def _limitations(expectation: Expectation, estimate: Estimate, valid: int) -> Iterator[str]:
     """Yield the reasons why an expectation must not hold although the repeats with a value meet it."""
     if missing := max(valid - estimate.n, estimate.missing):
         yield f"{missing} of {estimate.n + missing} repeats have no value"
     if estimate.n_censored:
-        yield f"in {estimate.n_censored} of {estimate.n} repeats it had not ended, so they give only lower bounds"
+        share = f"{estimate.n_censored} of {estimate.n}"
+        yield f"in {share} repeats the timed event had not ended, so they give only lower bounds"
     if expectation.is_below and estimate.quantity.of_sent and estimate.sample is not None:
         infinite = int(np.isinf(estimate.sample.high).sum()) - estimate.n_censored
         if infinite:
@@ -137,8 +138,8 @@ def _decide_figure(expectation: Expectation, estimate: Estimate) -> _Decision:
     if estimate.low is None:
         return _Decision(Ruling.OPEN, "a single repeat has no interval" if estimate.n == 1 else "it has no interval")
     high = estimate.high_of_sent if expectation.is_below and estimate.quantity.of_sent else estimate.high
-    top = math.inf if high is None else high
-    ends = [expectation.is_met(end) for end in (estimate.low, top)]
+    upper_end = math.inf if high is None else high
+    ends = [expectation.is_met(end) for end in (estimate.low, upper_end)]
     if all(ends):
         return _Decision(Ruling.HOLDS)
     if not any(ends):

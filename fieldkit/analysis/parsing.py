@@ -1,4 +1,4 @@
-"""Conversion of CSV lines to columns by pyarrow; if it fails, the lines are read in order to find the error."""
+"""Conversion of CSV lines to columns by pyarrow. If it fails, the lines are read sequentially to find the error."""
 
 import csv
 import io
@@ -174,7 +174,7 @@ def _explain_row(
         value = cells.get(name, "")
         if (problem := column.invalid_value_reason(value)) is not None:
             remedy = _SPREADSHEET_REMEDY if column.unit == "ns" and "e" in value.lower() else _REMEDY
-            return EvidenceError(f"{name} is {shown(value)}, {problem}", where=where, remedy=remedy)
+            return EvidenceError(f"{name} is {quoted_cell(value)}, {problem}", where=where, remedy=remedy)
     numeric = (name for name, column in declared.items() if column.type in {int, float})
     numbers = {name: float(cells.get(name) or "nan") for name in numeric}
     if (quantity := contradiction(numbers, quantities(declared.values()))) is not None:
@@ -186,12 +186,12 @@ def _explain_row(
     if cells["status"] not in ENDED:
         possible = ", ".join(sorted(ENDED))
         return EvidenceError(
-            f"status is {shown(cells['status'])}, not one of: {possible}", where=where, remedy=_REMEDY
+            f"status is {quoted_cell(cells['status'])}, not one of: {possible}", where=where, remedy=_REMEDY
         )
     return None
 
 
-def shown(text: str) -> str:
+def quoted_cell(text: str) -> str:
     """Return a cell of a table in quotes, shortened for a message."""
     return repr(text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}...")
 

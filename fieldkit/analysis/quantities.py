@@ -76,7 +76,7 @@ class Quantity:
         return self.label.removeprefix(f"{self.step}: ")
 
     @property
-    def is_own(self) -> bool:
+    def is_builtin(self) -> bool:
         """Whether it is a built-in quantity, instead of one that another package or a lab declares."""
         return not FIRST_OF_OTHERS <= self.rank < BACKGROUND
 
@@ -206,20 +206,20 @@ class Tally:
         return f"{self.name}{_SEPARATOR}{word}"
 
 
-def worded(columns: Iterable[Column]) -> tuple[Column, ...]:
+def word_columns(columns: Iterable[Column]) -> tuple[Column, ...]:
     """Return the columns whose words are counted, in their order."""
     return tuple(column for column in columns if column.figure is not None and column.figure.kind is Kind.WORDS)
 
 
-def tallies(column: Column, given: Iterable[tuple[int, str]]) -> Iterator[tuple[int, Tally]]:
+def tallies(column: Column, words_with_cell: Iterable[tuple[int, str]]) -> Iterator[tuple[int, Tally]]:
     """Yield the index of each cell in which a column has words, with their counts.
 
     Args:
         column: The column.
-        given: Cell and word of each valid repeat; the word is empty if missing.
+        words_with_cell: Cell and word of each valid repeat; the word is empty if missing.
     """
     counts: dict[int, Counter[str]] = {}
-    for cell, word in given:
+    for cell, word in words_with_cell:
         if word:
             counts.setdefault(cell, Counter())[word] += 1
     label = column.figure.label if column.figure else column.name

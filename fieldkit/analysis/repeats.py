@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
-from fieldkit.analysis.quantities import Quantity, quantities, worded
+from fieldkit.analysis.quantities import Quantity, quantities, word_columns
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
@@ -61,9 +61,9 @@ class Repeats:
         return tuple(quantity for quantity in all_quantities if self.numbers.keys() >= set(quantity.columns))
 
     @cached_property
-    def worded(self) -> tuple[Column, ...]:
+    def word_columns(self) -> tuple[Column, ...]:
         """The columns whose words are counted, in order."""
-        return tuple(column for column in worded(self.columns) if column.name in self.texts)
+        return tuple(column for column in word_columns(self.columns) if column.name in self.texts)
 
     def __len__(self) -> int:
         return len(next(iter(self.texts.values())))
@@ -198,7 +198,7 @@ def read(
     parser takes longer than parsing the 40 rows of a trial.
 
     Args:
-        paths: CSV files with the columns of trial.csv, of any schema version up to this fieldkit's.
+        paths: CSV files with the columns of trial.csv, of any schema version up to that of this version of fieldkit.
         declared: The columns of trial.csv.
         columns: Names of the columns to read, None for all; those of `IDENTITY` are always read.
         content: Function that reads the bytes of a table.
@@ -207,8 +207,8 @@ def read(
         ConfigurationError: A file cannot be read, is not a table of repeats, or was written by a newer fieldkit.
         EvidenceError: A line is invalid.
     """
-    wanted = None if columns is None else {*columns, *IDENTITY}
-    named = {name: column for name, column in _by_name(declared).items() if wanted is None or name in wanted}
+    requested = None if columns is None else {*columns, *IDENTITY}
+    named = {name: column for name, column in _by_name(declared).items() if requested is None or name in requested}
     batches: dict[bytes, _Batch] = {}
     parts: list[Repeats] = []
     order: list[NDArray[np.int64]] = []

@@ -65,11 +65,11 @@ def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str,
         more: Number of additional repeats by quantity, for each cell; they are the last column, if given.
     """
     names = [column.name for column in declared(EstimateRow)]
-    wanted = more or ({},) * len(cells)
+    additional = more or ({},) * len(cells)
     rows = (
         [*(cell.key[name] for name in by), *(getattr(row, name) for name in names)]
         + ([counts.get(row.quantity or "")] if more else [])
-        for cell, counts in zip(cells, wanted, strict=True)
+        for cell, counts in zip(cells, additional, strict=True)
         for row in estimate_rows(cell)
     )
     return csv_text([*by, *names, *([MORE] if more else [])], rows)
@@ -77,8 +77,8 @@ def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str,
 
 def to_json(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str, int]] = ()) -> str:
     """Return cells as one JSON object with the names, units and digits of `to_csv`; missing values are null."""
-    wanted = more or ({},) * len(cells)
-    listed = [_cell_object(cell, counts if more else None) for cell, counts in zip(cells, wanted, strict=True)]
+    additional = more or ({},) * len(cells)
+    listed = [_cell_object(cell, counts if more else None) for cell, counts in zip(cells, additional, strict=True)]
     cautions = list(wording.cautions(cells))
     document = {"schema_version": SCHEMA_VERSION, "by": list(by), "cautions": cautions, "cells": listed}
     return json_text(document, indent=1, allow_nan=False) + "\n"
@@ -90,9 +90,9 @@ def _cell_object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
     for row in estimate_rows(cell):
         if row.quantity is not None:
             values = {name: _round(value) for name, value in asdict(row).items()}
-            wanted = {} if more is None else {MORE: more.get(row.quantity)}
+            additional = {} if more is None else {MORE: more.get(row.quantity)}
             estimates[values.pop("quantity")] = {
-                name: value for name, value in (values | wanted).items() if name not in counts
+                name: value for name, value in (values | additional).items() if name not in counts
             }
     return {"key": dict(cell.key), **{name: getattr(cell, name) for name in counts}, "estimates": estimates}
 
@@ -180,13 +180,13 @@ def _word_rows(a: Tally, b: Tally, missing_in: str | None) -> Iterator[Differenc
 
 
 def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
-    """Return a Markdown table of the estimates to quote with their intervals, followed by word counts.
+    """Return a Markdown table of the estimates with their intervals, followed by word counts.
 
     The values that all cells have in common are in a line above the table.
     """
     varying, common = wording.varying_and_common(by, cells)
     shown = [(line, line.scale(cells)) for line in lines(cells, quantities)]
-    words = wording.worded(cells)
+    words = wording.word_labels(cells)
     head = [*varying, "repeats", *(scale.head(line.label) for line, scale in shown), *words.values()]
     marks = ["---"] * (len(varying) + 1) + ["---:"] * len(shown) + ["---"] * len(words)
     rows = [markdown_line(head), markdown_line(marks)]
@@ -213,7 +213,7 @@ def markdown_escaped(text: str) -> str:
 
 @dataclass(frozen=True)
 class _Column:
-    """One column of figures; its head has a line per attribute, empty if the cells are not distinguished by it."""
+    """One column of figures; its head has one line per attribute, empty if the cells do not differ in it."""
 
     scenario: str
     line: TableLine
@@ -226,7 +226,7 @@ class _Column:
 
 def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
     """Return a LaTeX `table` of column width (needs booktabs and graphicx); columns without a figure are omitted."""
-    down, common = (
+    row_keys, common = (
         [name for name in names if name not in _ACROSS_COLUMNS] for names in wording.varying_and_common(by, cells)
     )
     scales = {line: line.scale(cells) for line in lines(cells, quantities)}
@@ -240,15 +240,15 @@ def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quan
     ]
     rows: dict[tuple[str, ...], list[Cell]] = {}
     for cell in cells:
-        rows.setdefault(tuple(wording.key(cell, name) for name in down), []).append(cell)
+        rows.setdefault(tuple(wording.key(cell, name) for name in row_keys), []).append(cell)
     parts = [
         r"\begin{table}",
         r"\centering",
         rf"\caption{{{_latex_caption(common, cells)}}}",
         r"\resizebox{\columnwidth}{!}{%",
-        rf"\begin{{tabular}}{{{'l' * len(down)}{'r' * len(columns)}}}",
+        rf"\begin{{tabular}}{{{'l' * len(row_keys)}{'r' * len(columns)}}}",
         r"\toprule",
-        *_latex_head(down, columns, scales),
+        *_latex_head(row_keys, columns, scales),
         r"\midrule",
         *(
             _latex_line([*map(_latex_escaped, key), *_latex_figures(columns, scales, row)])
@@ -275,7 +275,7 @@ def _latex_caption(common: Sequence[str], cells: Sequence[Cell]) -> str:
 
 
 def _latex_head(
-    down: Sequence[str], columns: Sequence[_Column], scales: Mapping[TableLine, wording.Scale]
+    row_keys: Sequence[str], columns: Sequence[_Column], scales: Mapping[TableLine, wording.Scale]
 ) -> Iterator[str]:
     """Yield the lines of the head; a cell over several columns has a rule below it."""
     labels = [scales[column.line].head(column.line.label) for column in columns]
@@ -287,13 +287,13 @@ def _latex_head(
     levels = [level for level in levels if any(path[-1] for path in level)]
     for level in levels:
         is_last = level is levels[-1]
-        parts, rules, first = [], [], len(down) + 1
+        parts, rules, first = [], [], len(row_keys) + 1
         for path, group in groupby(level):
             width = len(list(group))
             parts.append(rf"\multicolumn{{{width}}}{{c}}{{{_latex_escaped(path[-1])}}}")
             rules.append(rf"\cmidrule(lr){{{first}-{first + width - 1}}}")
             first += width
-        yield _latex_line([*(_latex_escaped(name) if is_last else "" for name in down), *parts])
+        yield _latex_line([*(_latex_escaped(name) if is_last else "" for name in row_keys), *parts])
         if not is_last:
             yield " ".join(rules)
 

@@ -1,7 +1,7 @@
-"""Sample sizes: the repeats or packets that the expectations of a trial need, and more repeats of a cell.
+"""Sample sizes: the repeats or packets that expectations need, and the additional repeats that a cell needs.
 
 Expectations are checked before the trial runs. The additional repeats are those that narrow the interval of a cell to
-a wanted width.
+a requested width.
 """
 
 import math
@@ -52,7 +52,7 @@ def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
     if expectation.scope is Scope.EVERY:
         needed, shown = one_sided_bounds.repeats_for(_USUAL_SHARE), one_sided_bounds.share_low(repeats, repeats)
         return (
-            f"is about the repeats of this trial; over {100 * _USUAL_SHARE:.0f} % of all repeats it needs at least "
+            f"applies to the repeats of this trial; for {100 * _USUAL_SHARE:.0f} % of all repeats it needs at least "
             f"{needed} for 95 % confidence, and {repeats} show it for {math.floor(100 * shown)} %"
             if repeats < needed
             else ""
@@ -93,12 +93,14 @@ def _for_interval(expectation: Expectation, quantity: Quantity) -> int:
 _BISECTIONS: Final = 60  # enough for every number of repeats that a float represents exactly
 
 
-def more_wanted_of(cells: "Sequence[Cell]", half_widths: Mapping[str, float]) -> tuple[Mapping[str, int], ...]:
-    """Return `more_wanted` of all estimates: for each cell, by name of the quantity.
+def additional_repeats_by_cell(
+    cells: "Sequence[Cell]", half_widths: Mapping[str, float]
+) -> tuple[Mapping[str, int], ...]:
+    """Return `additional_repeats` of all estimates: for each cell, by name of the quantity.
 
     Args:
         cells: Cells with estimates of any quantities.
-        half_widths: Wanted half-width by unit. Quantities with other units, and estimates without an interval, are
+        half_widths: Requested half-width by unit. Quantities with other units, and estimates without an interval, are
             not in the result.
     """
     more_by_cell: tuple[dict[str, int], ...] = tuple({} for _ in cells)
@@ -108,14 +110,14 @@ def more_wanted_of(cells: "Sequence[Cell]", half_widths: Mapping[str, float]) ->
         estimates = [cells[index].estimates[quantity.name] for index in indices]
         ends = np.array([(estimate.value, estimate.low, estimate.high) for estimate in estimates], dtype=np.float64)
         n = [estimate.n for estimate in estimates]
-        more = more_wanted(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind, quantity.unit)
+        more = additional_repeats(Intervals(*ends.T), n, half_widths[quantity.unit], quantity.kind, quantity.unit)
         for index, count in zip(indices, more.tolist(), strict=True):
             if not math.isnan(count):
                 more_by_cell[index][quantity.name] = int(count)
     return more_by_cell
 
 
-def more_wanted(
+def additional_repeats(
     intervals: Intervals, n: ArrayLike, half_width: ArrayLike, kind: Kind, unit: str = "share"
 ) -> NDArray[np.float64]:
     """Return the number of additional repeats until the half-width of an interval is at most `half_width`.
@@ -128,7 +130,7 @@ def more_wanted(
     Args:
         intervals: Intervals as returned by `statistics` or `cells`, shape (cells,).
         n: Number of repeats of each.
-        half_width: Wanted half-width, in the unit of the value.
+        half_width: Requested half-width, in the unit of the value.
         kind: Kind of the quantity.
         unit: Unit of the quantity.
 
@@ -136,16 +138,18 @@ def more_wanted(
         Whole numbers, shape (cells,); 0 if the interval is narrow enough, NaN without an interval.
 
     Raises:
-        ValueError: A wanted half-width is not above 0.
+        ValueError: A requested half-width is not above 0.
     """
-    n, wanted = np.asarray(n, dtype=np.float64), np.asarray(half_width, dtype=np.float64)
-    if not (wanted > 0).all():
-        raise ValueError(f"half-width {wanted}: it must be above 0")
+    n, requested = np.asarray(n, dtype=np.float64), np.asarray(half_width, dtype=np.float64)
+    if not (requested > 0).all():
+        raise ValueError(f"half-width {requested}: it must be above 0")
     value, half = intervals.value, (intervals.high - intervals.low) / 2
     is_share = kind is not Kind.MEDIAN and unit == "share"
     bounded = is_share & (intervals.low >= 0) & (intervals.high <= 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(bounded, _inverse_trials(value, half) / _inverse_trials(value, wanted), (half / wanted) ** 2)
+        ratio = np.where(
+            bounded, _inverse_trials(value, half) / _inverse_trials(value, requested), (half / requested) ** 2
+        )
     ratio = np.maximum(ratio, 1)
     # Intervals that use no estimated variance have the normal quantile instead of Student's.
     if is_share:

@@ -1,7 +1,7 @@
 """Statistics over repeats with 95 % intervals: shares, means and medians, and differences of two samples.
 
-Each repeat is one independent sampling unit, with any dependence within it. All formulas are in closed form and
-vectorized over cells. There is no resampling, so no result depends on a seed. Coverage: docs/method-intervals.md.
+Each repeat is one independent sampling unit, whose items may depend on each other. All formulas are in closed form
+and vectorized over cells. There is no resampling, so no result depends on a seed. Coverage: docs/method-intervals.md.
 """
 
 import math
@@ -96,13 +96,13 @@ def shares(lost: ArrayLike, sent: ArrayLike) -> Intervals:
     with np.errstate(divide="ignore", invalid="ignore"):
         value = lost.sum(axis=1) / total
         deviations = lost - value[:, None] * sent
-        squares, free = _squares_and_freedom(np.where(np.abs(deviations) > _ROUNDING * sent, deviations, 0))
+        squares, freedom = _squares_and_freedom(np.where(np.abs(deviations) > _ROUNDING * sent, deviations, 0))
         trials = value * (1 - value) * total**2 * (n - 1) / (n * squares)
         # Repeats with equal shares have variance 0, but the share is not certain: then losses count as independent.
         trials = np.where(squares > 0, trials, total)
         repeats = total**2 / (sent**2).sum(axis=1)  # Kish 1965, Survey Sampling, 11.7: n if all sent the same number
         is_mixed = (value > 0) & (value < 1)
-        quantile = np.where(is_mixed, student(free), NORMAL)
+        quantile = np.where(is_mixed, student(freedom), NORMAL)
         low, high = _score_interval(value, np.where(is_mixed, trials, repeats), quantile)
     has_interval = (n > 1) & (value >= 0) & (value <= 1)
     return Intervals(value, np.where(has_interval, low, np.nan), np.where(has_interval, high, np.nan))
@@ -124,8 +124,8 @@ def mean_shares(values: ArrayLike) -> Intervals:
     intervals = shares(values, np.ones_like(values))
     is_outside = ((values < 0) | (values > 1)).any(axis=1)
     if is_outside.any():
-        others = means(values[is_outside])
-        intervals.low[is_outside], intervals.high[is_outside] = others.low, others.high
+        mean_intervals = means(values[is_outside])
+        intervals.low[is_outside], intervals.high[is_outside] = mean_intervals.low, mean_intervals.high
     return intervals
 
 
@@ -149,11 +149,11 @@ def means(values: ArrayLike) -> Intervals:
     deviations = values - value[:, None]
     scale = np.abs(deviations).max(axis=1)
     deviations /= np.where(scale > 0, scale, 1)[:, None]  # prevents underflow of powers of small deviations
-    squares, free = _squares_and_freedom(deviations)
+    squares, freedom = _squares_and_freedom(deviations)
     skew = (deviations**3).mean(axis=1) / np.where(squares > 0, squares / n, 1) ** 1.5
     skew = np.where(np.abs(skew) < 1e-6, 1e-6, skew)  # approximates the limit at 0 and prevents 0/0
     deviation = scale * np.sqrt(squares / (n - 1))
-    reach = student(free) / math.sqrt(n)
+    reach = student(freedom) / math.sqrt(n)
     low, high = (
         value - deviation * (np.cbrt(1 + skew * (w - skew / (6 * n))) - 1) / (skew / 3) for w in (reach, -reach)
     )
@@ -184,15 +184,15 @@ def medians(
         Medians; without interval for n = 1, and with infinity for an unknown upper end.
     """
     values = np.asarray(values, dtype=np.float64)
-    tops = values if upper is None else np.asarray(upper, dtype=np.float64)
+    upper_bounds = values if upper is None else np.asarray(upper, dtype=np.float64)
     n, value = values.shape[1], np.median(values, axis=1)
     if n < 2:
         return _no_interval(value)
     if n < MIN_FOR_ORDER_STATISTICS:
         centre = values.mean(axis=1)
         half = student(np.array(n - 1.0)) * values.std(axis=1, ddof=1) / math.sqrt(n)
-        half = np.where((tops > values).any(axis=1), 0, half)
-        low, high = np.minimum(centre - half, values.min(axis=1)), np.maximum(centre + half, tops.max(axis=1))
+        half = np.where((upper_bounds > values).any(axis=1), 0, half)
+        low, high = np.minimum(centre - half, values.min(axis=1)), np.maximum(centre + half, upper_bounds.max(axis=1))
         return _containing_value(
             value, np.maximum(low, least), np.where(np.isinf(high), high, np.minimum(high, most))
         )
@@ -200,7 +200,7 @@ def medians(
     return _containing_value(
         value,
         np.partition(values, rank - 1, axis=1)[:, rank - 1],
-        np.partition(tops, n - rank, axis=1)[:, n - rank],
+        np.partition(upper_bounds, n - rank, axis=1)[:, n - rank],
     )
 
 
@@ -268,13 +268,13 @@ def cliffs_delta(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(below + not_above - len(a) * len(b)) / (len(a) * len(b))
 
 
-def student(free: Floats) -> Floats:
-    """Return the 97.5 % quantile of Student's t with `free` degrees of freedom, 1 or at least 2, of any shape.
+def student(freedom: Floats) -> Floats:
+    """Return the 97.5 % quantile of Student's t with `freedom` degrees of freedom, 1 or at least 2, of any shape.
 
     Fisher and Cornish's expansion, with a fifth term that makes it exact at 2. The relative error is below 2e-4
     (compared with scipy, which would be a dependency for this function only).
     """
-    inverse = 1 / np.asarray(free, dtype=np.float64)
+    inverse = 1 / np.asarray(freedom, dtype=np.float64)
     series = NORMAL + inverse * np.polyval((_LAST_TERM, *reversed(_SERIES)), inverse)
     return np.where(inverse == 1, _QUANTILE_1, series)
 

@@ -85,14 +85,14 @@ class TableLine:
         estimate = self.estimate(cell)
         if estimate is None:
             return self._no_value(cell)
-        return wording.quoted(wording.number(scale, estimate), scale, estimate)
+        return wording.with_interval(wording.number(scale, estimate), scale, estimate)
 
     def amount(self, cell: Cell, scale: wording.Scale, between: str = " ") -> str:
         """Return a cell's figure with its unit and interval; `between` separates the parts."""
         estimate = self.estimate(cell)
         if estimate is None:
             return self._no_value(cell)
-        return wording.quoted(wording.amount(scale, estimate), scale, estimate, between)
+        return wording.with_interval(wording.amount(scale, estimate), scale, estimate, between)
 
     def _no_value(self, cell: Cell) -> str:
         return f"none, 0 of {cell.n_valid}" if self.is_lacking(cell) else ""
@@ -124,10 +124,10 @@ def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -
 
 def _quantity_lines(quantity: Quantity, cells: Sequence[Cell]) -> Iterator[TableLine]:
     label = wording.label(quantity)
-    concerned = [
+    cells_with_quantity = [
         cell for cell in cells if quantity.name in cell.estimates or quantity in cell.quantities_without_value
     ]
-    sizes = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in concerned})
+    sizes = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in cells_with_quantity})
     if not any(sizes):
         yield TableLine(label, (quantity,))
         return
@@ -142,7 +142,7 @@ def _payload_label(quantity: Quantity, sizes: Sequence[int]) -> str:
 
 
 def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> list[TableLine]:
-    """Return the lines for an operator during a trial, in order; all lines if there are none of these.
+    """Return the lines for an operator during a trial, in order; all lines if none of these exists.
 
     These are losses, delays, throughput and signal; quantities with an expectation; and quantities that the lab added
     to a procedure.
@@ -159,7 +159,7 @@ def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> lis
 
 def _is_for_operator(quantity: Quantity, expected: Collection[str]) -> bool:
     name = plain_name(quantity.name)
-    return name in _OPERATOR or not quantity.is_own or name.endswith(_FAULT_ENDINGS) or quantity.name in expected
+    return name in _OPERATOR or not quantity.is_builtin or name.endswith(_FAULT_ENDINGS) or quantity.name in expected
 
 
 def _operator_rank(quantity: Quantity) -> int:
@@ -187,7 +187,7 @@ def _with_radio_loss(chosen: Sequence[TableLine], cells: Sequence[Cell]) -> Iter
             yield TableLine(_with_step(step, "radio loss"), tuple(loss.quantities[0] for loss in losses))
 
 
-def sent(cells: Sequence[Cell]) -> dict[str, list[str]]:
+def sent_counts(cells: Sequence[Cell]) -> dict[str, list[str]]:
     """Return the number of items that the valid repeats of each cell sent, by label; an empty text if unknown."""
     steps = dict.fromkeys(estimate.quantity.step for cell in cells for estimate in cell.estimates.values())
     counts_by_label: dict[str, list[str]] = {}
@@ -206,5 +206,5 @@ def _trial_count(cell: Cell, names: Sequence[str]) -> str:
 
 
 def _with_step(step: str, label: str) -> str:
-    """Return a label with the name of its step as prefix, as in `columns.named`."""
+    """Return a label with the name of its step as prefix, as in `columns.with_step_name`."""
     return f"{step}: {label}" if step else label

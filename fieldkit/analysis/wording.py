@@ -68,13 +68,13 @@ class Scale:
 
 
 def interval(scale: Scale, estimate: Estimate) -> str:
-    """Return the interval of an estimate with the marks `*` and `!` that `cautions` explains; empty without one."""
+    """Return the interval of an estimate with the marks `*` and `!` (see `cautions`); empty if it has no interval."""
     text = scale.interval(estimate.low, estimate.high)
     return text and text + ("*" if assumes_normal(estimate) else "") + ("!" if is_dependent(estimate) else "")
 
 
 def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
-    """Return the value to quote without its unit, as `>= 2.30` if it is a lower bound.
+    """Return the value of an estimate without its unit, as `>= 2.30` if it is a lower bound.
 
     Args:
         scale: Scale of the number.
@@ -87,7 +87,7 @@ def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
 
 
 def amount(scale: Scale, estimate: Estimate) -> str:
-    """Return the value to quote with its unit, as `>= 2.30 s` if it is a lower bound."""
+    """Return the value of an estimate with its unit, as `>= 2.30 s` if it is a lower bound."""
     return f"{_at_least(estimate.is_lower_bound)}{scale.amount(estimate.value)}"
 
 
@@ -105,7 +105,7 @@ def incomplete(estimate: Estimate) -> str:
     return ", ".join(parts)
 
 
-def quoted(figure: str, scale: Scale, estimate: Estimate, between: str = " ") -> str:
+def with_interval(figure: str, scale: Scale, estimate: Estimate, between: str = " ") -> str:
     """Return a figure with its interval, and with the number of repeats unless all have a value.
 
     Args:
@@ -216,11 +216,11 @@ def time_scale(time_s: float) -> Scale:
 
 
 def label(quantity: Quantity) -> str:
-    """Return the label of the estimate to quote."""
+    """Return the label of the estimates of a quantity."""
     return f"{quantity.label}, median" if quantity.kind is Kind.MEDIAN else quantity.label
 
 
-def shown(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantity]:
+def with_estimates(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantity]:
     """Return the quantities that any of the cells has."""
     return [quantity for quantity in quantities if any(quantity.name in cell.estimates for cell in cells)]
 
@@ -253,7 +253,7 @@ def counts(cell: Cell) -> str:
     return status_counts({Status.VALID: cell.n_valid, Status.VOID: cell.n_void, Status.FAILED: cell.n_failed})
 
 
-def worded(cells: Sequence[Cell]) -> dict[str, str]:
+def word_labels(cells: Sequence[Cell]) -> dict[str, str]:
     """Return the labels of the word columns that any of the cells has, by name and in order."""
     return {name: tally.label for cell in cells for name, tally in cell.tallies.items()}
 
@@ -267,7 +267,7 @@ def tally(cell: Cell, name: str, between: str = ", ") -> str:
     return between.join((*_word_counts(words), *([f"{without} without"] if without else [])))
 
 
-def tallied(words: Tally) -> str:
+def tally_text(words: Tally) -> str:
     """Return the number of repeats for each word: `wet 12, dry 7`."""
     return ", ".join(_word_counts(words))
 

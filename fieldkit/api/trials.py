@@ -54,7 +54,7 @@ class TrialCell:
 
     Attributes:
         condition: The condition, by column.
-        n_valid: Number of valid repeats; all figures are of these.
+        n_valid: Number of valid repeats, from which all figures are computed.
         n_void: Number of attempts whose evidence was incomplete.
         n_failed: Number of attempts that failed.
     """
@@ -203,7 +203,7 @@ class Trials:
             )
         selected = transfers if step is None else {step: transfers[step]}
         return table.of_packets(
-            {name: fates.read_crossings(attempt, transfer) for name, transfer in selected.items()}
+            {name: fates.read_sent_packets(attempt, transfer) for name, transfer in selected.items()}
         )
 
     def __len__(self) -> int:

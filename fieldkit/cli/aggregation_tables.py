@@ -12,7 +12,7 @@ from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.judgements import Judgement, judge_by_trial
 from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.analysis.sample_size import more_wanted_of
+from fieldkit.analysis.sample_size import additional_repeats_by_cell
 from fieldkit.analysis.table_lines import TableLine
 from fieldkit.cli import results
 from fieldkit.cli.display import prose, show_note, table
@@ -60,7 +60,7 @@ def show(arguments: argparse.Namespace) -> int:
     for mixture in mixtures(repeats, by):
         show_note(mixture.removesuffix("."))
     cells = aggregate(repeats, by, quantities=quantities, words=counted)
-    more = more_wanted_of(cells, widths) if widths else ()
+    more = additional_repeats_by_cell(cells, widths) if widths else ()
     if form in _FOR_PROGRAMS:
         print_text(_FOR_PROGRAMS[form](by, cells, more), end="")
     elif form in _FOR_PAPERS:
@@ -98,7 +98,7 @@ def _require_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) 
 
 
 def _require_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
-    if not wording.shown(cells, quantities):
+    if not wording.with_estimates(cells, quantities):
         names = " or ".join(quantity.name for quantity in quantities)
         raise EvidenceError(
             f"no valid repeat has a value of {names}, so the table would be empty",
@@ -144,7 +144,7 @@ def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], 
             ]
         if measured_cells:
             _show_table(scale.head(line.label.removesuffix(", median")), differing, measured_cells, figures)
-    for name, label in wording.worded(cells).items():
+    for name, label in wording.word_labels(cells).items():
         measured_cells = [cell for cell in cells if name in cell.tallies]
         figures = [
             {"n": _n(cell.tallies[name].n, cell), "repeats with each": wording.tally(cell, name)}

@@ -181,7 +181,7 @@ def _lines(comparison: Comparison, pair: Pair) -> list[tuple[str, ...]]:
         )
         for difference in pair.differences
     ]
-    words = [(a.label, wording.tallied(a), wording.tallied(b), "", wording.NOT_JUDGED) for a, b in pair.words]
+    words = [(a.label, wording.tally_text(a), wording.tally_text(b), "", wording.NOT_JUDGED) for a, b in pair.words]
     return figures + words or [("nothing measured", "", "", "", "")]
 
 

@@ -68,9 +68,9 @@ def _summary(group: Sequence[Cell], shown: Sequence[TableLine], between: str = "
     figures = [(line.label, *(line.amount(cell, line.scale(group), between) for cell in group)) for line in shown]
     words = [
         (label, *(wording.tally(cell, name, f",{between}") for cell in group))
-        for name, label in wording.worded(group).items()
+        for name, label in wording.word_labels(group).items()
     ]
-    sent = [(label, *counts) for label, counts in table_lines.sent(group).items()]
+    sent = [(label, *counts) for label, counts in table_lines.sent_counts(group).items()]
     rows = [("repeats", *map(wording.counts, group)), *sent, *(row for row in figures if any(row[1:])), *words]
     return ("[95 % interval]", *(str(cell.key["protocol"]).upper() for cell in group)), rows
 

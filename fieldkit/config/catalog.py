@@ -24,12 +24,12 @@ Item = TypeVar("Item", bound=Named)
 
 
 def load(kind: Kind, name: str, model: type[Item]) -> Item:
-    """Return the file of `name` as a frozen `model`; errors as `find`, `schema.read` and `named`."""
+    """Return the file of `name` as a frozen `model`; errors as `find`, `schema.read` and `validate_named`."""
     path = find(kind, name)
-    return named(schema.read(path), model, path.stem)
+    return validate_named(schema.read(path), model, path.stem)
 
 
-def named(document: schema.Document, model: type[Item], name: str) -> Item:
+def validate_named(document: schema.Document, model: type[Item], name: str) -> Item:
     """Return a document as a frozen `model` with this name.
 
     Raises:

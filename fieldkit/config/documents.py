@@ -1,6 +1,6 @@
 """YAML documents: read with the line of each value, written, and edited one value at a time.
 
-The only module that imports PyYAML.
+This is the only module that imports PyYAML.
 """
 
 import codecs
@@ -83,13 +83,13 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
                 if line.lstrip().startswith("- "):
                     raise _JoinedItemError(number)
 
-    def whole(self, node: yaml.ScalarNode) -> int:
+    def checked_int(self, node: yaml.ScalarNode) -> int:
         """Return a whole number. Leading zeros have no effect."""
         if len(node.value) > _MAX_DIGITS or abs(number := int(node.value)) > _MAX_INT:
             raise _problem(f"this number is beyond {_MAX_INT}", node)
         return number
 
-    def real(self, node: yaml.ScalarNode) -> float:
+    def checked_float(self, node: yaml.ScalarNode) -> float:
         """Return a number with a fraction or an exponent."""
         if len(node.value) > _MAX_DIGITS or not math.isfinite(number := float(node.value)):
             raise _problem("this number is too large, or has too many digits", node)
@@ -113,8 +113,8 @@ def _problem(text: str, place: yaml.Node | yaml.Event) -> yaml.MarkedYAMLError:
 
 
 # The type annotations of PyYAML accept only its own loaders.
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.whole)  # type: ignore[type-var]
-_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.real)  # type: ignore[type-var]
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.checked_int)  # type: ignore[type-var]
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.checked_float)  # type: ignore[type-var]
 
 
 class _Dumper(yaml.SafeDumper):
@@ -150,7 +150,7 @@ for _tag, (_pattern, _first) in _CORE_SCHEMA.items():
 
 
 # PyYAML converts some escapes and directives without checks, so invalid ones raise ValueError or OverflowError.
-_NOT_YAML: Final = (yaml.YAMLError, ValueError, OverflowError)
+_YAML_ERRORS: Final = (yaml.YAMLError, ValueError, OverflowError)
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class Document:
         return f"{self.source}:{self.lines.get(self.existing_part(location), 1)}"
 
     def existing_part(self, location: Location) -> Location:
-        """Return a location without the parts that do not exist in the file: a missing key, or the name of a kind."""
+        """Return a location without the parts that do not exist in the file: a missing key, or a union's tag."""
         existing: Location = ()
         for part in location:
             existing = (*existing, part) if (*existing, part) in self.lines else existing
@@ -200,7 +200,7 @@ class Document:
 
 
 def read(path: Path) -> Document:
-    """Read one YAML file; errors as `parse`, and a file that cannot be read."""
+    """Read one YAML file; raises as `parse`, and if the file cannot be read."""
     return parse(_text(path), source=str(path))
 
 
@@ -220,14 +220,14 @@ def _text(path: Path) -> str:
         raise ConfigurationError(
             f"cannot be read: {error.strerror}",
             where=str(path),
-            remedy=f"check its name and rights: {shell_command('ls', '-l', path)}",
+            remedy=f"check its name and permissions: {shell_command('ls', '-l', path)}",
         ) from error
     try:
         return data.decode()
     except UnicodeDecodeError as error:
-        wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        line = 1 if wide else data.count(b"\n", 0, error.start) + 1
-        remedy = "save it as UTF-8, not as UTF-16" if wide else "save it as UTF-8"
+        is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        line = 1 if is_utf16 else data.count(b"\n", 0, error.start) + 1
+        remedy = "save it as UTF-8, not as UTF-16" if is_utf16 else "save it as UTF-8"
         raise ConfigurationError("cannot be read: it is not UTF-8", where=f"{path}:{line}", remedy=remedy) from error
 
 
@@ -241,7 +241,7 @@ def parse(text: str, *, source: str) -> Document:
     try:
         loader = _Loader(text)
         return _document(loader, source)
-    except _NOT_YAML as error:
+    except _YAML_ERRORS as error:
         raise _configuration_error(error, text, source, loader.line + 1 if loader else 1) from error
 
 
@@ -249,7 +249,7 @@ def _document(loader: _Loader, source: str) -> Document:
     lines: dict[Location, int] = {}
     try:
         node = loader.get_single_node()
-        return Document(data=None if node is None else _plain(loader, node, (), lines), source=source, lines=lines)
+        return Document(data=None if node is None else _to_plain(loader, node, (), lines), source=source, lines=lines)
     finally:
         loader.dispose()
 
@@ -280,12 +280,12 @@ def _configuration_error(error: Exception, text: str, source: str, line: int) ->
     return ConfigurationError(f"not valid YAML: {message}", where=f"{source}:{line}", remedy=remedy)
 
 
-def _plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Location, int]) -> Any:  # noqa: ANN401
+def _to_plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Location, int]) -> Any:  # noqa: ANN401
     lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.SequenceNode):
         for index, item in enumerate(node.value):
             lines[(*place, index)] = item.start_mark.line + 1
-        return [_plain(loader, item, (*place, index), lines) for index, item in enumerate(node.value)]
+        return [_to_plain(loader, item, (*place, index), lines) for index, item in enumerate(node.value)]
     if isinstance(node, yaml.MappingNode):
         mapping: dict[str, Any] = {}
         for key_node, value_node in node.value:
@@ -298,7 +298,7 @@ def _plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Locati
             if problem:
                 raise _problem(problem, key_node)
             lines[(*place, key)] = key_node.start_mark.line + 1
-            mapping[key] = _plain(loader, value_node, (*place, key), lines)
+            mapping[key] = _to_plain(loader, value_node, (*place, key), lines)
         return mapping
     return loader.construct_object(node)
 

@@ -17,8 +17,8 @@ _PACKAGE: Final = Path(__file__).resolve().parents[1]
 def folders(kind: Kind) -> tuple[Path, ...]:
     """Return the folders searched for `kind`; the first match is used.
 
-    The lab's folder is in the current directory. In a source checkout the shipped files are next to the package, in a
-    wheel inside of it.
+    The lab's folder is in the current directory. In a source checkout the shipped files are next to the package; in a
+    wheel they are inside the package.
     """
     shipped = _PACKAGE / "data" / kind
     if not shipped.is_dir():
@@ -54,7 +54,7 @@ def find(kind: Kind, name: str) -> Path:
     """Return the file of `name`.
 
     Raises:
-        ConfigurationError: There is none; the message gives the nearest name.
+        ConfigurationError: There is no such file; the message gives the nearest name.
     """
     paths = names(kind)
     if name in paths:

@@ -1,4 +1,4 @@
-"""`for:` in lists of steps: its steps are repeated for each value, when a file is read.
+"""`for:` in lists of steps: when a file is read, the steps of the loop are repeated for each value.
 
     - for:
         each: {bytes: [502, 1400]}
@@ -19,7 +19,7 @@ from typing import Any, Final
 from fieldkit.config.documents import Document, Location
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 
-MOST: Final = 1000
+MAX_STEPS: Final = 1000
 """Maximum number of steps of a file after its loops are expanded."""
 
 _LOOP: Final = "for"
@@ -46,8 +46,8 @@ def expand_loops(document: Document, key: str) -> Document:
         return document  # validation reports the error
     expander = _Expander(document)
     steps = expander.steps(document.data[key], (key,), (key,), {})
-    others = {place: line for place, line in document.lines.items() if place[:1] != (key,) or place == (key,)}
-    return replace(document, data={**document.data, key: steps}, lines={**others, **expander.lines})
+    other_lines = {place: line for place, line in document.lines.items() if place[:1] != (key,) or place == (key,)}
+    return replace(document, data={**document.data, key: steps}, lines={**other_lines, **expander.lines})
 
 
 class _Expander:
@@ -90,9 +90,9 @@ class _Expander:
                 self._append_loop(result, item[_LOOP], (*here, _LOOP), to, values)
                 continue
             self._steps += 1
-            if self._steps > MOST:
+            if self._steps > MAX_STEPS:
                 raise self._problem(
-                    f"there are more than {MOST} steps after for: is expanded", here, "give fewer values"
+                    f"there are more than {MAX_STEPS} steps after for: is expanded", here, "give fewer values"
                 )
             result.append(self._copy(item, here, (*to, len(result)), values))
 
@@ -106,13 +106,13 @@ class _Expander:
                 "during: of for: is not a list of steps", (*at, "during"), "write the steps to repeat"
             )
         variables = self._variables(loop["each"], (*at, "each"), values)
-        if (times := math.prod(map(len, variables.values()))) > MOST:
+        if (count := math.prod(map(len, variables.values()))) > MAX_STEPS:
             raise self._problem(
-                f"for: has {times} combinations, more than {MOST}", (*at, "each"), "give fewer values"
+                f"for: has {count} combinations, more than {MAX_STEPS}", (*at, "each"), "give fewer values"
             )
-        for chosen in itertools.product(*variables.values()):
-            inside = {**values, **dict(zip(variables, chosen, strict=True))}
-            self._append(result, loop["during"], (*at, "during"), to, inside)
+        for combination in itertools.product(*variables.values()):
+            inner_values = {**values, **dict(zip(variables, combination, strict=True))}
+            self._append(result, loop["during"], (*at, "during"), to, inner_values)
 
     def _variables(self, each: Any, at: Location, outer: Values) -> dict[str, list[Scalar]]:  # noqa: ANN401 (any YAML)
         """Return the values of each variable of a loop."""
@@ -176,12 +176,12 @@ class _Expander:
 
         if (only_variable := _BRACES.fullmatch(text)) is not None:
             return value_of(only_variable)
-        return _BRACES.sub(lambda match: _in_text(value_of(match)), text)
+        return _BRACES.sub(lambda match: _yaml_text(value_of(match)), text)
 
     def _problem(self, what: str, at: Location, remedy: str) -> ConfigurationError:
         return ConfigurationError(what, where=self._document.where(at), remedy=remedy)
 
 
-def _in_text(value: Scalar) -> str:
+def _yaml_text(value: Scalar) -> str:
     """Return a value in the notation of YAML."""
     return str(value).lower() if isinstance(value, bool) else str(value)

@@ -55,7 +55,7 @@ class PublishedTopic(Strict):
         return round(self.size or 3 * (self.width or 0) * (self.height or 0))
 
 
-def _known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:
+def _require_known_placeholders(argv: tuple[str, ...]) -> tuple[str, ...]:
     for word in argv:
         for _, name, form, conversion in string.Formatter().parse(word):
             if name is not None and (name not in RECORD_PLACEHOLDERS or form or conversion):
@@ -92,7 +92,7 @@ class RecordCommand(Strict):
 
     distribution: str
     setup: tuple[Annotated[str, AfterValidator(_absolute_path)], ...] = ()
-    record: Annotated[tuple[str, ...], AfterValidator(_known_placeholders)]
+    record: Annotated[tuple[str, ...], AfterValidator(_require_known_placeholders)]
     ends: Annotated[str, Field(pattern="^(itself|sigint)$")]
     writes: str
     rmw: Annotated[str, Field(pattern="^(cyclonedds|zenoh)$", exclude_if=lambda name: name == "cyclonedds")] = (
@@ -129,7 +129,7 @@ class RobotBridge(Strict):
     program: str = "fieldkit"
 
     @schema.model_validator(mode="after")
-    def _carries_something(self) -> "RobotBridge":
+    def _require_topics(self) -> "RobotBridge":
         if not self.topics and not self.back:
             raise schema.validation_error("it carries no topics; add topics or back", "topics")
         if self.router is not None and self.to != "zenoh":
@@ -157,7 +157,7 @@ MAX_DOMAIN: Final = 232
 
 
 class Ros(Strict):
-    """The ROS side of a robot.
+    """ROS settings of a robot.
 
     Attributes:
         variant: The entry of `ros.variants` that the robot runs: `ros1` or `ros2`.
@@ -176,7 +176,7 @@ class Ros(Strict):
     bridge: RobotBridge | None = Field(default=None, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
-    def _variant_exists(self) -> "Ros":
+    def _require_variant(self) -> "Ros":
         if self.variant not in self.variants:
             raise schema.validation_error(f"variant {self.variant!r} has no entry under variants")
         if self.bridge is not None and self.variant != "ros1":
@@ -184,7 +184,7 @@ class Ros(Strict):
         return self
 
     @schema.model_validator(mode="after")
-    def _is_in_a_domain(self) -> "Ros":
+    def _require_valid_domain(self) -> "Ros":
         text = self.environment.get("ROS_DOMAIN_ID") or "0"
         if not (text.isascii() and text.isdecimal() and int(text) <= MAX_DOMAIN):
             message = f"{text!r} is not a domain of ROS 2; use a whole number from 0 to {MAX_DOMAIN}"
@@ -289,8 +289,8 @@ class ProfileSection(Strict):
 class RobotProfile(catalog.Named, Sectioned):
     """A robot model: one YAML file in `robots/`.
 
-    How to write one: [add a robot](add-a-robot.md). A key described as "for information only" has no effect in this
-    version.
+    [Add a robot](add-a-robot.md) describes how to write one. A key described as "for information only" has no effect
+    in this version.
 
     An emulated robot has its setup files at their paths, except in the root folder, `/proc`, `/sys` and `/dev`;
     those in `/run` and `/tmp` are lost at a reboot. It publishes topics of any type at their rates and sizes. For
@@ -305,7 +305,7 @@ class RobotProfile(catalog.Named, Sectioned):
         computer: The on-board computer, for information only.
         radio: The radio under test.
         tools: Programs on the robot, each a name or a path.
-        ros: Its ROS side; a robot without one records nothing.
+        ros: Its ROS settings; a robot without them records nothing.
         limits: Limits of the robot.
     """
 

@@ -65,7 +65,7 @@ class LabProgram(Strict):
         return content
 
 
-def _find(value: object) -> object:
+def _to_record(value: object) -> object:
     """Return the record of the program with a given path; a record is returned unchanged."""
     if isinstance(value, dict | LabProgram):
         return value
@@ -119,5 +119,5 @@ def _record(name: str, path: Path, folder: Path) -> dict[str, object]:
     }
 
 
-NamedProgram = Annotated[LabProgram, BeforeValidator(_find)]
+NamedProgram = Annotated[LabProgram, BeforeValidator(_to_record)]
 """A program: its path, `tools/probe.py`, in a procedure, or its record in `trial.yaml`."""

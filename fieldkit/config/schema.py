@@ -1,6 +1,6 @@
 """Strict YAML and JSON: load, validate, freeze. Errors in YAML have file, line and the nearest valid key.
 
-The only module that imports pydantic. Profiles, procedures, site files and back-end options are subclasses of
+This is the only module that imports pydantic. Profiles, procedures, site files and back-end options are subclasses of
 `Strict`, loaded by `load`; records that only programs write are parsed by a `Codec`.
 """
 
@@ -94,8 +94,8 @@ def validation_error(text: str, *at: str | int) -> Exception:
     """Return the exception that a validator raises. The user gets `text` with file and line.
 
     Args:
-        text: What is wrong.
-        at: Keys and indices from the validated value to the wrong part, for the line.
+        text: Description of the error.
+        at: Keys and indices from the validated value to the invalid part, for the line.
     """
     return PydanticCustomError("complaint", "{text}", {"text": text, "at": at})
 
@@ -124,12 +124,12 @@ def _converter(parse: Callable[[str], Quantity], symbol: str) -> BeforeValidator
 
 
 def _quantity(parse: Callable[[str], float], symbol: str, factor: float = 1.0) -> tuple[object, object, object]:
-    def show(value: float) -> str:
+    def format_value(value: float) -> str:
         # Quantities are read without exponents, but str() of a float has an exponent below 0.0001.
         return f"{Decimal(f'{value / factor:.12g}'):f}{symbol}"
 
-    shown = PlainSerializer(show, return_type=str)
-    return _converter(parse, symbol), shown, WithJsonSchema({"type": "string", "examples": [f"20{symbol}"]})
+    serializer = PlainSerializer(format_value, return_type=str)
+    return _converter(parse, symbol), serializer, WithJsonSchema({"type": "string", "examples": [f"20{symbol}"]})
 
 
 def _unit(table: dict[str, float], what: str) -> Callable[[str], float]:
@@ -165,7 +165,7 @@ Span = Annotated[
 class Strict(BaseModel):
     """Base of everything read from YAML: frozen, no unknown keys.
 
-    Numbers and booleans are declared as `Int`, `Number` and `Bool`, which convert nothing silently.
+    Numbers and booleans are declared as `Int`, `Number` and `Bool`, which do not convert other types.
     """
 
     # Most commands use few of the models, so each is built at first use.
@@ -197,7 +197,7 @@ class Strict(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _known_keys(cls, data: object) -> object:
+    def _reject_unknown_keys(cls, data: object) -> object:
         if not isinstance(data, dict):
             return data
         names, sections = _names(cls), cls.section_types()
@@ -266,7 +266,7 @@ Item = TypeVar("Item")
 def by_kind(
     kinds: Callable[[], Mapping[str, type[Model]]],
     make: Callable[[str, Model], Item],
-    take: Callable[[Item], tuple[str, Model]],
+    split: Callable[[Item], tuple[str, Model]],
     what: str,
 ) -> CoreSchema:
     """Return the schema of a mapping with one key that selects the model of its value: `- ping: {...}`.
@@ -274,13 +274,13 @@ def by_kind(
     Args:
         kinds: Returns the models by key. It is called during validation, so that models can contain such mappings.
         make: Makes the object for a mapping.
-        take: Returns key and value of such an object.
+        split: Returns key and value of such an object.
         what: Noun for messages.
     """
 
     def validated(data: Any) -> Item:  # noqa: ANN401 (any YAML value, or an object that `make` returned)
         if not isinstance(data, Mapping):
-            return _require_made(data)
+            return _require_item(data)
         models = kinds()
         if unknown := next((str(key) for key in data if key not in models), None):
             parent = next((str(key) for key in data if key in models and unknown in _types(models[key])), None)
@@ -295,16 +295,16 @@ def by_kind(
         ((kind, value),) = data.items()
         return make(kind, _validated_under(kind, models[kind], value))
 
-    def _require_made(data: Any) -> Item:  # noqa: ANN401 (as above)
+    def _require_item(data: Any) -> Item:  # noqa: ANN401 (as above)
         try:
-            take(data)
+            split(data)
         except AttributeError:
             raise validation_error(f"a {what} is a mapping with one key, one of: {', '.join(kinds())}") from None
-        made: Item = data
-        return made
+        item: Item = data
+        return item
 
     def plain(item: Item, info: SerializationInfo) -> dict[str, Any]:
-        kind, value = take(item)
+        kind, value = split(item)
         data = value.model_dump(
             mode=info.mode,
             by_alias=bool(info.by_alias),
@@ -349,7 +349,7 @@ def validate(document: Document, model: type[Model]) -> Model:
 
 
 def folder() -> Path:
-    """Return the folder of the file that is being validated, or the current directory without one."""
+    """Return the folder of the file that is being validated, or the current directory if there is no file."""
     return _FOLDER.get()
 
 

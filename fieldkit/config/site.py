@@ -51,8 +51,8 @@ class SiteRobot(Strict):
         port: SSH port.
         user: SSH user; required by the field backend.
         key: Path of the private key; without it, keys of the SSH agent are used.
-        password: In place of a key: `ask` at the terminal once per run, or read it from the system's `keyring`. The
-            password itself is never written into the file.
+        password: In place of a key: `ask` requests it at the terminal once per run, `keyring` reads it from the
+            system's keyring. The password itself is never written into the file.
         host_key: Pinned host key, `ssh-ed25519 AAAA...`; required by the field backend. `fieldkit enroll` writes it.
         address: Its IPv4 address on the radio under test; without it, `host`.
     """
@@ -74,7 +74,7 @@ class SiteRobot(Strict):
 
 
 class Site(Strict):
-    """A lab: its robots and their roles. `fieldkit.yaml` in the current folder.
+    """A lab: its robots and their roles, in the file `fieldkit.yaml` of the current folder.
 
     For real robots see [field](field.md). Without a site file the emulated backend uses two TurtleBots and a
     Duckiedrone.
@@ -83,8 +83,8 @@ class Site(Strict):
     from 10.42.0.1 on, in the order of the file, and generated keys. With `control: radio` the operator's laptop is a
     station too, `laptop` at 10.42.0.254: it is 2 m from the relay in `master` and from the receiver in `masterless`,
     never behind the wall, with the same radio as the robots, and every packet of SSH is subject to the radio model.
-    In `master`, packets from sender to receiver cross two links, so `loss` and `delay` apply twice. What the radio
-    models: [method](method-radio.md#the-emulated-radio).
+    In `master`, packets from sender to receiver cross two links, so `loss` and `delay` apply twice.
+    [Method](method-radio.md#the-emulated-radio) describes the radio model.
 
     Attributes:
         backend: Backend used if the command line gives none.
@@ -120,25 +120,27 @@ class Site(Strict):
 
     @schema.model_validator(mode="after")
     def _roles_name_robots(self) -> "Site":
-        for topology, cast in self.roles.items():
-            for role, name in cast.items():
+        for topology, robot_by_role in self.roles.items():
+            for role, name in robot_by_role.items():
                 if name not in self.robots:
                     robots = ", ".join(self.robots)
                     raise schema.validation_error(
                         f"roles.{topology}.{role} names {name!r}; the robots are: {robots}", "roles", topology, role
                     )
                 # A procedure may define other roles. A role that resembles an unassigned fixed role is a misspelling.
-                unassigned = [fixed for fixed in FIXED_ROLES if fixed not in cast]
+                unassigned = [fixed for fixed in FIXED_ROLES if fixed not in robot_by_role]
                 if role not in FIXED_ROLES and (suggestion := did_you_mean(role, unassigned, "")):
                     raise schema.validation_error(f"roles.{topology}.{role}: {suggestion}", "roles", topology, role)
-            if len(set(cast.values())) < len(cast):
+            if len(set(robot_by_role.values())) < len(robot_by_role):
                 raise schema.validation_error(f"roles.{topology}: one robot has two roles", "roles", topology)
         return self
 
     @schema.model_validator(mode="after")
     def _ros_master_has_a_robot(self) -> "Site":
         # A role of a procedure exists only in trials of that procedure, so it cannot be the master.
-        assigned = [role for role in FIXED_ROLES if any(role in cast for cast in self.roles.values())]
+        assigned = [
+            role for role in FIXED_ROLES if any(role in robot_by_role for robot_by_role in self.roles.values())
+        ]
         if self.ros_master is not None and self.ros_master not in assigned:
             raise schema.validation_error(
                 f"ros_master must be one of the assigned roles: {', '.join(assigned)}", "ros_master"
@@ -186,7 +188,7 @@ def pin_host_key(path: Path, robot: str, host_key: str) -> None:
     """Set the `host_key` of a robot; every other character of the file is unchanged. The write is atomic.
 
     Raises:
-        ConfigurationError: The file cannot be read or written, or is written in a way that cannot be edited.
+        ConfigurationError: The file cannot be read or written, or its layout does not allow the edit.
     """
     old = documents.read(path)
     try:

@@ -13,9 +13,9 @@ from fieldkit.core.units import format_count
 Fields = Mapping[str, Any]
 """Types by key of a mapping, from its model."""
 
-_ALIKE: Final = 0.8
-"""Similarity (`difflib`) from which a name counts as a misspelling of another."""
-_DEEPEST: Final = 10
+_MIN_SIMILARITY: Final = 0.8
+"""Minimum similarity (`difflib`) at which a name counts as a misspelling of another."""
+_MAX_DEPTH: Final = 10
 """Maximum nesting of generic types that is searched."""
 
 
@@ -42,7 +42,9 @@ def misplaced_hint(key: str, data: Mapping[Any, Any], fields: Fields, outer: Seq
             return "", index
     valid = f"valid keys: {', '.join(fields)}"
     if preceding and _is_opaque_mapping(fields.get(preceding[-1])):
-        similar = [f"did you mean {name!r}? " for name in difflib.get_close_matches(key, fields, n=1, cutoff=_ALIKE)]
+        similar = [
+            f"did you mean {name!r}? " for name in difflib.get_close_matches(key, fields, n=1, cutoff=_MIN_SIMILARITY)
+        ]
         return (
             f"{''.join(similar) or f'{valid}; '}if it is a key of {preceding[-1]}, indent it below {preceding[-1]}:",
             -1,
@@ -56,7 +58,7 @@ def _inner_keys(kind: Any, depth: int = 0) -> Iterator[Sequence[str]]:  # noqa: 
     if fields is not None:
         yield [field.alias or name for name, field in fields.items()]
         return
-    if getattr(kind, "__origin__", kind) in {list, tuple, dict} or depth == _DEEPEST:
+    if getattr(kind, "__origin__", kind) in {list, tuple, dict} or depth == _MAX_DEPTH:
         return
     for part in get_args(kind):
         yield from _inner_keys(part, depth + 1)
@@ -72,7 +74,7 @@ SHAPES: Final[dict[str, str]] = {}
 
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
 _MAX_SHOWN: Final = 60
-_NOTHING: Final = ", and there are none; indent the keys that belong to this line more than this line"
+_NO_KEYS_HINT: Final = ", and there are none; indent the keys that belong to this line more than this line"
 _MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 
 
@@ -87,7 +89,7 @@ def explain(problems: Sequence[Any], document: Document) -> ConfigurationError:
     def line(problem: Any) -> int:  # noqa: ANN401 (as in `explain`)
         return int(document.where(_location(problem)).rsplit(":", 1)[1])
 
-    problems = sorted(_without_echoes(problems), key=line)
+    problems = sorted(_without_cascading_errors(problems), key=line)
     first = problems[0]
     location = _location(first)
     place: Location = first["loc"]
@@ -128,16 +130,16 @@ def _missing_key(problem: Any) -> str:  # noqa: ANN401 (as in `explain`)
     return last if problem["type"] == "missing" and isinstance(last, str) else ""
 
 
-def _without_echoes(problems: Sequence[Any]) -> list[Any]:
+def _without_cascading_errors(problems: Sequence[Any]) -> list[Any]:
     """Return the problems without those of lists that are too short only because of an error in their items."""
 
-    def is_echo(problem: Any) -> bool:  # noqa: ANN401 (as in `explain`)
+    def is_cascading(problem: Any) -> bool:  # noqa: ANN401 (as in `explain`)
         depth = len(problem["loc"])
         return problem["type"] == "too_short" and any(
             other["loc"][:depth] == problem["loc"] and len(other["loc"]) > depth for other in problems
         )
 
-    return [problem for problem in problems if not is_echo(problem)]
+    return [problem for problem in problems if not is_cascading(problem)]
 
 
 def _location(problem: Any) -> Location:  # noqa: ANN401 (as in `explain`)
@@ -152,7 +154,7 @@ def _message(problem: Mapping[str, Any]) -> str:
     value, context = problem["input"], problem.get("ctx", {})
     match problem["type"]:
         case "model_type" | "dict_type":
-            message = f"keys with values are needed here{_NOTHING * (value is None)}"
+            message = f"keys with values are needed here{_NO_KEYS_HINT * (value is None)}"
         case "value_error":
             message = str(context["error"])
         case "union_tag_not_found":

@@ -94,8 +94,8 @@ class Figure:
         at_least: Column with the observed duration if the event had not ended (a right-censored value). It has a
             value only in repeats in which the figure's column is empty for this reason. Only for medians; it has the
             same unit and no figure.
-        of_sent: Column with the same statistic over all sent items, in which a lost item is later than every received
-            one; empty if the result is infinite. For a figure that is computed from received items only, such as a
+        of_sent: Column with the same statistic over all sent items, in which the value of a lost item is infinite;
+            empty if the result is infinite. For a figure that is computed from received items only, such as a
             median RTT. An expectation `NAME < AMOUNT` must hold for both. Only for medians; it has the same unit.
     """
 
@@ -147,7 +147,7 @@ class Column:
         return low, high
 
     def declaration_error(self) -> str | None:
-        """Return why other programs cannot read or show the column, or None if they can."""
+        """Return the error in this declaration, such as an invalid name, or None if it is valid."""
         if not _NAME.fullmatch(self.name):
             return "its name is not made of lower-case letters, digits and _, with points between parts"
         texts = {"name": self.name, "unit": self.unit, "meaning": self.meaning}
@@ -158,10 +158,10 @@ class Column:
                 return f"its {attribute} is not 1 to {_MAX_LENGTHS[attribute]} printable characters"
         if self.bounds is not None and not self.bounds[0] <= self.bounds[1]:
             return f"its bounds {self.bounds[0]:g} and {self.bounds[1]:g} are not in ascending order"
-        return None if self.figure is None else self._figure_flaw(self.figure)
+        return None if self.figure is None else self._figure_error(self.figure)
 
-    def _figure_flaw(self, figure: Figure) -> str | None:
-        """Return why the repeats cannot be aggregated by this figure, or None if they can."""
+    def _figure_error(self, figure: Figure) -> str | None:
+        """Return the reason why the figure cannot aggregate the repeats of this column, or None if it can."""
         if (figure.kind is Kind.WORDS) is not (self.type is str):
             return "a text column needs a figure of kind words, and no other column can have one"
         if (figure.kind is Kind.FLAG) is not (self.type is bool):
@@ -174,7 +174,7 @@ class Column:
         return "the unit of a counted figure must be share" if is_counted and self.unit != "share" else None
 
     def invalid_value_reason(self, text: str) -> str | None:
-        """Return why a cell's text is not a possible value, such as `not a number`; None if it is one, or missing."""
+        """Return the reason why a text is not a possible value: `not a number`; None if it is possible or missing."""
         if self.type is str or text in MISSING:
             return None
         if self.type is bool:
@@ -204,7 +204,7 @@ def columns(
     Raises:
         TypeError: `rank` is not a number.
     """
-    if not isinstance(rank, int):  # without it, the first column would be lost unnoticed
+    if not isinstance(rank, int):  # without a rank, the first column would be lost without an error
         raise TypeError("the first argument of columns is the rank, for example 100")
     return tuple(_make_column(rank, *parts) for parts in declared)
 
@@ -312,9 +312,11 @@ class EstimateRow:
     n_valid: int | None = _column("count", "Valid repeats.")
     n_void: int | None = _column("count", "Attempts with incomplete evidence.")
     n_failed: int | None = _column("count", "Attempts that failed.")
-    n: int | None = _column("count", "Valid repeats that have a value of the quantity; all numbers are of these.")
+    n: int | None = _column(
+        "count", "Valid repeats that have a value of the quantity; all numbers are computed from these."
+    )
     value: float | None = _column(
-        "unit", "Estimate to quote: share of all counted items, mean over repeats, or median over repeats."
+        "unit", "Point estimate: share of all counted items, mean over repeats, or median over repeats."
     )
     low: float | None = _column(
         "unit", "Lower end of the 95 % interval, with repeats as sampling units; empty for a single repeat."
@@ -407,7 +409,7 @@ def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def csv_line(values: Iterable[object]) -> str:
-    """Return values as one CSV line with line end; text that a spreadsheet would read as a formula is `guarded`."""
+    """Return values as one CSV line with line end; text that a spreadsheet would read as a formula is escaped."""
     out = io.StringIO()
     cells = (escape_formula(cell(value)) if isinstance(value, str) else cell(value) for value in values)
     csv.writer(out, lineterminator="\n").writerow(cells)

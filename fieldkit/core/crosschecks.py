@@ -7,8 +7,8 @@ from enum import StrEnum
 class CheckOutcome(StrEnum):
     """Consequence of a contradiction.
 
-    `void`: the repeat does not count; `withheld`: the columns are empty, with the reason; `unchecked`: the quantity
-    has one source only.
+    `void`: the repeat does not count; `withheld`: the columns are empty, and the reason is reported; `unchecked`: the
+    quantity has one source only.
     """
 
     VOID = "void"
@@ -23,7 +23,7 @@ class CrossCheck:
     Attributes:
         quantity: Description of the quantity.
         columns: Columns of trial.csv that depend on it; patterns of `fnmatch`.
-        source: File and field that the columns are computed from; ROLE stands for a role.
+        source: File and field that the columns are computed from; ROLE is a placeholder for a role.
         against: Independent sources; empty only if the quantity is unchecked.
         tolerance: Legitimate differences, with the reason; for an unchecked quantity, why it has only one source.
         outcome: Consequence of a larger difference.

@@ -49,7 +49,7 @@ class Deadline:
     def extended_by_suspension(self, began_s: float, wait_s: float) -> "Deadline":
         """Return the deadline, extended by the time for which this process was suspended during a wait.
 
-        A suspension is no evidence about the awaited program, whose answer may have arrived already.
+        A suspension does not show that the awaited program failed: its answer may have arrived already.
 
         Args:
             began_s: Start of the wait, in seconds of `time.monotonic`.
@@ -60,7 +60,7 @@ class Deadline:
 
 
 class ExpiredError(TimeoutError):
-    """A fieldkit deadline has passed, in contrast to a `TimeoutError` of the system, as of a dead connection.
+    """A fieldkit deadline has passed, in contrast to a `TimeoutError` of the operating system for a connection.
 
     Args:
         what: What did not happen in time, for messages: `start`.

@@ -67,7 +67,7 @@ class MotionHeldError(RobotError):
 
 
 class HostKeyError(RobotError):
-    """The robot's SSH host key has changed: another machine, or a new installation; a person must check it."""
+    """The robot's SSH host key has changed, by another machine or a new installation; a person must check it."""
 
     ends_trial = True
 
@@ -94,11 +94,11 @@ class EvidenceError(FieldkitError):
     exit_code = 4
 
 
-def raised(error: BaseException) -> str:
+def describe_exception(error: BaseException) -> str:
     """Return an exception in one line with the place in the code: `KeyError: 'a' (hops_step.py, line 28)`.
 
-    The place is the last one in the outermost file that does not belong to fieldkit, because the error of a step or
-    policy of another package may be raised by a library that it calls; without such a file, it is the last one.
+    The place is the last traceback entry in the outermost file that is not part of fieldkit, because a step or policy
+    of another package may call a library that raises the error. Without such a file, it is the last entry.
     """
     first_line = next(iter(str(error).splitlines()), "")
     text = type(error).__name__ + (f": {first_line}" if first_line else "")
@@ -113,16 +113,16 @@ def raised(error: BaseException) -> str:
 def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:
     """Return the remedy for an unknown name: `did you mean 'rtt_loss'?`, or `otherwise` if no known name is similar.
 
-    Similar are all names that contain `name` as a whole word, as `rtt_loss` contains `rtt`, or that end with it after
-    the name of a step, as `up.rtt`; otherwise the closest match. The case of letters is ignored.
+    A name is similar if it contains `name` as a whole word, as `rtt_loss` contains `rtt`, or ends with it after the
+    name of a step, as `up.rtt`. If there is no such name, the closest match is similar. Case is ignored.
     """
     names = {candidate.lower(): candidate for candidate in known}
-    shell_command = name.lower()
+    lower_name = name.lower()
     matches = [
         candidate
         for lower, candidate in names.items()
-        if shell_command in lower.split("_") or lower.endswith(f".{shell_command}")
-    ] or [names[lower] for lower in difflib.get_close_matches(shell_command, names, n=1)]
+        if lower_name in lower.split("_") or lower.endswith(f".{lower_name}")
+    ] or [names[lower] for lower in difflib.get_close_matches(lower_name, names, n=1)]
     return f"did you mean {' or '.join(map(repr, matches))}?" if matches else otherwise
 
 

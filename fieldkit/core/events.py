@@ -217,7 +217,7 @@ class ExpectationJudged:
         ruling: `holds`, `does not hold` or `undecided`.
         why: Reason of the ruling that the numbers do not show; empty if they show it.
         measured: Measured value, formatted for people.
-        interval: Its interval or bound, formatted for people; empty without one.
+        interval: Its interval or bound, formatted for people; empty if there is none.
         n: Number of valid repeats that have the figure.
         n_valid: Number of valid repeats.
         n_censored: Number of repeats among `n` with a right-censored value.

@@ -17,10 +17,10 @@ _HARD_LINK_REASON: Final = "it has a second hard link, and writing would change 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that atomically replaces `path` at the end of the body; after a crash one of the two is complete.
+    """Open a file that atomically replaces `path` at the end of the body; a crash leaves the old or the new file.
 
-    The mode of an existing file is kept, and the file stays if the body raises. An existing symbolic link is
-    replaced, and its target is not changed. A device (as /dev/null for root), a pipe or a socket is not replaced.
+    The mode of an existing file is kept, and the file is unchanged if the body raises. An existing symbolic link is
+    replaced, and its target is not changed. A device (such as /dev/null), a pipe or a socket is not replaced.
 
     Raises:
         OSError: The file cannot be written; an existing file is unchanged.
@@ -143,7 +143,7 @@ def _sync(path: Path, flags: int = os.O_RDONLY) -> None:
         os.close(descriptor)
 
 
-def existing(folder: Path) -> Path:
+def nearest_existing(folder: Path) -> Path:
     """Return the folder, or its closest parent that exists."""
     absolute = folder.absolute()
     return next(path for path in (absolute, *absolute.parents) if path.is_dir())
@@ -151,4 +151,4 @@ def existing(folder: Path) -> Path:
 
 def free_bytes(folder: Path) -> int:
     """Return the number of free bytes on the disk of `folder`, which need not exist yet."""
-    return shutil.disk_usage(existing(folder)).free
+    return shutil.disk_usage(nearest_existing(folder)).free

@@ -11,8 +11,8 @@ def positions_m(placement: Placement) -> Mapping[Role, Vector]:
     """Return the position of each role, in metres east, north, up.
 
     Master: the relay is at the origin, and the stations are on opposite sides of it, each at the placement's
-    distance. Masterless: the sender is at the origin, and the receiver is the distance east of it; there is no relay.
-    Robots in additional roles are at their posts.
+    distance. Masterless: the sender is at the origin, and the receiver is at this distance east of it; there is no
+    relay. Robots in additional roles are at their posts.
     """
     distance_m = placement.distance.metres
     if placement.topology is Topology.MASTER:
@@ -45,7 +45,7 @@ def heading_rad(role: Role, facing: str) -> float:
 
 
 def other_end(role: Role, topology: Topology) -> Role:
-    """Return the robot at the other end of a robot's link; of the relay's two links, the sender's."""
+    """Return the robot at the other end of a robot's link. The relay has two links; its other end is the sender."""
     if role == Role.RELAY:
         return Role.SENDER
     if topology is Topology.MASTER:

@@ -1,4 +1,4 @@
-"""An append-only file of JSON lines: each line is on disk before the caller continues, and a crash is tolerated."""
+"""Append-only file of JSON lines: `append` waits until its lines are on disk; `read` omits an incomplete last one."""
 
 import errno
 import fcntl
@@ -27,7 +27,7 @@ def locked(path: Path, what: str) -> Iterator[None]:
 
     Args:
         path: The file; created if it does not exist.
-        what: What the file is the journal of, for the message: `trial`.
+        what: Subject of the journal, for the message: `trial`.
 
     Raises:
         ConfigurationError: Another process holds the lock, or the file cannot be written.
@@ -63,9 +63,9 @@ def append(path: Path, *records: Mapping[str, Any]) -> None:
     lines = "".join(json.dumps(record) + "\n" for record in records).encode()
     descriptor = files.open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     try:
-        before = os.fstat(descriptor).st_size
+        old_size = os.fstat(descriptor).st_size
         if os.write(descriptor, lines) != len(lines):
-            os.ftruncate(descriptor, before)
+            os.ftruncate(descriptor, old_size)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         os.fsync(descriptor)
     finally:
@@ -78,13 +78,13 @@ def repair_last_line(path: Path, parse: Parse[object]) -> None:
         content = files.read(path, _LIMIT_BYTES)
     except FileNotFoundError:
         return
-    torn = content.rpartition(b"\n")[2]
-    if not torn:
+    incomplete_line = content.rpartition(b"\n")[2]
+    if not incomplete_line:
         return
     try:
-        parse(json.loads(torn.decode()))
+        parse(json.loads(incomplete_line.decode()))
     except JSON_ERRORS:
-        os.truncate(path, len(content) - len(torn))
+        os.truncate(path, len(content) - len(incomplete_line))
     else:
         with path.open("ab") as file:
             file.write(b"\n")

@@ -98,6 +98,6 @@ def _selector(search_path: tuple[str, ...]) -> Callable[..., EntryPoints]:  # no
 
 
 def location(point: EntryPoint) -> str:
-    """Return the description of an entry point for error messages, with the package that pip knows it by."""
+    """Return the description of an entry point for error messages, with the name and version of its package."""
     package = f" of {point.dist.name} {point.dist.version}" if point.dist is not None else ""
     return f"entry point {point.name} = {point.value}{package}"

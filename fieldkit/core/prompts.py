@@ -130,7 +130,7 @@ class Script(Operator):
         self._lines = lines
         self._source = source
         self._sink = sink
-        self._asked = 0
+        self._line_number = 0
 
     @override
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
@@ -153,7 +153,7 @@ class Script(Operator):
         return answer
 
     def _next(self, request: str) -> str:
-        self._asked += 1
+        self._line_number += 1
         line = next(self._lines, None)
         if line is None:
             raise ConfigurationError(
@@ -168,7 +168,7 @@ class Script(Operator):
 
     @property
     def _where(self) -> str:
-        return f"{self._source}:{self._asked}"
+        return f"{self._source}:{self._line_number}"
 
 
 def answer_hint(*, may_skip: bool) -> str:

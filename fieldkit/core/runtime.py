@@ -33,7 +33,7 @@ class NameHeldError(ConfigurationError):
 
 
 def user_at_host() -> str:
-    """Return `user@laptop`, the name of the lock holder on robots."""
+    """Return `user@laptop`, which identifies the lock holder on robots."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user id without an account
@@ -95,7 +95,7 @@ def hold_lock(name: str) -> Iterator[None]:
 
     Raises:
         NameHeldError: Another process holds the lock.
-        ConfigurationError: The folder of lock files cannot be created, or is another user's.
+        ConfigurationError: The folder of lock files cannot be created, or another user owns it.
     """
     path = base_folder() / f"fieldkit-{os.geteuid()}"
     try:

@@ -89,7 +89,7 @@ def _repeat_cases(plan: Plan, entries: Iterable[JournalEntry]) -> Iterator[ET.El
 
 
 def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
-    """Judge the expectations of a trial; without its table, which it has after the first attempt, none is decided."""
+    """Judge the expectations of a trial; all are undecided before its first attempt has ended."""
     if not plan.procedure.expect:
         return ()
     table = folder / store.TRIAL_CSV

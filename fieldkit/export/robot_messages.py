@@ -105,14 +105,16 @@ def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer])
     marked = {file: _unknown(capture.packets) for file, capture in captures.items()}
     by_path: dict[tuple[str, str, str, str], list[Transfer]] = {}
     for transfer in transfers:
-        here, there = transfer.captures
-        if here is not None and there is not None and {here, there} <= captures.keys():
-            by_path.setdefault((here, there, transfer.sender_address, transfer.receiver_address), []).append(transfer)
-    for (here, there, sender, receiver), same_path in by_path.items():
-        matched = _matched(captures[here], captures[there], same_path)
+        sender_file, receiver_file = transfer.captures
+        if sender_file is not None and receiver_file is not None and {sender_file, receiver_file} <= captures.keys():
+            by_path.setdefault(
+                (sender_file, receiver_file, transfer.sender_address, transfer.receiver_address), []
+            ).append(transfer)
+    for (sender_file, receiver_file, sender, receiver), same_path in by_path.items():
+        matched = _matched(captures[sender_file], captures[receiver_file], same_path)
         if matched is None:
             continue
-        sent, received = marked[here], marked[there]
+        sent, received = marked[sender_file], marked[receiver_file]
         forward = sent.packets.are_from(sender) & sent.packets.are_to(receiver) & ~matched.ambiguous
         sent.lost[forward] = ~matched.arrived[forward]
         is_ambiguous = np.append(matched.ambiguous, False)[matched.sent_index]  # the last entry is for match.NONE
@@ -126,15 +128,15 @@ def _unknown(packets: Packets) -> MarkedPackets:
     return MarkedPackets(packets, lost, copy)
 
 
-def _matched(here: Capture, there: Capture, same_path: Sequence[Transfer]) -> Match | None:
+def _matched(sender: Capture, receiver: Capture, same_path: Sequence[Transfer]) -> Match | None:
     """Return the matching packets of two captures, or None if they cannot be matched for all transfers of a path."""
-    sent, received = here.packets, there.packets
-    if here.damage or there.damage:
+    sent, received = sender.packets, receiver.packets
+    if sender.damage or receiver.damage:
         return None
     is_tcp = any(transfer.protocol is Protocol.TCP for transfer in same_path)
     if is_tcp and (_is_offloaded(sent) or _is_offloaded(received)):
         return None
-    if any(altered_packets.reason(sent, received, transfer) for transfer in same_path):
+    if any(altered_packets.incomparability_reason(sent, received, transfer) for transfer in same_path):
         return None
     try:
         return match(sent, received)
@@ -188,7 +190,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
     )
 
 
-def flaws(record: AttemptRecord) -> Iterator[Json]:
+def omissions(record: AttemptRecord) -> Iterator[Json]:
     """Yield a log message for each part of the evidence that the other messages do not contain."""
 
     def line(text: str, file: str) -> Json:

@@ -15,7 +15,7 @@ from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.result_tables import estimate_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column, EstimateRow, cell, csv_text, declared
 from fieldkit.measure.transfers import fates
-from fieldkit.measure.transfers.fates import Crossings
+from fieldkit.measure.transfers.fates import SentPackets
 
 Table: TypeAlias = pa.Table
 
@@ -48,7 +48,7 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def of_repeats(repeats: Repeats) -> Table:
-    """Return all columns but the source, those of every trial first, with units and meanings as metadata."""
+    """Return all columns except the source, those of every trial first, with units and meanings as metadata."""
     arrays = [
         _texts(repeats.texts[column.name])
         if column.name in repeats.texts
@@ -72,7 +72,7 @@ def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
     return _table_of_rows(columns, [[None if value == "" else value for value in row] for row in rows])
 
 
-def of_packets(transfers: Mapping[str, Crossings]) -> Table:
+def of_packets(transfers: Mapping[str, SentPackets]) -> Table:
     """Return the packets of transfers in one table, with the name of the step in each row.
 
     Args:
@@ -80,7 +80,7 @@ def of_packets(transfers: Mapping[str, Crossings]) -> Table:
     """
     columns = (
         Column("step", "text", "Name of the step that sent the packet; empty if the step has no name."),
-        *fates.CROSSING_COLUMNS,
+        *fates.PACKET_COLUMNS,
     )
     schema = _schema(columns)
     parts = [

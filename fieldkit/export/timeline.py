@@ -1,6 +1,6 @@
 """The timeline of a trial as messages of an MCAP file, from its journal and raw evidence.
 
-Laptop, sender and receiver have separate clocks. No time is shifted: each channel names its clock.
+Laptop, sender and receiver have separate clocks. No time is shifted; the metadata of each channel contain its clock.
 """
 
 import heapq
@@ -121,9 +121,9 @@ def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, i
         samples_by_role = position_columns.readable_samples(evidence(attempt))
         # A position from before the start of the attempt is reported at the start.
         messages_of_attempt = [
-            _place(plan, whereabouts.role, max(whereabouts.utc_ns, attempt.started_utc_ns), whereabouts.position_m)
-            for whereabouts in evidence(attempt).read_or_none(track.read, track.FILE) or ()
-            if whereabouts.position_m is not None and whereabouts.role in plan.cast.keys() - samples_by_role.keys()
+            _place(plan, point.role, max(point.utc_ns, attempt.started_utc_ns), point.position_m)
+            for point in evidence(attempt).read_or_none(track.read, track.FILE) or ()
+            if point.position_m is not None and point.role in plan.cast.keys() - samples_by_role.keys()
         ]
         for role in filter(samples_by_role.__contains__, plan.cast):
             messages_of_attempt += _sampled(plan, role, samples_by_role[role], attempt.started_utc_ns, ended_ns)
@@ -158,5 +158,5 @@ def _robots(plan: Plan, evidence: _Evidence, attempts: Iterable[Attempt]) -> Ite
     """Yield the messages of the robots' recordings, attempt by attempt."""
     for attempt in attempts:
         record = robot_messages.read(plan, attempt, evidence(attempt))
-        yield from (Message(_LOG, attempt.started_utc_ns, flaw) for flaw in robot_messages.flaws(record))
+        yield from (Message(_LOG, attempt.started_utc_ns, omission) for omission in robot_messages.omissions(record))
         yield from robot_messages.messages(record)

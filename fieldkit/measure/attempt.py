@@ -88,18 +88,18 @@ class AttemptEvidence:
         return (self.folder / name).is_file()
 
     def links(self, role: Role) -> Sequence[LinkSample]:
-        """Return a robot's link samples in order of time: the testbed's if there are any, else the robot's."""
+        """Return a robot's link samples in order of time: those of the testbed if there are any, else the robot's."""
         modelled = self.read_or_none(link_samples.read, link_samples.FILE) or {}
         return modelled.get(role) or self.read_or_none(link_samples.read_robot, "", role) or ()
 
     def counters(self, role: Role) -> Counters:
         """Return the increments of a robot's kernel counters during the attempt; an unknown one is None."""
-        before, after = (self.read_or_none(host.read, file(role)) for file in (host.before, host.after))
+        before, after = (self.read_or_none(host.read, file(role)) for file in (host.before_file, host.after_file))
         return host.difference(before or Counters(None, None), after or Counters(None, None))
 
     def interface_bytes(self, role: Role, interface: str) -> int | None:
         """Return the number of bytes that an interface received during the attempt, or None if unknown."""
-        files = (file(role) for file in (host.before, host.after))
+        files = (file(role) for file in (host.before_file, host.after_file))
         before, after = (self.read_or_none(host.received_bytes, file, interface) for file in files)
         return None if before is None or after is None or after < before else after - before
 

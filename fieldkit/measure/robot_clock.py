@@ -13,21 +13,21 @@ class Exchange:
     """One exchange of timestamps as in RFC 5905, section 8, with no processing time on the robot.
 
     Attributes:
-        asked_ns: The laptop's clock before the request, nanoseconds since 1970 UTC.
-        robot_ns: The robot's clock at some moment in between.
-        answered_ns: The laptop's clock when the answer had arrived.
+        request_ns: The laptop's clock before the request, nanoseconds since 1970 UTC.
+        robot_ns: The robot's clock at some time between them.
+        response_ns: The laptop's clock after the response arrived.
         resolution_ns: Resolution of `robot_ns`: the robot's clock was at most this much later. 0 if it is exact.
     """
 
-    asked_ns: int
+    request_ns: int
     robot_ns: int
-    answered_ns: int
+    response_ns: int
     resolution_ns: int = 0
 
     @property
     def width_ns(self) -> int:
         """Width of the interval that contains the offset."""
-        return self.answered_ns - self.asked_ns + self.resolution_ns
+        return self.response_ns - self.request_ns + self.resolution_ns
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ def offset(exchanges: Sequence[Exchange]) -> Offset:
     """Return the offset from the exchange with the narrowest interval: its midpoint, and half its width as the error.
 
     The robot read its clock at some time between request and answer, so its offset is between
-    `robot - answered` and `robot + resolution - asked`.
+    `robot - response` and `robot + resolution - request`.
 
     Raises:
         ValueError: There is no exchange.
     """
     best = min(exchanges, key=lambda exchange: exchange.width_ns)
-    middle_ns = best.robot_ns + best.resolution_ns / 2 - best.asked_ns - (best.answered_ns - best.asked_ns) / 2
+    middle_ns = best.robot_ns + best.resolution_ns / 2 - best.request_ns - (best.response_ns - best.request_ns) / 2
     return Offset(offset_s=middle_ns / 1e9, error_s=best.width_ns / 2e9)
 
 
@@ -80,7 +80,7 @@ def job_end_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
         role: Role of the robot that ran the job.
         job: The job's name.
     """
-    before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
+    before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file))
     if before is None or after is None or before.boot != after.boot:
         return None
     if before.clock is None or after.clock is None or clock.step_description(before.clock, after.clock):

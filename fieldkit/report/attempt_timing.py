@@ -31,7 +31,7 @@ from fieldkit.trial.procedure import PlacedStep
 
 _SHOWN_BY_EVIDENCE: Final = frozenset(("record", "send", "listen", "ping"))
 """Jobs whose evidence has more exact times."""
-_HEALS: Final = "-heals"
+_HEALS_SUFFIX: Final = "-heals"
 _LONGEST_PAUSE_NS: Final = 1_000_000_000
 """Longest time between two changes of position of a moving robot."""
 
@@ -54,14 +54,14 @@ class Activity:
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class AttemptTimes:
     """Times from the evidence of one attempt, all of them on the clock of the first sending robot.
 
     Attributes:
         recorded: The bags that were sent, by file.
         transfers: Transfers with known fates of their packets.
         pings: Step name, role and output of each ping with an output.
-        ahead_ns: Clock offset of each role relative to the first sending robot; 0 if unknown.
+        clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if unknown.
         clocks: A sentence about the source of the clock offset.
         links: Samples of the radio link at each end.
         distances_m: Distances between those ends, with the start time of each; empty if unknown.
@@ -73,7 +73,7 @@ class Moments:
     recorded: Mapping[str, RecordingContents]
     transfers: Sequence[tuple[Transfer, Fates]]
     pings: Sequence[tuple[str, Role, ping.Ping]]
-    ahead_ns: Mapping[Role, int]
+    clock_offset_ns: Mapping[Role, int]
     clocks: str
     links: Mapping[Role, Sequence[tuple[int, StationSample]]]
     distances_m: Sequence[tuple[int, float | None]]
@@ -82,7 +82,7 @@ class Moments:
     activities: Sequence[Activity] = ()
 
 
-def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> Moments:
+def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> AttemptTimes:
     """Return the times from the evidence of the attempt in a row."""
     transfers = plan.transfers(model.Protocol(repeats.texts["protocol"][row]))
     first = next(iter(transfers), None)
@@ -99,32 +99,36 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> M
     offset_ns, clocks = _clock_offset(
         transfers, packets, ends, {transfer.name: _offset_s(repeats, row, transfer) for transfer in transfers}
     )
-    ahead_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: offset_ns}
+    clock_offset_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: offset_ns}
     links = {role: link.link_history(evidence.links(role)) for role in ends}
-    moments = Moments(
+    times = AttemptTimes(
         recorded={file: contents for file, contents in bags.items() if contents},
-        transfers=[(transfer, _shifted(packet_fates, transfer, ahead_ns)) for transfer, packet_fates in packets],
+        transfers=[
+            (transfer, _shifted(packet_fates, transfer, clock_offset_ns)) for transfer, packet_fates in packets
+        ],
         pings=[(name, role, output) for name, role, output in outputs if output],
-        ahead_ns=ahead_ns,
+        clock_offset_ns=clock_offset_ns,
         clocks=clocks,
-        links={role: [(at_ns - ahead_ns[role], sample) for at_ns, sample in line] for role, line in links.items()},
+        links={
+            role: [(at_ns - clock_offset_ns[role], sample) for at_ns, sample in line] for role, line in links.items()
+        },
         ends=ends,
         distances_m=position_columns.distances_m(evidence, ends),
         jobs={
-            (role, name): (start_ns - ahead_ns[role], stop_ns - ahead_ns[role])
+            (role, name): (start_ns - clock_offset_ns[role], stop_ns - clock_offset_ns[role])
             for role in plan.cast
             for name, (start_ns, stop_ns) in (
-                evidence.read_or_none(host.job_times_ns, host.after(role)) or {}
+                evidence.read_or_none(host.job_times_ns, host.after_file(role)) or {}
             ).items()
         },
     )
     activities = [
-        *_activities_of_evidence(moments),
-        *_activities_of_jobs(moments),
-        *_activities_of_faults(moments, evidence),
+        *_activities_of_evidence(times),
+        *_activities_of_jobs(times),
+        *_activities_of_faults(times, evidence),
         *_activities_of_moves(evidence),
     ]
-    return replace(moments, activities=sorted(activities, key=lambda activity: activity.start_ns))
+    return replace(times, activities=sorted(activities, key=lambda activity: activity.start_ns))
 
 
 def _offset_s(repeats: Repeats, row: int, transfer: Transfer) -> float:
@@ -156,36 +160,36 @@ def _clock_offset(
     unknown = f"The offset between the clocks of {ends[0]} and {ends[1]} is not known"
     if offset_ns is None:
         return 0, f"{unknown}: each time is by the clock of its robot."
-    return offset_ns, f"{unknown}: here the first packet is assumed to take no time."
+    return offset_ns, f"{unknown}: here the delay of the first packet is assumed to be 0."
 
 
-def _shifted(packet_fates: Fates, transfer: Transfer, ahead_ns: Mapping[Role, int]) -> Fates:
+def _shifted(packet_fates: Fates, transfer: Transfer, clock_offset_ns: Mapping[Role, int]) -> Fates:
     return replace(
         packet_fates,
-        sent_ns=packet_fates.sent_ns - ahead_ns[transfer.source],
-        received_ns=packet_fates.received_ns - ahead_ns[transfer.destination],
+        sent_ns=packet_fates.sent_ns - clock_offset_ns[transfer.source],
+        received_ns=packet_fates.received_ns - clock_offset_ns[transfer.destination],
     )
 
 
-def _activities_of_evidence(moments: Moments) -> Iterator[Activity]:
+def _activities_of_evidence(times: AttemptTimes) -> Iterator[Activity]:
     """Yield recordings, transfers and pings, which have times in their evidence."""
-    for file, recording in moments.recorded.items():
-        label = _step_label("record", Path(file).stem if len(moments.recorded) > 1 else "")
+    for file, recording in times.recorded.items():
+        label = _step_label("record", Path(file).stem if len(times.recorded) > 1 else "")
         yield Activity(
             label, recording.started_utc_ns, recording.started_utc_ns + round(recording.duration_s * 1e9), "sky"
         )
-    for transfer, packets in moments.transfers:
+    for transfer, packets in times.transfers:
         sent_ns, received_ns = packets.sent_ns, packets.received_ns
         yield Activity(_step_label("send", transfer.name), int(sent_ns.min()), int(sent_ns.max()), "blue")
         if len(received_ns):
             label = _step_label("receive", transfer.name)
             yield Activity(label, int(received_ns.min()), int(received_ns.max()), "green")
-    for name, role, pings in moments.pings:
+    for name, role, pings in times.pings:
         stamps_ns = [
-            reply.at_utc_ns - moments.ahead_ns[role] for reply in pings.answers if reply.at_utc_ns is not None
+            reply.at_utc_ns - times.clock_offset_ns[role] for reply in pings.answers if reply.at_utc_ns is not None
         ]
         # The time of the job includes requests without a reply, for which ping prints no time.
-        if times_ns := [*stamps_ns, *moments.jobs.get((role, step_prefixed(name, "ping")), ())]:
+        if times_ns := [*stamps_ns, *times.jobs.get((role, step_prefixed(name, "ping")), ())]:
             yield Activity(_step_label("ping", name), min(times_ns), max(times_ns), "pink")
 
 
@@ -194,43 +198,43 @@ def _step_label(what: str, name: str) -> str:
     return f"{what} {name}".rstrip()
 
 
-def _activities_of_jobs(moments: Moments) -> Iterator[Activity]:
+def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
     """Yield the jobs that no other evidence shows. Jobs of the same name on several robots are combined."""
-    shown = {activity.name.partition(" ")[0] for activity in _activities_of_evidence(moments)}
-    names = dict.fromkeys(name for _, name in moments.jobs)
+    shown = {activity.name.partition(" ")[0] for activity in _activities_of_evidence(times)}
+    names = dict.fromkeys(name for _, name in times.jobs)
     for name in names:
         what = plain_name(name)
         if what.startswith("fault-") or (what in _SHOWN_BY_EVIDENCE and {what, "receive"} & shown):
             continue
-        times = [span for (_, job), span in moments.jobs.items() if job == name]
+        spans = [span for (_, job), span in times.jobs.items() if job == name]
         step = name.rpartition(".")[0]
         yield Activity(
-            _step_label(what, step), min(start for start, _ in times), max(stop for _, stop in times), "sky"
+            _step_label(what, step), min(start for start, _ in spans), max(stop for _, stop in spans), "sky"
         )
 
 
-def _activities_of_faults(moments: Moments, evidence: AttemptEvidence) -> Iterator[Activity]:
-    """Yield each fault from its start to the end of its cause, at which the job starts that waits for recovery."""
-    for (role, name), (heals_ns, _) in moments.jobs.items():
+def _activities_of_faults(times: AttemptTimes, evidence: AttemptEvidence) -> Iterator[Activity]:
+    """Yield each fault from its start to the end of its cause, which is the start of the job that awaits recovery."""
+    for (role, name), (heals_ns, _) in times.jobs.items():
         step, _, what = name.rpartition(".")
-        kind = what.removeprefix("fault-").removesuffix(_HEALS)
-        if what.startswith("fault-") and what.endswith(_HEALS) and kind in {str(fault) for fault in FaultKind}:
+        kind = what.removeprefix("fault-").removesuffix(_HEALS_SUFFIX)
+        if what.startswith("fault-") and what.endswith(_HEALS_SUFFIX) and kind in {str(fault) for fault in FaultKind}:
             note = step_prefixed(step, outage.note_file(FaultKind(kind)))
             lasted_s = evidence.read_or_none(outage.cause_lasted_s, note) or 0.0
             yield Activity(f"fault {_step_label(kind, step)}", heals_ns - round(lasted_s * 1e9), heals_ns, "lost")
-            yield from _outage(moments, evidence, role, FaultKind(kind), step)
+            yield from _outage(times, evidence, role, FaultKind(kind), step)
 
 
 def _outage(
-    moments: Moments, evidence: AttemptEvidence, role: Role, kind: FaultKind, step: str
+    times: AttemptTimes, evidence: AttemptEvidence, role: Role, kind: FaultKind, step: str
 ) -> Iterator[Activity]:
     """Yield the longest time without an answer to the observer's pings, up to the end if no more answers came."""
     output = evidence.read_or_none(ping.read, step_prefixed(step, outage.observed_file(kind)))
     stamps_ns = sorted(reply.at_utc_ns for reply in output.answers if reply.at_utc_ns is not None) if output else []
     if not stamps_ns or kind is FaultKind.KILL:
         return
-    end_ns = moments.jobs.get((role, step_prefixed(step, f"fault-{kind}")), (0, 0))[1]
-    times_ns = [stamp_ns - moments.ahead_ns[role] for stamp_ns in stamps_ns]
+    end_ns = times.jobs.get((role, step_prefixed(step, f"fault-{kind}")), (0, 0))[1]
+    times_ns = [stamp_ns - times.clock_offset_ns[role] for stamp_ns in stamps_ns]
     gaps = list(pairwise([*times_ns, max(end_ns, times_ns[-1])]))
     start_ns, stop_ns = max(gaps, key=lambda gap: gap[1] - gap[0])
     yield Activity(f"no answer {_step_label(kind, step)}", start_ns, stop_ns, "void")
@@ -238,9 +242,9 @@ def _outage(
 
 def _activities_of_moves(evidence: AttemptEvidence) -> Iterator[Activity]:
     """Yield the time in which each robot moved during the attempt, by the track of the testbed."""
-    places = evidence.read_or_none(track.read, track.FILE) or ()
-    for role in dict.fromkeys(sample.role for sample in places):
-        track_points = [sample for sample in places if sample.role == role]
+    samples = evidence.read_or_none(track.read, track.FILE) or ()
+    for role in dict.fromkeys(sample.role for sample in samples):
+        track_points = [sample for sample in samples if sample.role == role]
         changes = [
             (before.utc_ns, after.utc_ns)
             for before, after in pairwise(track_points)
@@ -254,7 +258,7 @@ def _activities_of_moves(evidence: AttemptEvidence) -> Iterator[Activity]:
 class DrawsPanels(Protocol):
     """A step whose evidence is drawn over time, in panels of the time line of an attempt."""
 
-    def panels(self, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+    def panels(self, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
         """Yield the panels; there are none without evidence.
 
         Args:
@@ -270,7 +274,7 @@ TIME_LABEL: Final = "time [s]"
 _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 
 
-def flow_panels(evidence: AttemptEvidence, plan: Plan, times: Moments, zero_ns: int) -> Iterator[Panel]:
+def flow_panels(evidence: AttemptEvidence, plan: Plan, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the panels of steps whose evidence has times: tests of iperf3, and steps that draw their panels.
 
     Args:
@@ -286,7 +290,7 @@ def flow_panels(evidence: AttemptEvidence, plan: Plan, times: Moments, zero_ns: 
             yield from placed.step.panels(evidence, times, zero_ns)
 
 
-def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the payload rate that each end counted per second. The first second starts with the client."""
     step = placed.step
     client = next((span for (_, job), span in times.jobs.items() if job == step.prefixed_name("iperf3-client")), None)

@@ -22,7 +22,7 @@ class Series:
         style: Colour, marker and line.
         x: Positions.
         y: Values.
-        low: Lower ends of their intervals, None for a point without one; empty if no point has one.
+        low: Lower ends of their intervals, None for a point without interval; empty if no point has one.
         high: Upper ends.
         join: Type of line between the points.
         behind: Single values behind the points, as (x, y), drawn faintly.
@@ -65,7 +65,7 @@ class EdgeMark:
 
 @dataclass(frozen=True)
 class Span:
-    """A stretch of time in a lane.
+    """A time interval in a lane.
 
     Attributes:
         lane: Number of the lane, from 0.

@@ -12,7 +12,7 @@ from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import LOSSES, Quantity, with_plain_name
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.wording import measured as measured_in
-from fieldkit.analysis.wording import worded
+from fieldkit.analysis.wording import word_labels
 from fieldkit.core.columns import fault_column_name, plain_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind
@@ -35,7 +35,7 @@ _ALWAYS_VISIBLE: Final = frozenset(
 """Quantities that are always visible in tables. The others are collapsed."""
 
 
-_FIRST: Final = "expected and own figures"
+_FIRST: Final = "expected and lab-defined figures"
 """Quantities with an expectation, and quantities that a lab declares."""
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
 _MAX_FURTHER: Final = 12
@@ -129,7 +129,7 @@ class Contents:
         return Counter(trial.versions for trial in self.trials if trial.versions)
 
 
-def put_together(
+def build_contents(
     repeats: Repeats,
     *,
     title: str,
@@ -193,7 +193,7 @@ def _further_charts(
     cells: Sequence[Cell],
     identities: Identities,
     evidence: Evidence,
-    wanted: Sequence[str],
+    requested: Sequence[str],
     first: Sequence[str],
 ) -> ChartSection:
     """Return charts of quantities that fieldkit does not define, up to a limit, and of requested quantities.
@@ -202,19 +202,19 @@ def _further_charts(
         cells: Conditions.
         identities: Labels and styles of their series.
         evidence: The table and the available evidence.
-        wanted: Names of quantities that are drawn in any case.
+        requested: Names of quantities that are drawn in any case.
         first: Plain names of those that are drawn already.
     """
     drawn = {*distance.LOSS, *distance.DELAY, *distance.RATE, *first}
     others: dict[str, str] = {}  # the first name with each plain name
     for quantity in measured_in(cells):
         if (
-            not quantity.is_own
+            not quantity.is_builtin
             and plain_name(quantity.name) not in drawn
             and distance.has_curve(cells, quantity, evidence)
         ):
             others.setdefault(plain_name(quantity.name), quantity.name)
-    chosen = dict.fromkeys((*map(plain_name, wanted), *list(others)[:_MAX_FURTHER]))
+    chosen = dict.fromkeys((*map(plain_name, requested), *list(others)[:_MAX_FURTHER]))
     undrawn = [name for plain, name in others.items() if plain not in chosen]
     return ChartSection(
         "further",
@@ -224,26 +224,26 @@ def _further_charts(
     )
 
 
-def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, wanted: str) -> int | None:
+def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, requested: str) -> int | None:
     """Return the row whose time line is drawn.
 
     Args:
         cells: Conditions.
         evidence: The table and the available evidence.
-        wanted: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty, use the
+        requested: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty, use the
             repeat with the median loss among the valid repeats with losses of the condition with the highest loss.
 
     Returns:
-        The row, or None if `wanted` is empty and no evidence is available.
+        The row, or None if `requested` is empty and no evidence is available.
 
     Raises:
         ConfigurationError: There is no such attempt, or several, or its evidence is not available.
     """
-    if wanted:
-        row = evidence.repeats.row(wanted)
+    if requested:
+        row = evidence.repeats.row(requested)
         if evidence.attempt(row) is None:
             raise ConfigurationError(
-                f"the evidence of {wanted} is not available", remedy="name a repeat of a trial whose folder exists"
+                f"the evidence of {requested} is not available", remedy="name a repeat of a trial whose folder exists"
             )
         return row
     measured = measured_in(cells)
@@ -298,17 +298,17 @@ def _tables_of_protocol(
 ) -> Iterator[CellTable]:
     """Yield the tables of one protocol: expected and lab-declared quantities, built-in ones, steps, words."""
     lines = [(wording.place(cell, differing=differing), cell) for cell in cells]
-    words = worded(cells)
+    words = word_labels(cells)
     first = ranking.first(measured_in(cells))
-    if lab_words := {name: label for name, label in words.items() if ranking.is_own(name)}:
+    if lab_words := {name: label for name, label in words.items() if ranking.is_lab_declared(name)}:
         words = {name: label for name, label in words.items() if name not in lab_words}
     if first or lab_words:
         yield CellTable(f"{title}, {_FIRST}", first, (), lines, _ping_sizes(first, cells, evidence), lab_words)
     remaining = [quantity for quantity in measured_in(cells) if quantity not in first]
     for step in dict.fromkeys(("", *(quantity.step for quantity in remaining))):
-        builtin = [quantity for quantity in remaining if quantity.step == step and quantity.is_own]
-        others = [quantity for quantity in remaining if quantity.step == step and not quantity.is_own]
-        # Without quantities to be always visible, the first ones are.
+        builtin = [quantity for quantity in remaining if quantity.step == step and quantity.is_builtin]
+        others = [quantity for quantity in remaining if quantity.step == step and not quantity.is_builtin]
+        # If no quantity is always visible, the first ones are visible.
         visible = [quantity for quantity in builtin if plain_name(quantity.name) in _ALWAYS_VISIBLE] or builtin[
             :_MAX_IN_TABLE
         ]

@@ -12,7 +12,7 @@ from fieldkit.report import wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.coverage import Absence, absences
 from fieldkit.report.headlines import Ranking
-from fieldkit.report.series import Identities, Identity, Point, ends, panels, point
+from fieldkit.report.series import Identities, Identity, Point, axis_limits, panels, point
 from fieldkit.report.trial_folders import Evidence
 
 LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "topic_loss", "iperf3_loss", "iperf3_captured_loss")
@@ -114,17 +114,20 @@ class _CurveDrawing:
     def chart(self, measured: Mapping[Quantity, Sequence[Cell]]) -> Iterator[Chart]:
         """Yield the chart of a quantity, or of the same quantity of several steps, if it has several distances."""
         if not any(
-            is_curve(with_missing(self.cells, each, cells), each, self.evidence) for each, cells in measured.items()
+            is_curve(with_missing(self.cells, step_quantity, cells), step_quantity, self.evidence)
+            for step_quantity, cells in measured.items()
         ):
             return
         quantity, several = next(iter(measured)), len(measured) > 1
-        values = [cell.estimates[each.name].value for each, cells in measured.items() for cell in cells]
+        values = [
+            cell.estimates[step_quantity.name].value for step_quantity, cells in measured.items() for cell in cells
+        ]
         scale = scale_of(quantity, values)
         groups = {
-            _panel_title(title, each if several else None, group, self.evidence): self._places(
-                each, group, scale.factor
+            _panel_title(title, step_quantity if several else None, group, self.evidence): self._places(
+                step_quantity, group, scale.factor
             )
-            for each, cells in measured.items()
+            for step_quantity, cells in measured.items()
             for title, group in panels(cells).items()
         }
         label = quantity.label if quantity.step and not several else _capital(quantity.plain_label)
@@ -132,7 +135,7 @@ class _CurveDrawing:
         y_label = f"{label} [{unit}]" if unit else label
         points = [place.content for places in groups.values() for place in places if isinstance(place.content, Point)]
         of_protocols = {
-            protocol: ends([point for point in points if point.protocol == protocol], scale.unit)
+            protocol: axis_limits([point for point in points if point.protocol == protocol], scale.unit)
             for protocol in {point.protocol for point in points}
         }
         missing = [place for places in groups.values() for place in places if isinstance(place.content, Absence)]
@@ -210,10 +213,10 @@ def _panel_title(title: str, quantity: Quantity | None, cells: Sequence[Cell], e
     return ", ".join((quantity.step, title, *sizes))
 
 
-_NONE: Final = ", dotted where nothing was lost, because each repeat then counts as one trial"
-_CUT: Final = "an arrow where an interval continues beyond the axis, where no repeat is drawn"
-_LACKING: Final = "a cross at the edge where a condition has no value, and why"
-_SOME: Final = "beside a point, how many of the valid repeats have a value, if not all"
+_NONE: Final = ", dotted if nothing was lost, because each repeat then counts as one trial"
+_CUT: Final = "an arrow if an interval continues beyond the axis; no repeat is drawn there"
+_LACKING: Final = "a cross at the edge, with the reason, if a condition has no value"
+_SOME: Final = "next to a point, the number of valid repeats with a value, if not all have one"
 _BOUND: Final = "hollow, with an arrow: a lower bound, because something had not ended"
 _HOW: Final = {
     "counted": "Share of all that was sent",

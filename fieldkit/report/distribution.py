@@ -92,10 +92,10 @@ def _chart(
     scale = time_scale(min(sample.times_s[-1] for sample in nonempty))
     chart_panels = []
     for condition, group in panels([sample.cell for sample in nonempty]).items():
-        alike_s = np.concatenate(
+        same_protocol_s = np.concatenate(
             [sample.times_s for sample in nonempty if sample.cell.key["protocol"] == group[0].key["protocol"]]
         )
-        is_log = needs_log(alike_s)
+        is_log = needs_log(same_protocol_s)
         for place in _places(group):
             place_samples = [
                 sample for sample in nonempty if sample.cell in group and wording.distance(sample.cell) == place
@@ -110,8 +110,8 @@ def _chart(
                     series=series,
                     words=_words(f"{title}, {condition}, {place}", place_samples, identities, scale),
                     top=1.0,
-                    left=scale.factor * float(alike_s.min()) / _LOG_ROOM if is_log else 0.0,
-                    right=scale.factor * float(alike_s.max()) * (_LOG_ROOM if is_log else _ROOM),
+                    left=scale.factor * float(same_protocol_s.min()) / _LOG_ROOM if is_log else 0.0,
+                    right=scale.factor * float(same_protocol_s.max()) * (_LOG_ROOM if is_log else _ROOM),
                     x_log=is_log,
                 )
             )
@@ -151,13 +151,15 @@ def _words(title: str, samples: Sequence[_Sample], identities: Identities, scale
 
 def _caption(samples: Sequence[_Sample], unit_name: str, *, is_log: bool) -> str:
     counts = sorted(len(sample.times_s) for sample in samples)
-    many = str(counts[0]) if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
-    text = f"Share of {unit_name} that took at most this time{_LOG if is_log else ''}; {many} {unit_name} per line"
+    count_text = str(counts[0]) if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+    text = (
+        f"Share of {unit_name} that took at most this time{_LOG if is_log else ''}; {count_text} {unit_name} per line"
+    )
     places = {wording.distance(sample.cell) for sample in samples}
     if len(places) > MAX_DISTANCES:
         text += f"; of {len(places)} distances the nearest, a middle one and the farthest"
     if counts[-1] > MAX_STEPS:
-        text += f"; lines of more than {MAX_STEPS} go through as many quantiles"
+        text += f"; a line of more than {MAX_STEPS} {unit_name} is drawn through {MAX_STEPS} quantiles"
     return (
         f"{text}. Requests without a reply are in no line: see ping loss." if unit_name == "replies" else f"{text}."
     )

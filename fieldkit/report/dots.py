@@ -13,7 +13,7 @@ from fieldkit.report import distance, wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.coverage import absences
 from fieldkit.report.headlines import Ranking
-from fieldkit.report.series import Identities, Identity, Point, ends, needs_log, panels, point
+from fieldkit.report.series import Identities, Identity, Point, axis_limits, needs_log, panels, point
 from fieldkit.report.trial_folders import Evidence
 
 _DODGE: Final = 0.7
@@ -55,7 +55,7 @@ class _Lane:
 
 
 def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[Chart]:
-    """Yield the dot plot of all quantities that no curve shows, if there are any."""
+    """Yield the dot plot of all quantities without a chart against distance, if there are any."""
     ranking = Ranking(evidence)
     quantities = measured(cells)
     first = ranking.first(quantities)
@@ -82,7 +82,7 @@ def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
             drawing.panel(title if len(places) == 1 else f"{title}, {place}", unit, lanes)
             for (title, place, unit), lanes in ranked
         ]
-        yield Chart("quantities", f"All quantities at {wording.listed(places)}", _caption(drawn), drawn)
+        yield Chart("quantities", f"All quantities at {wording.join_words(places)}", _caption(drawn), drawn)
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _with_limits(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
     values = list(chain.from_iterable((point.value, *point.repeats) for point in points))
     if needs_log(values):
         return replace(panel, x_log=True, left=min(values) / _LOG_ROOM, right=max(values) * _LOG_ROOM)
-    left, right = ends(points, unit)
+    left, right = axis_limits(points, unit)
     return replace(panel, left=left, right=right)
 
 
@@ -172,7 +172,7 @@ def _series(identity: Identity, placed: Sequence[tuple[float, Point]], aside: fl
 def _caption(drawn: Sequence[Panel]) -> str:
     parts = [
         _HOW,
-        "The axis is logarithmic where values differ more than 30 times."
+        "The axis is logarithmic if values differ by a factor of more than 30."
         if any(panel.x_log for panel in drawn)
         else "",
         "Hollow, with an arrow: a lower bound, because something had not ended."

@@ -1,4 +1,4 @@
-"""Draw panels on axes of matplotlib. `figures` makes pages and files of them."""
+"""Draw panels on axes of matplotlib. `figures` creates pages and files from them."""
 
 import math
 from collections.abc import Collection
@@ -87,16 +87,16 @@ def _set_ticks(axis: Axis, *, is_log: bool, ticks: int) -> None:
 
 
 def _draw_series(axes: Axes, series: Series, panel: Panel) -> None:
-    look = _look(series.style)
+    options = _line_options(series.style)
     if series.join == "steps":
-        axes.step(series.x, series.y, where="post", **look)
+        axes.step(series.x, series.y, where="post", **options)
         return
     is_sideways = bool(panel.lanes)
     _draw_singles(axes, series, panel)
-    axes.plot(series.x, series.y, clip_on=False, **(look | {"linestyle": "none"}))
+    axes.plot(series.x, series.y, clip_on=False, **(options | {"linestyle": "none"}))
     if series.join == "line":
         for start, stop in _line_segments(len(series.x), series.breaks):
-            axes.plot(series.x[start:stop], series.y[start:stop], clip_on=False, **(look | {"marker": None}))
+            axes.plot(series.x[start:stop], series.y[start:stop], clip_on=False, **(options | {"marker": None}))
     for x, y, low, high in zip(series.x, series.y, series.low, series.high, strict=False):
         if low is not None:
             ends = (low, math.inf if high is None else high)
@@ -127,14 +127,14 @@ def _draw_singles(axes: Axes, series: Series, panel: Panel) -> None:
 
 def _draw_bound(axes: Axes, at: tuple[float, float], style: Style, *, is_sideways: bool) -> None:
     """Draw a value that is only a lower bound: a hollow marker, and an arrow towards larger values."""
-    look = _look(style) | {"markerfacecolor": LIGHT["paper"], "linestyle": "none", "zorder": 4}
-    axes.plot(*at, clip_on=False, **look)
+    options = _line_options(style) | {"markerfacecolor": LIGHT["paper"], "linestyle": "none", "zorder": 4}
+    axes.plot(*at, clip_on=False, **options)
     arrow = axes.annotate(
         "",
         at,
         (_ARROW, 0) if is_sideways else (0, _ARROW),
         textcoords="offset points",
-        arrowprops={"arrowstyle": "<-", "color": look["color"], "linewidth": 1.1},
+        arrowprops={"arrowstyle": "<-", "color": options["color"], "linewidth": 1.1},
     )
     arrow.set_in_layout(False)
 
@@ -198,10 +198,10 @@ def _shorten(text: str, max_length: int) -> str:
 
 def handle(label: str, style: Style) -> Line2D:
     """Return the legend handle of a series."""
-    return Line2D([], [], label=_shorten(label, _TITLE), **_look(style))
+    return Line2D([], [], label=_shorten(label, _TITLE), **_line_options(style))
 
 
-def _look(style: Style) -> dict[str, Any]:
+def _line_options(style: Style) -> dict[str, Any]:
     colour = LIGHT[style.colour]
     return {
         "color": colour,

@@ -38,7 +38,7 @@ _MATERIALS: Final[dict[str, Colour]] = {"foliage": "green", "wood": "orange", "b
 """Colours of obstacles that are not grey."""
 _SNR_DB: Final = (0.0, 60.0)
 """Range of the colour scale: from almost no reception to more than any mode needs. It is equal in all figures."""
-_BACKED: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
+_LABEL_BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
 _EDGE: Final = 0.15
 """Share of the world next to its edges in which labels are aligned inwards."""
 
@@ -168,7 +168,7 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
                 ha=_side(middle_m[0], lab.area_m[0]),
                 va="center",
                 zorder=3,
-                bbox=_BACKED,
+                bbox=_LABEL_BACKGROUND,
             )
 
 

@@ -41,7 +41,7 @@ class Ranking:
         by_name = {quantity.name: quantity for quantity in quantities}
         return [by_name[name] for name in dict.fromkeys((*self._expected, *self._lab_columns)) if name in by_name]
 
-    def is_own(self, name: str) -> bool:
+    def is_lab_declared(self, name: str) -> bool:
         """Return True if a lab declares this column."""
         return name in self._lab_columns
 
@@ -64,7 +64,7 @@ def _lab_columns(plan: Plan) -> Iterator[str]:
 
 _OF_PROTOCOLS: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
 _OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
-"""Quantities of trials that stream topics, in which pings and transfers only serve clocks and load."""
+"""Quantities of trials that stream topics, in which pings and transfers only provide clock offset and load."""
 _MAX_FIRST: Final = 6
 """Maximum number of headlines of expected quantities and of a lab's quantities."""
 _MAX_PLACES: Final = 3
@@ -78,13 +78,13 @@ _COUNT_TEXTS: Final = {
 
 
 @dataclass(frozen=True)
-class Extreme:
+class HeadlineLine:
     """One line of a headline.
 
     Attributes:
         which: `least`, `most`; empty if there is nothing to compare.
         value: The figure with its unit, or the missing result.
-        interval: Its 95 % interval, and the number of repeats that have it if not all; empty without either.
+        interval: Its 95 % interval, and the number of repeats with a value if not all have one; may be empty.
         place: The condition.
         is_missing: True if it reports something missing or lost.
     """
@@ -102,11 +102,11 @@ class Headline:
 
     Attributes:
         subject: Its title.
-        ends: Its lines, the worst first.
+        lines: Its lines, the worst first.
     """
 
     subject: str
-    ends: Sequence[Extreme]
+    lines: Sequence[HeadlineLine]
 
 
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
@@ -124,19 +124,19 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
     first = writer.ranking.first(measured(cells))[:_MAX_FIRST]
     for quantity in first:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
-        own_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
-        yield from writer.quantity(quantity.label, [quantity], own_cells)
+        group_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
+        yield from writer.quantity(quantity.label, [quantity], group_cells)
     for protocol, names in _OF_PROTOCOLS.items():
         of_protocol = [cell for cell in cells if cell.key["protocol"] == protocol]
         with_topics = [cell for cell in of_protocol if with_plain_name(measured([cell]), _OF_TOPICS[0])]
         others = [cell for cell in of_protocol if cell not in with_topics]
-        for own_cells, wanted in ((with_topics, _OF_TOPICS), (others, names)):
-            for quantities_of_name in _chosen(measured(own_cells), wanted):
+        for group_cells, quantity_names in ((with_topics, _OF_TOPICS), (others, names)):
+            for quantities_of_name in _existing_quantities(measured(group_cells), quantity_names):
                 if quantities_of_name[0] not in first:
                     yield from writer.quantity(
-                        _subject(quantities_of_name, protocol, own_cells is with_topics),
+                        _subject(quantities_of_name, protocol, group_cells is with_topics),
                         quantities_of_name,
-                        own_cells,
+                        group_cells,
                     )
 
 
@@ -160,7 +160,7 @@ class _HeadlineWriter:
         counted = [(cell, coverage.repeat_counts(cell, self.evidence, silent)) for cell in cells]
         planned, valid = (sum(getattr(counts, name) for _, counts in counted) for name in ("planned", "valid"))
         is_missing = valid < planned or bool(unmeasured)
-        ends = [Extreme("", wording.unbroken(f"{valid} of {planned} valid"), "", "", is_missing)]
+        lines = [HeadlineLine("", wording.without_breaks(f"{valid} of {planned} valid"), "", "", is_missing)]
         for name, text in _COUNT_TEXTS.items():
             affected = [
                 (cell, getattr(counts, name), counts.planned) for cell, counts in counted if getattr(counts, name)
@@ -172,20 +172,20 @@ class _HeadlineWriter:
             ]
             if affected:
                 total = format_count(sum(count for _, count, _ in affected), "repeat")
-                ends.append(Extreme("", text.format(total), "", _first_places(places), is_missing=True))
+                lines.append(HeadlineLine("", text.format(total), "", _first_places(places), is_missing=True))
         if unmeasured:
             total = format_count(len(unmeasured), "condition")
-            ends.append(Extreme("", f"{total} not run", "", _first_places(unmeasured), is_missing=True))
-        return Headline("Repeats", ends)
+            lines.append(HeadlineLine("", f"{total} not run", "", _first_places(unmeasured), is_missing=True))
+        return Headline("Repeats", lines)
 
-    def quantity(self, subject: str, same: Sequence[Quantity], cells: Sequence[Cell]) -> Iterator[Headline]:
-        """Yield the headline of a quantity, or of the same one of several steps; one per payload size of pings."""
-        if len(same) > 1 or plain_name(same[0].name) != "rtt_median_s":
-            sizes = {size: None for quantity in same for size in self._sizes(quantity, cells)}
-            yield self._headline(", ".join((subject, *sizes)), same, cells)
+    def quantity(self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]) -> Iterator[Headline]:
+        """Yield the headline of a quantity, or of its variants in several steps; one per payload size of pings."""
+        if len(variants) > 1 or plain_name(variants[0].name) != "rtt_median_s":
+            sizes = {size: None for quantity in variants for size in self._sizes(quantity, cells)}
+            yield self._headline(", ".join((subject, *sizes)), variants, cells)
             return
-        step = same[0].step
-        for size in self._sizes(same[0], cells) or [""]:
+        step = variants[0].step
+        for size in self._sizes(variants[0], cells) or [""]:
             protocols = {cell.key["protocol"] for cell in cells if self.evidence.payload(cell, step) == size}
             # Cells without any reply have an unknown size, and are assigned by their protocol.
             matching = [
@@ -193,37 +193,39 @@ class _HeadlineWriter:
                 for cell in cells
                 if self.evidence.payload(cell, step) in {size, ""} and cell.key["protocol"] in protocols
             ]
-            yield self._headline(", ".join(filter(None, (subject, size))), same, matching)
+            yield self._headline(", ".join(filter(None, (subject, size))), variants, matching)
 
     def _sizes(self, quantity: Quantity, cells: Sequence[Cell]) -> list[str]:
         is_rtt = plain_name(quantity.name) == "rtt_median_s"
         return self.evidence.payloads(cells, quantity.step) if is_rtt else []
 
-    def _headline(self, subject: str, same: Sequence[Quantity], cells: Sequence[Cell]) -> Headline:
+    def _headline(self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]) -> Headline:
         values = [
             (cell, cell.estimates[quantity.name])
-            for quantity in same
+            for quantity in variants
             for cell in cells
             if quantity.name in cell.estimates
         ]
-        values.sort(key=lambda pair: pair[1].value, reverse=self.ranking.more_is_worse(same[0]) is not False)
+        values.sort(key=lambda pair: pair[1].value, reverse=self.ranking.more_is_worse(variants[0]) is not False)
         missing = [
-            (quantity, absence) for quantity in same for absence in coverage.absences(cells, quantity, self.evidence)
+            (quantity, absence)
+            for quantity in variants
+            for absence in coverage.absences(cells, quantity, self.evidence)
         ]
         has_protocols = len({cell.key["protocol"] for cell in cells}) > 1
 
         def place(cell: Cell, quantity: Quantity) -> str:
             describe = wording.condition if has_protocols else wording.place
             return ", ".join(
-                filter(None, (quantity.step if len(same) > 1 else "", describe(cell, differing=self.differing)))
+                filter(None, (quantity.step if len(variants) > 1 else "", describe(cell, differing=self.differing)))
             )
 
-        return Headline(subject, [*_missing(missing, place), *_ends(values, place, is_whole=not missing)])
+        return Headline(subject, [*_missing(missing, place), *_worst_and_best(values, place, is_whole=not missing)])
 
 
 def _missing(
     lacking: Sequence[tuple[Quantity, Absence]], place: Callable[[Cell, Quantity], str]
-) -> Iterator[Extreme]:
+) -> Iterator[HeadlineLine]:
     """Yield a line per reason for missing values, with the conditions; those without any value come first."""
     ordered = sorted(lacking, key=lambda pair: -pair[1].count / pair[1].of)
     for reason in dict.fromkeys(absence.reason for _, absence in ordered):
@@ -232,26 +234,30 @@ def _missing(
             for quantity, absence in ordered
             if absence.reason == reason
         ]
-        yield Extreme("", reason, "", _first_places(places), is_missing=True)
+        yield HeadlineLine("", reason, "", _first_places(places), is_missing=True)
 
 
-def _ends(
+def _worst_and_best(
     values: Sequence[tuple[Cell, Estimate]], place: Callable[[Cell, Quantity], str], *, is_whole: bool
-) -> list[Extreme]:
+) -> list[HeadlineLine]:
     """Return the worst and the best of values that are sorted from worst to best, or the value that all have."""
     worst, best = (wording.value(values[index][1]) for index in (0, -1))
     if worst == best and len(values) > 1:
-        return [Extreme("in all conditions" if is_whole else "in all others", worst, "", "")]
+        return [HeadlineLine("in all conditions" if is_whole else "in all others", worst, "", "")]
     end_names = ("least", "most") if values[0][1].value < values[-1][1].value else ("most", "least")
-    lines = [_end(values, text, place) for text in dict.fromkeys((worst, best))]
+    lines = [_line_of_value(values, text, place) for text in dict.fromkeys((worst, best))]
     return [replace(line, which=end if len(values) > 1 else "") for line, end in zip(lines, end_names, strict=False)]
 
 
-def _end(values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Cell, Quantity], str]) -> Extreme:
-    """Return a value with all conditions that have it, and its interval if only one has."""
+def _line_of_value(
+    values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Cell, Quantity], str]
+) -> HeadlineLine:
+    """Return a value with all conditions that have it, and its interval if only one condition has it."""
     same = [(cell, estimate) for cell, estimate in values if wording.value(estimate) == text]
     interval = wording.interval(same[0][1]) if len(same) == 1 else ""
-    return Extreme("", text, interval, _first_places([place(cell, estimate.quantity) for cell, estimate in same]))
+    return HeadlineLine(
+        "", text, interval, _first_places([place(cell, estimate.quantity) for cell, estimate in same])
+    )
 
 
 def _first_places(places: Sequence[str]) -> str:
@@ -260,18 +266,18 @@ def _first_places(places: Sequence[str]) -> str:
     return "; ".join((*places[:_MAX_PLACES], *([f"{more} more"] if more > 0 else [])))
 
 
-def _subject(same: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
-    first = same[0]
-    label = first.label if len(same) == 1 else first.plain_label
+def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
+    first = variants[0]
+    label = first.label if len(variants) == 1 else first.plain_label
     names_protocol = has_topics or first.plain_label.startswith(protocol.upper())
     return label if names_protocol else f"{label} with {protocol.upper()}"
 
 
-def _chosen(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
-    """Return the quantities called `names`, else the first ones, each with the same quantity of other steps."""
-    chosen = [same for name in names if (same := _quantities_named(quantities, name))]
+def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
+    """Return the quantities called `names`, or the first ones if none exists, with variants in other steps."""
+    existing = [same for name in names if (same := _quantities_named(quantities, name))]
     others = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)
-    return chosen or [_quantities_named(quantities, name) for name in list(others)[: len(names)]]
+    return existing or [_quantities_named(quantities, name) for name in list(others)[: len(names)]]
 
 
 def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:

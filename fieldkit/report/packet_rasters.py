@@ -19,15 +19,15 @@ MAX_REPEATS: Final = 400
 MAX_LINES: Final = 20
 """Maximum number of lines of a cell."""
 MAX_COLUMNS: Final = 300
-"""Maximum number of columns of a line. A line with more packets combines several in a column, which is marked if any
-of them is."""
+"""Maximum number of columns of a line. If a line has more packets, each column represents several packets and is
+marked if any of them is marked."""
 
-_WHAT: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments sent again"}
+_MARK_MEANING: Final = {Protocol.UDP: "IP packets lost", Protocol.TCP: "segments retransmitted"}
 
 
 @dataclass(frozen=True)
 class Raster:
-    """A line per repeat, a column per packet.
+    """A raster with a line per repeat and a column per packet.
 
     Attributes:
         place: The condition, as far as it differs from the others of its group.
@@ -64,15 +64,15 @@ class RasterGroup:
 def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
     """Yield the rasters of all cells whose captures are available."""
     differing = wording.differing(cells) - {"topology"}
-    share = min(MAX_LINES, max(1, MAX_REPEATS // max(1, len(cells))))
-    for title, cells_of in panels(cells).items():
+    max_lines = min(MAX_LINES, max(1, MAX_REPEATS // max(1, len(cells))))
+    for title, group in panels(cells).items():
         drawn = {
-            wording.place(cell, differing=differing): _marked_packets(cell, evidence, share) for cell in cells_of
+            wording.place(cell, differing=differing): _marked_packets(cell, evidence, max_lines) for cell in group
         }
         for transfer in dict.fromkeys(name for lines in drawn.values() for name in lines):
             marked = {place: lines.get(transfer, []) for place, lines in drawn.items()}
             width = -(-max(len(line) for lines in marked.values() for line in lines) // MAX_COLUMNS)
-            what = _WHAT[transfer[1]]
+            what = _MARK_MEANING[transfer[1]]
             yield RasterGroup(
                 title=", ".join(filter(None, (transfer[0], title))),
                 what=what if width == 1 else f"{what}; a column is {width} packets, marked if any of them is",
@@ -80,7 +80,7 @@ def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
             )
 
 
-def _marked_packets(cell: Cell, evidence: Evidence, share: int) -> dict[tuple[str, Protocol], list[Mask]]:
+def _marked_packets(cell: Cell, evidence: Evidence, max_lines: int) -> dict[tuple[str, Protocol], list[Mask]]:
     """Return the mask of marked packets of each of the first valid repeats, by name and protocol of the transfer."""
     masks: dict[tuple[str, Protocol], list[Mask]] = {}
     for row in evidence.rows(cell).tolist():
@@ -90,7 +90,7 @@ def _marked_packets(cell: Cell, evidence: Evidence, share: int) -> dict[tuple[st
         for transfer in plan.transfers(Protocol(evidence.repeats.texts["protocol"][row])):
             if (packets := fates.read(attempt, transfer)) is not None:
                 masks.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
-        if max(map(len, masks.values()), default=0) == share:
+        if max(map(len, masks.values()), default=0) == max_lines:
             break
     return masks
 

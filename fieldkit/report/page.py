@@ -1,6 +1,6 @@
 """The page of a report: one HTML file that contains its figures and opens without a network.
 
-The only module that imports jinja2.
+This is the only module that imports jinja2.
 """
 
 import os

@@ -94,7 +94,7 @@ _MARGIN: Final = 0.25
 """Margins of an axis that does not start at 0, as a share of the range of values."""
 _LOG_FROM_DECADES: Final = 1.5
 _VAGUE_FROM: Final = 0.5
-"""Width from which an interval is too wide for a curve, as a share of the axis."""
+"""Minimum width at which an interval is too wide for a curve, as a share of the axis."""
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,8 @@ class Point:
     Attributes:
         cell: The condition.
         value: The figure.
-        low: Lower end of its 95 % interval, None without one.
-        high: Upper end, None without one.
+        low: Lower end of its 95 % interval; None if it has none.
+        high: Upper end; None if it has no interval.
         repeats: Values of single repeats, some of them if there are many.
         bounds: True for each of these that is only a lower bound.
         is_bound: True if the figure is only a lower bound because of them.
@@ -175,7 +175,7 @@ def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> 
     )
 
 
-def ends(points: Sequence[Point], unit: str) -> tuple[float, float]:
+def axis_limits(points: Sequence[Point], unit: str) -> tuple[float, float]:
     """Return the ends of an axis for these points. It starts at 0 unless a value is negative, as in dBm."""
     if min(point.bottom for point in points) < 0:
         values = [value for point in points for value in (point.value, *point.repeats)]

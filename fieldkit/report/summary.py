@@ -38,9 +38,9 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
     repeats = evidence.repeats
     trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")
     return (
-        f"{trials} of {wording.listed(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
-        f"{wording.listed([name.upper() for name in _values(cells, 'protocol')])}; "
-        f"{_topologies(cells)}{wording.listed(_values(cells, 'backend'))} robots. "
+        f"{trials} of {wording.join_words(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
+        f"{wording.join_words([name.upper() for name in _values(cells, 'protocol')])}; "
+        f"{_topologies(cells)}{wording.join_words(_values(cells, 'backend'))} robots. "
         f"{format_count(len(repeats), 'attempt')}: {status_counts(Counter(repeats.texts['status']))}. "
         "All figures are of the valid ones."
     )
@@ -84,7 +84,7 @@ def _values(cells: Sequence[Cell], name: str) -> list[str]:
 
 def _topologies(cells: Sequence[Cell]) -> str:
     known = sorted({name for cell in cells if (name := wording.text(cell, "topology"))})
-    return f"{wording.listed(known)}; " if known else ""
+    return f"{wording.join_words(known)}; " if known else ""
 
 
 def _distances(cells: Sequence[Cell]) -> str:
@@ -119,7 +119,7 @@ def _counted(reasons: Sequence[str]) -> list[str]:
 
 def title(cells: Sequence[Cell]) -> str:
     """Return the default title of a report."""
-    return f"Loss and delay: {wording.listed(_values(cells, 'procedure'))}"
+    return f"Loss and delay: {wording.join_words(_values(cells, 'procedure'))}"
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report import attempt_timing
-from fieldkit.report.attempt_timing import Moments
+from fieldkit.report.attempt_timing import AttemptTimes
 from fieldkit.report.charts import Chart, Panel, Series, Span
 from fieldkit.report.theme import Style
 from fieldkit.report.trial_folders import Evidence
@@ -22,7 +22,7 @@ from fieldkit.report.trial_folders import Evidence
 MAX_PACKETS: Final = 1500
 """Maximum number of packets of each kind in a panel; of more packets, every k-th is drawn."""
 
-_MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "sent again"}
+_MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "retransmitted"}
 _SENT: Final = Style("blue", "o", "none")
 _RECEIVED: Final = Style("green", "^", "none")
 _MARK: Final = Style("lost", "x", "none")
@@ -107,7 +107,7 @@ def _within(series: Series, right_s: float) -> Series:
     return replace(series, x=x[is_shown], y=y[is_shown])
 
 
-def _bars(times: Moments, zero_ns: int) -> Panel:
+def _bars(times: AttemptTimes, zero_ns: int) -> Panel:
     """Return a panel with a lane per activity name, the first at the top."""
     names = list(dict.fromkeys(activity.name for activity in times.activities))
     last = len(names) - 1
@@ -153,11 +153,11 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
     )
 
 
-def _round_trips(name: str, role: Role, output: ping.Ping, times: Moments, zero_ns: int) -> Iterator[Panel]:
+def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the round-trip times, and the requests without a reply, by the time of sending."""
-    ahead_ns = times.ahead_ns[role]
+    clock_offset_ns = times.clock_offset_ns[role]
     answered = [
-        (reply.seq, reply.at_utc_ns - ahead_ns - zero_ns, reply.rtt_s)
+        (reply.seq, reply.at_utc_ns - clock_offset_ns - zero_ns, reply.rtt_s)
         for reply in output.answers
         if reply.at_utc_ns is not None and reply.rtt_s is not None
     ]
@@ -187,7 +187,7 @@ def _round_trips(name: str, role: Role, output: ping.Ping, times: Moments, zero_
 
 
 def _spread_over_job(
-    number: NDArray[np.int64], name: str, role: Role, times: Moments, zero_ns: int
+    number: NDArray[np.int64], name: str, role: Role, times: AttemptTimes, zero_ns: int
 ) -> NDArray[np.float64] | None:
     """Return approximate send times of requests without any reply, spread evenly over the job; None if unknown."""
     if (span := times.jobs.get((role, step_prefixed(name, "ping")))) is None:
@@ -204,7 +204,7 @@ def estimate_send_times(
 
     Args:
         number: Sequence numbers of those requests.
-        known: Sequence numbers of answered requests, rising.
+        known: Sequence numbers of answered requests, ascending.
         at_s: Times of the replies to these.
     """
     step_s = (at_s[-1] - at_s[0]) / (known[-1] - known[0]) if len(known) > 1 else 1.0  # default interval of ping
@@ -213,12 +213,14 @@ def estimate_send_times(
     return interpolated + step_s * steps_outside
 
 
-def _links(times: Moments, zero_ns: int) -> Iterator[Panel]:
+def _links(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the signal and the PHY rate of both radios over time."""
-    signals = {role: [(at_ns, sample.signal_dbm) for at_ns, sample in link_] for role, link_ in times.links.items()}
+    signals = {
+        role: [(at_ns, sample.signal_dbm) for at_ns, sample in history] for role, history in times.links.items()
+    }
     rates = {
-        role: [(at_ns, sample.tx_rate_bit_s and sample.tx_rate_bit_s / 1e6) for at_ns, sample in link_]
-        for role, link_ in times.links.items()
+        role: [(at_ns, sample.tx_rate_bit_s and sample.tx_rate_bit_s / 1e6) for at_ns, sample in history]
+        for role, history in times.links.items()
     }
     yield from _radio_panel("signal", "[dBm]", signals, zero_ns, bottom=None)
     yield from _radio_panel("PHY rate", "[Mbit/s]", rates, zero_ns, bottom=0.0)
@@ -251,7 +253,7 @@ def _radio_panel(
         )
 
 
-def _distance(times: Moments, zero_ns: int) -> Iterator[Panel]:
+def _distance(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the distance between sender and receiver over time, if it changed."""
     changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in times.distances_m]
     known_m = [metres for _, metres in changes if metres is not None]

@@ -9,13 +9,13 @@ from fieldkit.analysis.wording import interval as interval_of
 
 def value(result: Estimate) -> str:
     """Return the value of an estimate with non-breaking spaces: `3.21 %`."""
-    return unbroken(amount(_scale(result), result))
+    return without_breaks(amount(_scale(result), result))
 
 
 def interval(result: Estimate) -> str:
     """Return the interval of an estimate, and the count of its repeats if not all: `[1.10, 6.70] (7 of 10)`."""
     part = incomplete(result)
-    return unbroken(" ".join(filter(None, (interval_of(_scale(result), result), f"({part})" if part else ""))))
+    return without_breaks(" ".join(filter(None, (interval_of(_scale(result), result), f"({part})" if part else ""))))
 
 
 def estimate(result: Estimate) -> str:
@@ -23,7 +23,7 @@ def estimate(result: Estimate) -> str:
     return f"{value(result)} {interval(result)}".strip()
 
 
-def unbroken(words: str) -> str:
+def without_breaks(words: str) -> str:
     """Return a text with non-breaking spaces."""
     return words.replace(" ", "\N{NO-BREAK SPACE}")
 
@@ -47,11 +47,11 @@ def distance(cell: Cell) -> str:
     """Return a cell's distance as the operator wrote it, `30ft`, or in metres if only these are known."""
     if label := text(cell, "distance"):
         return label
-    return "distance unknown" if cell.key["distance_m"] is None else unbroken(f"{metres(cell):.2f} m")
+    return "distance unknown" if cell.key["distance_m"] is None else without_breaks(f"{metres(cell):.2f} m")
 
 
 def scenario(cell: Cell) -> str:
-    """Return a cell's scenario, `LOS` or `NLOS`, or the procedure without one."""
+    """Return a cell's scenario, `LOS` or `NLOS`, or its procedure if it has no scenario."""
     return text(cell, "scenario").upper() or text(cell, "procedure") or "no scenario"
 
 
@@ -92,6 +92,6 @@ def differing(cells: Sequence[Cell]) -> frozenset[str]:
     return frozenset(names)
 
 
-def listed(parts: list[str]) -> str:
+def join_words(parts: list[str]) -> str:
     """Return `a`, `a and b`, or `a, b and c`."""
     return " and ".join(filter(None, (", ".join(parts[:-1]), *parts[-1:])))

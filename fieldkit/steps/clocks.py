@@ -22,9 +22,9 @@ def exchanges(shell: Shell, within_s: float) -> list[Exchange]:
     """
     results = []
     for _ in range(EXCHANGES):
-        asked_ns = time.time_ns()
+        request_ns = time.time_ns()
         output = shell.run(("date", "-u", "+%s.%N"), deadline=Deadline.after(within_s), check=False).stdout
-        answered_ns = time.time_ns()
+        response_ns = time.time_ns()
         if (date := parse_date(output.decode("ascii", "replace"))) is not None:
-            results.append(Exchange(asked_ns, date[0], answered_ns, resolution_ns=date[1]))
+            results.append(Exchange(request_ns, date[0], response_ns, resolution_ns=date[1]))
     return results

@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.columns import Measured, Value
-from fieldkit.core.errors import EvidenceError, RobotError, raised
+from fieldkit.core.errors import EvidenceError, RobotError, describe_exception
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import host, program_output
 from fieldkit.remote import jobs
@@ -92,7 +92,7 @@ class ProgramStep(Step):
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the program failed, and for the columns without a value; equal reasons are given once."""
-        after = view.evidence.read_or_none(host.state, host.after(self.robot))
+        after = view.evidence.read_or_none(host.state, host.after_file(self.robot))
         ending = (after.endings or {}).get(self.prefixed_name(self.kind_name())) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.exit_codes:
             yield f"{view.scene.robot(self.robot).name}: {self.kind_name()} ended with exit code {ending.code}"
@@ -109,7 +109,7 @@ class ProgramStep(Step):
         except EvidenceError as error:
             return Measured.all_missing(columns, error.what)
         except (ValueError, LookupError, ArithmeticError) as error:
-            return Measured.all_missing(columns, f"the output is not as expected: {raised(error)}")
+            return Measured.all_missing(columns, f"the output is not as expected: {describe_exception(error)}")
         return Measured.from_optional(
             {column.name: values.get(column.name) for column in columns}, "the program did not print it"
         )

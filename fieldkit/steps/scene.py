@@ -34,10 +34,10 @@ _HEADER_BYTES: Final = 8
 _FRAGMENT_BYTES: Final = 1480
 """Payload of an IPv4 packet in an Ethernet frame, including the UDP or ICMP header."""
 
-BY_ITSELF: Final = frozenset({Cause.ITSELF})
+BY_ITSELF: Final = frozenset({Cause.EXITED})
 BY_LIMIT: Final = frozenset({Cause.LIMIT})
 BY_ITSELF_OR_LIMIT: Final = BY_ITSELF | BY_LIMIT
-BY_FIELDKIT: Final = frozenset({Cause.ASKED})
+BY_FIELDKIT: Final = frozenset({Cause.STOPPED})
 
 
 @dataclass(frozen=True)

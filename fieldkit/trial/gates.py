@@ -7,7 +7,7 @@ from traceback import format_exception
 from typing import Final
 
 from fieldkit.core.columns import Measured, cell, step_prefixed
-from fieldkit.core.errors import EvidenceError, raised
+from fieldkit.core.errors import EvidenceError, describe_exception
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
@@ -70,7 +70,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see the docstring)
-            why = f"the evidence of {placed.called} cannot be measured: {raised(error)}"
+            why = f"the evidence of {placed.called} cannot be measured: {describe_exception(error)}"
             step_errors.append("".join(format_exception(error)))
             problems.append(why)
             result = Measured.all_missing(placed.step.output_columns(), why)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from fieldkit.core.errors import raised
+from fieldkit.core.errors import describe_exception
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import clock, endings, host
@@ -26,8 +26,10 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> I
     restarted_roles = restarted(procedure)
     for role in sorted(procedure.roles()):
         name = scene.robot(role).name
-        before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after))
-        for file, state in ((host.before(role), before), (host.after(role), after)):
+        before, after = (
+            evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)
+        )
+        for file, state in ((host.before_file(role), before), (host.after_file(role), after)):
             if state is None:
                 yield f"{name}: {file} is missing, or cannot be read"
         if before is not None and after is not None:
@@ -78,7 +80,7 @@ def _job_problems(
         try:
             planned_jobs = () if placed.disturbed else tuple(own_jobs(placed.step, scene))
         except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
-            yield f"the commands of {placed.called} cannot be derived: {raised(error)}"
+            yield f"the commands of {placed.called} cannot be derived: {describe_exception(error)}"
             continue
         for planned in planned_jobs:
             if planned.role is not role:

@@ -48,10 +48,10 @@ def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
 def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
     places_m = scene.places_m
     try:
-        accounts = position_columns.position_accounts(evidence).robots
+        sources_by_role = position_columns.read_position_sources(evidence).robots
     except EvidenceError:
         return
-    for ends in combinations([role for role in sort_roles(accounts) if role in places_m], 2):
+    for ends in combinations([role for role in sort_roles(sources_by_role) if role in places_m], 2):
         try:
             source, destination = position_columns.trajectories_of_pair(evidence, (ends[0], ends[1]))
             satellites = position_columns.samples_of(evidence, ends[0]).frame == WGS84
@@ -70,12 +70,12 @@ def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
 def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) -> Ints:
     """Return the times at which the distance of two robots is compared, by the laptop's clock."""
     times_ns = np.unique(np.concatenate([trajectory.times_ns for trajectory in trajectories]))
-    states = [evidence.read_or_none(host.state, file(role)) for file in (host.before, host.after)]
+    states = [evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)]
     clocks = [state.clock for state in states if state is not None and state.clock is not None]
     if len(clocks) < len(states):
         return times_ns
-    ahead_ns = position_columns.ahead_ns(evidence, role)
-    first, last = clocks[0].first_ns - ahead_ns, clocks[1].last_ns - ahead_ns
+    offset_ns = position_columns.clock_offset_ns(evidence, role)
+    first, last = clocks[0].first_ns - offset_ns, clocks[1].last_ns - offset_ns
     inside = times_ns[(times_ns > first) & (times_ns < last)]
     return np.concatenate(((first,), inside, (last,)))
 

@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Field, Int, Number, Strict
 from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
-from fieldkit.core.errors import ConfigurationError, FieldkitError, raised
+from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.steps.capabilities import DescribesActions, HasRefusals, Moves, Pings, SendsFile
@@ -115,7 +115,7 @@ class Plan(Strict):
                 raise
             except Exception as error:
                 raise ConfigurationError(
-                    f"the commands of the step {entry.kind} cannot be derived: {raised(error)}",
+                    f"the commands of the step {entry.kind} cannot be derived: {describe_exception(error)}",
                     remedy="report it to the author of the step",
                 ) from error
 

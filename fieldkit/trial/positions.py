@@ -14,7 +14,7 @@ from fieldkit.core.model import Role, Status
 from fieldkit.core.units import format_bytes, parse_offset_m
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.positions import position_columns, position_files, position_sources
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.trial import gates, journal, manifest, store
 from fieldkit.trial.plan import Plan
@@ -42,7 +42,7 @@ class AttemptPositions:
 
 
 def set_positions(
-    folder: Path, sources: Mapping[Role, Path | Account], *, offset_s: float, gap_s: float, heights: bool
+    folder: Path, sources: Mapping[Role, Path | PositionSource], *, offset_s: float, gap_s: float, heights: bool
 ) -> Rebuilt:
     """Store positions of robots with a trial, replacing those added before, and rebuild its tables.
 
@@ -72,13 +72,13 @@ def set_positions(
         problem = f"the evidence is not what was measured: {manifest.summarize(changes)}"
         raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
     with journal.claimed(folder):
-        accounts_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
-        if accounts_by_role:
-            text = position_sources.text(Accounts(accounts_by_role, heights=heights))
+        sources_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
+        if sources_by_role:
+            text = position_sources.text(PositionSources(sources_by_role, heights=heights))
             files.write(folder / position_sources.FILE, text.encode())
         else:
             (folder / position_sources.FILE).unlink(missing_ok=True)
-        _remove_others(folder, {account.file for account in accounts_by_role.values()})
+        _remove_others(folder, {source.file for source in sources_by_role.values()})
         if (folder / store.MANIFEST_FILE).exists():
             manifest.Manifest(folder).renew_positions()
     return rebuild(folder)
@@ -100,14 +100,14 @@ def _demand_file(path: Path) -> None:
         raise ConfigurationError(problem, where=str(path), remedy="cut it to the time of the trial")
 
 
-def _stored(folder: Path, role: Role, source: Path | Account, offset_s: float, gap_s: float) -> Account:
-    """Copy the position file of a robot into the trial's folder and return its account."""
-    if isinstance(source, Account):
+def _stored(folder: Path, role: Role, source: Path | PositionSource, offset_s: float, gap_s: float) -> PositionSource:
+    """Copy the position file of a robot into the trial's folder and return it as a position source."""
+    if isinstance(source, PositionSource):
         return source
     name = f"{store.POSITIONS}{role}{source.suffix.lower()}"
     with source.open("rb") as content, files.replacing(folder / name) as copy:
         shutil.copyfileobj(content, copy)
-    return Account(file=name, offset_s=offset_s, gap_s=gap_s)
+    return PositionSource(file=name, offset_s=offset_s, gap_s=gap_s)
 
 
 def _remove_others(folder: Path, names: set[str]) -> None:
@@ -116,7 +116,7 @@ def _remove_others(folder: Path, names: set[str]) -> None:
             path.unlink()
 
 
-def parse_source(text: str) -> tuple[Role, Path | Account]:
+def parse_source(text: str) -> tuple[Role, Path | PositionSource]:
     """Return a role and the position source of its robot: `receiver=walk.gpx`, `sender=48.1,11.5`, `sender=0m,5m`.
 
     A third number is the height above the ellipsoid in metres.
@@ -134,7 +134,7 @@ def parse_source(text: str) -> tuple[Role, Path | Account]:
     return role, _place(source) or Path(source)
 
 
-def _place(text: str) -> Account | None:
+def _place(text: str) -> PositionSource | None:
     """Return a fixed place, or None if the text is not one."""
     try:
         (first, first_is_length), (second, is_length), *third = map(_degrees_or_m, text.split(","))
@@ -144,7 +144,7 @@ def _place(text: str) -> Account | None:
     if first_is_length is not is_length or not fits or len(third) > 1:
         return None
     height_m = third[0][0] if third else 0.0 if is_length else None
-    return Account(place=(first, second, height_m), frame=LOCAL if is_length else WGS84)
+    return PositionSource(place=(first, second, height_m), frame=LOCAL if is_length else WGS84)
 
 
 def _degrees_or_m(text: str) -> tuple[float, bool]:

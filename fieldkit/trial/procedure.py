@@ -136,7 +136,9 @@ class Procedure(catalog.Named, Sectioned):
     @schema.model_validator(mode="after")
     def _can_be_measured(self) -> "Procedure":
         """Reject steps that would be measured incorrectly or not at all."""
-        robot_files = (name(role) for role in self.roles() for name in (host.before, host.after, link_samples.file))
+        robot_files = (
+            name(role) for role in self.roles() for name in (host.before_file, host.after_file, link_samples.file)
+        )
         claimed, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
         filled = set[str]()
         for placed in self.walk():
@@ -338,7 +340,7 @@ def read_procedure(path: Path) -> Procedure:
     Raises:
         ConfigurationError: The file cannot be read, or has an error.
     """
-    return catalog.named(schema.read(path), Procedure, path.stem)
+    return catalog.validate_named(schema.read(path), Procedure, path.stem)
 
 
 def with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:

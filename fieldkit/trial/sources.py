@@ -9,7 +9,7 @@ from pathlib import Path
 from fieldkit.analysis import expectations, repeats
 from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.expectations import Expectation
-from fieldkit.analysis.quantities import Quantity, quantities, worded
+from fieldkit.analysis.quantities import Quantity, quantities, word_columns
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.core import files
 from fieldkit.core.columns import Column
@@ -47,7 +47,7 @@ class Sources:
     @cached_property
     def words(self) -> Mapping[str, Column]:
         """The columns whose words are counted, by name and in order."""
-        return {column.name: column for column in worded(self.columns)}
+        return {column.name: column for column in word_columns(self.columns)}
 
     def condition(self, text: str, *, option: str = "--by") -> tuple[str, ...]:
         """Return the columns that define a condition, without duplicates.

@@ -13,7 +13,7 @@ from fieldkit.analysis import sample_size
 from fieldkit.analysis.statistics import Intervals, shares
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import Interval
-from tests.helpers.single import median, more_wanted, share, wilson
+from tests.helpers.single import additional_repeats, median, share, wilson
 
 
 def half(interval: Interval | None) -> float:
@@ -30,7 +30,7 @@ def test_a_flag_needs_the_number_of_wilsons_formula(true: int, untrue: int, want
         for many in count(n)
         if z / (1 + z * z / many) * math.sqrt(p * (1 - p) / many + (z / many) ** 2 / 4) <= wanted * (1 + 1e-9)
     )
-    assert more_wanted(wilson(true, n), n, wanted, Kind.FLAG) == total - n
+    assert additional_repeats(wilson(true, n), n, wanted, Kind.FLAG) == total - n
 
 
 @given(st.integers(2, 25), st.floats(0.2, 1.5))
@@ -45,7 +45,7 @@ def test_students_quantile_decreases_with_more_repeats(n: int, part: float) -> N
 
     total = next(many for many in count(n) if expected(many) <= part * now * (1 + 2e-4))
     assert interval is not None
-    assert more_wanted(interval, n, part * now, Kind.MEDIAN) == pytest.approx(total - n, abs=1)
+    assert additional_repeats(interval, n, part * now, Kind.MEDIAN) == pytest.approx(total - n, abs=1)
 
 
 @pytest.mark.parametrize(("rate", "spread"), [(0.02, 40), (0.35, 8), (0.97, 30)])
@@ -59,7 +59,7 @@ def test_the_planned_number_gives_the_wanted_width(rate: float, spread: float) -
 
     now = cells(20)
     wanted = float(np.median(now.high - now.low)) / 2 / 3
-    more = int(np.median(sample_size.more_wanted(now, 20, wanted, Kind.COUNTED)))
+    more = int(np.median(sample_size.additional_repeats(now, 20, wanted, Kind.COUNTED)))
     then = cells(20 + more)
     assert 100 < more < 260
     assert float(np.median(then.high - then.low)) / 2 == pytest.approx(wanted, rel=0.05)
@@ -68,22 +68,22 @@ def test_the_planned_number_gives_the_wanted_width(rate: float, spread: float) -
 def test_where_nothing_was_lost_that_many_clean_repeats_are_enough() -> None:
     clean = share([0] * 20, [36] * 20)
     assert clean is not None
-    more = more_wanted(clean, 20, 0.02, Kind.COUNTED)
+    more = additional_repeats(clean, 20, 0.02, Kind.COUNTED)
     assert wilson(0, 20 + more).high / 2 <= 0.02 < wilson(0, 20 + more - 1).high / 2
 
 
 @pytest.mark.parametrize("kind", list(Kind))
 def test_no_more_repeats_are_needed_for_a_narrow_interval(kind: Kind) -> None:
     interval = Interval(0.2, 0.1, 0.4)
-    assert more_wanted(interval, 20, 0.15, kind) == 0
-    assert more_wanted(interval, 20, 5.0, kind) == 0
-    assert more_wanted(interval, 20, 0.1499, kind) == 1
+    assert additional_repeats(interval, 20, 0.15, kind) == 0
+    assert additional_repeats(interval, 20, 5.0, kind) == 0
+    assert additional_repeats(interval, 20, 0.1499, kind) == 1
 
 
 def test_a_single_repeat_gives_no_number() -> None:
-    assert np.isnan(sample_size.more_wanted(shares([[3]], [[36]]), 1, 0.1, Kind.COUNTED)).all()
+    assert np.isnan(sample_size.additional_repeats(shares([[3]], [[36]]), 1, 0.1, Kind.COUNTED)).all()
 
 
 def test_an_interval_without_width_is_refused() -> None:
     with pytest.raises(ValueError, match="above 0"):
-        more_wanted(wilson(1, 2), 2, 0.0, Kind.FLAG)
+        additional_repeats(wilson(1, 2), 2, 0.0, Kind.FLAG)

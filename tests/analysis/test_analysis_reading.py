@@ -179,7 +179,7 @@ def test_a_trial_in_two_tables_counts_once(tmp_path: Path) -> None:
     paths = [write(tmp_path / "a", rows[:2]), write(tmp_path / "copy", rows)]
     rows_read, notes = deduplicated(read(paths, trial_columns()))
     assert rows_read.column("repeat") == [1, 2, 3]
-    assert notes == (f"{tmp_path / 'copy'}: 2 rows of {tmp_path / 'a'} again, counted once",)
+    assert notes == (f"{tmp_path / 'copy'}: 2 rows also in {tmp_path / 'a'}, counted once",)
 
 
 def test_two_tables_that_contradict_each_other_are_refused(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_a_median_of_open_gaps_is_a_lower_bound() -> None:
     estimate = gaps([0.2] * 4, [2.0, 2.5, 2.8, 2.9, 3.0, 3.1]).estimates["rtt_gap_s"]
     assert (estimate.value, estimate.is_lower_bound) == (2.25, True)
     scale = wording.scale_of(estimate.quantity, [estimate.value])
-    shown = wording.quoted(wording.amount(scale, estimate), scale, estimate)
+    shown = wording.with_interval(wording.amount(scale, estimate), scale, estimate)
     assert shown == ">= 2250 ms [200, ...) (6 of 10 not ended)"
 
 
@@ -95,7 +95,7 @@ def test_censored_repeats_do_not_make_an_expectation_hold() -> None:
     """The case of issue 21: in 3 of 10 repeats the link was down when the ping ended."""
     result = judged("rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8]))
     assert result.ruling is Ruling.OPEN
-    assert result.why == "in 3 of 10 repeats it had not ended, so they give only lower bounds"
+    assert result.why == "in 3 of 10 repeats the timed event had not ended, so they give only lower bounds"
     assert judged("every rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8])).ruling is Ruling.FAILS
     assert judged("max rtt_gap_s < 2 s", gaps([0.2] * 7, [1.3])).ruling is Ruling.OPEN
     assert judged("rtt_gap_s < 2 s", gaps([], [5.0] * 4)).ruling is Ruling.FAILS
@@ -157,7 +157,7 @@ def rtt(medians_s: Sequence[Known], of_sent_s: Sequence[Known]) -> Cell:
     [
         ([0.1] * 10, Ruling.HOLDS, ""),
         ([0.15] * 10, Ruling.HOLDS, ""),
-        ([0.3] * 10, Ruling.OPEN, "if lost items count as late, the interval extends beyond it"),
+        ([0.3] * 10, Ruling.OPEN, "if lost items count as infinitely late, the interval extends beyond the bound"),
         (
             [None] + [0.1] * 9,
             Ruling.OPEN,

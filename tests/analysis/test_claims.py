@@ -34,7 +34,7 @@ def warning(text: str, repeats: int) -> str:
             "max rtt_gap_s < 300 ms",
             20,
             (
-                "is about the repeats of this trial; over 90 % of all repeats it needs at least 29 for 95 % "
+                "applies to the repeats of this trial; for 90 % of all repeats it needs at least 29 for 95 % "
                 "confidence, and 20 show it for 86 %"
             ),
         ),

@@ -120,4 +120,4 @@ def test_all_lines_are_shown_if_none_is_for_an_operator() -> None:
 
 def test_sent_packets_are_summed_over_all_valid_repeats() -> None:
     cells = cells_of([TCP, PINGED, replace(PINGED, repeat=2), replace(PINGED, repeat=3, status="void")])
-    assert table_lines.sent(cells) == {"packets sent": ["40", "432"]}
+    assert table_lines.sent_counts(cells) == {"packets sent": ["40", "432"]}

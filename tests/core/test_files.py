@@ -37,5 +37,5 @@ def test_free_bytes_of_a_missing_folder_are_those_of_its_parent_s_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert files.existing(Path("trials/campaign_lawn")) == tmp_path
+    assert files.nearest_existing(Path("trials/campaign_lawn")) == tmp_path
     assert files.free_bytes(Path("trials")) > 0

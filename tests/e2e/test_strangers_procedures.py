@@ -254,7 +254,7 @@ def test_text_answers_are_counted_in_all_outputs(lab_results: Mapping[str, LabRe
         r"^ grass +wet 2 +dry 2 +words are counted, not judged$", results.outputs["compare"], re.MULTILINE
     )
     assert re.search(
-        r"TCP, expected and own figures condition repeats wind, median people, median grass 5m 2 valid "
+        r"TCP, expected and lab-defined figures condition repeats wind, median people, median grass 5m 2 valid "
         r"3\.75 m/s \[[^]]+\]\* 1\.00 \[[^]]+\]\* wet 2 15m 2 valid 1\.50 m/s \[[^]]+\]\* 1\.00 \(1 of 2\) dry 2 ",
         results.page,
     )
@@ -277,8 +277,8 @@ def test_each_transfer_has_a_separate_timeline(lab_results: Mapping[str, LabResu
     assert sorted(lane for lane, _, _ in spans) == ["receive down", "receive up", "send down", "send up"]
     assert all(float(start_s) < float(stop_s) for _, start_s, stop_s in spans)
     assert [float(start_s) for _, start_s, _ in spans] == sorted(float(start_s) for _, start_s, _ in spans)
-    assert "up, TCP, masterless Marked: segments sent again" in results.page
-    assert "down, TCP, masterless Marked: segments sent again" in results.page
+    assert "up, TCP, masterless Marked: segments retransmitted" in results.page
+    assert "down, TCP, masterless Marked: segments retransmitted" in results.page
     values: dict[str, list[str]] = {}
     with (folder / "time.mcap").open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():

@@ -20,7 +20,7 @@ from fieldkit.core.prompts import Question
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.positions import position_columns, position_files, position_sources
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import drive_log
@@ -118,9 +118,9 @@ def _judge_needs(data: bytes, _: Path) -> None:
     assert all(finding.detail.isprintable() and finding.remedy.isprintable() for finding in report.findings)
 
 
-def _accounts_text(sender: Account, receiver: Account) -> bytes:
+def _accounts_text(sender: PositionSource, receiver: PositionSource) -> bytes:
     clocks = {Role.SENDER: Offset(0.2, 0.01), Role.RECEIVER: Offset(-0.2, 0.01)}
-    return position_sources.text(Accounts({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
+    return position_sources.text(PositionSources({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
 
 
 @cache
@@ -148,12 +148,12 @@ def _read_bag(data: bytes, place: Path) -> None:
     path = place / "track.bag"
     path.write_bytes(data)
     for stamps in ("header", "received"):
-        account = Account(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
+        position_source = PositionSource(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
         with suppress(EvidenceError):
-            found = position_files.read_topic(path, account)
+            found = position_files.read_topic(path, position_source)
             _check_samples(found)
             if found.yaws_rad is not None:
-                _check_samples(position_files.to_placement_frame(found, account))
+                _check_samples(position_files.to_placement_frame(found, position_source))
 
 
 def _read_positions_file(ending: str, data: bytes, place: Path) -> None:
@@ -185,14 +185,14 @@ def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
 
 
 def _accounts() -> tuple[bytes, ...]:
-    by_odometry = Account(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
-    at_rest = Account(place=(0.0, 0.0, 0.2))
-    degrees = Account(place=(48.1, 11.5, None), frame=WGS84)
-    metres = Account(place=(0.0, 0.0, 0.0), frame=LOCAL)
+    by_odometry = PositionSource(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
+    at_rest = PositionSource(place=(0.0, 0.0, 0.2))
+    degrees = PositionSource(place=(48.1, 11.5, None), frame=WGS84)
+    metres = PositionSource(place=(0.0, 0.0, 0.0), frame=LOCAL)
     return (
         _accounts_text(at_rest, by_odometry),
-        _accounts_text(degrees, Account(file="positions-receiver.gpx", offset_s=0.5)),
-        _accounts_text(metres, Account(file="positions-receiver.csv")),
+        _accounts_text(degrees, PositionSource(file="positions-receiver.gpx", offset_s=0.5)),
+        _accounts_text(metres, PositionSource(file="positions-receiver.csv")),
     )
 
 

@@ -38,7 +38,7 @@ from fieldkit.measure.evidence import (
     track,
 )
 from fieldkit.measure.evidence.sandbox import ReaderError
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.motion.logs import tlog, tlog_positions
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
@@ -287,7 +287,7 @@ def _read_host(path: Path) -> None:
     host.stations(path)
     state = host.state(path)
     for ending in (state.endings or {}).values():
-        endings.termination_error(ending, frozenset({endings.Cause.ITSELF}))
+        endings.termination_error(ending, frozenset({endings.Cause.EXITED}))
     if state.clock is not None:
         clock.step_description(state.clock, state.clock)
 
@@ -331,7 +331,7 @@ def _measure_tlog(path: Path) -> None:
     for kind in (tlog.LOCAL, tlog.GLOBAL):
         for stamps in ("header", "received"):
             with suppress(EvidenceError):
-                tlog_positions.read_tlog(path, Account(topic=kind, stamps=stamps))
+                tlog_positions.read_tlog(path, PositionSource(topic=kind, stamps=stamps))
 
 
 def _measure_topic_log(path: Path) -> None:

@@ -33,9 +33,9 @@ def median(values: ArrayLike, least: float = -math.inf) -> Interval | None:
     return _single(statistics.medians(np.atleast_2d(values), least))
 
 
-def more_wanted(interval: Interval, n: int, half_width: float, kind: Kind) -> int:
+def additional_repeats(interval: Interval, n: int, half_width: float, kind: Kind) -> int:
     intervals = Intervals(*(np.array([bound]) for bound in (interval.value, interval.low, interval.high)))
-    return int(sample_size.more_wanted(intervals, n, half_width, kind)[0])
+    return int(sample_size.additional_repeats(intervals, n, half_width, kind)[0])
 
 
 def _single(intervals: Intervals) -> Interval | None:

@@ -56,13 +56,13 @@ def texts(trials: Sequence[Path]) -> Iterator[tuple[str, str]]:
     yield "export.csv", Path("table.csv").read_text(encoding="utf-8")
     yield "mcap.json", _json({trial.name: _timeline(trial) for trial in trials})
     recorded: list[contents.Contents] = []
-    put_together = contents.put_together
+    build_contents = contents.build_contents
 
     def record_contents(*arguments: Any, **options: Any) -> contents.Contents:  # noqa: ANN401 (passed on unchanged)
-        recorded.append(put_together(*arguments, **options))
+        recorded.append(build_contents(*arguments, **options))
         return recorded[-1]
 
-    with patch.object(contents, "put_together", record_contents):
+    with patch.object(contents, "build_contents", record_contents):
         command_output("report", "trials", "-o", "report.html")
     yield "report.txt", _page_text(Path("report.html").read_text(encoding="utf-8"))
     yield "figures.json", _json(list(_figures(recorded[0])))

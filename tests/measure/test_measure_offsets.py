@@ -13,9 +13,9 @@ DELAYS_NS = st.lists(st.tuples(st.integers(0, 2 * S), st.integers(0, 2 * S)), mi
 
 
 def test_the_fastest_exchange_gives_midpoint_and_half_its_round_trip() -> None:
-    slow = Exchange(asked_ns=0, robot_ns=3 * S, answered_ns=2 * S)
+    slow = Exchange(request_ns=0, robot_ns=3 * S, response_ns=2 * S)
     # Asked at 10 s, answered at 10.4 s; at the midpoint, 10.2 s, the robot's clock showed 15 s.
-    fast = Exchange(asked_ns=10 * S, robot_ns=15 * S, answered_ns=10 * S + 4 * S // 10)
+    fast = Exchange(request_ns=10 * S, robot_ns=15 * S, response_ns=10 * S + 4 * S // 10)
     estimate = offset([slow, fast])
     assert estimate.offset_s == pytest.approx(4.8)
     assert estimate.error_s == pytest.approx(0.2)
@@ -32,12 +32,12 @@ def test_a_clock_with_a_resolution_of_seconds_adds_a_second_of_uncertainty() -> 
 def test_the_true_offset_is_within_the_error(true_s: float, ways: list[tuple[int, int]], whole_seconds: bool) -> None:
     true_ns = round(true_s * S)
     exchanges = []
-    asked_ns = 1_700_000_000 * S
+    request_ns = 1_700_000_000 * S
     for there, back in ways:
-        read = asked_ns + there + true_ns
+        read = request_ns + there + true_ns
         robot_ns, resolution_ns = (read // S * S, S) if whole_seconds else (read, 0)
-        exchanges.append(Exchange(asked_ns, robot_ns, asked_ns + there + back, resolution_ns))
-        asked_ns += there + back
+        exchanges.append(Exchange(request_ns, robot_ns, request_ns + there + back, resolution_ns))
+        request_ns += there + back
     estimate = offset(exchanges)
     assert abs(estimate.offset_s - true_ns / S) <= estimate.error_s + 1e-6
 

@@ -523,10 +523,10 @@ def test_end_of_each_job_is_recorded_with_boot_id_and_clock(shell: LocalShell, t
     assert after.endings is not None
     assert before.endings is None
     assert {name: (ending.cause, ending.code) for name, ending in after.endings.items()} == {
-        "stopped": (Cause.ASKED, 0),
-        "broken": (Cause.ITSELF, 0),
-        "lost": (Cause.ITSELF, None),
-        "job": (Cause.ITSELF, 3),
+        "stopped": (Cause.STOPPED, 0),
+        "broken": (Cause.EXITED, 0),
+        "lost": (Cause.EXITED, None),
+        "job": (Cause.EXITED, 3),
         "slow": (Cause.LIMIT, 0),
     }
     lasted_s = after.endings["job"].lasted_s

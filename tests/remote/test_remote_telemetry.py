@@ -82,7 +82,7 @@ def test_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_path:
     assert measured.values["sender_tx_failures"] == measured.values["sender_roams"] == 0
     after = host.state(into / "sender-after.txt")
     assert after.endings is not None
-    assert after.endings["link"].cause is Cause.ASKED
+    assert after.endings["link"].cause is Cause.STOPPED
     asked = (tmp_path / "asked").read_text().splitlines()
     assert "dev wlan0 station get 04:f0:21:32:3f:d2" in asked, "of its cell, which some drivers list nowhere"
 

@@ -16,7 +16,7 @@ from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import outage, ping
 from fieldkit.report import distance, distribution, dots, figures
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
-from fieldkit.report.contents import put_together
+from fieldkit.report.contents import build_contents
 from fieldkit.report.series import Identities, needs_log
 from fieldkit.report.theme import Style
 from fieldkit.report.trial_folders import load_evidence
@@ -60,7 +60,7 @@ def test_curve_has_a_cross_where_nothing_arrived() -> None:
     assert panel.right is not None
     assert panel.right > 60
     assert "nothing arrived: 3 of 3 at 60m" in panel.words
-    assert "a cross at the edge where a condition has no value" in chart.caption
+    assert "a cross at the edge, with the reason, if a condition has no value" in chart.caption
 
 
 def test_cross_of_a_missing_rate_is_at_the_bottom() -> None:
@@ -79,7 +79,7 @@ def test_point_shows_the_number_of_repeats_with_a_value() -> None:
     some = [*at(20, 2), lawns.row(3, distance="20m", distance_m=20.0, **LOST)]
     (chart,) = curves(parsed([*at(10), *some]), "rtt_median_s")
     assert list(chart.panels[0].series[0].notes) == ["", "2 of 3"]
-    assert "how many of the valid repeats have a value" in chart.caption
+    assert "the number of valid repeats with a value" in chart.caption
 
 
 def test_line_is_broken_at_missing_values_and_very_wide_intervals() -> None:
@@ -106,7 +106,7 @@ def test_broken_line_is_drawn_in_segments() -> None:
 
 def test_quantities_of_one_distance_are_dots_not_curves() -> None:
     repeats = parsed(at(10, 3, goodput_bit_s=2e6))
-    report = put_together(repeats, title="", repeat="", command=["fieldkit"])
+    report = build_contents(repeats, title="", repeat="", command=["fieldkit"])
     assert report.against_distance == []
     (chart,) = dot_charts(repeats)
     assert chart.title == "All quantities at 10m"

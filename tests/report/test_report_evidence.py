@@ -12,7 +12,7 @@ from fieldkit.config import schema
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import track
 from fieldkit.report import distribution, packet_rasters, timeline
-from fieldkit.report.contents import put_together, repeat_to_draw
+from fieldkit.report.contents import build_contents, repeat_to_draw
 from fieldkit.report.series import Identities
 from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial import sources, store
@@ -102,9 +102,9 @@ def test_time_line_shows_the_distance_between_moving_robots(trial: Path) -> None
 
 
 def test_repeat_of_the_time_line_can_be_selected(trial: Path) -> None:
-    report = put_together(sources.find([trial], print).read(), title="", repeat="udp-01.void1", command=())
+    report = build_contents(sources.find([trial], print).read(), title="", repeat="udp-01.void1", command=())
     assert "one-repeat" not in [section.name for section in report.sections]
-    report = put_together(sources.find([trial], print).read(), title="", repeat=f"{trial.name}/udp-01", command=())
+    report = build_contents(sources.find([trial], print).read(), title="", repeat=f"{trial.name}/udp-01", command=())
     assert report.sections[-1].charts[0].title == "Time line of udp-01"
 
 

@@ -27,7 +27,7 @@ def lines(rows: Sequence[RepeatRow], unmeasured: Sequence[str] = ()) -> dict[str
 
 
 def texts(headline: Headline) -> list[str]:
-    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.ends)
+    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.lines)
     return [" ".join(parts).replace("\N{NO-BREAK SPACE}", " ") for parts in lines]
 
 

@@ -22,7 +22,7 @@ from fieldkit.measure.transfers import fates, iperf3_load, tcp
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report import distance, distribution, figures, headlines, packet_rasters, strips, summary, timeline
 from fieldkit.report.charts import Chart, Panel, Series
-from fieldkit.report.contents import put_together
+from fieldkit.report.contents import build_contents
 from fieldkit.report.series import Identities
 from fieldkit.report.theme import Style
 from fieldkit.report.trial_folders import load_evidence
@@ -282,7 +282,7 @@ def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> 
     far = {"distance": "20ft", "distance_m": 6.096}
     rows = [{**lawns.row(number), **tested, **counts, **place} for place in ({}, far) for number in (1, 2)]
     path.write_text(to_csv(rows, columns), encoding="utf-8")
-    page = put_together(read([path], columns), title="", repeat="", command=["fieldkit"])
+    page = build_contents(read([path], columns), title="", repeat="", command=["fieldkit"])
     titles = {section.name: [chart.title for chart in section.charts] for section in page.against_distance}
     assert {"iperf3 loss against distance", "iperf3 loss, captured against distance"} <= set(titles["loss"])
     assert "iperf3 throughput against distance" in titles["rate"]
@@ -290,7 +290,7 @@ def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> 
 
 def ends(headline: headlines.Headline) -> list[str]:
     """Return one text per end of a headline."""
-    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.ends)
+    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.lines)
     return [plain(" ".join(parts)) for parts in lines]
 
 

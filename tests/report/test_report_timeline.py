@@ -40,7 +40,7 @@ def jobs(trial: Path, **spans: tuple[float, float]) -> Path:
     ]
     clock = f"{BOOT_S}.00 {BEGAN_NS // recorded.SECOND_NS}.000000000 {BOOT_S}.00"
     text = "\n".join(["==> jobs <==", *lines, "==> clock <==", clock, "==> end <==", ""])
-    (folder / host.after(Role.SENDER)).write_text(text, encoding="utf-8")
+    (folder / host.after_file(Role.SENDER)).write_text(text, encoding="utf-8")
     return folder
 
 
@@ -138,9 +138,9 @@ def test_a_topic_has_a_panel_of_its_delays_and_losses(trial: Path) -> None:
         trial, '{"topics": {"from": "sender", "to": "receiver", "over": "dds", "rate": "10Hz", "bytes": "100B"}}'
     )
     folder = jobs(trial, publish=(4.0, 7.0))
-    after = folder / host.after(Role.SENDER)
+    after = folder / host.after_file(Role.SENDER)
     text = after.read_text(encoding="utf-8").replace("publish", "subscribe")
-    (folder / host.after(Role.RECEIVER)).write_text(text, encoding="utf-8")
+    (folder / host.after_file(Role.RECEIVER)).write_text(text, encoding="utf-8")
     begin_ns = BEGAN_NS + 4 * 10**9
 
     def record(kind: int, sequence: int, sent_ns: int, at_ns: int) -> bytes:

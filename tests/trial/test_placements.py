@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.positions import position_sources
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.view import View
@@ -22,19 +22,19 @@ DEGREE_M = 110_574.28
 """Metres per degree of latitude at the equator."""
 
 
-def stood(folder: Path, receiver: Account, sender: Account) -> AttemptEvidence:
-    stored = Accounts({Role.SENDER: sender, Role.RECEIVER: receiver})
+def stood(folder: Path, receiver: PositionSource, sender: PositionSource) -> AttemptEvidence:
+    stored = PositionSources({Role.SENDER: sender, Role.RECEIVER: receiver})
     (folder / position_sources.FILE).write_text(position_sources.text(stored), encoding="utf-8")
     return AttemptEvidence(folder)
 
 
 def in_metres(folder: Path, apart_m: float) -> AttemptEvidence:
-    sender, receiver = (Account(place=(at_m, 0.0, 0.0), frame=LOCAL) for at_m in (5.0, 5.0 + apart_m))
+    sender, receiver = (PositionSource(place=(at_m, 0.0, 0.0), frame=LOCAL) for at_m in (5.0, 5.0 + apart_m))
     return stood(folder, receiver, sender)
 
 
 def on_earth(folder: Path, apart_m: float) -> AttemptEvidence:
-    sender, receiver = (Account(place=(at_m / DEGREE_M, 0.0, None), frame=WGS84) for at_m in (0.0, apart_m))
+    sender, receiver = (PositionSource(place=(at_m / DEGREE_M, 0.0, None), frame=WGS84) for at_m in (0.0, apart_m))
     return stood(folder, receiver, sender)
 
 
@@ -67,7 +67,7 @@ def test_satellite_positions_have_the_tolerance_of_their_error(
 
 def test_missing_positions_contradict_nothing(tmp_path: Path) -> None:
     assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
-    lone = Accounts({Role.RECEIVER: Account(place=(300.0, 0.0, 0.0), frame=LOCAL)})
+    lone = PositionSources({Role.RECEIVER: PositionSource(place=(300.0, 0.0, 0.0), frame=LOCAL)})
     (tmp_path / position_sources.FILE).write_text(position_sources.text(lone), encoding="utf-8")
     assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
     assert placements.contradiction(replace(SCENE, placement=None), in_metres(tmp_path, 300.0)) is None
@@ -81,7 +81,7 @@ def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
 ) -> None:
     places_m = SCENE.places_m
     x, y, z = places_m[Role.RECEIVER]
-    evidence = stood(tmp_path, Account(place=(x + off_m, y, z)), Account(place=places_m[Role.SENDER]))
+    evidence = stood(tmp_path, PositionSource(place=(x + off_m, y, z)), PositionSource(place=places_m[Role.SENDER]))
     problems = list(follow.problems(View(SCENE, evidence), ()))
     assert (problems == []) if why is None else [why in reason for reason in problems] == [True]
 

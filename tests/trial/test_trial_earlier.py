@@ -15,7 +15,7 @@ from tests.helpers.plans import problems
 from tests.helpers.stored_trials import TRIALS
 from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
 
-EARLIER = "packets of an earlier attempt were still on the way"
+EARLIER = "packets of an earlier attempt were still in transit"
 HEADS = 8
 """Offset of a record's lengths, after which its IP packet starts: the captures have link type RAW."""
 KEPT = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))

@@ -128,7 +128,7 @@ def fewer_frames(folder: Path) -> None:
         (text("track.csv", "utc_ns"), "track.csv: is not a track of robots"),
         (text("track.csv", track.text([]).replace("lines 0", "lines 1")), "track.csv: has 0 lines of 1: truncated"),
         (text("link.csv", "utc_ns"), "link.csv: is not a file of link samples"),
-        (text("lateness.txt", "bound"), "lateness.txt: is not a lateness of packets"),
+        (text("lateness.txt", "bound"), "lateness.txt: is not a file of packet lateness"),
         (cut_capture, "receiver capture: ends inside the packet at byte"),
         (fewer_frames, "receiver capture: the file has 23 packets, tcpdump counted 24"),
         (without("ping.txt"), "ping.txt is missing"),

@@ -9,7 +9,7 @@ from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Role
 from fieldkit.measure.evidence import ping
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.trial import journal, manifest, positions
 from tests.helpers.runs import rows
@@ -141,10 +141,10 @@ def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("sender=48.1,-11.5", Account(place=(48.1, -11.5, None), frame=WGS84)),
-        ("sender=-48.1,11.5,520", Account(place=(-48.1, 11.5, 520.0), frame=WGS84)),
-        ("sender=0m,10ft", Account(place=(0.0, 3.048, 0.0), frame=LOCAL)),
-        ("sender=-1m,2m,3m", Account(place=(-1.0, 2.0, 3.0), frame=LOCAL)),
+        ("sender=48.1,-11.5", PositionSource(place=(48.1, -11.5, None), frame=WGS84)),
+        ("sender=-48.1,11.5,520", PositionSource(place=(-48.1, 11.5, 520.0), frame=WGS84)),
+        ("sender=0m,10ft", PositionSource(place=(0.0, 3.048, 0.0), frame=LOCAL)),
+        ("sender=-1m,2m,3m", PositionSource(place=(-1.0, 2.0, 3.0), frame=LOCAL)),
         ("sender=walk.gpx", Path("walk.gpx")),
         ("sender=1,2m", Path("1,2m")),
         ("sender=1,2,3,4", Path("1,2,3,4")),

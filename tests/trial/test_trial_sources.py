@@ -47,7 +47,7 @@ def test_a_copy_counts_once_with_a_note(tmp_path: Path) -> None:
     copy = write(tmp_path, repeats(replace(ROW, trial="1"), 2), "copy.csv")
     notes: list[str] = []
     assert len(load([table, copy], notes)) == 2
-    assert notes == [f"{copy}: 2 rows of {table} again, counted once"]
+    assert notes == [f"{copy}: 2 rows also in {table}, counted once"]
 
 
 def test_a_trial_without_a_table_is_named(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
     chosen = [data.quantity(name).name for name in arguments.quantity]
     repeats = data.read()
-    report_contents = contents.put_together(
+    report_contents = contents.build_contents(
         repeats,
         title=arguments.title,
         repeat=arguments.repeat,

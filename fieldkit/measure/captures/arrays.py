@@ -194,7 +194,7 @@ class Fields:
 
 
 NO_TIME: Final = -1
-"""Time of a frame for which the file has none."""
+"""Time of a frame that has no time in the file."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,7 @@ def _raw(_: Integers, frames: Frames) -> Ints:
 
 
 def _null(integers: Integers, frames: Frames) -> Ints:
-    """The address family is in the byte order of the capturing machine, which may differ from the file's."""
+    """Return the positions after the address family, whose byte order may differ from that of the file."""
     family = integers.u32(frames.start)
     is_ip = _is_in(family, _IP_FAMILIES) | _is_in(family, [number << 24 for number in _IP_FAMILIES])
     return np.where(is_ip, frames.start + 4, NO_HEADER)
@@ -88,8 +88,8 @@ def _radiotap(integers: Integers, frames: Frames) -> Ints:
         after[extended] += 4
         extended = extended[more & (after[extended] < end[extended])]
     # The flags follow the time stamp, which is aligned to 8 bytes.
-    stamped = present & 1 == 1
-    flags_at = np.where(stamped, frames.start + (after - frames.start + 7) // 8 * 8 + 8, after)
+    has_timestamp = present & 1 == 1
+    flags_at = np.where(has_timestamp, frames.start + (after - frames.start + 7) // 8 * 8 + 8, after)
     flags = np.where((present & 2 == 2) & (flags_at < end), integers.u8(flags_at), 0)
     network = _from_80211(integers, frames, frames.start + length, padded=flags & 0x20 != 0)
     return np.where((integers.u8(frames.start) == 0) & (flags & 0x40 == 0), network, NO_HEADER)
@@ -115,10 +115,10 @@ def _from_80211(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) 
     aggregated = qos & (integers.u8(mac + header - 2) & 0x80 != 0)
     header += 4 * (qos & (flags & 0x80 != 0))  # HT control
     llc = mac + np.where(padded, (header + 3) // 4 * 4, header)
-    # Data of version 0; not a null frame, not encrypted, not a later fragment, and not an aggregate (A-MSDU).
-    clear = (kind & 0x4F == 0x08) & (flags & 0x40 == 0) & (integers.u8(mac + 22) & 0x0F == 0) & ~aggregated
-    clear &= (integers.u32(llc) == _SNAP) & (integers.u16(llc + 4) == 0)
-    return np.where(clear, _after_ethertype(integers, frames, llc + 6, llc + 8), NO_HEADER)
+    # Data frames of version 0, except null frames, encrypted frames, later fragments and aggregates (A-MSDU).
+    readable = (kind & 0x4F == 0x08) & (flags & 0x40 == 0) & (integers.u8(mac + 22) & 0x0F == 0) & ~aggregated
+    readable &= (integers.u32(llc) == _SNAP) & (integers.u16(llc + 4) == 0)
+    return np.where(readable, _after_ethertype(integers, frames, llc + 6, llc + 8), NO_HEADER)
 
 
 def _is_in(values: Ints, allowed: tuple[int, ...] | list[int]) -> Mask:
@@ -151,7 +151,7 @@ def check_link_type(*link_types: int, where: str) -> None:
     """Check that at least one of these link types is supported.
 
     Raises:
-        EvidenceError: None is supported.
+        EvidenceError: No link type is supported.
     """
     if not LINKS.keys() & set(link_types):
         raise EvidenceError(
@@ -252,19 +252,21 @@ def address_text(upper: int, lower: int) -> str:
 
 def ip_headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
     """Return the complete and valid IP headers at the positions `at` in `frames`; a negative position has none."""
-    kept = np.where(at < 0, 0, frames.start + frames.captured_bytes - at)
+    captured = np.where(at < 0, 0, frames.start + frames.captured_bytes - at)
     version = integers.u8(np.maximum(at, 0)) >> 4
-    four = np.flatnonzero((version == 4) & (kept >= _IPV4_HEADER_BYTES))
-    six = np.flatnonzero((version == 6) & (kept >= _IPV6_HEADER_BYTES))
+    ipv4_frames = np.flatnonzero((version == 4) & (captured >= _IPV4_HEADER_BYTES))
+    ipv6_frames = np.flatnonzero((version == 6) & (captured >= _IPV6_HEADER_BYTES))
     wire = frames.wire_bytes - (at - frames.start)
-    parts = [_ipv4(integers, four, at[four], kept[four], wire[four])]
-    if not len(six):
+    parts = [_ipv4(integers, ipv4_frames, at[ipv4_frames], captured[ipv4_frames], wire[ipv4_frames])]
+    if not len(ipv6_frames):
         return parts[0]
-    both = Headers.concatenated([*parts, _ipv6(integers, six, at[six], kept[six], wire[six])])
+    both = Headers.concatenated(
+        [*parts, _ipv6(integers, ipv6_frames, at[ipv6_frames], captured[ipv6_frames], wire[ipv6_frames])]
+    )
     return both.where(np.argsort(both.frame))
 
 
-def _ipv4(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> Headers:
+def _ipv4(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints) -> Headers:
     head = integers.fields(_IPV4, at)
     header = (head["length"] & 0xF) * 4
     # Segmentation offload leaves the total length 0 in frames above 64 KiB; the wire length is used instead.
@@ -281,9 +283,9 @@ def _ipv4(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
         header_bytes=header,
         payload_at=at + header,
         payload_bytes=total - header,
-        wrong_checksum=_wrong_checksums(integers, head, at, np.minimum(header, kept)),
+        wrong_checksum=_wrong_checksums(integers, head, at, np.minimum(header, captured)),
     )
-    valid = (header >= _IPV4_HEADER_BYTES) & (header <= kept) & (total >= header)
+    valid = (header >= _IPV4_HEADER_BYTES) & (header <= captured) & (total >= header)
     return ipv4 if valid.all() else ipv4.where(valid)
 
 
@@ -317,10 +319,10 @@ def _mapped(value: Ints) -> Addresses:
     return halves
 
 
-def _ipv6(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> Headers:
-    end = at + kept
+def _ipv6(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints) -> Headers:
+    end = at + captured
     protocol = integers.u8(at + 6)
-    payload_end = at + _IPV6_HEADER_BYTES + _ipv6_payload_bytes(integers, at, kept, protocol, wire)
+    payload_end = at + _IPV6_HEADER_BYTES + _ipv6_payload_bytes(integers, at, captured, protocol, wire)
     payload_at = at + _IPV6_HEADER_BYTES
     ip_id, fragment = np.zeros_like(at), np.zeros_like(at)
 
@@ -353,17 +355,17 @@ def _ipv6(integers: Integers, frame: Ints, at: Ints, kept: Ints, wire: Ints) -> 
     )
 
 
-def _ipv6_payload_bytes(integers: Integers, at: Ints, kept: Ints, protocol: Ints, wire: Ints) -> Ints:
+def _ipv6_payload_bytes(integers: Integers, at: Ints, captured: Ints, protocol: Ints, wire: Ints) -> Ints:
     """Return the payload length after the fixed header.
 
     If the header has 0, the length is that of the jumbo option or, for frames from segmentation offload, follows from
     the wire length.
     """
     payload_length = integers.u16(at + 4)
-    jumbo = (protocol == _HOP_BY_HOP) & (kept >= 48) & (integers.u16(at + 42) == _JUMBO_OPTION)
+    jumbo = (protocol == _HOP_BY_HOP) & (captured >= 48) & (integers.u16(at + 42) == _JUMBO_OPTION)
     may_be_offloaded = (protocol == TCP) | (protocol == UDP)
-    longer = np.where(jumbo, integers.u32(at + 44), np.where(may_be_offloaded, wire - _IPV6_HEADER_BYTES, 0))
-    return np.where(payload_length == 0, longer, payload_length)
+    actual_length = np.where(jumbo, integers.u32(at + 44), np.where(may_be_offloaded, wire - _IPV6_HEADER_BYTES, 0))
+    return np.where(payload_length == 0, actual_length, payload_length)
 
 
 def _halves(integers: Integers, at: Ints) -> Addresses:

@@ -36,16 +36,16 @@ _TRANSPORT: Final = layout(
 )
 
 NO_PORT: Final = -1
-"""Port of a packet without one: a later fragment, or another protocol."""
+"""Port of a packet that has no port: a later fragment, or another protocol."""
 
 NO_STAMP: Final = -1
-"""TCP time stamp of a packet without one, or truncated before it."""
+"""TCP time stamp of a packet that has none, or was truncated before it."""
 
 NO_ECHO: Final = -1
 """Identifier of a packet that is not an ICMP echo, or was truncated before it."""
 
 ECHO_REPLY: Final = 1 << 16
-"""Added to the identifier of an echo that is a reply."""
+"""Added to the identifier of an ICMP echo reply."""
 
 NOT_CAPTURED: Final = -1
 """Content hash of a packet that was truncated before `CONTENT_BYTES` of content."""
@@ -86,16 +86,16 @@ class Packets(Table):
         tcp_seq: TCP sequence number; 0 without a TCP header.
         tcp_ack: TCP acknowledgment number; 0 without a TCP header.
         tcp_flags: TCP flags; 0 without a TCP header.
-        tcp_stamp: TSval of the TCP time stamp option, which is later in a retransmission; `NO_STAMP` without one.
-        tcp_mss: Maximum segment size option of a SYN; 0 without one.
-        tcp_payload_bytes: Length after the TCP header; 0 without one.
-        udp_bytes: Length field of the UDP header, which includes the header; 0 without one.
+        tcp_stamp: TSval of the TCP time stamp option, which is larger in a retransmission; `NO_STAMP` if it has none.
+        tcp_mss: Maximum segment size option of a SYN; 0 if it has none.
+        tcp_payload_bytes: Length after the TCP header; 0 without a TCP header.
+        udp_bytes: Length field of the UDP header, which includes the header; 0 without a UDP header.
         echo: Identifier of an ICMP echo request, which differs between ping processes; `ECHO_REPLY` is added in a
             reply. `NO_ECHO` for other packets.
         echo_seq: Sequence number of an ICMP echo request or reply; `NO_ECHO` for other packets.
         content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header, else after the IP header. The
-            transport checksum is not included, because offload computes it later. `NOT_CAPTURED` if one is
-            missing.
+            transport checksum is not included, because offload computes it later. `NOT_CAPTURED` if one
+            of these bytes is missing.
     """
 
     time_ns: Ints
@@ -159,7 +159,7 @@ def decode(integers: Integers, frames: Frames) -> Packets:
 
     first = ip.fragment_offset == 0
     is_tcp, is_udp = first & (protocol == TCP), first & (protocol == UDP)
-    ports = (is_tcp | is_udp | first & (protocol == SCTP)) & (captured >= 4)
+    has_ports = (is_tcp | is_udp | first & (protocol == SCTP)) & (captured >= 4)
     tcp, udp = is_tcp & (captured >= 20), is_udp & (captured >= UDP_HEADER_BYTES)
     head = integers.fields(_TRANSPORT, transport)
     tcp_header = (head["length"] >> 4) * 4
@@ -179,8 +179,8 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         ip_header_bytes=ip.header_bytes,
         ip_payload_bytes=payload,
         wrong_checksum=ip.wrong_checksum,
-        sport=np.where(ports, head["sport"], NO_PORT),
-        dport=np.where(ports, head["dport"], NO_PORT),
+        sport=np.where(has_ports, head["sport"], NO_PORT),
+        dport=np.where(has_ports, head["dport"], NO_PORT),
         tcp_seq=np.where(tcp, head["seq"], 0),
         tcp_ack=np.where(tcp, head["ack"], 0),
         tcp_flags=tcp_flags,

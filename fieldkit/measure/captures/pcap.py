@@ -29,7 +29,7 @@ CLASSIC_MAGIC: Final[dict[bytes, tuple[Order, int]]] = {
 
 _FILE_HEADER_BYTES: Final = 24
 _RECORD_HEADER_BYTES: Final = 16
-# After this many records of equal length the next is probably as long.
+# After this many records of equal length, the next record probably has this length too.
 _MIN_RUN: Final = 16
 # libpcap's MAXIMUM_SNAPLEN: no record of a valid file is longer.
 _MAX_CAPTURED_BYTES: Final = 262_144
@@ -71,7 +71,7 @@ def classic_chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Ch
 def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[Ints, int]:
     """Return the start positions of the records from `at` to before `stop`, and the position of the next record.
 
-    A snap length gives most records the same length. Runs of such records are checked together, in growing leaps.
+    A snap length gives most records the same length. Such records are checked together, in groups of growing size.
     """
     captured = struct.Struct(f"{order}I").unpack_from
     parts: list[Ints] = []
@@ -83,11 +83,13 @@ def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[Ints, int]:
         at += step
         run_length = run_length + 1 if step == previous_step else 0
         if run_length >= _MIN_RUN and at < stop:
-            leap = _equal_length_run(data, order, at, step, min(4 * run_length, (stop - at + step - 1) // step))
-            parts += [np.array(starts, dtype=np.int64), np.arange(leap) * step + at]
+            equal_count = _equal_length_run(
+                data, order, at, step, min(4 * run_length, (stop - at + step - 1) // step)
+            )
+            parts += [np.array(starts, dtype=np.int64), np.arange(equal_count) * step + at]
             starts = []
-            at += leap * step
-            run_length += leap
+            at += equal_count * step
+            run_length += equal_count
     return np.concatenate([*parts, np.array(starts, dtype=np.int64)]), at
 
 
@@ -120,7 +122,7 @@ CHUNK_BYTES: Final = 1 << 22
 """Number of file bytes that are decoded together; the memory needed besides the columns is a few times as much."""
 
 _SPARE_DIVISOR: Final = 8
-"""One row in this many is allocated in addition to the expected number of rows."""
+"""The expected number of rows divided by this is the number of additional rows that are allocated."""
 
 READERS: Final = dict.fromkeys(CLASSIC_MAGIC, classic_chunks) | {pcapng.MAGIC: pcapng.chunks}
 """Readers of frames, by the first four bytes of the file."""
@@ -214,5 +216,5 @@ def _concatenate(captures: Iterable[Capture], size_bytes: int) -> Capture:
         joined.write(rows, capture.packets)
         rows, frames, damage = stop, frames + capture.frames, capture.damage
     if joined is None:
-        raise ValueError("a capture file has one chunk at least")
+        raise ValueError("a capture file has at least one chunk")
     return Capture(joined.where(slice(0, rows)), frames, damage)

@@ -51,7 +51,7 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
 
     Raises:
         EvidenceError: The file does not start with a complete section header, a section with packets has no interface
-            of a known link type, or the file has more sections and interfaces than a capture has.
+            of a known link type, or the file has more than `_MAX_DEFINITIONS` sections and interfaces.
     """
     if _next_definition(_Section(LITTLE), data, 0) is None:
         raise EvidenceError("has no complete section header", where=where, remedy="repeat the measurement")

@@ -15,9 +15,9 @@ from fieldkit.measure.evidence.iperf3 import IperfInterval, IperfTest
 _ROUNDING_S: Final = 0.002
 """iperf3 prints times with 6 digits, some versions print `seconds` with more."""
 _SUMMARY_DELAY_S: Final = 0.02
-"""Difference allowed because the clock is read for the last interval and, later, for the summary."""
-_EMPTY_S: Final = 1.1
-"""Version 3.17 omits a last interval in which nothing arrived."""
+"""Allowed difference: the clock is read for the last interval and again, later, for the summary."""
+_MAX_OMITTED_S: Final = 1.1
+"""Maximum length of a last interval that version 3.17 omits because nothing arrived in it."""
 _ROUNDING: Final = 1e-3
 _EARLY_S: Final = 0.1
 """A timer of the client may end a test this much before its duration."""
@@ -99,9 +99,9 @@ def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
         ("bytes", totals.sent_bytes if sends else totals.received_bytes, _sum(intervals, "payload_bytes")),
         ("retransmits", totals.retransmits if sends else None, _sum(intervals, "retransmits")),
     )
-    for quantity, total, added in sums:
-        if total is not None and added is not None and total != added:
-            yield f"the sum of {quantity} over its intervals is {added}, but its summary has {total}"
+    for quantity, total, interval_sum in sums:
+        if total is not None and interval_sum is not None and total != interval_sum:
+            yield f"the sum of {quantity} over its intervals is {interval_sum}, but its summary has {total}"
     end_s = intervals[-1].end_s if intervals else None
     if end_s is not None and totals.ends_s and not any(_ends_near(end_s, total_s) for total_s in totals.ends_s):
         yield f"its last interval ends at {end_s:.3f} s, but its summary at {max(totals.ends_s):.3f} s"
@@ -110,7 +110,7 @@ def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
 
 
 def _ends_near(last_s: float, total_s: float) -> bool:
-    return -_SUMMARY_DELAY_S < total_s - last_s < _EMPTY_S
+    return -_SUMMARY_DELAY_S < total_s - last_s < _MAX_OMITTED_S
 
 
 def _gaps(intervals: tuple[IperfInterval, ...]) -> Iterator[str]:
@@ -156,7 +156,7 @@ def _datagram_bytes(test: IperfTest, payload_bytes: int) -> Iterator[str]:
         yield f"it received {received_bytes} bytes, but counts {counted}"
 
 
-def compare_ends(client: IperfTest, server: IperfTest, order: IperfSettings) -> Iterator[str]:
+def compare_ends(client: IperfTest, server: IperfTest, settings: IperfSettings) -> Iterator[str]:
     """Yield the contradictions between the JSON of both ends, and differences from the procedure's settings."""
     if client.start.cookie != server.start.cookie:
         yield "client and server have different cookies, so they are different tests"
@@ -164,33 +164,33 @@ def compare_ends(client: IperfTest, server: IperfTest, order: IperfSettings) -> 
     if set(client.ports) != {(own, other) for other, own in server.ports}:
         yield "client and server report different ports"
     for name, test in (("client", client), ("server", server)):
-        yield from (f"the {name} {why}" for why in _differences(test, order))
+        yield from (f"the {name} {why}" for why in _differences(test, settings))
     total_s = sum(interval.lasted_s for interval in client.intervals)
-    if order.lasts_s is not None and client.intervals and total_s < order.lasts_s - _EARLY_S:
-        yield f"the client's intervals last {total_s:.1f} s in total instead of {order.lasts_s:g} s"
-    sender, receiver = (server, client) if order.reverse else (client, server)
-    yield from _totals(client, sender, receiver, order)
+    if settings.lasts_s is not None and client.intervals and total_s < settings.lasts_s - _EARLY_S:
+        yield f"the client's intervals last {total_s:.1f} s in total instead of {settings.lasts_s:g} s"
+    sender, receiver = (server, client) if settings.reverse else (client, server)
+    yield from _totals(client, sender, receiver, settings)
 
 
-def _differences(test: IperfTest, order: IperfSettings) -> Iterator[str]:
+def _differences(test: IperfTest, settings: IperfSettings) -> Iterator[str]:
     start = test.start
-    settings = {
-        "protocol": (start.protocol or None, str(order.protocol)),
-        "streams": (start.streams, order.streams),
-        "direction": (start.reverse, order.reverse),
-        "datagram size": (start.block_bytes, order.payload_bytes if order.protocol is Protocol.UDP else None),
-        "number of connections": (len(test.ports), order.streams),
+    comparisons = {
+        "protocol": (start.protocol or None, str(settings.protocol)),
+        "streams": (start.streams, settings.streams),
+        "direction": (start.reverse, settings.reverse),
+        "datagram size": (start.block_bytes, settings.payload_bytes if settings.protocol is Protocol.UDP else None),
+        "number of connections": (len(test.ports), settings.streams),
     }
-    for setting, (actual, wanted) in settings.items():
-        if actual is not None and wanted is not None and actual != wanted:
+    for setting, (actual, required) in comparisons.items():
+        if actual is not None and required is not None and actual != required:
             yield f"had another {setting} than the procedure requires"
 
 
-def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, order: IperfSettings) -> Iterator[str]:
+def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, settings: IperfSettings) -> Iterator[str]:
     """Yield differences between the client's summary, which has the server's results, and the counts of both ends."""
     totals = client.totals
     sent_bytes, received_bytes = _sum(sender.intervals, "payload_bytes"), _sum(receiver.intervals, "payload_bytes")
-    if order.protocol is Protocol.TCP and (received_bytes or 0) > (
+    if settings.protocol is Protocol.TCP and (received_bytes or 0) > (
         sent_bytes if sent_bytes is not None else math.inf
     ):
         yield f"{received_bytes} bytes were received of {sent_bytes} sent"
@@ -202,10 +202,10 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, order: Ip
         ("datagrams lost", totals.lost, (_sum(receiver.intervals, "lost"),)),
     )
     for quantity, total, candidates in comparisons:
-        added = [count for count in candidates if count is not None]
-        if total is not None and added and total not in added:
-            yield f"the client's summary has {total} {quantity}, but the intervals have {added[0]}"
-    if order.protocol is Protocol.TCP:
+        known_counts = [count for count in candidates if count is not None]
+        if total is not None and known_counts and total not in known_counts:
+            yield f"the client's summary has {total} {quantity}, but the intervals have {known_counts[0]}"
+    if settings.protocol is Protocol.TCP:
         return
     jitters_s = [test.totals.jitter_s for test in (client, receiver) if test.totals.jitter_s is not None]
     if jitters_s and not math.isclose(jitters_s[0], jitters_s[-1], rel_tol=_ROUNDING, abs_tol=1e-6):
@@ -216,7 +216,7 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, order: Ip
 
 
 def date_problem(test: IperfTest, window: tuple[int, int] | None) -> str | None:
-    """Return the reason why a test was not made during the attempt, by the robot's clock, or None."""
+    """Return the reason why a test did not run during the attempt by the robot's clock, or None if it did."""
     if window is None or test.start.began_utc_s is None:
         return None
     first_s, last_s = (edge_ns / 1e9 for edge_ns in window)

@@ -1,10 +1,10 @@
 """Contradictions between the results of an iperf3 test and the captures of both ends.
 
-iperf3 counts what its sockets read and write, a capture what passed the interface. The bytes that iperf3 has received
-at a given time are therefore at most those in the capture up to then. They are at least those that the kernel had
-acknowledged (TCP), or those that arrived minus those dropped at its socket buffer (UDP). Times in the JSON are
-relative to the start of the test, which is between the client's last message on the control connection and the first
-packet of data.
+iperf3 counts the bytes that its sockets read and write; a capture contains the packets that passed the interface. At
+any time, iperf3 has therefore received at most the bytes in the capture up to then. It has received at least the
+bytes that the kernel had acknowledged (TCP), or the bytes that arrived minus those dropped at its socket buffer
+(UDP). Times in the JSON are relative to the start of the test, which is between the client's last message on the
+control connection and the first packet of data.
 """
 
 from collections.abc import Iterator
@@ -79,28 +79,28 @@ class _Progress:
         return int(self.lower[index]) if index >= 0 else 0
 
 
-def find(flow: LoadFlow, sent: IperfTest, received: IperfTest, witness: LoadEvidence) -> Iterator[str]:
+def find(flow: LoadFlow, sent: IperfTest, received: IperfTest, evidence: LoadEvidence) -> Iterator[str]:
     """Yield the contradictions between both ends' JSON and both captures; none if a capture has no times."""
-    if (witness.receiver.time_ns == NO_TIME).any() or (witness.sender.time_ns == NO_TIME).any():
+    if (evidence.receiver.time_ns == NO_TIME).any() or (evidence.sender.time_ns == NO_TIME).any():
         return
-    sent_streams, received_streams = flow.streams(witness.sender), flow.streams(witness.receiver)
+    sent_streams, received_streams = flow.streams(evidence.sender), flow.streams(evidence.receiver)
     if missing := sum(not len(stream) for stream in sent_streams):
         yield f"the sender's capture has no packet of {format_count(missing, 'stream')} of iperf3"
         return
     if flow.protocol is Protocol.UDP:
-        yield from _datagrams(sent, received, sent_streams, received_streams, witness)
+        yield from _datagrams(sent, received, sent_streams, received_streams, evidence)
     else:
-        yield from _sent_bytes(sent, sent_streams, witness)
+        yield from _sent_bytes(sent, sent_streams, evidence)
     progress = (
         _udp_progress(flow, received_streams)
         if flow.protocol is Protocol.UDP
-        else _tcp_progress(flow, received_streams, witness)
+        else _tcp_progress(flow, received_streams, evidence)
     )
     if progress is not None:
-        yield from _arrivals(flow, received, progress, witness)
+        yield from _arrivals(flow, received, progress, evidence)
 
 
-def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, witness: LoadEvidence) -> Iterator[str]:
+def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, evidence: LoadEvidence) -> Iterator[str]:
     """Yield a contradiction for the first interval at whose end iperf3 had received too many or too few bytes."""
     total_bytes = sum(interval.payload_bytes for interval in received.intervals)
     if not len(progress.times_ns):
@@ -108,10 +108,10 @@ def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, witness:
             yield f"iperf3 received {total_bytes} bytes, but the receiver's capture contains none of them"
         return
     first_ns = int(progress.times_ns[0])
-    request_ns = _last_request_ns(flow, witness, first_ns)
+    request_ns = _last_request_ns(flow, evidence, first_ns)
     dropped_bytes = 0
     if flow.protocol is Protocol.UDP:
-        dropped_bytes = (witness.receiver_counters.udp_undelivered or 0) * flow.payload_bytes
+        dropped_bytes = (evidence.receiver_counters.udp_undelivered or 0) * flow.payload_bytes
     received_bytes = 0
     for interval in received.intervals:
         received_bytes += interval.payload_bytes
@@ -127,18 +127,18 @@ def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, witness:
             return
 
 
-def _last_request_ns(flow: LoadFlow, witness: LoadEvidence, first_ns: int) -> int:
+def _last_request_ns(flow: LoadFlow, evidence: LoadEvidence, first_ns: int) -> int:
     """Return the time of the client's last control message before the data; `first_ns` if there is none."""
     client, server = flow.source_address, flow.destination_address
-    if witness.reverse:
+    if evidence.reverse:
         client, server = server, client
-    packets = witness.receiver
+    packets = evidence.receiver
     data_ports = np.array(
-        [source_port if not witness.reverse else destination_port for source_port, destination_port in flow.ports]
+        [source_port if not evidence.reverse else destination_port for source_port, destination_port in flow.ports]
     )
     is_request = packets.are_from(client) & packets.are_to(server) & (packets.protocol == TCP)
     is_request &= (
-        (packets.dport == witness.server_port) & (packets.tcp_payload_bytes > 0) & (packets.time_ns < first_ns)
+        (packets.dport == evidence.server_port) & (packets.tcp_payload_bytes > 0) & (packets.time_ns < first_ns)
     )
     if flow.protocol is Protocol.TCP:
         is_request &= ~np.isin(packets.sport, data_ports)
@@ -154,10 +154,10 @@ def _udp_progress(flow: LoadFlow, streams: list[Packets]) -> _Progress:
     return _Progress(times_ns, np.zeros_like(upper) if fragmented else upper, upper)
 
 
-def _tcp_progress(flow: LoadFlow, streams: list[Packets], witness: LoadEvidence) -> _Progress | None:
+def _tcp_progress(flow: LoadFlow, streams: list[Packets], evidence: LoadEvidence) -> _Progress | None:
     """Return the progress of all streams; None if a stream is too long for unambiguous sequence numbers."""
-    cookie_bytes = 0 if witness.reverse else COOKIE_BYTES
-    times: list[Ints] = []
+    cookie_bytes = 0 if evidence.reverse else COOKIE_BYTES
+    parts_ns: list[Ints] = []
     lower: list[Ints] = []
     upper: list[Ints] = []
     for (sport, dport), stream in zip(flow.ports, streams, strict=True):
@@ -166,23 +166,23 @@ def _tcp_progress(flow: LoadFlow, streams: list[Packets], witness: LoadEvidence)
             return None
         data = stream.where(stream.tcp_payload_bytes > 0)
         received = (data.tcp_seq - first_seq) % 2**32 + data.tcp_payload_bytes
-        answers = _answers(flow, witness.receiver, sport, dport)
-        acknowledged = (answers.tcp_ack - first_seq) % 2**32
+        acknowledgments = _acknowledgments(flow, evidence.receiver, sport, dport)
+        acknowledged = (acknowledgments.tcp_ack - first_seq) % 2**32
         if max(received.max(initial=0), acknowledged.max(initial=0)) > LONGEST_BYTES:
             return None
         for at_ns, position, increments, other_increments in (
             (data.time_ns, received, upper, lower),
-            (answers.time_ns, acknowledged, lower, upper),
+            (acknowledgments.time_ns, acknowledged, lower, upper),
         ):
             total = np.maximum.accumulate(np.maximum(position - cookie_bytes, 0))
-            times.append(at_ns)
+            parts_ns.append(at_ns)
             increments.append(np.diff(total, prepend=0))
             other_increments.append(np.zeros_like(total))
-    moments = np.concatenate(times)
-    order = np.argsort(moments, kind="stable")
+    times_ns = np.concatenate(parts_ns)
+    order = np.argsort(times_ns, kind="stable")
     bounds = [np.cumsum(np.concatenate(parts)[order]) for parts in (lower, upper)]
-    first = int(np.argmax(bounds[1] > 0)) if len(moments) and bounds[1][-1] > 0 else len(moments)
-    return _Progress(moments[order][first:], bounds[0][first:], bounds[1][first:])
+    first = int(np.argmax(bounds[1] > 0)) if len(times_ns) and bounds[1][-1] > 0 else len(times_ns)
+    return _Progress(times_ns[order][first:], bounds[0][first:], bounds[1][first:])
 
 
 def _first_seq(stream: Packets) -> int | None:
@@ -191,7 +191,7 @@ def _first_seq(stream: Packets) -> int | None:
     return int(syn.tcp_seq[0]) + 1 if len(syn) else None
 
 
-def _answers(flow: LoadFlow, packets: Packets, sport: int, dport: int) -> Packets:
+def _acknowledgments(flow: LoadFlow, packets: Packets, sport: int, dport: int) -> Packets:
     ends = packets.are_from(flow.destination_address) & packets.are_to(flow.source_address)
     return packets.where(
         ends
@@ -203,10 +203,10 @@ def _answers(flow: LoadFlow, packets: Packets, sport: int, dport: int) -> Packet
     )
 
 
-def _sent_bytes(sent: IperfTest, streams: list[Packets], witness: LoadEvidence) -> Iterator[str]:
+def _sent_bytes(sent: IperfTest, streams: list[Packets], evidence: LoadEvidence) -> Iterator[str]:
     """Yield a contradiction if iperf3 wrote fewer TCP bytes than were captured, or more than a socket can buffer."""
     written = sum(interval.payload_bytes for interval in sent.intervals)
-    cookie_bytes = 0 if witness.reverse else COOKIE_BYTES
+    cookie_bytes = 0 if evidence.reverse else COOKIE_BYTES
     unique, carried, segment_bytes = 0, 0, 1
     for stream in streams:
         first_seq = _first_seq(stream)
@@ -218,7 +218,7 @@ def _sent_bytes(sent: IperfTest, streams: list[Packets], witness: LoadEvidence) 
             return
         unique += max(end - cookie_bytes, 0)
         carried += int(data.tcp_payload_bytes.sum()) - cookie_bytes
-        mss = [int(packets.tcp_mss.max(initial=0)) for packets in (witness.sender, stream)]
+        mss = [int(packets.tcp_mss.max(initial=0)) for packets in (evidence.sender, stream)]
         segment_bytes = max(segment_bytes, *mss)
     # From version 3.16 on, the thread of each stream may continue writing while the others are counted.
     if written + _BLOCK_BYTES * len(streams) < unique:
@@ -240,7 +240,7 @@ def _datagrams(
     received: IperfTest,
     sent_streams: list[Packets],
     received_streams: list[Packets],
-    witness: LoadEvidence,
+    evidence: LoadEvidence,
 ) -> Iterator[str]:
     counts = [
         [getattr(interval, name) for interval in test.intervals]
@@ -254,13 +254,13 @@ def _datagrams(
     race = _RACE_DATAGRAMS * len(sent_streams) + round(_RACE_SHARE * written)
     if written + race < captured:
         yield f"iperf3 sent {written} datagrams, but {captured} are in the sender's capture"
-    refused = witness.sender_counters.udp_send_errors or 0
+    refused = evidence.sender_counters.udp_send_errors or 0
     tail, missed = max(written - expected, 0), max(captured - arrived, 0)
-    # A sender's queue that drops datagrams before the capture causes gaps in the numbers that the receiver gets.
+    # A sender's queue that drops datagrams before the capture causes gaps in the numbers that the receiver reads.
     is_plausible = captured + refused >= written or tail <= missed + _TAIL_SHARE * written + _TAIL_DATAGRAMS
     if not is_plausible:
         yield (f"iperf3 sent {written} datagrams, but the receiver expected {expected}, and {captured} were captured")
-    undelivered = witness.receiver_counters.udp_undelivered or 0
+    undelivered = evidence.receiver_counters.udp_undelivered or 0
     max_lost = missed + undelivered + max(written - captured, 0)
     if not any(stream.more_fragments.any() for stream in received_streams):
         # Each copy reduces iperf3's number of losses by one.

@@ -1,7 +1,7 @@
 """Contradictions within the output of ping, and between the output and captures.
 
 Round-trip times of iputils' ping differed from captured ones by -0.03 to 0.9 ms, the median by less than 0.1 ms, on a
-busy machine with 2 cores. busybox reads the time of a reply when its process resumes, iputils gets it from the
+busy machine with 2 cores. busybox reads the time of a reply when its process resumes, iputils reads it from the
 kernel.
 """
 
@@ -171,12 +171,12 @@ def _summary(output: Ping) -> Iterator[str]:
     if output.summary_s is None or not times_s:
         return
     line_times_s = min(times_s), sum(times_s) / len(times_s), max(times_s)
-    for name, summed_s, printed_s in zip(
+    for name, summary_s, printed_s in zip(
         ("shortest", "mean", "longest"), output.summary_s, line_times_s, strict=True
     ):
-        if abs(summed_s - printed_s) > _ROUNDING * max(summed_s, printed_s) + 2e-6:
+        if abs(summary_s - printed_s) > _ROUNDING * max(summary_s, printed_s) + 2e-6:
             in_lines = f"but its lines {1e3 * printed_s:.3f} ms"
-            yield f"ping's summary has {1e3 * summed_s:g} ms as the {name} time, {in_lines}"
+            yield f"ping's summary has {1e3 * summary_s:g} ms as the {name} time, {in_lines}"
 
 
 def compare_with_capture(

@@ -51,7 +51,7 @@ def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, cut: 
     if sender is None or receiver is None:
         return
     if earlier_packets := _earlier_traffic(sender.packets, receiver.packets, transfer):
-        yield f"packets of an earlier attempt were still on the way: {earlier_packets}"
+        yield f"packets of an earlier attempt were still in transit: {earlier_packets}"
     elif transfer.protocol is Protocol.UDP:
         size_problems = list(_udp(sender.packets, receiver.packets, files, transfer))
         yield from size_problems or udp_file_checks.find(
@@ -71,8 +71,8 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
 def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
     """Return a description of packets of an earlier transfer, or None; in one transfer each netcat has one port.
 
-    Such packets arrive with payload from a port from which nothing was sent; or they were delayed in the sender, and
-    are sent from another port than that of the last start. Retransmissions of an aborted connection are no start.
+    Such packets arrive with payload from a port that sent nothing; or they were delayed in the sender, and
+    are sent from another port than that of the last start. A retransmission of an aborted connection is not a start.
     """
     sent, received = (
         packets.where(packets.dport == transfer.port) for packets in map(transfer.forward, (sender, receiver))
@@ -88,7 +88,9 @@ def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> 
     return None
 
 
-def _amounts(files: _Files, captured_bytes: int, arrived_bytes: int, transfer: Transfer) -> Iterator[str]:
+def _byte_count_contradictions(
+    files: _Files, captured_bytes: int, arrived_bytes: int, transfer: Transfer
+) -> Iterator[str]:
     """Yield contradictions if captures contain more bytes than were sent, or fewer than were received."""
     if captured_bytes > files.sent_bytes:
         yield f"{captured_bytes} bytes left the {transfer.source}, but {transfer.sent_file} has {files.sent_bytes}"
@@ -118,14 +120,14 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
         announced
     )
     sent_bytes = int((sent.udp_bytes[first] - UDP_HEADER_BYTES).sum())
-    yield from _amounts(files, sent_bytes, arrived_bytes, transfer)
+    yield from _byte_count_contradictions(files, sent_bytes, arrived_bytes, transfer)
     # Copies can compensate for missing packets in the sum, but not packet by packet. A later fragment whose id
     # another transfer uses too cannot be assigned.
-    others = np.concatenate(
+    other_ids = np.concatenate(
         [packets.ip_id[(packets.dport != transfer.port) & (packets.dport != NO_PORT)] for packets in both]
     )
-    certain = first | ~np.isin(sent.ip_id, others)
-    missing = int((~np.isin(keys[certain], keys_received)).sum())
+    is_assignable = first | ~np.isin(sent.ip_id, other_ids)
+    missing = int((~np.isin(keys[is_assignable], keys_received)).sum())
     if missing and files.are_equal and files.received_bytes <= arrived_bytes:
         missing_text = f"lacks {format_count(missing, 'packet')} of it"
         yield f"{transfer.received_file} is complete, but the {transfer.destination}'s capture {missing_text}"
@@ -173,7 +175,7 @@ def _tcp(
     if files is None:
         return
     arrived_bytes = connections.payload(received).size_bytes
-    yield from _amounts(files, connections.payload(sent).size_bytes, arrived_bytes, transfer)
+    yield from _byte_count_contradictions(files, connections.payload(sent).size_bytes, arrived_bytes, transfer)
     ended = not connections.numbers(sent).bytes_not_in(acknowledged)
     # If a program stops reading before the end, the kernel rejects the rest with a reset.
     refused = (answers.tcp_flags & RST != 0).any()
@@ -248,7 +250,7 @@ CROSS_CHECKS: Final = (
         ("delay_s", "delay_*_s", "delay_packets"),
         "`medium.txt`",
         (),
-        "only the testbed knows them; the file is rejected if a robot provides it",
+        "only the testbed can measure them; the file is rejected if a robot provides it",
         CheckOutcome.UNCHECKED,
     ),
     CrossCheck(

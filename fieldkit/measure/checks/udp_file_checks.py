@@ -41,7 +41,7 @@ class _Block:
 def find(
     evidence: AttemptEvidence, transfer: Transfer, sender: Packets, receiver: Packets, *, cut: bool
 ) -> Iterator[str]:
-    """Yield differences between the file and what arrived; none if datagrams cannot be identified in the captures.
+    """Yield differences between the file and the arrived datagrams; none if the captures do not identify them.
 
     Args:
         evidence: The attempt's evidence.

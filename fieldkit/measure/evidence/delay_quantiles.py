@@ -1,4 +1,4 @@
-"""Quantiles of delays in which lost packets count as infinitely late, instead of being omitted."""
+"""Quantiles of delays that include lost packets with an infinite delay."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 def quantile_of_sent(arrived_s: Sequence[float] | NDArray[np.float64], sent: int, share: float) -> float | None:
-    """Return a quantile of the delays of all sent packets, in which a lost packet is later than every received one.
+    """Return a quantile of the delays of all sent packets, in which the delay of a lost packet is infinite.
 
     It is interpolated linearly, as by `numpy.quantile`, so it equals the quantile of the received packets if no
     packet was lost.

@@ -26,16 +26,16 @@ _TOLERANCE_S: Final = 0.1
 class Cause(StrEnum):
     """Cause of a job's termination: it exited, fieldkit stopped it, or its time limit was reached."""
 
-    ITSELF = "itself"
-    ASKED = "asked"
+    EXITED = "itself"
+    STOPPED = "asked"
     LIMIT = "limit"
     RUNNING = "running"
     """The job was still running when its state was recorded."""
 
 
 _NOT_ALLOWED: Final = {
-    Cause.ITSELF: "exited before fieldkit stopped it, with exit code {}",
-    Cause.ASKED: "was stopped by fieldkit before it had finished",
+    Cause.EXITED: "exited before fieldkit stopped it, with exit code {}",
+    Cause.STOPPED: "was stopped by fieldkit before it had finished",
     Cause.LIMIT: "did not exit, and was stopped at its time limit",
 }
 
@@ -45,7 +45,7 @@ class Ending:
     """Termination of a job.
 
     Attributes:
-        cause: Cause of the termination; `ITSELF` includes a signal that was not sent by fieldkit.
+        cause: Cause of the termination; `EXITED` includes a signal that was not sent by fieldkit.
         code: Exit code; None if the job was killed together with its supervisor, or is still running.
         lasted_s: Duration in seconds; None if the end is unknown.
         ended_s: End, in seconds since boot; None if unknown.
@@ -77,7 +77,7 @@ def _ending(match: re.Match[str]) -> Ending:
 
 
 def termination_error(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) -> str | None:
-    """Return why the termination of a job is not acceptable, without its name; None if it is.
+    """Return the reason why the termination of a job is not acceptable, without its name; None if it is.
 
     Args:
         ending: The termination.
@@ -88,9 +88,9 @@ def termination_error(ending: Ending, allowed: Collection[Cause], least_s: float
         return "was still running when the evidence was collected" if ending.cause is Cause.RUNNING else "was killed"
     if ending.cause not in allowed:
         return _NOT_ALLOWED[ending.cause].format(ending.code)
-    if ending.cause is Cause.ITSELF and ending.code > _KILLED:
+    if ending.cause is Cause.EXITED and ending.code > _KILLED:
         return f"was killed by {_signal(ending.code - _KILLED)}, not by fieldkit"
-    if ending.cause is Cause.ITSELF and ending.lasted_s is not None and ending.lasted_s + _TOLERANCE_S < least_s:
+    if ending.cause is Cause.EXITED and ending.lasted_s is not None and ending.lasted_s + _TOLERANCE_S < least_s:
         return f"exited after {ending.lasted_s:.1f} s of {least_s:g} s"
     return None
 

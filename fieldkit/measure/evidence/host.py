@@ -96,7 +96,7 @@ class HostState:
     sections: frozenset[str] = frozenset()
 
 
-def before(role: Role) -> str:
+def before_file(role: Role) -> str:
     """Return the name of the file with a robot's state before an attempt.
 
     The file has sections, each with a line `==> FILE <==` and its text.
@@ -104,7 +104,7 @@ def before(role: Role) -> str:
     return f"{role}-before.txt"
 
 
-def after(role: Role) -> str:
+def after_file(role: Role) -> str:
     """Return the name of the file with a robot's state after an attempt."""
     return f"{role}-after.txt"
 
@@ -246,7 +246,7 @@ def _parse_snmp(snmp: str) -> dict[tuple[str, str], int]:
 def without_shared_counters(measured: Measured) -> Measured:
     """Return the columns of `measure` for a repeat in which other steps send UDP to the receiver too.
 
-    A counter above 0 becomes missing, because it is unknown whose datagrams it counts; 0 holds for all steps.
+    A counter above 0 becomes missing, because it may count the datagrams of other steps; 0 is valid for every step.
     """
     names = (column.name for column in COLUMNS)
     return measured.without({name: _SHARED_REASON for name in names if measured.values.get(name)})

@@ -256,9 +256,9 @@ def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | 
     }
     inapplicable = _TCP_COLUMNS if protocol is Protocol.UDP else _UDP_COLUMNS
     applicable = {name: value for name, value in values.items() if name not in inapplicable}
-    others = [column for column in COLUMNS if column.name in inapplicable]
+    inapplicable_columns = [column for column in COLUMNS if column.name in inapplicable]
     return Measured.from_optional(applicable, "iperf3 does not report it") | Measured.all_missing(
-        others, f"not for {protocol}"
+        inapplicable_columns, f"not for {protocol}"
     )
 
 

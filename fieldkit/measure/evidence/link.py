@@ -133,13 +133,13 @@ def link_history(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample
     """
     associated = next((sample.cell for sample in samples if sample.cell), "")
     if any(sample.cell for sample in samples):
-        chosen = {station.station for sample in samples for station in sample.stations}
+        station_names = {station.station for sample in samples for station in sample.stations}
     else:
-        chosen = {_busiest(samples), ""}
+        station_names = {_busiest(samples), ""}
     link = []
     for sample in samples:
         associated = sample.cell or associated
-        candidates = [station for station in sample.stations if station.station in chosen]
+        candidates = [station for station in sample.stations if station.station in station_names]
         # A sample of /proc/net/wireless has no station name and only a signal, so it is the last choice.
         candidates.sort(key=lambda station: (station.station != "", station.station == associated))
         if candidates:
@@ -184,12 +184,15 @@ def _total_increment(counter: str, links: Sequence[Sequence[StationSample]]) -> 
 
 
 def _busiest(samples: Sequence[LinkSample]) -> str:
-    """Return the station with which the most packets were exchanged, the first one of equals."""
+    """Return the station with which the most packets were exchanged, the first one if several are equal."""
     names = dict.fromkeys(station.station for sample in samples for station in sample.stations)
 
     def packets(name: str) -> int:
-        seen = [station for sample in samples for station in sample.stations if station.station == name]
-        return sum(_increment(counts) or 0 for counts in ([s.tx_packets for s in seen], [s.rx_packets for s in seen]))
+        peer_samples = [station for sample in samples for station in sample.stations if station.station == name]
+        return sum(
+            _increment(counts) or 0
+            for counts in ([s.tx_packets for s in peer_samples], [s.rx_packets for s in peer_samples])
+        )
 
     return max(names, key=packets, default="")
 

@@ -7,7 +7,7 @@ output of that time: `link`, `survey` and `station` of iw, `wireless` of the ker
 boot; the host state before the attempt gives the time of boot. A testbed's `link.csv` has a line per time and peer
 station.
 
-The lines of iw are those of its station.c, link.c and survey.c, equal in versions 3 to 6 except for later additions.
+The lines of iw are documented by its station.c, link.c and survey.c; versions 3 to 6 differ only in added lines.
 Drivers omit values that they do not support. A received power of 0 dBm or more is invalid: some drivers print 0, or a
 percentage.
 """
@@ -200,10 +200,10 @@ def read_robot(folder: Path, role: Role) -> Sequence[LinkSample]:
     Raises:
         EvidenceError: The files are missing, or do not contain the robot's clock.
     """
-    paths = [folder / name(role) for name in (host.before, host.after) if (folder / name(role)).is_file()]
+    paths = [folder / name(role) for name in (host.before_file, host.after_file) if (folder / name(role)).is_file()]
     dumps = [(state.clock, host.stations(path)) for path in paths if (state := host.state(path)).clock]
     if not dumps or dumps[0][0] is None:
-        raise EvidenceError("does not contain the clock", where=str(folder / host.before(role)))
+        raise EvidenceError("does not contain the clock", where=str(folder / host.before_file(role)))
     clock = dumps[0][0]
     boot_ns = (clock.lowest_ns + clock.highest_ns) // 2
     samples = [LinkSample(bounds.first_ns, parse_stations(dump)) for bounds, dump in dumps if bounds is not None]
@@ -217,15 +217,15 @@ def _sampler_text(path: Path) -> str:
     """Return the text of a robot's sampler, empty if there is no file."""
     if path.is_file():
         return reading.text(path)
-    packed = path.with_name(f"{path.name}.gz")
-    if not packed.is_file():
+    compressed = path.with_name(f"{path.name}.gz")
+    if not compressed.is_file():
         return ""
-    reading.size(packed)  # checks that it is a readable file
+    reading.size(compressed)  # checks that it is a readable file
     try:
-        with gzip.open(packed, "rb") as file_:
+        with gzip.open(compressed, "rb") as file_:
             content = file_.read(reading.MAX_TEXT_BYTES)
     except (OSError, EOFError, zlib.error) as error:
-        raise EvidenceError(f"cannot be read: {error}", where=str(packed)) from error
+        raise EvidenceError(f"cannot be read: {error}", where=str(compressed)) from error
     return content.decode(errors="replace")
 
 

@@ -59,7 +59,7 @@ def read_lateness(path: Path) -> Lateness:
     """
     match = _LATENESS_TEXT.match(reading.text(path))
     if match is None:
-        raise EvidenceError("is not a lateness of packets", where=str(path))
+        raise EvidenceError("is not a file of packet lateness", where=str(path))
     bound, line_count, body = match.groups()
     lines = body.splitlines()
     if line_count is not None and int(line_count) != len(lines):
@@ -74,8 +74,8 @@ def lateness_quantile_ns(lateness: Lateness, share: float) -> int | None:
     """Return the quantile of the lateness at `share` (0 to 1) in ns; None if there are no packets."""
     counts = sorted((late_ns, count) for late_ns, count in lateness.packets.items() if count)
     cumulative = accumulate(count for _, count in counts)
-    wanted = share * sum(count for _, count in counts)
-    return next((late_ns for (late_ns, _), total in zip(counts, cumulative, strict=True) if total >= wanted), None)
+    min_total = share * sum(count for _, count in counts)
+    return next((late_ns for (late_ns, _), total in zip(counts, cumulative, strict=True) if total >= min_total), None)
 
 
 def too_late(lateness: Lateness) -> int:
@@ -97,7 +97,7 @@ def measure_lateness(lateness: Lateness | None) -> Measured:
 
 
 def lateness_problem(lateness: Lateness) -> str | None:
-    """Return why the emulation did not follow its model, or None if it did."""
+    """Return the reason why the emulation did not follow its model, or None if it did."""
     late_ns = lateness_quantile_ns(lateness, 1.0)
     if late_ns is None or late_ns <= lateness.bound_ns:
         return None

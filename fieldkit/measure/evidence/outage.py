@@ -22,7 +22,7 @@ SILENT_S: Final = 1.0
 """A robot has not recovered if its last answer is older than this at the end of the observation."""
 
 # Gaps of this length also occur without a fault; a reboot or a time out of range takes longer.
-_UNREMARKABLE_INTERVALS: Final = 3
+_MAX_NORMAL_GAP_INTERVALS: Final = 3
 
 _NUMBER: Final = r"[0-9]{1,9}(?:\.[0-9]{1,9})?"
 _NOTE: Final = re.compile(rf"lasted_s (?P<lasted>{_NUMBER}|unknown)\ninterval_s (?P<interval>{_NUMBER})\n")
@@ -80,7 +80,7 @@ class Recovery:
 
     Attributes:
         outage_s: Longest time between two answers, in seconds; None if the robot did not recover.
-        recovery_s: Part of the outage after the end of the cause, never negative; None if `outage_s` is, or if the
+        recovery_s: Part of the outage after the end of the cause, never negative; None if `outage_s` is None or the
             duration of the cause is unknown.
         recovered: Whether the robot answered at the end of the observation.
         recovery_at_least_s: Lower bound of `recovery_s` if the robot did not recover.
@@ -102,11 +102,11 @@ class _Note:
 
 @dataclass(frozen=True)
 class _Answers:
-    """Times of the answers and end of the observation, in seconds of one clock; process IDs present at both ends."""
+    """Times of the answers and end of the observation, in seconds of one clock; process IDs that did not change."""
 
     at_s: Sequence[float]
     end_s: float
-    survivors: Set[str] = frozenset()
+    unchanged_pids: Set[str] = frozenset()
 
 
 def read(folder: Path, kind: FaultKind, name: str = "") -> Recovery:
@@ -130,7 +130,7 @@ def read(folder: Path, kind: FaultKind, name: str = "") -> Recovery:
         bound_s = None if note.lasted_s is None else max(0.0, silent_s - note.lasted_s)
         return Recovery(outage_s=None, recovery_s=None, recovered=False, recovery_at_least_s=bound_s)
     outage_s = max((after - before for before, after in pairwise(answers.at_s)), default=0.0)
-    if answers.survivors or (kind is not FaultKind.KILL and outage_s < _min_outage_s(note)):
+    if answers.unchanged_pids or (kind is not FaultKind.KILL and outage_s < _min_outage_s(note)):
         raise EvidenceError("the fault had no effect: its target answered all the time", where=path.name)
     recovery_s = None if note.lasted_s is None else max(0.0, outage_s - note.lasted_s)
     return Recovery(outage_s=outage_s, recovery_s=recovery_s, recovered=True)
@@ -147,7 +147,7 @@ def cause_lasted_s(path: Path) -> float | None:
 
 def _min_outage_s(note: _Note) -> float:
     """Return the shortest plausible outage; half of the cause's duration, because an operator reacts late."""
-    return max((note.lasted_s or 0.0) / 2, _UNREMARKABLE_INTERVALS * note.interval_s)
+    return max((note.lasted_s or 0.0) / 2, _MAX_NORMAL_GAP_INTERVALS * note.interval_s)
 
 
 def _note(path: Path) -> _Note:
@@ -161,7 +161,7 @@ def _note(path: Path) -> _Note:
 def _ping_answers(path: Path, note: _Note) -> _Answers:
     output = ping.read(path)
     if output.transmitted is None:
-        raise EvidenceError("ping was cut short, its summary is missing", where=path.name)
+        raise EvidenceError("ping was stopped before its summary", where=path.name)
     stamps_ns = [reply.at_utc_ns for reply in output.answers if reply.at_utc_ns is not None]
     numbers = [reply.seq for reply in output.answers]
     if len(stamps_ns) == len(numbers):
@@ -175,8 +175,10 @@ def _ping_answers(path: Path, note: _Note) -> _Answers:
 def _process_answers(path: Path) -> _Answers:
     matches = [match for line in reading.text(path).split("\n") if (match := _WATCH_LINE.match(line))]
     up = [match for match in matches if match["pids"] is not None]
-    survivors = set(up[0]["pids"].split()) & set(up[-1]["pids"].split()) if up else set()
-    return _Answers([float(match["at"]) for match in up], float(matches[-1]["at"]) if matches else 0.0, survivors)
+    unchanged_pids = set(up[0]["pids"].split()) & set(up[-1]["pids"].split()) if up else set()
+    return _Answers(
+        [float(match["at"]) for match in up], float(matches[-1]["at"]) if matches else 0.0, unchanged_pids
+    )
 
 
 def measure(kind: FaultKind, effect: Recovery | None) -> Measured:

@@ -49,8 +49,8 @@ SENT_COLUMNS: Final = columns(
         "rtt_median_sent_s",
         "s",
         (
-            "Median round-trip time over all echo requests, in which an unanswered request is later than every "
-            "answer; empty if half of the requests or more were unanswered."
+            "Median round-trip time over all echo requests, in which the time of an unanswered request "
+            "is infinite; empty if half of the requests or more were unanswered."
         ),
     ),
 )
@@ -89,7 +89,7 @@ _SEQUENCE_NUMBERS: Final = 1 << 16
 _MAX_LATE_NUMBERS: Final = 1 << 10
 """An answer whose number is below the previous one by less than this is late; otherwise the numbers have wrapped."""
 
-UNREMARKABLE_S: Final = 1.0
+MIN_OPEN_GAP_S: Final = 1.0
 """A gap at the start or end of a ping is ignored if it is shorter than this and than the longest gap in between."""
 MOTION_COLUMNS: Final = columns(
     40,
@@ -268,7 +268,7 @@ def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
     """Return the longest time without an answer, in the order of requests; None if answers have no time stamps.
 
     A gap in which ping started or ended is open. It is returned if it is at least as long as the longest gap between
-    two answers, or at least `UNREMARKABLE_S` long.
+    two answers, or at least `MIN_OPEN_GAP_S` long.
 
     Args:
         output: Output of ping.
@@ -281,7 +281,7 @@ def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
     gap_ns, lost = max(closed, default=(0, 0))
     unanswered = _open_ends(output, [seq for seq, _ in stamped])
     open_s = unanswered * interval_s
-    if unanswered and (unanswered >= lost or open_s >= UNREMARKABLE_S):
+    if unanswered and (unanswered >= lost or open_s >= MIN_OPEN_GAP_S):
         return AnswerGap(max(open_s, gap_ns / 1e9), max(unanswered, lost), is_open=True)
     return AnswerGap(gap_ns / 1e9, lost, is_open=False) if closed else None
 
@@ -291,10 +291,10 @@ def _stamped_answers(output: Ping) -> Iterator[tuple[int, int]]:
     last: int | None = None
     for answer in output.answers:
         if answer.at_utc_ns is not None:
-            ahead = (
+            difference = (
                 0 if last is None else (answer.seq - last + _MAX_LATE_NUMBERS) % _SEQUENCE_NUMBERS - _MAX_LATE_NUMBERS
             )
-            last = answer.seq if last is None else last + ahead
+            last = answer.seq if last is None else last + difference
             yield last, answer.at_utc_ns
 
 

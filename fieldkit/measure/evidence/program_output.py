@@ -22,7 +22,7 @@ _TOO_DEEP: Final = "it is nested too deeply"
 
 
 def path_error(text: str) -> str | None:
-    """Return why a text is not a path into JSON, or None if it is."""
+    """Return the reason why a text is not a path into JSON, or None if it is."""
     try:
         _compile_path(text)
     except ValueError as error:
@@ -31,7 +31,7 @@ def path_error(text: str) -> str | None:
 
 
 def expression_error(text: str) -> str | None:
-    """Return why a text is not a regular expression with one group, or None if it is."""
+    """Return the reason why a text is not a regular expression with one group, or None if it is."""
     try:
         groups = _compile_expression(text).groups
     except ValueError as error:

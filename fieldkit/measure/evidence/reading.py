@@ -21,7 +21,7 @@ MAX_TEXT_BYTES: Final = 64 << 20
 
 _CHUNK_BYTES: Final = 1 << 20
 _MAX_READ_BYTES: Final = 1 << 24
-"""Size up to which a file is read into memory instead of mapped; most captures are smaller."""
+"""Files up to this size are read into memory, larger ones are mapped; most captures are smaller."""
 
 
 def size(path: Path) -> int:
@@ -154,7 +154,7 @@ _END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
 
 
 def numbered_lines_problem(path: Path) -> str | None:
-    """Return why a log is not complete; None if it is, or if its lines have no numbers, as in older versions.
+    """Return the reason why a log is not complete; None if it is, or if its lines have no numbers.
 
     Raises:
         EvidenceError: As `reading.text`.

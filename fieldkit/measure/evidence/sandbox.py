@@ -78,7 +78,7 @@ class SandboxedReader:
             size_bytes: Size of the file; the limits grow with it.
 
         Raises:
-            ConfinedAnswerError: The reader failed, or exceeded the limits of memory, disk or time.
+            ReaderError: The reader failed, or exceeded the limits of memory, disk or time.
         """
         with self._query_lock:
             for _ in range(2):

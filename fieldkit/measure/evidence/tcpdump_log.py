@@ -33,7 +33,7 @@ def log_of(capture: str) -> str:
 
 @dataclass(frozen=True)
 class CaptureLog:
-    """Counters that tcpdump printed for a capture; they are None if it was killed before.
+    """Counters that tcpdump printed for a capture; they are None if it was killed before it printed them.
 
     Attributes:
         listening: Whether it printed that it is listening; earlier packets are not captured.

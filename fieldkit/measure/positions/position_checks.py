@@ -17,7 +17,7 @@ OF_POSITIONS: Final = (
         ("*_distance_*", "*_relative_speed_m_s", "*_sender_speed_m_s"),
         "positions that a step or a person recorded",
         ("the placement in `trial.yaml`",),
-        "10 % of the distance plus 2 m, or plus 15 m by satellites: distances are paced off, receivers have errors",
+        "10 % of the distance plus 2 m (plus 15 m for satellite receivers), for errors of placement and of receivers",
         CheckOutcome.WITHHELD,
     ),
     CrossCheck(

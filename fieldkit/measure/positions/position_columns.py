@@ -15,7 +15,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.evidence import track
 from fieldkit.measure.positions import position_files, position_sources, trajectories
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import WGS84, Samples, ecef_m
 from fieldkit.measure.positions.trajectories import Trajectory
 
@@ -38,7 +38,7 @@ def measure(
         times_ns: The times, nanoseconds since 1970 UTC.
     """
     try:
-        sources = position_accounts(evidence)
+        sources = read_position_sources(evidence)
         if not sources.robots.keys() & set(ends):
             return track.measure(evidence.read_or_none(track.read, track.FILE), declared, ends, times_ns)
         source, destination = trajectories_of_pair(evidence, ends)
@@ -46,8 +46,8 @@ def measure(
         return Measured.all_missing(declared, error.what)
     if not len(times_ns):
         return Measured.all_missing(declared, "no packet has a time")
-    ahead_ns = _ahead_ns(sources, ends[0])
-    start_ns, end_ns = int(min(times_ns)) - ahead_ns, int(max(times_ns)) - ahead_ns
+    offset_ns = _offset_ns(sources, ends[0])
+    start_ns, end_ns = int(min(times_ns)) - offset_ns, int(max(times_ns)) - offset_ns
     for role, trajectory in zip(ends, (source, destination), strict=True):
         if problem := trajectory.coverage_problem(start_ns, end_ns):
             reason = f"the positions of the {role} from {sources.robots[role].description} {problem}"
@@ -65,43 +65,43 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     the positions. The list is empty if no distance is known.
     """
     try:
-        sources = position_accounts(evidence)
+        sources = read_position_sources(evidence)
         if not sources.robots.keys() & set(ends):
             return list(track.distances_m(evidence.read_or_none(track.read, track.FILE) or (), *ends))
         source, destination = trajectories_of_pair(evidence, ends)
     except EvidenceError:
         return ()
-    ahead_ns, distances = _ahead_ns(sources, ends[0]), list[tuple[int, float | None]]()
+    offset_ns, distances = _offset_ns(sources, ends[0]), list[tuple[int, float | None]]()
     for at_ns, metres in zip(*trajectories.distances_m(source, destination), strict=True):
-        since_ns = distances[-1][0] - ahead_ns if distances else int(at_ns)
+        since_ns = distances[-1][0] - offset_ns if distances else int(at_ns)
         if any(trajectory.coverage_problem(since_ns, int(at_ns)) for trajectory in (source, destination)):
-            distances.append((since_ns + ahead_ns + 1, None))
-        distances.append((int(at_ns) + ahead_ns, float(metres)))
+            distances.append((since_ns + offset_ns + 1, None))
+        distances.append((int(at_ns) + offset_ns, float(metres)))
     return distances
 
 
-def position_accounts(evidence: AttemptEvidence) -> Accounts:
+def read_position_sources(evidence: AttemptEvidence) -> PositionSources:
     """Return the sources of positions besides the testbed; most attempts have none.
 
     Raises:
         EvidenceError: A file that lists them is damaged.
     """
-    return evidence.cached(_read_accounts)
+    return evidence.cached(_read_sources)
 
 
-def _read_accounts(evidence: AttemptEvidence) -> Accounts:
+def _read_sources(evidence: AttemptEvidence) -> PositionSources:
     of_attempt = (
         evidence.read(position_sources.read, position_sources.FILE)
         if evidence.has(position_sources.FILE)
-        else Accounts()
+        else PositionSources()
     )
     trial = _trial_folder(evidence)
     of_trial = (
         position_sources.read(trial / position_sources.FILE)
         if trial and (trial / position_sources.FILE).is_file()
-        else Accounts()
+        else PositionSources()
     )
-    return Accounts(
+    return PositionSources(
         {**of_attempt.robots, **of_trial.robots}, of_attempt.clocks, of_attempt.heights or of_trial.heights
     )
 
@@ -114,7 +114,7 @@ def _trial_folder(evidence: AttemptEvidence) -> Path | None:
 
 def sources_text(evidence: AttemptEvidence) -> str | None:
     """Return the sources as text, `sender as placed, receiver /odom`, or None if there are none."""
-    robots = position_accounts(evidence).robots
+    robots = read_position_sources(evidence).robots
     return ", ".join(f"{role} {robots[role].description}" for role in sort_roles(robots)) or None
 
 
@@ -128,7 +128,7 @@ def trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> 
 
 
 def _trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
-    sources = position_accounts(evidence)
+    sources = read_position_sources(evidence)
     source, destination = (samples_of(evidence, role) for role in ends)
     if source.frame != destination.frame:
         frames = f"the {ends[0]} {source.frame}, the {ends[1]} {destination.frame}"
@@ -142,10 +142,10 @@ def _trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) ->
     )
 
 
-def _trajectory(samples: Samples, places_m: Floats, account: Account) -> Trajectory:
-    if account.place is not None:
+def _trajectory(samples: Samples, places_m: Floats, position_source: PositionSource) -> Trajectory:
+    if position_source.place is not None:
         return trajectories.stationary(places_m[0])
-    return Trajectory(samples.times_ns, places_m, round(account.gap_s * 1e9))
+    return Trajectory(samples.times_ns, places_m, round(position_source.gap_s * 1e9))
 
 
 def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
@@ -154,26 +154,28 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
     Raises:
         EvidenceError: The robot has no source, or the source cannot be read.
     """
-    sources = position_accounts(evidence)
-    if (account := sources.robots.get(role)) is None:
+    sources = read_position_sources(evidence)
+    if (position_source := sources.robots.get(role)) is None:
         raise EvidenceError(f"no source has the position of the {role}")
-    if account.place is not None:
-        place = np.array([account.place], dtype=float)  # NaN for None
-        return Samples(np.zeros(1, dtype=np.int64), place, account.frame)
-    if account.topic:
-        recorded_samples = evidence.read(position_files.read_topic, account.file, account)
-        samples = _shifted(recorded_samples, -_ahead_ns(sources, Role(account.clock) if account.clock else role))
-        return samples if samples.yaws_rad is None else position_files.to_placement_frame(samples, account)
+    if position_source.place is not None:
+        place = np.array([position_source.place], dtype=float)  # NaN for None
+        return Samples(np.zeros(1, dtype=np.int64), place, position_source.frame)
+    if position_source.topic:
+        recorded_samples = evidence.read(position_files.read_topic, position_source.file, position_source)
+        samples = _shifted(
+            recorded_samples, -_offset_ns(sources, Role(position_source.clock) if position_source.clock else role)
+        )
+        return samples if samples.yaws_rad is None else position_files.to_placement_frame(samples, position_source)
     folder = _trial_folder(evidence)
     assert folder is not None  # only the sources of a trial have neither a place nor a topic
-    return _shifted(_samples_in_trial(folder / account.file), round(account.offset_s * 1e9))
+    return _shifted(_samples_in_trial(folder / position_source.file), round(position_source.offset_s * 1e9))
 
 
 def readable_samples(evidence: AttemptEvidence) -> Mapping[Role, Samples]:
     """Return the samples of each robot with a readable source besides the testbed."""
     samples_by_role: dict[Role, Samples] = {}
     with suppress(EvidenceError):
-        for role in position_accounts(evidence).robots:
+        for role in read_position_sources(evidence).robots:
             with suppress(EvidenceError):
                 samples_by_role[role] = samples_of(evidence, role)
     return samples_by_role
@@ -197,19 +199,19 @@ def _read_cached(path: Path, _mtime_ns: int, _size_bytes: int) -> Samples:
     return position_files.read_file(path)
 
 
-def _ahead_ns(sources: Accounts, role: Role) -> int:
+def _offset_ns(sources: PositionSources, role: Role) -> int:
     """Return the offset of a robot's clock from the laptop's, positive if it was ahead; 0 if it was not measured."""
     return round(sources.clocks[role].offset_s * 1e9) if role in sources.clocks else 0
 
 
-def ahead_ns(evidence: AttemptEvidence, role: Role) -> int:
-    """Return the offset of a robot's clock from the laptop's, or 0 if unknown. Errors as for `position_accounts`."""
-    return _ahead_ns(position_accounts(evidence), role)
+def clock_offset_ns(evidence: AttemptEvidence, role: Role) -> int:
+    """Return the offset of a robot's clock from the laptop's, or 0; raises as `read_position_sources`."""
+    return _offset_ns(read_position_sources(evidence), role)
 
 
 def clock_error_s(evidence: AttemptEvidence) -> float | None:
     """Return the maximum error between the times of two robots, or None if no clock offset was measured."""
-    errors = sorted(offset.error_s for offset in position_accounts(evidence).clocks.values())
+    errors = sorted(offset.error_s for offset in read_position_sources(evidence).clocks.values())
     return sum(errors[-2:]) if errors else None
 
 
@@ -236,15 +238,15 @@ DRIFT: Final = 0.1
 """Upper limit of odometry drift as a share of the path, for wheels that do not slip."""
 PLACE_M: Final = 0.5
 SATELLITE_M: Final = 10.0
-"""Position errors of other sources: a lab's robot that moves between two places, and a satellite receiver (5 m at
-each end of the path)."""
+"""Largest position errors: `PLACE_M` of local positions, `SATELLITE_M` of a satellite receiver (5 m at each end of
+the path)."""
 _AROUND_NS: Final = 1_000_000_000
 
 
 def distance_contradiction(
     evidence: AttemptEvidence, role: Role, farthest_m: float, speed_m_s: float, during_ns: tuple[int, int] | None
 ) -> str | None:
-    """Return the reason why a robot cannot have been that far from its place, or None if it can.
+    """Return the reason why a robot cannot have been that far from its start, or None if it can.
 
     Args:
         evidence: The attempt's evidence.
@@ -276,8 +278,8 @@ def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: f
     a smaller one is not.
     """
     try:
-        account = position_accounts(evidence).robots.get(role)
-        if account is None or account.place is not None:
+        position_source = read_position_sources(evidence).robots.get(role)
+        if position_source is None or position_source.place is not None:
             return None
         samples = samples_of(evidence, role)
     except EvidenceError:
@@ -287,9 +289,8 @@ def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: f
     places_m = ecef_m(north, east, np.zeros(len(up_m))) if on_earth else samples.values
     other_m = _from_first_m(places_m)
     if farthest_m - other_m > (SATELLITE_M if on_earth else PLACE_M) + DRIFT * farthest_m:
-        return (
-            f"it was {farthest_m:.1f} m from its place by its odometry, and {other_m:.1f} m by {account.description}"
-        )
+        other_text = f"{other_m:.1f} m by {position_source.description}"
+        return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_text}"
     return None
 
 

@@ -14,13 +14,13 @@ from fieldkit.core import plugins
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.evidence.sandbox import ReaderError, SandboxedReader
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import MAX_SAMPLES, WGS84, Samples, read_csv, require_increasing
 
 MAX_STALE_S: Final = 10.0
 """If stamps and reception times differ by more than this, the stamps are from another clock."""
 
-PositionReader = Callable[[Path, Account], Samples]
+PositionReader = Callable[[Path, PositionSource], Samples]
 """Returns the samples of a source in a file, with the errors of `read_topic`."""
 
 _GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
@@ -62,7 +62,7 @@ def _read_gpx(path: Path) -> Samples:
     return Samples(np.array([at_ns for at_ns, *_ in points]), values, WGS84)
 
 
-def read_topic(path: Path, account: Account) -> Samples:
+def read_topic(path: Path, position_source: PositionSource) -> Samples:
     """Return the samples in a topic of a bag, or of a message type in a telemetry log, by the recorder's clock.
 
     Raises:
@@ -72,7 +72,7 @@ def read_topic(path: Path, account: Account) -> Samples:
     if point is None:
         raise EvidenceError("is not a recording in a known format", where=str(path))
     reader: PositionReader = plugins.load(point)
-    return reader(path, account)
+    return reader(path, position_source)
 
 
 @cache
@@ -81,24 +81,28 @@ def _readers() -> Mapping[str, EntryPoint]:
     return {f".{point.name}": point for point in plugins.entry_points(plugins.POSITIONS)}
 
 
-def to_placement_frame(samples: Samples, account: Account) -> Samples:
+def to_placement_frame(samples: Samples, position_source: PositionSource) -> Samples:
     """Transform odometry to the frame of the placement, with the robot's place and heading at the start of the step.
 
     Args:
         samples: Odometry with times by the laptop's clock.
-        account: Has the start time, place and heading.
+        position_source: Has the start time, place and heading.
 
     Raises:
         EvidenceError: The heading is unknown, or odometry has no sample at the start.
     """
     assert samples.yaws_rad is not None
-    if account.heading_rad is None:
-        raise EvidenceError(f"{account.topic} has no absolute direction, and the robot's initial heading is unknown")
-    at = int(np.searchsorted(samples.times_ns, account.began_utc_ns, side="right")) - 1
+    if position_source.heading_rad is None:
+        raise EvidenceError(
+            f"{position_source.topic} has no absolute direction, and the robot's initial heading is unknown"
+        )
+    at = int(np.searchsorted(samples.times_ns, position_source.began_utc_ns, side="right")) - 1
     if at < 0:
-        late_s = (int(samples.times_ns[0]) - account.began_utc_ns) / 1e9
-        raise EvidenceError(f"{account.topic} begins {late_s:.1f} s after the step started, so the start is unknown")
-    turn_rad = account.heading_rad - float(samples.yaws_rad[at])
+        late_s = (int(samples.times_ns[0]) - position_source.began_utc_ns) / 1e9
+        raise EvidenceError(
+            f"{position_source.topic} begins {late_s:.1f} s after the step started, so the start is unknown"
+        )
+    turn_rad = position_source.heading_rad - float(samples.yaws_rad[at])
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     from_start_m = samples.values - samples.values[at]
     turned = np.column_stack(
@@ -108,4 +112,4 @@ def to_placement_frame(samples: Samples, account: Account) -> Samples:
             from_start_m[:, 2],
         )
     )
-    return replace(samples, values=turned + np.array(account.start))
+    return replace(samples, values=turned + np.array(position_source.start))

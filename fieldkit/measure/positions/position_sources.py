@@ -1,7 +1,7 @@
 """Sources of robots' positions, as stored in `positions.json` of an attempt or of a whole trial.
 
-Steps that follow robots write the attempt's file, `fieldkit positions` the trial's. If both have the position of one
-robot, the trial's file takes precedence.
+Steps that follow robots write the attempt's file; `fieldkit positions` writes the trial's file. If both
+have the position of one robot, the trial's file takes precedence.
 """
 
 import json
@@ -29,7 +29,7 @@ reports once a second has then missed two positions."""
 
 
 @dataclass(frozen=True)
-class Account:
+class PositionSource:
     """Source of one robot's position: a fixed place or a file.
 
     Attributes:
@@ -75,7 +75,7 @@ class Account:
 
 
 @dataclass(frozen=True)
-class Accounts:
+class PositionSources:
     """Sources of the positions of several robots.
 
     Attributes:
@@ -84,32 +84,32 @@ class Accounts:
         heights: True if heights above the ellipsoid are used; they are often wrong by 10 m.
     """
 
-    robots: Mapping[Role, Account] = field(default_factory=lambda: MappingProxyType({}))
+    robots: Mapping[Role, PositionSource] = field(default_factory=lambda: MappingProxyType({}))
     clocks: Mapping[Role, Offset] = field(default_factory=lambda: MappingProxyType({}))
     heights: bool = False
 
 
-def merge(base: Accounts, override: Accounts) -> Accounts:
+def merge(base: PositionSources, override: PositionSources) -> PositionSources:
     """Combine two sets of sources. `override` takes precedence, except if it only has the planned placement."""
     robots = {**base.robots}
-    for role, account in override.robots.items():
-        if role not in robots or account.frame != PLACED or account.place is None:
-            robots[role] = account
-    return Accounts(robots, {**base.clocks, **override.clocks}, base.heights or override.heights)
+    for role, position_source in override.robots.items():
+        if role not in robots or position_source.frame != PLACED or position_source.place is None:
+            robots[role] = position_source
+    return PositionSources(robots, {**base.clocks, **override.clocks}, base.heights or override.heights)
 
 
-def text(accounts: Accounts) -> str:
+def text(position_sources: PositionSources) -> str:
     """Return the sources as JSON for `read`."""
-    defaults = asdict(Account())
+    defaults = asdict(PositionSource())
     robots = {
-        role: {name: value for name, value in asdict(account).items() if value != defaults[name]}
-        for role, account in accounts.robots.items()
+        role: {name: value for name, value in asdict(position_source).items() if value != defaults[name]}
+        for role, position_source in position_sources.robots.items()
     }
-    clocks = {role: asdict(offset) for role, offset in accounts.clocks.items()}
-    return json.dumps({"robots": robots, "clocks": clocks, "heights": accounts.heights}, indent=2) + "\n"
+    clocks = {role: asdict(offset) for role, offset in position_sources.clocks.items()}
+    return json.dumps({"robots": robots, "clocks": clocks, "heights": position_sources.heights}, indent=2) + "\n"
 
 
-def read(path: Path) -> Accounts:
+def read(path: Path) -> PositionSources:
     """Return the sources in a file.
 
     Raises:
@@ -117,14 +117,17 @@ def read(path: Path) -> Accounts:
     """
     try:
         data = json.loads(reading.text(path))
-        robots = {Role(role): _record_from_json(Account, account) for role, account in data.pop("robots").items()}
+        robots = {
+            Role(role): _record_from_json(PositionSource, position_source)
+            for role, position_source in data.pop("robots").items()
+        }
         clocks = {Role(role): _record_from_json(Offset, offset) for role, offset in data.pop("clocks").items()}
         heights = data.pop("heights")
     except JSON_ERRORS as error:
         raise EvidenceError("is not a valid list of position sources", where=str(path)) from error
     if data or not isinstance(heights, bool):
         raise EvidenceError("is not a valid list of position sources: it has unknown keys", where=str(path))
-    return Accounts(robots, clocks, heights)
+    return PositionSources(robots, clocks, heights)
 
 
 def _record_from_json(record: type[Any], values: Mapping[str, Any]) -> Any:  # noqa: ANN401 (an instance of the type)

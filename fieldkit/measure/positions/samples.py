@@ -27,7 +27,7 @@ LOCAL: Final = "metres"
 MAX_SAMPLES: Final = 1_000_000
 _MAX_NS: Final = 2**62
 _NS_PER: Final = {"t_s": 10**9, "t_ms": 10**6, "t_us": 10**3, "t_ns": 1}
-_COUNTED: Final = re.compile(r"-?[0-9]{1,20}(?:\.[0-9]*)?", re.ASCII)
+_UNIX_TIME: Final = re.compile(r"-?[0-9]{1,20}(?:\.[0-9]*)?", re.ASCII)
 _AXES: Final = ("x", "y", "z")
 _DEGREES: Final = {"lat": 90.0, "lon": 180.0}
 
@@ -180,7 +180,7 @@ def _time_ns(name: str, text: str, where: str) -> int:
     """Return a time in nanoseconds since 1970 UTC."""
     invalid = EvidenceError(f"{text[:40]!r} is not a time", where=where, remedy="write it as 2026-11-22T10:00:00.5Z")
     if name != "t":
-        if not _COUNTED.fullmatch(text):  # also rejects 1.7e9, because a time with an exponent has lost digits
+        if not _UNIX_TIME.fullmatch(text):  # also rejects 1.7e9, because a time with an exponent has lost digits
             raise invalid
         return round(Decimal(text) * _NS_PER[name])  # a float cannot represent nanoseconds since 1970
     try:

@@ -1,7 +1,7 @@
 """Packets of a transfer that were altered between sender and receiver.
 
 A router that translates addresses or ports (NAT), changes ids or sequence numbers, or fragments packets differently,
-alters them so that they match nothing in the sender's capture and would count as lost. With complete captures, the
+alters them: they match no packet in the sender's capture and would count as lost. With complete captures, the
 receiver has no packet of the transfer that is not in the sender's capture.
 
 A router computes the checksum of the IPv4 header again. A wrong one shows that the header changed on a link or in the
@@ -22,7 +22,7 @@ from fieldkit.measure.transfers.transfer_spec import Transfer
 MAX_ALTERED_SHARE: Final = 0.05
 """Largest permitted share of received packets that are not in the sender's capture: a few may be earlier traffic."""
 
-_MAX_STRAGGLERS: Final = 3
+_MAX_LATE_PACKETS: Final = 3
 """A connection that was aborted earlier may still send up to this many packets from its port to the transfer's."""
 
 _DUPLICATE_NS: Final = 1_000_000
@@ -39,7 +39,7 @@ def header_problem(packets: Packets) -> str | None:
     )
 
 
-def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
+def incomparability_reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
     """Return the reason why two complete captures cannot be compared, or None if they can.
 
     Args:
@@ -58,13 +58,13 @@ def reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None
     expected, other_port = received.where(has_port[received.sport]), received.where(~has_port[received.sport])
     matches_sent = np.isin(_address_free_keys(other_port), _address_free_keys(sent))
     is_earlier_traffic = matches_sent.sum() <= MAX_ALTERED_SHARE * len(other_port)
-    if is_earlier_traffic and len(other_port) > _MAX_STRAGGLERS and not len(expected):
+    if is_earlier_traffic and len(other_port) > _MAX_LATE_PACKETS and not len(expected):
         return (
             f"none of its {len(sent)} packets reached the receiver, but {len(other_port)} others did"
-            f" {_most_common_ends(other_port)}: packets of an earlier attempt were still on the way,"
-            " or a router changed the port and more"
+            f" {_most_common_ends(other_port)}: packets of an earlier attempt were still in transit,"
+            " or a router changed the port and other fields"
         )
-    if is_earlier_traffic or len(other_port) <= _MAX_STRAGGLERS:
+    if is_earlier_traffic or len(other_port) <= _MAX_LATE_PACKETS:
         other_port = other_port.where(matches_sent)
     altered = Packets.concatenated((other_port, _with_other_address(sender, receiver, sent, expected, transfer)))
     changed = int((~_were_sent(sent, expected)).sum())
@@ -105,20 +105,25 @@ def _duplicate_count(sent: Packets) -> int:
     key = row_hashes(connection_keys(with_id), _ip_keys(with_id), with_id.tcp_seq)
     order = np.lexsort((with_id.time_ns, key))
     key, time_ns = key[order], with_id.time_ns[order]
-    edges = np.flatnonzero(np.append(True, key[1:] != key[:-1])) if len(key) else key.astype(np.int64)
-    pairs = edges[np.diff(np.append(edges, len(key))) == 2]
+    group_starts = np.flatnonzero(np.append(True, key[1:] != key[:-1])) if len(key) else key.astype(np.int64)
+    pairs = group_starts[np.diff(np.append(group_starts, len(key))) == 2]
     return int((time_ns[pairs + 1] - time_ns[pairs] < _DUPLICATE_NS).sum())
 
 
 def _with_other_address(
     sender: Packets, receiver: Packets, sent: Packets, expected: Packets, transfer: Transfer
 ) -> Packets:
-    """Return received packets that equal sent, not received packets except for an address."""
+    """Return received packets that equal, except for an address, a sent packet that did not arrive unaltered."""
     # One end of the transfer must be unaltered.
-    from_it, to_it = receiver.are_from(transfer.sender_address), receiver.are_to(transfer.receiver_address)
-    others = (from_it | to_it | (receiver.dport == transfer.port)) & (receiver.sport != NO_PORT)
-    others &= (receiver.protocol == sent.protocol[0]) & ~(from_it & to_it & (receiver.dport == transfer.port))
-    candidates = receiver.where(others)
+    is_from_sender, is_to_receiver = (
+        receiver.are_from(transfer.sender_address),
+        receiver.are_to(transfer.receiver_address),
+    )
+    is_candidate = (is_from_sender | is_to_receiver | (receiver.dport == transfer.port)) & (receiver.sport != NO_PORT)
+    is_candidate &= (receiver.protocol == sent.protocol[0]) & ~(
+        is_from_sender & is_to_receiver & (receiver.dport == transfer.port)
+    )
+    candidates = receiver.where(is_candidate)
     if not len(candidates):
         return candidates
     candidates = candidates.where(~np.isin(connection_keys(candidates), connection_keys(sender)))

@@ -2,18 +2,18 @@
 
 No packet arrives before it was sent. The offset is therefore at most the apparent delay of any packet to the
 receiver, and at least the negative apparent delay of any packet from it. With constant drift the offset is a straight
-line over time, and each line is possible that is below all upper bounds and above all lower bounds (Duda et al.,
+line over time, and every line below all upper bounds and above all lower bounds is possible (Duda et al.,
 "Estimating global time in distributed systems", ICDCS 1987; the convex hulls are those of Moon, Skelly and Towsley,
 "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999). The captures contain no more
 information: the division of a round trip into its two directions is unobservable (Paxson, "On calibrating
 measurements of packet transit times", SIGMETRICS 1998).
 
-A single wrong time stamp can exclude the true line. Therefore each line counts as possible that violates at most one
-packet's bound: the true line is one of them if one time stamp is wrong, by any amount. This is the intersection of
-Marzullo and Owicki ("Maintaining the time in a distributed system", PODC 1983; RFC 5905, section 11.2.1) with at
-most one faulty source, where each packet is a source. The lines are those of the polygons that result if one packet
-is left out; only packets on the convex hulls change the polygon. No smaller set has this property, because each of
-these lines is the true one if the time stamp of the packet that was left out is wrong.
+A single wrong time stamp can exclude the true line. Therefore a line counts as possible if it violates the bound of
+at most one packet: the true line is one of them if one time stamp is wrong, by any amount. This is the intersection
+algorithm of Marzullo and Owicki ("Maintaining the time in a distributed system", PODC 1983; RFC 5905, section
+11.2.1) with at most one faulty source, where each packet is a source. The lines are those of the polygons that result
+if one packet is left out; only packets on the convex hulls change the polygon. No smaller set has this property,
+because each of these lines is the true one if the time stamp of the packet that was left out is wrong.
 """
 
 from collections.abc import Sequence
@@ -80,19 +80,19 @@ class Clocks:
         """Maximum error of `skew`."""
         return float(max(self.skews[-1] - self.skew, self.skew - self.skews[0]))
 
-    def ahead_s(self, receiver_ns: Ints) -> Floats:
+    def offset_at_s(self, receiver_ns: Ints) -> Floats:
         """Return the offset relative to `base_ns` at times of the receiver's clock."""
         return self.offset_s + self.skew * self._elapsed_s(receiver_ns)
 
     def delays_s(self, sender_ns: Ints, receiver_ns: Ints) -> Floats:
         """Return the one-way delays of packets from sender to receiver; each time is by the end's own clock."""
-        return (receiver_ns - sender_ns - self.base_ns) / 1e9 - self.ahead_s(receiver_ns)
+        return (receiver_ns - sender_ns - self.base_ns) / 1e9 - self.offset_at_s(receiver_ns)
 
     def error_s(self, receiver_ns: Ints) -> float:
         """Return the maximum error of the offset at these times of the receiver's clock."""
         # The possible range widens with the distance from the middle, so the error is largest at the ends.
         ends = np.array((receiver_ns.min(), receiver_ns.max()))
-        best, drift = self.ahead_s(ends), np.outer(self.skews, self._elapsed_s(ends))
+        best, drift = self.offset_at_s(ends), np.outer(self.skews, self._elapsed_s(ends))
         above, below = self.highest_s[:, None] + drift - best, best - self.lowest_s[:, None] - drift
         return float(max(above.max(), below.max()))
 
@@ -111,7 +111,7 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
 
     Args:
         forward: Packets from sender to receiver, at least one, each frame in one pair only.
-        reverse: Packets from receiver to sender, likewise.
+        reverse: Packets from receiver to sender, under the same conditions.
     """
     times = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
     middle_ns = (int(times.min()) + int(times.max())) // 2
@@ -121,7 +121,7 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     ceiling, floor = ceilings[0], floors[0]
     if _polygon(ceiling, floor) is None:
         return None
-    hulls = [(each, floor) for each in ceilings] + [(ceiling, each) for each in floors[1:]]
+    hulls = [(hull, floor) for hull in ceilings] + [(ceiling, hull) for hull in floors[1:]]
     polygons = [polygon for pair in hulls if (polygon := _polygon(*pair)) is not None]
     skews, lowest_s, highest_s = np.concatenate(polygons, axis=1)
     order = np.argsort(skews, kind="stable")
@@ -142,7 +142,7 @@ def _best_skew(ceilings: Sequence["_Hull"], floors: Sequence["_Hull"], first: fl
         first: Lowest possible skew.
         last: Highest possible skew.
     """
-    slopes = np.concatenate([each.slopes() for each in ceilings] + [-each.slopes() for each in floors])
+    slopes = np.concatenate([hull.slopes() for hull in ceilings] + [-hull.slopes() for hull in floors])
     skews = np.clip(np.append(slopes, (0.0, -MAX_SKEW, MAX_SKEW)), first, last)
     lowest_s, highest_s = _range_without_fastest(ceilings, floors, skews)
     width_s = highest_s - lowest_s
@@ -186,8 +186,8 @@ def _points(pairs: StampPairs, middle_ns: int, base_ns: int) -> tuple[Floats, Fl
 
 def _possible_skews(skews: Floats, width_s: Floats) -> tuple[float, float]:
     """Return the range of skews in which `width_s`, concave and linear between `skews`, is not negative."""
-    top = int(width_s.argmax())
-    rising, falling = slice(None, top + 1), slice(None, top - 1 if top else None, -1)
+    peak = int(width_s.argmax())
+    rising, falling = slice(None, peak + 1), slice(None, peak - 1 if peak else None, -1)
     return (
         float(np.interp(0.0, width_s[rising], skews[rising])),
         float(np.interp(0.0, width_s[falling], skews[falling])),
@@ -215,11 +215,11 @@ class _Hull:
         outer = _lower_hull(points)
         on_hull = set(outer)
         # Without a point of this hull, only points of the hull of all others can be on the hull in addition.
-        others = [point for index, point in enumerate(points) if index not in on_hull]
-        nearest = [others[index] for index in _lower_hull(others)]
+        inner_points = [point for index, point in enumerate(points) if index not in on_hull]
+        inner_hull = [inner_points[index] for index in _lower_hull(inner_points)]
         hulls = [[points[index] for index in outer]]
         for left_out in outer:
-            rest = sorted([points[index] for index in outer if index != left_out] + nearest)
+            rest = sorted([points[index] for index in outer if index != left_out] + inner_hull)
             hulls.append([rest[index] for index in _lower_hull(rest)])
         return [cls(*np.array(hull).reshape(-1, 2).T) for hull in hulls]
 

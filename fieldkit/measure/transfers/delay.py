@@ -36,7 +36,7 @@ COLUMNS: Final = columns(
     ("one_way_mean_s", "s", "Mean one-way delay; empty as for one_way_min_s."),
     ("one_way_p95_s", "s", "95th percentile of the one-way delay; empty as for one_way_min_s."),
     ("one_way_error_s", "s", "Maximum error of each one-way delay that is caused by the clocks."),
-    ("one_way_withheld", "text", "Reason why one-way delays are empty; empty if none is."),
+    ("one_way_withheld", "text", "Reason why one-way delays are empty; empty if all of them have a value."),
     (
         "delay_variation_median_s",
         "s",
@@ -115,9 +115,9 @@ def tcp_copies(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
     A frame arrives with its last byte. If offload joined several frames, the joined frame matches the last of them.
     """
     sent_pieces, received_pieces, matched = frames.payload.sent, frames.payload.received, frames.payload.match
-    certain = matched.arrived & ~matched.ambiguous & _is_last_piece(sent_pieces)
-    certain[certain] = _is_last_piece(received_pieces)[matched.received_index[certain]]
-    return sent_pieces.frame[certain], received_pieces.frame[matched.received_index[certain]]
+    is_certain = matched.arrived & ~matched.ambiguous & _is_last_piece(sent_pieces)
+    is_certain[is_certain] = _is_last_piece(received_pieces)[matched.received_index[is_certain]]
+    return sent_pieces.frame[is_certain], received_pieces.frame[matched.received_index[is_certain]]
 
 
 def tcp_sent(frames: tcp.TcpFrames) -> int:
@@ -144,8 +144,8 @@ def measure(
         sent: Number of packets that the transfer sent.
         ambiguous: True if some packets are missing in `pairs` because they are ambiguous.
     """
-    others = _others(sender, receiver, transfer)
-    reverse = _reverse(sender, receiver, transfer.sender_address, transfer.receiver_address)
+    other_pairs = _other_pairs(sender, receiver, transfer)
+    reverse_pairs = _reverse_pairs(sender, receiver, transfer.sender_address, transfer.receiver_address)
     if not len(pairs):
         return _withheld(
             "the packets of the transfer cannot be distinguished"
@@ -154,17 +154,17 @@ def measure(
         )
     if any(
         (times == NO_TIME).any()
-        for stamps in (pairs, others, reverse)
+        for stamps in (pairs, other_pairs, reverse_pairs)
         for times in (stamps.sender_ns, stamps.receiver_ns)
     ):
         return _withheld("a capture lacks times")
     pairs = pairs.where(np.argsort(pairs.receiver_ns, kind="stable"))
     transit_ns = pairs.receiver_ns - pairs.sender_ns
     jitter = Measured.from_optional({"jitter_s": jitter_s(transit_ns)}, "a single packet has none")
-    if not len(reverse):
+    if not len(reverse_pairs):
         variation = _variation((transit_ns - transit_ns.min()) / 1e9)
         return jitter | variation | _withheld("no packet from receiver to sender is in both captures")
-    clocks = estimate(StampPairs.concatenated((pairs, others)), reverse)
+    clocks = estimate(StampPairs.concatenated((pairs, other_pairs)), reverse_pairs)
     if clocks is None:
         return _withheld(UNSTEADY)
     delay_s, error_s = _delays_s(pairs, clocks)
@@ -185,10 +185,10 @@ def packet_delays(
         receiver: Packets of the receiver's capture, all with times.
         transfer: Identifies the transfer's packets.
     """
-    reverse = _reverse(sender, receiver, transfer.sender_address, transfer.receiver_address)
+    reverse = _reverse_pairs(sender, receiver, transfer.sender_address, transfer.receiver_address)
     if not len(pairs) or not len(reverse):
         return None
-    clocks = estimate(StampPairs.concatenated((pairs, _others(sender, receiver, transfer))), reverse)
+    clocks = estimate(StampPairs.concatenated((pairs, _other_pairs(sender, receiver, transfer))), reverse)
     delays = None if clocks is None else _delays_s(pairs, clocks)
     return delays if delays and math.isfinite(delays[1]) else None
 
@@ -205,9 +205,9 @@ def clocks_between(sender: Packets, receiver: Packets, sender_address: str, rece
         receiver_address: Address of the receiver on it.
     """
     forward = _matched_pairs(
-        *(packets.where(_goes(packets, sender_address, receiver_address)) for packets in (sender, receiver))
+        *(packets.where(_is_between(packets, sender_address, receiver_address)) for packets in (sender, receiver))
     )
-    reverse = _reverse(sender, receiver, sender_address, receiver_address)
+    reverse = _reverse_pairs(sender, receiver, sender_address, receiver_address)
     times = (forward.sender_ns, forward.receiver_ns, reverse.sender_ns, reverse.receiver_ns)
     if any(not len(stamps) or (stamps == NO_TIME).any() for stamps in times):
         return None
@@ -297,26 +297,26 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
     )
 
 
-def _others(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
+def _other_pairs(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
     """Return the other packets from sender to receiver: those without payload, and ping's."""
     ends = transfer.sender_address, transfer.receiver_address
     return _matched_pairs(
         *(
-            packets.where(_goes(packets, *ends) & ~_may_be_transfer(packets, transfer))
+            packets.where(_is_between(packets, *ends) & ~_may_be_transfer(packets, transfer))
             for packets in (sender, receiver)
         )
     )
 
 
-def _reverse(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> StampPairs:
+def _reverse_pairs(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> StampPairs:
     """Return the packets from receiver to sender."""
     pairs = _matched_pairs(
-        *(packets.where(_goes(packets, receiver_address, sender_address)) for packets in (receiver, sender))
+        *(packets.where(_is_between(packets, receiver_address, sender_address)) for packets in (receiver, sender))
     )
     return StampPairs(sender_ns=pairs.receiver_ns, receiver_ns=pairs.sender_ns)
 
 
-def _goes(packets: Packets, source: str, destination: str) -> Mask:
+def _is_between(packets: Packets, source: str, destination: str) -> Mask:
     return packets.are_from(source) & packets.are_to(destination)
 
 
@@ -344,6 +344,6 @@ def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
 
 def _copies(matched: Match, chosen: Mask | None = None) -> tuple[Ints, Ints]:
     """Return the indices of matched packets among those sent and those received, without ambiguous ones."""
-    certain = matched.arrived & ~matched.ambiguous
-    index = np.flatnonzero(certain if chosen is None else certain & chosen)
+    is_certain = matched.arrived & ~matched.ambiguous
+    index = np.flatnonzero(is_certain if chosen is None else is_certain & chosen)
     return index, matched.received_index[index]

@@ -34,8 +34,8 @@ _MIN_INTERVALS: Final = 3
 are a loss, not a stall."""
 
 _EDGE_PACKETS: Final = 100
-"""Number of packets at each end of a flow from which the sender's clock offset is taken; drift is negligible within
-them."""
+"""Number of packets at each end of a flow from which the sender's clock offset is computed; drift is negligible
+within them."""
 
 REORDERING_NS: Final = 100_000_000
 """Packets handled by two processors may be out of order by less than this; by more, the clock was set back."""
@@ -125,12 +125,14 @@ def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Deliv
     """
     sent, received = frames.sent, frames.received
     _require_times(sent.time_ns, received.time_ns)
-    advancing, received_run = advancing_frames(received)
-    _, sent_run = advancing_frames(sent)
-    has_payload = received_run > expected.head_bytes
+    advancing, received_contiguous = advancing_frames(received)
+    _, sent_contiguous = advancing_frames(sent)
+    has_payload = received_contiguous > expected.head_bytes
     # Two processors may have captured two packets in the wrong order.
     at_ns = np.maximum.accumulate(received.time_ns[advancing])[has_payload]
-    delivered_bytes, sent_bytes = (int(bytes_[-1]) if len(bytes_) else 0 for bytes_ in (received_run, sent_run))
+    delivered_bytes, sent_bytes = (
+        int(bytes_[-1]) if len(bytes_) else 0 for bytes_ in (received_contiguous, sent_contiguous)
+    )
     is_complete = delivered_bytes >= max(sent_bytes, expected.size_bytes or 0, expected.head_bytes + 1)
     data = sent.tcp_payload_bytes > expected.head_bytes
     first_ns = int(sent.time_ns.min())
@@ -143,7 +145,7 @@ def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Deliv
         return delivery
     if is_complete:
         return replace(delivery, end_ns=None)
-    # A receiver that knows the size waits for the rest until it is terminated.
+    # A receiver of a known number of bytes waits for the rest until it is terminated.
     return (
         delivery
         if expected.size_bytes is None or expected.until_ns is None
@@ -212,7 +214,7 @@ def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
 
 
 def _require_times(sent_ns: Ints, received_ns: Ints) -> None:
-    """Raise an error for captures from which durations cannot be computed."""
+    """Raise an error if durations cannot be computed from the times of the captures."""
     if not len(sent_ns):
         raise EvidenceError("no packet of the flow is in the sender's capture")
     for times_ns in (sent_ns, received_ns):

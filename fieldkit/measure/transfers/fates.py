@@ -53,7 +53,7 @@ def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets
     sender, receiver = (capture.packets for capture in captures if capture is not None)
     if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
         raise EvidenceError("a capture lacks times", where=str(evidence.folder))
-    if why := altered_packets.reason(sender, receiver, transfer):
+    if why := altered_packets.incomparability_reason(sender, receiver, transfer):
         raise EvidenceError(f"the captures of the transfer cannot be compared: {why}", where=str(evidence.folder))
     return sender, receiver
 
@@ -115,7 +115,7 @@ def _relative_seq(base: int, tcp_seq: Ints) -> NDArray[np.int64]:
     return (tcp_seq - base + 2**31) % 2**32 - 2**31
 
 
-CROSSING_COLUMNS: Final = columns(
+PACKET_COLUMNS: Final = columns(
     0,
     ("sent_ns", "ns", "Time of sending by the sender's clock, nanoseconds since 1970 UTC."),
     (
@@ -148,8 +148,8 @@ CROSSING_COLUMNS: Final = columns(
 
 
 @dataclass(frozen=True, eq=False)
-class Crossings:
-    """Packets that a transfer sent, in the order of the sender's capture; the fields are those of `COLUMNS`.
+class SentPackets:
+    """Packets that a transfer sent, in the order of the sender's capture; the fields are those of `PACKET_COLUMNS`.
 
     For TCP, only frames with payload are included. All arrays have shape (n,); empty values are masked.
     """
@@ -172,8 +172,8 @@ class _MatchedPackets:
         sent: Packets in the sender's capture.
         received: Packets in the receiver's capture.
         chosen: Mask of the sent packets that belong to the transfer.
-        lost: As `Crossings.lost`.
-        sent_again: As `Crossings.sent_again`.
+        lost: As `SentPackets.lost`.
+        sent_again: As `SentPackets.sent_again`.
         copies: Indices of matched sent packets, and of their copies among the received packets.
     """
 
@@ -185,7 +185,7 @@ class _MatchedPackets:
     copies: tuple[Ints, Ints]
 
 
-def read_crossings(evidence: AttemptEvidence, transfer: Transfer) -> Crossings:
+def read_sent_packets(evidence: AttemptEvidence, transfer: Transfer) -> SentPackets:
     """Return the packets of a transfer.
 
     Args:
@@ -196,17 +196,15 @@ def read_crossings(evidence: AttemptEvidence, transfer: Transfer) -> Crossings:
         EvidenceError: As for `both_packets` and `tcp_streams.cut`.
     """
     sender, receiver = both_packets(evidence, transfer)
-    packets = {Protocol.UDP: _udp_crossings, Protocol.TCP: _tcp_crossings}[transfer.protocol](
-        sender, receiver, transfer
-    )
+    packets = {Protocol.UDP: _match_udp, Protocol.TCP: _match_tcp}[transfer.protocol](sender, receiver, transfer)
     sent_index, received_index = packets.copies
     pairs = StampPairs(packets.sent.time_ns[sent_index], packets.received.time_ns[received_index])
-    received_ns = _no_crossings(len(packets.sent), np.int64)
-    delay_s, error_s = (_no_crossings(len(packets.sent), np.float64) for _ in range(2))
+    received_ns = _all_masked(len(packets.sent), np.int64)
+    delay_s, error_s = (_all_masked(len(packets.sent), np.float64) for _ in range(2))
     received_ns[sent_index] = pairs.receiver_ns
     if (delays := delay.packet_delays(pairs, sender, receiver, transfer)) is not None:
         delay_s[sent_index], error_s[sent_index] = delays
-    return Crossings(
+    return SentPackets(
         sent_ns=np.ma.array(packets.sent.time_ns[packets.chosen]),
         received_ns=received_ns[packets.chosen],
         lost=packets.lost[packets.chosen],
@@ -218,35 +216,35 @@ def read_crossings(evidence: AttemptEvidence, transfer: Transfer) -> Crossings:
     )
 
 
-def _no_crossings(rows: int, kind: type[np.generic]) -> MaskedArray:
+def _all_masked(rows: int, kind: type[np.generic]) -> MaskedArray:
     return np.ma.array(np.zeros(rows, kind), mask=True)
 
 
-def _udp_crossings(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
-    crossing = udp.match_transfer(sender, receiver, transfer)
+def _match_udp(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
+    matched = udp.match_transfer(sender, receiver, transfer)
     # Each received packet that may be a copy may hide the loss of another packet.
-    hidden = np.append(crossing.chosen, False)[crossing.match.sent_index] & crossing.match.possible_copy
+    hidden = np.append(matched.chosen, False)[matched.match.sent_index] & matched.match.possible_copy
     return _MatchedPackets(
-        sent=crossing.sent,
-        received=crossing.received,
-        chosen=crossing.chosen,
-        lost=np.ma.array(~crossing.match.arrived, mask=crossing.match.ambiguous | hidden.any()),
-        sent_again=_no_crossings(len(crossing.sent), np.bool_),
-        copies=delay.udp_copies(crossing),
+        sent=matched.sent,
+        received=matched.received,
+        chosen=matched.chosen,
+        lost=np.ma.array(~matched.match.arrived, mask=matched.match.ambiguous | hidden.any()),
+        sent_again=_all_masked(len(matched.sent), np.bool_),
+        copies=delay.udp_copies(matched),
     )
 
 
-def _tcp_crossings(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
-    crossing = tcp.match_transfer(sender, receiver, transfer)
-    pieces, match = crossing.payload.sent, crossing.payload.match
-    lost, ambiguous = np.zeros((2, len(crossing.sent)), dtype=np.bool_)
+def _match_tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
+    matched = tcp.match_transfer(sender, receiver, transfer)
+    pieces, match = matched.payload.sent, matched.payload.match
+    lost, ambiguous = np.zeros((2, len(matched.sent)), dtype=np.bool_)
     lost[pieces.frame[~match.arrived]] = True
     ambiguous[pieces.frame[match.ambiguous]] = True
     return _MatchedPackets(
-        sent=crossing.sent,
-        received=crossing.received,
-        chosen=crossing.sent.tcp_payload_bytes > 0,
+        sent=matched.sent,
+        received=matched.received,
+        chosen=matched.sent.tcp_payload_bytes > 0,
         lost=np.ma.array(lost, mask=ambiguous | match.possible_copy.any()),
-        sent_again=np.ma.array(tcp.sent_again(crossing)),
-        copies=delay.tcp_copies(crossing),
+        sent_again=np.ma.array(tcp.sent_again(matched)),
+        copies=delay.tcp_copies(matched),
     )

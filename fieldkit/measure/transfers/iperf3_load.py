@@ -69,7 +69,7 @@ class LoadFlow:
     window_s: tuple[float, float]
 
     def streams(self, packets: Packets) -> list[Packets]:
-        """Return the data packets of each stream in a capture; of a UDP datagram only the first fragment."""
+        """Return the data packets of each stream in a capture, for UDP only the first fragment of each datagram."""
         number = UDP if self.protocol is Protocol.UDP else TCP
         ends = packets.are_from(self.source_address) & packets.are_to(self.destination_address)
         packets_between = packets.where(ends & (packets.protocol == number))
@@ -105,15 +105,15 @@ def _loss(flow: LoadFlow, sent: list[Packets], received: list[Packets]) -> float
 
 def _rate(flow: LoadFlow, received: list[Packets]) -> float | None:
     """Return the rate of received payload, each byte once; None if it cannot be computed."""
-    udp = flow.protocol is Protocol.UDP
-    data = [packets if udp else packets.where(packets.tcp_payload_bytes > COOKIE_BYTES) for packets in received]
+    is_udp = flow.protocol is Protocol.UDP
+    data = [packets if is_udp else packets.where(packets.tcp_payload_bytes > COOKIE_BYTES) for packets in received]
     times_ns: Ints = np.concatenate([packets.time_ns for packets in data]) if data else np.array([], dtype=np.int64)
     start_s, end_s = flow.window_s
     if not len(times_ns) or (times_ns == NO_TIME).any() or end_s <= start_s:
         return None
     start_ns, end_ns = (int(times_ns.min()) + round(1e9 * second) for second in flow.window_s)
     inside = [packets.where((start_ns <= packets.time_ns) & (packets.time_ns < end_ns)) for packets in data]
-    if udp:
+    if is_udp:
         return 8 * flow.payload_bytes * sum(map(len, inside)) / (end_s - start_s)
     total = 0
     for stream, frames in zip(received, inside, strict=True):

@@ -41,7 +41,7 @@ class Match:
             such packet in the sender's capture. Shape (m,).
         duplicates: Mask of received packets that are further copies of a packet that had arrived. Shape (m,).
         ambiguous: Mask of sent packets that cannot be distinguished: others are equal and were sent at nearly the
-            same time, so it is unknown which of them arrived in which order. They are matched in the order of
+            same time, so the order of their arrival is unknown. They are matched in the order of
             sending: if n were sent and m received, min(n, m) arrived. Shape (n,).
         possible_copy: Mask of received packets that count as arrived but may be copies of another packet, because
             packets with their key arrived closer together than they were sent. Shape (m,).
@@ -347,7 +347,7 @@ def _nearest(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns:
 
 
 def _clock_offset_ns(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> tuple[int, bool]:
-    """Return the receiver's clock minus the sender's, including the delay, and whether it is known or a guess.
+    """Return the receiver's clock minus the sender's, including the delay; False if it is only a rough estimate.
 
     It is known from items with a unique key or, if there are none, from groups of which all items arrived.
     """

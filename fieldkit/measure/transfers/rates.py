@@ -60,7 +60,7 @@ class Rates:
 
     Attributes:
         throughput_bit_s: IP-layer bits per second; None with fewer than two packets with payload, or without times.
-        completion_s: Time until the program had the file; None if it never had it, or if that is unknown.
+        completion_s: Time until the program had the file; None if it never had the file, or if this is unknown.
         head_bytes: Payload in the first packet, with which the measured time starts.
     """
 
@@ -99,7 +99,7 @@ def of_udp(packets: udp.UdpPackets) -> Rates:
 
 
 def of_tcp(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> Rates:
-    """Return the rates of a TCP transfer; only the throughput if it has several connections with separate ends.
+    """Return the rates of a TCP transfer; only the throughput if it has several connections.
 
     If offload joined segments into a frame, the headers of these segments are added.
 
@@ -124,7 +124,7 @@ def of_tcp(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts:
 def _closed_ns(sent: Packets, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> int | None:
     """Return the time at which the receiver closed the connection after it acknowledged every byte, or None.
 
-    Netcat exits after it has read until the end of the connection, so its kernel's FIN shows that it got everything.
+    Netcat exits after it has read to the end of the connection. Its kernel's FIN shows that it received every byte.
     """
     is_syn = sent.tcp_flags & SYN != 0
     if len(np.unique(sent.sport)) != 1 or len(isn := np.unique(sent.tcp_seq[is_syn])) != 1:

@@ -41,18 +41,20 @@ class FaultTimes:
     Attributes:
         began_ns: Start of its cause, nanoseconds since 1970 UTC by the laptop's clock.
         ended_ns: End of its cause; None if unknown.
-        ahead: Offset of each robot's clock from the laptop's, by role.
+        clock_offsets: Offset of each robot's clock from the laptop's, by role.
     """
 
     began_ns: int
     ended_ns: int | None
-    ahead: Mapping[Role, Offset]
+    clock_offsets: Mapping[Role, Offset]
 
 
 def fault_times_text(times: FaultTimes) -> str:
     """Return the content of a file that `read_fault_times` reads."""
     ended = "unknown" if times.ended_ns is None else str(times.ended_ns)
-    lines = (f"ahead_s {role} {offset.offset_s:.9f} {offset.error_s:.9f}\n" for role, offset in times.ahead.items())
+    lines = (
+        f"ahead_s {role} {offset.offset_s:.9f} {offset.error_s:.9f}\n" for role, offset in times.clock_offsets.items()
+    )
     return f"began_utc_ns {times.began_ns}\nended_utc_ns {ended}\n{''.join(lines)}"
 
 
@@ -207,7 +209,7 @@ def measure(
     recoveries_s = [stream.recovery_s for stream in streams if stream.recovery_s is not None]
     if recoveries_s and len(recoveries_s) == len(streams):
         values[_column_name(recovery, any(stream.recovery_open for stream in streams))] = max(recoveries_s)
-    reason = "the end of the cause is unknown, or the value is in the other column: with or without recovery"
+    reason = "the end of the cause is unknown, or the other column of the pair has the value"
     return Measured(values, {column.name: reason for column in declared_columns if column.name not in values})
 
 
@@ -219,7 +221,7 @@ def _fault_times_at(times: FaultTimes | None, role: Role) -> tuple[int, int | No
     """Return start and end of a fault by the clock of a robot."""
     if times is None:
         raise EvidenceError("the start of the fault is unknown")
-    ahead = times.ahead.get(role)
+    ahead = times.clock_offsets.get(role)
     if ahead is None:
         raise EvidenceError(f"the clock offset of the {role} is unknown")
     if ahead.error_s > MAX_ERROR_S:

@@ -77,8 +77,8 @@ class TcpCounts:
 def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpFrames:
     """Match the frames of a TCP transfer in both captures.
 
-    A connection is included if its SYN is in the sender's capture. This excludes what the kernel still retransmits of
-    an earlier transfer, which may last minutes after that was aborted.
+    A connection is included if its SYN is in the sender's capture. This excludes retransmissions of
+    an aborted earlier transfer, which may continue for minutes.
 
     Raises:
         EvidenceError: As for `tcp_streams.cut`.

@@ -95,7 +95,7 @@ _CONNECTION_BITS: Final = 33
 
 
 @dataclass(frozen=True, eq=False)
-class Covered:
+class Intervals:
     """Intervals of positions from `starts` up to and excluding `stops`; they may overlap."""
 
     starts: Ints
@@ -111,9 +111,9 @@ class Covered:
         uncovered_from = np.maximum(starts[1:], reached[:-1])
         return int(reached[0] - starts[0] + np.maximum(reached[1:] - uncovered_from, 0).sum())
 
-    def bytes_not_in(self, other: "Covered") -> int:
+    def bytes_not_in(self, other: "Intervals") -> int:
         """Return the number of bytes that these intervals cover and `other` does not."""
-        both = Covered(np.concatenate((self.starts, other.starts)), np.concatenate((self.stops, other.stops)))
+        both = Intervals(np.concatenate((self.starts, other.starts)), np.concatenate((self.stops, other.stops)))
         return both.size_bytes - other.size_bytes
 
 
@@ -140,28 +140,28 @@ class Connections:
         """Return a mask of the ports that belong to one of these connections."""
         return np.isin(ports, self.ports)
 
-    def payload(self, frames: Packets) -> Covered:
+    def payload(self, frames: Packets) -> Intervals:
         """Return the payload bytes in frames from sender to receiver."""
         selected = frames.where(self.includes(frames.sport) & (frames.tcp_payload_bytes > 0))
         # SYN consumes a sequence number before the data that TCP Fast Open lets it carry (RFC 7413).
-        starts = self._places(selected.sport, selected.tcp_seq + (selected.tcp_flags & SYN != 0))
-        return Covered(starts, starts + selected.tcp_payload_bytes)
+        starts = self._positions(selected.sport, selected.tcp_seq + (selected.tcp_flags & SYN != 0))
+        return Intervals(starts, starts + selected.tcp_payload_bytes)
 
-    def numbers(self, frames: Packets) -> Covered:
+    def numbers(self, frames: Packets) -> Intervals:
         """Return the sequence numbers of bytes and of FINs; a FIN is acknowledged like one byte."""
         ends = frames.where(self.includes(frames.sport) & (frames.tcp_flags & FIN != 0))
-        stops = self._places(ends.sport, ends.tcp_seq) + ends.tcp_payload_bytes
+        stops = self._positions(ends.sport, ends.tcp_seq) + ends.tcp_payload_bytes
         carried = self.payload(frames)
-        return Covered(np.concatenate((carried.starts, stops)), np.concatenate((carried.stops, stops + 1)))
+        return Intervals(np.concatenate((carried.starts, stops)), np.concatenate((carried.stops, stops + 1)))
 
-    def acknowledged(self, answers: Packets) -> Covered:
+    def acknowledged(self, answers: Packets) -> Intervals:
         """Return the sequence numbers that frames from receiver to sender acknowledge."""
         selected = answers.where(self.includes(answers.dport) & (answers.tcp_flags & ACK != 0))
-        starts = self._places(selected.dport, self.first_seq[np.searchsorted(self.ports, selected.dport)])
-        return Covered(starts, np.maximum(starts, self._places(selected.dport, selected.tcp_ack)))
+        starts = self._positions(selected.dport, self.first_seq[np.searchsorted(self.ports, selected.dport)])
+        return Intervals(starts, np.maximum(starts, self._positions(selected.dport, selected.tcp_ack)))
 
-    def _places(self, ports: Ints, numbers: Ints) -> Ints:
+    def _positions(self, ports: Ints, numbers: Ints) -> Ints:
         index = np.searchsorted(self.ports, ports)
         relative = (numbers - self.first_seq[index] + LONGEST_BYTES) % 2**32 - LONGEST_BYTES
-        places: Ints = (index + 1 << _CONNECTION_BITS) + relative
-        return places
+        positions: Ints = (index + 1 << _CONNECTION_BITS) + relative
+        return positions

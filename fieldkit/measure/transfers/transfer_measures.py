@@ -34,12 +34,12 @@ PAPER_COUNTS: Final = ("paper_packets", "paper_received", "paper_loss", "paper_t
 
 def paper_frames_from(packets: Packets, address: str, port: int) -> int:
     """Return the number of packets that match `src ADDRESS and port PORT`."""
-    return int((packets.are_from(address) & _port(packets, port)).sum())
+    return int((packets.are_from(address) & _has_port(packets, port)).sum())
 
 
 def paper_frames_to(packets: Packets, address: str, port: int) -> int:
     """Return the number of packets that match `dst ADDRESS and port PORT`."""
-    return int((packets.are_to(address) & _port(packets, port)).sum())
+    return int((packets.are_to(address) & _has_port(packets, port)).sum())
 
 
 def paper_transfer_s(packets: int, delay_s: float) -> float:
@@ -47,7 +47,7 @@ def paper_transfer_s(packets: int, delay_s: float) -> float:
     return packets * delay_s
 
 
-def _port(packets: Packets, port: int) -> Mask:
+def _has_port(packets: Packets, port: int) -> Mask:
     matches: Mask = (packets.sport == port) | (packets.dport == port)
     return matches
 
@@ -55,8 +55,8 @@ def _port(packets: Packets, port: int) -> Mask:
 def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -> Measured:
     """Return all columns of a transfer.
 
-    Columns that depend on missing, unreadable or damaged evidence are missing. The gates decide whether the repeat is
-    valid without them.
+    Columns that depend on missing, unreadable or damaged evidence are missing. The gates determine whether the
+    repeat is valid without them.
 
     Args:
         evidence: The attempt's evidence.
@@ -65,9 +65,9 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
     """
     captures = [evidence.whole_capture(file) for file in transfer.captures]
     sender, receiver = captures if transfer.captured else (None, None)
-    contradiction = incomparable(evidence, transfer)
+    contradiction = incomparability_reason(evidence, transfer)
     pings = evidence.read_or_none(ping.read, step_prefixed(transfer.name, ping.FILE))
-    states = (host.before(transfer.destination), host.after(transfer.destination))
+    states = (host.before_file(transfer.destination), host.after_file(transfer.destination))
     files = _files(evidence, transfer)
     return (
         files
@@ -96,20 +96,24 @@ def _system(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
     """Return the columns of the operating systems of both ends."""
     if transfer.protocol is Protocol.UDP:
         return Measured.all_missing(host.SYSTEM, "UDP has no congestion control")
-    return host.measure_system(evidence.read_or_none(host.congestion_control, host.before(transfer.source)))
+    return host.measure_system(evidence.read_or_none(host.congestion_control, host.before_file(transfer.source)))
 
 
-def incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
+def incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     """Return the reason why no loss can be computed from two undamaged captures, or None if it can.
 
     The captures contradict the file or each other. None as well if there are not two captures.
     """
-    return evidence.cached(_incomparable, transfer) if transfer.captured else None
+    return evidence.cached(_incomparability_reason, transfer) if transfer.captured else None
 
 
-def _incomparable(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
+def _incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     sender, receiver = map(evidence.whole_capture, transfer.captures)
-    if sender and receiver and (why := altered_packets.reason(sender.packets, receiver.packets, transfer)):
+    if (
+        sender
+        and receiver
+        and (why := altered_packets.incomparability_reason(sender.packets, receiver.packets, transfer))
+    ):
         return f"the captures of the transfer cannot be compared: {why}"
     if evidence.read_or_none(reading.size, transfer.received_file):
         for role, capture in ((transfer.source, sender), (transfer.destination, receiver)):
@@ -190,7 +194,7 @@ def _layers(
     reason = "no such packet was sent, none arrived, or it is ambiguous which arrived"
     count_columns = Measured.from_optional(counts, reason)
     rate_columns = Measured.from_optional(
-        rate_values, "the captures do not have two packets, or not the end, of the transfer"
+        rate_values, "the captures have fewer than two packets of the transfer, or not its end"
     )
     no_such_count = Measured.all_missing(other_columns, f"not applicable to {transfer.protocol}")
     return delays | count_columns | rate_columns | stall_columns | no_such_count

@@ -25,7 +25,7 @@ class Transfer:
         sent_file: Name of the sent file in the attempt's folder.
         received_file: Name of the file that the listener wrote, in the same folder.
         captures: Names of the sender's and the receiver's capture in the same folder; None without a capture.
-        name: Name of its step, which is the prefix of its other files; empty without one.
+        name: Name of its step, which is the prefix of its other files; empty if the step has no name.
     """
 
     protocol: Protocol

@@ -6,12 +6,12 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.positions.position_files import MAX_STALE_S
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import PLACED, WGS84, Samples, require_increasing
 from fieldkit.motion.logs import tlog
 
 
-def read_tlog(path: Path, account: Account) -> Samples:
+def read_tlog(path: Path, position_source: PositionSource) -> Samples:
     """Return the samples of a message type in a telemetry log. Times are the recorder's.
 
     With `stamps` set to `header`, the differences between times are those of the autopilot's time since boot. The
@@ -20,14 +20,14 @@ def read_tlog(path: Path, account: Account) -> Samples:
     Raises:
         EvidenceError: The log cannot be read, has no such message, or the autopilot restarted during the recording.
     """
-    rows = tlog.positions(path, account.system, account.topic)
+    rows = tlog.positions(path, position_source.system, position_source.topic)
     if not rows:
         raise EvidenceError(
-            f"no {account.topic}", where=str(path), remedy="request it: set `rates` in the step mavlink"
+            f"no {position_source.topic}", where=str(path), remedy="request it: set `rates` in the step mavlink"
         )
     received_ns = np.array([row[0] for row in rows], dtype=np.int64) * 1_000
     times_ns = received_ns
-    if account.stamps == "header":
+    if position_source.stamps == "header":
         boot_ns = np.array([row[1] for row in rows], dtype=np.int64) * 1_000_000
         if (np.diff(boot_ns) < -MAX_STALE_S * 1e9).any():
             raise EvidenceError("the autopilot restarted", where=str(path), remedy="write times: received")
@@ -35,5 +35,5 @@ def read_tlog(path: Path, account: Account) -> Samples:
     times_ns, first = np.unique(times_ns, return_index=True)
     require_increasing([int(times_ns[0]), int(times_ns[-1])][: len(times_ns)], [str(path)] * 2)
     values = np.array([row[2:] for row in rows], dtype=float)[first]
-    is_local = account.topic == tlog.LOCAL
+    is_local = position_source.topic == tlog.LOCAL
     return Samples(times_ns, values[:, :3], PLACED if is_local else WGS84, values[:, 3] if is_local else None)

@@ -17,7 +17,7 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.positions import position_checks, position_sources
-from fieldkit.measure.positions.position_sources import GAP_S, Account, Accounts
+from fieldkit.measure.positions.position_sources import GAP_S, PositionSource, PositionSources
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import motion_sources, tlog
 from fieldkit.motion.logs.tlog import GLOBAL, LOCAL, Tlog
@@ -183,9 +183,9 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         if code != 0:
             raise scene.failure(planned, f"{planned.job.name} ended with exit code {code}")
 
-    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
+    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
         """Return the sources of the robots' positions in an attempt."""
-        account = Account(
+        position_source = PositionSource(
             file=self._file,
             topic=_POSITIONS[self.positions or "local"],
             stamps=self.times,
@@ -196,7 +196,9 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             clock="" if self.recorder == self.robot else self.recorder,
             system=self.system,
         )
-        return Accounts({**follow.stationary_robots(self, scene), self.robot: account}, offsets, self.heights)
+        return PositionSources(
+            {**follow.stationary_robots(self, scene), self.robot: position_source}, offsets, self.heights
+        )
 
     @override
     def roles(self) -> frozenset[Role]:

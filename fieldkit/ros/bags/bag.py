@@ -23,8 +23,8 @@ _READER: Final = SandboxedReader("fieldkit.ros.bags.bag_reader")
 
 _BLOCK_BYTES: Final = 512  # unit of st_blocks on every file system
 _MIN_ALLOCATED_BYTES: Final = 64 << 20
-"""Some file systems update the block count of a file only seconds after a write, so up to this size the file size
-counts."""
+"""Some file systems update the block count of a file only seconds after a write, so up to this size, the file size
+is used."""
 
 
 def read(path: Path) -> RecordingContents:
@@ -56,7 +56,7 @@ def read(path: Path) -> RecordingContents:
             where=where,
             remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
         ) from error
-    messages, metadata_messages = contents["messages"], contents.get("closed", contents["messages"])
+    messages, metadata_messages = contents["messages"], contents.get("metadata_messages", contents["messages"])
     if messages != metadata_messages:
         raise EvidenceError(
             f"the file contains {messages} messages, {METADATA} states {metadata_messages}",

@@ -6,12 +6,12 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.positions.position_files import MAX_STALE_S
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import PLACED, WGS84, Samples
 from fieldkit.ros.bags import bag
 
 
-def read_bag(path: Path, account: Account) -> Samples:
+def read_bag(path: Path, account: PositionSource) -> Samples:
     """Return the samples in a topic of a bag. Times are the robot's.
 
     If several messages have the same time, the first is used.

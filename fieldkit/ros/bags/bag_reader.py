@@ -43,7 +43,7 @@ def answer(question: Json) -> Json:
         return contents(rosbag1.Reader(path))
     if path.suffix == ".db3":
         _check_database(path)
-    return contents(_open_ros2(path)) | {"closed": contents(_open_ros2(path.parent))["messages"]}
+    return contents(_open_ros2(path)) | {"metadata_messages": contents(_open_ros2(path.parent))["messages"]}
 
 
 def _open_ros2(path: Path) -> "rosbag2.Reader":
@@ -92,12 +92,12 @@ def battery_share(path: Path, topic: str) -> float:
     """Return the charge in the last `sensor_msgs/BatteryState` of a topic; NaN if there is no such message."""
     share = math.nan
     with _open_decoder(path) as reader:
-        chosen = [
+        connections = [
             connection
             for connection in reader.connections
             if connection.topic == topic and connection.msgtype == _BATTERY
         ]
-        for connection, _, data in reader.messages(chosen) if chosen else ():
+        for connection, _, data in reader.messages(connections) if connections else ():
             message: Any = reader.deserialize(data, connection.msgtype)
             share = float(message.percentage)
     return share
@@ -118,8 +118,8 @@ def positions(path: Path, topic: str, child: str) -> Json:
     rows: list[tuple[int, int, float, float, float, float]] = []
     types, frames = set[str](), set[str]()
     with _open_decoder(path) as reader:
-        chosen = [connection for connection in reader.connections if connection.topic == topic]
-        for connection, received_ns, data in reader.messages(chosen) if chosen else ():
+        connections = [connection for connection in reader.connections if connection.topic == topic]
+        for connection, received_ns, data in reader.messages(connections) if connections else ():
             message: Any = reader.deserialize(data, connection.msgtype)
             types.add(connection.msgtype)
             for part in message.transforms if connection.msgtype == _TF_MESSAGE else (message,):

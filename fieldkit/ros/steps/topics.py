@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from fieldkit.measure.attempt import AttemptEvidence
     from fieldkit.measure.captures.packets import Packets
     from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
-    from fieldkit.report.attempt_timing import Moments
+    from fieldkit.report.attempt_timing import AttemptTimes
     from fieldkit.report.charts import Panel
     from fieldkit.ros.streams.topic_columns import TopicTraffic
     from fieldkit.ros.streams.topic_samples import TopicLog
@@ -267,7 +267,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             self._traffic(view), self._both_logs(view), self._packets(view), self._schedule
         )
 
-    def panels(self, evidence: "AttemptEvidence", times: "Moments", zero_ns: int) -> "Iterator[Panel]":
+    def panels(self, evidence: "AttemptEvidence", times: "AttemptTimes", zero_ns: int) -> "Iterator[Panel]":
         """Yield the panel of the delays; see `DrawsPanels.panels`."""
         from fieldkit.ros.streams import topic_panel  # noqa: PLC0415 (needed only by reports)
 

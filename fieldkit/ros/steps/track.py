@@ -16,7 +16,7 @@ from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.positions import position_checks, position_sources, samples
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.ros.steps.record import SUBSCRIBE_S, RecordStep
 from fieldkit.steps.base import Step, StepEntry
@@ -78,12 +78,14 @@ class Spot(Strict):
         return self
 
     @property
-    def account(self) -> Account:
+    def position_source(self) -> PositionSource:
         """The position as a source of positions."""
         if self.frame is not None:
-            return Account(place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}")
+            return PositionSource(
+                place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}"
+            )
         up_m = None if self.alt is None else float(self.alt)
-        return Account(place=(float(self.lat or 0), float(self.lon or 0), up_m), frame=samples.WGS84)
+        return PositionSource(place=(float(self.lat or 0), float(self.lon or 0), up_m), frame=samples.WGS84)
 
 
 class TrackedRobot(Strict):
@@ -198,15 +200,15 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         )
         return math.ceil(_PERIODS / min(rates_hz, default=1.0))
 
-    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> Accounts:
+    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
         """Return the sources of the robots' positions in an attempt."""
         places_m = scene.places_m
         sources = dict(follow.stationary_robots(self, scene))
         for role, tracked in self.robots.items():
             if tracked.at is not None:
-                sources[role] = tracked.at.account
+                sources[role] = tracked.at.position_source
             elif tracked.topic is not None:
-                sources[role] = Account(
+                sources[role] = PositionSource(
                     file=self._recorders(1.0)[role].bag(scene.robot(role)),
                     topic=tracked.topic,
                     child=tracked.child or "",
@@ -216,7 +218,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
                     heading_rad=None if tracked.facing is None else geometry.heading_rad(role, tracked.facing),
                     began_utc_ns=began_utc_ns,
                 )
-        return Accounts(sources, offsets, self.heights)
+        return PositionSources(sources, offsets, self.heights)
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:

@@ -1,7 +1,7 @@
 """Contradictions between the logs of a topic and the captures of its ends.
 
 A capture shows the head of most samples: number and time of sending (`topic_samples`). Each sample in a log is
-therefore compared with its packet. The clock is the same, because both were recorded on the same robot. If TCP or a
+therefore compared with its packet. Their times are comparable, because both are from one robot's clock. If TCP or a
 middleware put several samples into one packet, so that the capture shows no heads, counts and bytes are compared.
 """
 
@@ -32,10 +32,10 @@ MIN_SAMPLES: Final = 20
 than `MIN_SAMPLES` samples. A program on a busy robot delays single samples for longer, but not all of them."""
 
 SLOW_S: Final = 0.02
-"""A delay of which the subscriber's program caused more than this, and more than a tenth, is withheld: such a program
+"""A delay is withheld if the subscriber's program caused more than this and more than a tenth of it: such a program
 cannot be distinguished from a log with wrong times. On two idle hosts the largest of 100 was 0.3 to 13 ms."""
 
-SHARE_FIGURES: Final = {
+PROGRAM_DELAY_FIGURES: Final = {
     "topic_delay_median_s": "median",
     "topic_delay_mean_s": "mean",
     "topic_delay_p95_s": "95th percentile",
@@ -49,13 +49,13 @@ SHARE_FIGURES: Final = {
     "topic_jitter_s": "95th percentile",
     "topic_deadline_misses": "largest",
 }
-"""Columns of time, and the statistic of the delay in the subscriber's program with which each is compared."""
+"""Time columns, and the statistic of the delay in the subscriber's program with which each is compared."""
 
 _GRACE_NS: Final = 300_000_000
-"""Around the match and the end of the subscriber's log, a captured sample may be missing in the log."""
+"""Within this time of the match or of the end of the subscriber's log, a captured sample may be missing in it."""
 
-_GIVE_UP_NS: Final = 600_000_000
-"""After a sample was finally lost, the next ones may wait this long for the message that reports the loss."""
+_MAX_RELEASE_WAIT_NS: Final = 600_000_000
+"""If a sample is permanently lost, the next ones may wait this long for the message that reports the loss."""
 
 _READ_BURST_NS: Final = 1_000_000
 """Within this time a subscriber's program reads all samples in its queue."""
@@ -131,14 +131,14 @@ def withheld(
     reliable: bool,
     deadline_s: float | None,
 ) -> dict[str, str]:
-    """Return the time columns in which the subscriber's program has too large a share, with the reason.
+    """Return the time columns that the delay of the subscriber's program distorts too much, with the reason.
 
     Args:
         values: Columns of the topic from the logs.
         arrived: Samples that arrived, each once.
         captured: The topic in both captures.
         reliable: As in `TopicPlan`.
-        deadline_s: Deadline of the topic; None without one.
+        deadline_s: Deadline of the topic; None if it has no deadline.
     """
     if captured.subscriber is None or not len(arrived):
         return {}
@@ -154,7 +154,7 @@ def withheld(
         "95th percentile of those sent": _quantile_of_sent(latency_s, values, 0.95),
     }
     reasons = {}
-    for name, figure in SHARE_FIGURES.items():
+    for name, figure in PROGRAM_DELAY_FIGURES.items():
         value = deadline_s if name == "topic_deadline_misses" else values.get(name)
         if name in values and isinstance(value, float) and figures_s[figure] > max(SLOW_S, LARGEST_ERROR * value):
             late_text = f"the subscriber's log is later than its capture by {figures_s[figure]:.3f} s"
@@ -176,7 +176,7 @@ class _Arrivals:
     Attributes:
         after_ns: Time of the record minus that of the first packet with the sample's head.
         latency_s: Time of the record minus that of the packet that completed the sample and all earlier ones, for
-            samples for which that packet is known; None if it is known for none.
+            samples for which that packet is known; None if it is known for no sample.
     """
 
     after_ns: Ints
@@ -232,14 +232,16 @@ def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
     known = np.concatenate((numbers, heads.sequence))
     after_gap = (numbers > 0) & ~np.isin(numbers - 1, known)
     released_ns = np.where(is_captured, 0, at_ns)
-    released_ns[after_gap & is_captured] = np.minimum(at_ns, heads.at_ns[rank] + _GIVE_UP_NS)[after_gap & is_captured]
+    released_ns[after_gap & is_captured] = np.minimum(at_ns, heads.at_ns[rank] + _MAX_RELEASE_WAIT_NS)[
+        after_gap & is_captured
+    ]
     released_ns = np.maximum.accumulate(released_ns)
     mask: Mask = (after_gap | (np.append(0, released_ns[:-1]) > heads.at_ns[rank]))[is_captured]
     return mask
 
 
 def _contiguous_ns(subscriber: SampleFlow, end: Ints) -> Ints | None:
-    """Return when a TCP connection had delivered every byte before `end`, from the first copy of each segment."""
+    """Return the times at which a TCP connection had delivered every byte before `end`; None if it is unknown."""
     if (connection := subscriber.connection()) is None:
         return None
     data, _ = connection
@@ -306,7 +308,7 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
 
 
 def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
-    """Yield a contradiction if the capture has too few packets for the samples in a log, which has no duplicates."""
+    """Yield a contradiction if the capture has too few packets for the samples in a log without duplicates."""
     if not plan.on_ports and not len(subscriber.heads):
         return
     packets = subscriber.packets

@@ -17,7 +17,7 @@ from fieldkit.ros.streams import topic_samples
 from fieldkit.ros.streams.topic_samples import TopicLog
 
 MAX_SLEW_NS: Final = 1_000_000
-"""Largest difference by which two consecutive times of one program may be reversed by a slewed clock."""
+"""A slewed clock may reverse two consecutive times of one program by at most this."""
 
 SETTLES_NS: Final = 500_000_000
 """Minimum time between the record of the match and the first sample (`fieldkit.agent.stream.SETTLES_S`)."""
@@ -117,7 +117,7 @@ def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
 
 
 def _publisher_problems(plan: TopicPlan, sent: TopicLog) -> Iterator[str]:
-    """Yield properties of a log that no publisher writes."""
+    """Yield the properties of a log that no publisher can produce."""
     samples, numbers = sent.samples, sent.numbers
     if (numbers != np.arange(len(numbers))).any():
         yield "the publisher's log does not number its samples from 0 on without a gap"

@@ -223,8 +223,8 @@ def withheld_reasons(measured: Measured, reason: str) -> dict[str, str]:
     """
     if not reason:
         return {}
-    by_clocks = {column.name for column in (*_TIMES, *_OF_SENT)} - {"topic_deadline_misses"}
-    names = by_clocks | {column.name for column in _TRAFFIC}
+    clock_dependent = {column.name for column in (*_TIMES, *_OF_SENT)} - {"topic_deadline_misses"}
+    names = clock_dependent | {column.name for column in _TRAFFIC}
     return {name: reason for name in sorted(names) if name not in measured.values}
 
 
@@ -272,12 +272,14 @@ def _times(arrived: TopicSamples, clocks: Clocks | None, deadline_s: float | Non
         variation_s = (transit_ns - transit_ns.min()) / 1e9
         values["topic_delay_variation_p95_s"] = float(np.percentile(variation_s, 95))
     if len(arrived) and clocks is not None and math.isfinite(clocks.error_s(arrived.at_ns)):
-        values |= _by_clocks(arrived, clocks, sent)
-    reason = "too few samples arrived, there is no deadline, or the captures do not give the clock offset well enough"
+        values |= _clock_dependent_values(arrived, clocks, sent)
+    reason = (
+        "too few samples arrived, there is no deadline, or the clock offset from the captures is not accurate enough"
+    )
     return Measured.from_optional(values, reason) | Measured.all_missing((*_TIMES, *_OF_SENT), reason)
 
 
-def _by_clocks(arrived: TopicSamples, clocks: Clocks, sent: int) -> dict[str, float]:
+def _clock_dependent_values(arrived: TopicSamples, clocks: Clocks, sent: int) -> dict[str, float]:
     """Return delays and ages whose clock error is small enough."""
     delay_s, error_s = clocks.delays_s(arrived.sent_ns, arrived.at_ns), clocks.error_s(arrived.at_ns)
     mean_s, peak_s = age_s((arrived.at_ns - arrived.at_ns[0]) / 1e9, delay_s)
@@ -307,8 +309,8 @@ def age_s(at_s: Floats, delay_s: Floats) -> tuple[float | None, float | None]:
     """
     sent_s = at_s - delay_s
     newest_s = np.maximum.accumulate(sent_s)
-    fresh = np.concatenate(([True], sent_s[1:] > newest_s[:-1]))
-    at_s, newest_s = at_s[fresh], newest_s[fresh]
+    is_newer = np.concatenate(([True], sent_s[1:] > newest_s[:-1]))
+    at_s, newest_s = at_s[is_newer], newest_s[is_newer]
     if len(at_s) < 2:
         return None, None
     # Between two arrivals the age increases linearly.

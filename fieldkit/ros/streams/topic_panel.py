@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.report.attempt_timing import TIME_LABEL, Moments
+from fieldkit.report.attempt_timing import TIME_LABEL, AttemptTimes
 from fieldkit.report.charts import Panel, Series
 from fieldkit.report.theme import Style
 from fieldkit.ros.streams import topic_samples
@@ -19,7 +19,7 @@ _RECEIVED: Final = Style("green", "^", "none")
 _LOST: Final = Style("lost", "x", "none")
 
 
-def panels(step: Step, evidence: AttemptEvidence, times: Moments, zero_ns: int) -> Iterator[Panel]:
+def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the delays of received samples, and lost samples, by the time of sending; see `DrawsPanels.panels`."""
     logs = {
         role: evidence.read_or_none(topic_samples.read_log, step.prefixed_name(f"{role}-topic.bin"))
@@ -35,12 +35,12 @@ def panels(step: Step, evidence: AttemptEvidence, times: Moments, zero_ns: int) 
     if not len(sent.sequence):
         return
     is_lost = ~np.isin(sent.sequence, received.sequence)
-    lost_s = (sent.at_ns[is_lost] - times.ahead_ns[publisher] - zero_ns) / 1e9
+    lost_s = (sent.at_ns[is_lost] - times.clock_offset_ns[publisher] - zero_ns) / 1e9
     took_ms = (
         received.at_ns - received.sent_ns
     ) / 1e6  # measured with two clocks, so only differences are meaningful
     excess_ms = took_ms - took_ms.min(initial=math.inf) if len(took_ms) else took_ms
-    received_s = (received.sent_ns - times.ahead_ns[publisher] - zero_ns) / 1e9
+    received_s = (received.sent_ns - times.clock_offset_ns[publisher] - zero_ns) / 1e9
     kinds = (
         ("sample received", _RECEIVED, received_s, excess_ms),
         ("sample lost", _LOST, lost_s, np.zeros(len(lost_s))),

@@ -67,7 +67,7 @@ class TopicLog:
     Attributes:
         samples: Samples that the middleware accepted, or that arrived.
         begun_ns: Time at which the middleware started discovery; None if it is not recorded.
-        matched_ns: Time at which the other end was discovered; None if it never was.
+        matched_ns: Time at which the other end was discovered; None if it was not discovered.
         refused: Number of samples that the middleware did not accept.
         skipped: Number of samples whose time passed while an earlier one was being written.
         foreign: Number of received messages that are not samples of the stream.
@@ -249,7 +249,7 @@ class SampleFlow:
     Attributes:
         heads: Samples from publisher to subscriber whose head was captured.
         packets: All packets of the topic's data from publisher to subscriber; fragments have the ports of the first.
-        reverse: All packets of the topic's data from subscriber to publisher; likewise.
+        reverse: All packets of the topic's data from subscriber to publisher; ports as in `packets`.
     """
 
     heads: SampleHeads

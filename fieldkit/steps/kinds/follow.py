@@ -12,7 +12,7 @@ from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Role
 from fieldkit.core.threads import run_parallel
 from fieldkit.measure.positions import position_columns, position_sources
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import PLACED
 from fieldkit.measure.robot_clock import Exchange, Offset, offset
 from fieldkit.remote import jobs
@@ -35,7 +35,7 @@ COLUMNS: Final = columns(
 )
 """Columns of trials with a step that records positions."""
 
-MakeAccounts = Callable[[int, Mapping[Role, Offset]], Accounts]
+MakeAccounts = Callable[[int, Mapping[Role, Offset]], PositionSources]
 """Returns the sources of positions. Receives the start of the steps inside, in nanoseconds since 1970 UTC of the
 laptop's clock, and the offsets of the robots' clocks from it."""
 
@@ -92,7 +92,7 @@ def follow(
         offsets = {role: offset(results) for role, results in exchanges.items() if results}
         path = scene.laptop_folder / position_sources.FILE
         # Steps inside may have written the sources for other robots.
-        earlier = position_sources.read(path) if path.exists() else Accounts()
+        earlier = position_sources.read(path) if path.exists() else PositionSources()
         merge = position_sources.merge(earlier, make_accounts(began_utc_ns, offsets))
         path.write_text(position_sources.text(merge), encoding="utf-8")
     return list(zip(recordings, codes, strict=True))
@@ -105,12 +105,12 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
     return run_parallel(stop, recordings)
 
 
-def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, Account]:
+def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]:
     """Return the fixed positions of the robots that stay where they were placed while the steps inside run."""
     leads = (step for step in steps_inside(nest) if isinstance(step, Nest) and step.leads)
     moving = frozenset[Role]().union(*(step.moves() for step in leads if isinstance(step, Moves)))
     places_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moving}
-    return {role: Account(place=places_m[role]) for role in nest.roles() if role in places_m}
+    return {role: PositionSource(place=places_m[role]) for role in nest.roles() if role in places_m}
 
 
 def placement_error(what: str, within: Sequence[Nest]) -> str | None:
@@ -125,7 +125,7 @@ def placement_error(what: str, within: Sequence[Nest]) -> str | None:
 def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
     """Yield the reasons why the recorded positions of robots cannot be used."""
     try:
-        sources = position_columns.position_accounts(view.evidence)
+        sources = position_columns.read_position_sources(view.evidence)
         for role in roles:
             position_columns.samples_of(view.evidence, role)
     except EvidenceError as error:
@@ -136,12 +136,17 @@ def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
     yield from _place_problems(view, sources)
 
 
-def _place_problems(view: View, sources: Accounts) -> Iterator[str]:
+def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
     """Yield a reason for each robot whose fixed position or start differs from its placement."""
-    for role, account in sources.robots.items():
+    for role, position_source in sources.robots.items():
         planned_m = view.scene.places_m.get(role)
-        recorded_m = account.place if account.place is not None else account.start
-        if planned_m is None or account.frame != PLACED or account.offset_s or not (account.place or account.topic):
+        recorded_m = position_source.place if position_source.place is not None else position_source.start
+        if (
+            planned_m is None
+            or position_source.frame != PLACED
+            or position_source.offset_s
+            or not (position_source.place or position_source.topic)
+        ):
             continue
         deviation_m = math.dist(planned_m, [metres or 0.0 for metres in recorded_m])
         if deviation_m > _ROUNDING_M:

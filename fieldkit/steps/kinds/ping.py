@@ -197,7 +197,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         # If the captures lack packets of this ping, the origin of other packets cannot be determined.
         if not uncaptured and view.captured(*roles) and (earlier := self._earlier_packets(view)):
             what = f"{format_count(earlier, 'packet')} of a ping that sent no request in this attempt arrived"
-            yield f"packets of an earlier attempt were still on the way: {what}"
+            yield f"packets of an earlier attempt were still in transit: {what}"
 
     def _contradictions(self, result: Ping, view: View) -> Iterator[str]:
         """Yield the contradictions with each capture.

@@ -308,10 +308,10 @@ class TransferStep(
         """Yield a reason for a missing file, a netcat that was stopped by a signal, and each contradiction."""
         transfer = self.transfer(view.scene, view.within)
         endings = [self._ending(view, role, job) for role, job in self._jobs]
-        listened, sent = (ending if ending and ending.cause is Cause.ITSELF else None for ending in endings)
+        listened, sent = (ending if ending and ending.cause is Cause.EXITED else None for ending in endings)
         if not view.evidence.has(self._into):
             yield f"{self._into} is missing"
-        elif why := transfer_measures.incomparable(view.evidence, transfer):
+        elif why := transfer_measures.incomparability_reason(view.evidence, transfer):
             yield why
         else:
             finished = listened is not None and listened.code == 0
@@ -329,7 +329,7 @@ class TransferStep(
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
         """Return the recorded termination of a netcat, or None if the robot recorded none."""
-        after = view.evidence.read_or_none(host.state, host.after(role))
+        after = view.evidence.read_or_none(host.state, host.after_file(role))
         return (after.endings or {}).get(job) if after else None
 
     @override

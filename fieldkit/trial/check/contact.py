@@ -27,7 +27,7 @@ def judge(shell: Shell, report: Report) -> Offset | None:
     """Report that the robot answers; return its clock's offset, or None without a time; errors as for `log_in`."""
     log_in(shell)
     exchanges = clocks.exchanges(shell, CONTACT_S)
-    fastest_s = min((exchange.answered_ns - exchange.asked_ns for exchange in exchanges), default=0) / 1e9
+    fastest_s = min((exchange.response_ns - exchange.request_ns for exchange in exchanges), default=0) / 1e9
     report.ok("connection", f"host key and login right, answers in {1e3 * fastest_s:.0f} ms")
     return offset(exchanges) if exchanges else None
 

@@ -43,7 +43,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
 
 def judge_laptop(plan: Plan, out: Path, report: Report) -> None:
     """Report whether the disk of `out` has space for the trial, and whether fetching its evidence takes long."""
-    judge_room(plan, files.free_bytes(out), files.existing(out), report)
+    judge_room(plan, files.free_bytes(out), files.nearest_existing(out), report)
     if (fetch_s := size.fetch_s(plan)) > LONG_FETCH_S:
         rate = size.FETCHED_BYTES_PER_S
         evidence, duration = format_bytes(rate * fetch_s), format_duration(fetch_s)

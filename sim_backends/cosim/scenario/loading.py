@@ -67,7 +67,7 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     try:
         for key, value in (changes or {}).items():
             _change(document.data, key.split("."), value)
-        scenario = catalog.named(document, CosimScenario, path.stem)
+        scenario = catalog.validate_named(document, CosimScenario, path.stem)
         with document.locating_errors("world"):
             world = load_world(scenario.world)
         check(scenario, world, document.where)

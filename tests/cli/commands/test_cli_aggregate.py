@@ -18,7 +18,7 @@ from fieldkit.core.columns import Kind
 from fieldkit.core.model import Interval
 from fieldkit.trial.plan import PLAN_FILE
 from tests.helpers.paths import DATA
-from tests.helpers.single import more_wanted
+from tests.helpers.single import additional_repeats
 from tests.helpers.stored_trials import TRIALS
 from tests.helpers.tables import ROW, RepeatRow, parsed, repeats, replace, write
 
@@ -169,7 +169,7 @@ def test_width_gives_the_number_of_repeats_needed(campaign: Path, capsys: pytest
     for line in lines:
         interval = Interval(*(float(line[name]) for name in ("value", "low", "high")))
         width = 0.01 if line["unit"] == "share" else 0.005
-        assert line["more_wanted"] == str(more_wanted(interval, int(line["n"]), width, Kind(line["estimate"])))
+        assert line["more_wanted"] == str(additional_repeats(interval, int(line["n"]), width, Kind(line["estimate"])))
     assert {line["more_wanted"] == "0" for line in lines} == {True, False}
     whole = json.loads(output_of(capsys, *words, "--format", "json"))
     counts = [estimate["more_wanted"] for cell in whole["cells"] for estimate in cell["estimates"].values()]

@@ -18,10 +18,10 @@ send limit 130 1286154 12981.58
 
 def test_recorded_terminations_are_parsed() -> None:
     by_name = endings.parse(NOTED.splitlines())
-    assert (by_name["capture"].cause, by_name["capture"].code) == (Cause.ASKED, 0)
+    assert (by_name["capture"].cause, by_name["capture"].code) == (Cause.STOPPED, 0)
     assert by_name["capture"].lasted_s == pytest.approx(2.25)
-    assert by_name["killed"] == Ending(Cause.ITSELF, None, None)
-    assert [by_name[name].cause for name in ("ping", "busy", "send")] == [Cause.ITSELF, Cause.RUNNING, Cause.LIMIT]
+    assert by_name["killed"] == Ending(Cause.EXITED, None, None)
+    assert [by_name[name].cause for name in ("ping", "busy", "send")] == [Cause.EXITED, Cause.RUNNING, Cause.LIMIT]
 
 
 @pytest.mark.parametrize("line", ["", "capture", "a b 0 1 2.00", "ping itself 0 1 2.0 more", "x itself 9999 1 2.00"])
@@ -32,21 +32,21 @@ def test_other_lines_are_ignored(line: str) -> None:
 @pytest.mark.parametrize(
     ("line", "allowed", "least_s", "problem"),
     [
-        ("job asked 0 100 9.00", {Cause.ASKED}, 0.0, None),
-        ("job itself 0 100 9.00", {Cause.ASKED}, 0.0, "exited before fieldkit stopped it, with exit code 0"),
-        ("job limit 0 100 9.00", {Cause.ASKED}, 0.0, "did not exit, and was stopped at its time limit"),
-        ("job itself 0 100 9.00", {Cause.ITSELF}, 0.0, None),
-        ("job itself 1 100 9.00", {Cause.ITSELF}, 0.0, None),
-        ("job itself 143 100 9.00", {Cause.ITSELF, Cause.LIMIT}, 0.0, "was killed by SIGTERM, not by fieldkit"),
-        ("job itself 137 100 9.00", {Cause.ITSELF}, 0.0, "was killed by SIGKILL, not by fieldkit"),
-        ("job itself 255 100 9.00", {Cause.ITSELF}, 0.0, "was killed by signal 127, not by fieldkit"),
-        ("job limit 130 100 9.00", {Cause.ITSELF, Cause.LIMIT}, 0.0, None),
+        ("job asked 0 100 9.00", {Cause.STOPPED}, 0.0, None),
+        ("job itself 0 100 9.00", {Cause.STOPPED}, 0.0, "exited before fieldkit stopped it, with exit code 0"),
+        ("job limit 0 100 9.00", {Cause.STOPPED}, 0.0, "did not exit, and was stopped at its time limit"),
+        ("job itself 0 100 9.00", {Cause.EXITED}, 0.0, None),
+        ("job itself 1 100 9.00", {Cause.EXITED}, 0.0, None),
+        ("job itself 143 100 9.00", {Cause.EXITED, Cause.LIMIT}, 0.0, "was killed by SIGTERM, not by fieldkit"),
+        ("job itself 137 100 9.00", {Cause.EXITED}, 0.0, "was killed by SIGKILL, not by fieldkit"),
+        ("job itself 255 100 9.00", {Cause.EXITED}, 0.0, "was killed by signal 127, not by fieldkit"),
+        ("job limit 130 100 9.00", {Cause.EXITED, Cause.LIMIT}, 0.0, None),
         ("job limit 137 100 9.00", {Cause.LIMIT}, 15.0, None),
-        ("job asked 0 100 9.00", {Cause.ITSELF}, 0.0, "was stopped by fieldkit before it had finished"),
-        ("job itself 0 100 15.95", {Cause.ITSELF}, 15.0, None),
-        ("job itself 0 100 9.00", {Cause.ITSELF}, 15.0, "exited after 8.0 s of 15 s"),
-        ("job itself - 100 -", {Cause.ITSELF}, 15.0, "was killed"),
-        ("job running - 100 -", {Cause.ITSELF}, 0.0, "was still running when the evidence was collected"),
+        ("job asked 0 100 9.00", {Cause.EXITED}, 0.0, "was stopped by fieldkit before it had finished"),
+        ("job itself 0 100 15.95", {Cause.EXITED}, 15.0, None),
+        ("job itself 0 100 9.00", {Cause.EXITED}, 15.0, "exited after 8.0 s of 15 s"),
+        ("job itself - 100 -", {Cause.EXITED}, 15.0, "was killed"),
+        ("job running - 100 -", {Cause.EXITED}, 0.0, "was still running when the evidence was collected"),
     ],
 )
 def test_terminations_that_are_not_acceptable(

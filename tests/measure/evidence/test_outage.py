@@ -113,7 +113,7 @@ def test_a_process_that_does_not_recover(tmp_path: Path) -> None:
         (FaultKind.LINK_DOWN, pings(list(range(1, 60)), 59), "had no effect"),
         (FaultKind.REBOOT, pings([1, 2, 4, 5], 5), "had no effect"),
         (FaultKind.LINK_DOWN, pings([], 59), "did not answer before"),
-        (FaultKind.LINK_DOWN, pings(AWAY, 49).partition("\n\n")[0], "summary is missing"),
+        (FaultKind.LINK_DOWN, pings(AWAY, 49).partition("\n\n")[0], "stopped before its summary"),
         (FaultKind.KILL, watched((5.0, "31"), (5.1, "31 32"), (5.2, "31")), "had no effect"),
         (FaultKind.KILL, watched((5.0, ""), (5.1, "")), "did not answer before"),
         (FaultKind.KILL, "", "did not answer before"),

@@ -10,7 +10,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import recordings
 from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.positions import position_files
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from tests.helpers.outside_packages import write_package
 
 READER = """\
@@ -42,4 +42,4 @@ def test_a_file_in_another_format_is_rejected(tmp_path: Path, name: str) -> None
     with pytest.raises(EvidenceError, match="is not a recording in a known format"):
         recordings.read(tmp_path / name)
     with pytest.raises(EvidenceError, match="is not a recording in a known format"):
-        position_files.read_topic(tmp_path / name, Account(topic="/odom"))
+        position_files.read_topic(tmp_path / name, PositionSource(topic="/odom"))

@@ -15,7 +15,7 @@ from fieldkit.core.model import FIXED_ROLES, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping, track
 from fieldkit.measure.positions import position_columns, position_sources
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, PLACED, WGS84
 from fieldkit.measure.robot_clock import Offset
 from tests.ros.bags.test_bag_positions import BEGAN_NS, S, odometry, stamped, written
@@ -28,10 +28,10 @@ ORACLE = (
 )
 AWAY = [odometry(BEGAN_NS + n * S, float(n), 0.0) for n in range(5)]
 """Odometry of a robot that moves away at 1 m/s for 4 s."""
-ODOMETRY = Account(
+ODOMETRY = PositionSource(
     file="track.bag", topic="/where", start=(10.0, 0.0, 0.0), heading_rad=0.0, began_utc_ns=BEGAN_NS, gap_s=1.5
 )
-HERE = Account(place=(0.0, 0.0, 0.0))
+HERE = PositionSource(place=(0.0, 0.0, 0.0))
 
 
 @pytest.fixture
@@ -42,9 +42,13 @@ def attempt(tmp_path: Path) -> Path:
     return folder
 
 
-def write_accounts(folder: Path, robots: Mapping[Role, Account], clocks: Mapping[Role, float] | None = None) -> None:
+def write_accounts(
+    folder: Path, robots: Mapping[Role, PositionSource], clocks: Mapping[Role, float] | None = None
+) -> None:
     offsets = {role: Offset(offset_s, 0.01) for role, offset_s in (clocks or {}).items()}
-    (folder / position_sources.FILE).write_text(position_sources.text(Accounts(robots, offsets)), encoding="utf-8")
+    (folder / position_sources.FILE).write_text(
+        position_sources.text(PositionSources(robots, offsets)), encoding="utf-8"
+    )
 
 
 def mean_m(folder: Path, begin_s: float = 1.0, end_s: float = 3.0) -> float | str:
@@ -67,10 +71,10 @@ def test_the_trials_sources_precede_the_attempts_and_those_the_testbeds(attempt:
     trial = attempt.parent.parent
     lines = "".join(f"{BEGAN_NS + n * S},{30 + n},0\n" for n in range(5))
     (trial / "positions-receiver.csv").write_text(f"t_ns,x_m,y_m\n{lines}", encoding="ascii")
-    local = Account(place=(0.0, 0.0, 0.0), frame=LOCAL)
-    write_accounts(trial, {SENDER: local, RECEIVER: Account(file="positions-receiver.csv")})
+    local = PositionSource(place=(0.0, 0.0, 0.0), frame=LOCAL)
+    write_accounts(trial, {SENDER: local, RECEIVER: PositionSource(file="positions-receiver.csv")})
     assert mean_m(attempt) == pytest.approx(32)
-    later = Account(file="positions-receiver.csv", offset_s=-1.0)
+    later = PositionSource(file="positions-receiver.csv", offset_s=-1.0)
     write_accounts(trial, {SENDER: local, RECEIVER: later})
     assert mean_m(attempt) == pytest.approx(33), "each line was so a second before"
     write_accounts(trial, {RECEIVER: later})
@@ -94,7 +98,7 @@ def test_times_of_robots_are_converted_to_one_clock(
 ) -> None:
     wrong_ns = round(1e9 * clocks.get(RECEIVER, 0.0)) if clocks.get(RECEIVER) == -3600 else 0
     written(attempt, [odometry(BEGAN_NS + wrong_ns + n * S, float(n), 0.0) for n in range(-1, 6)], late_ns=wrong_ns)
-    start = Account(
+    start = PositionSource(
         file="track.bag",
         topic="/where",
         start=(10.0, 0.0, 0.0),
@@ -153,8 +157,8 @@ def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
 
 def test_a_tracker_and_a_fixed_place_in_its_frame(attempt: Path) -> None:
     written(attempt, [stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
-    tracker = Account(file="track.bag", topic="/where")
-    write_accounts(attempt, {SENDER: Account(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
+    tracker = PositionSource(file="track.bag", topic="/where")
+    write_accounts(attempt, {SENDER: PositionSource(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
     write_accounts(attempt, {SENDER: HERE, RECEIVER: tracker})
     assert (
@@ -167,17 +171,17 @@ def test_wgs84_heights_are_used_only_if_requested(attempt: Path) -> None:
     latitude, longitude = 39.74, -104.99  # 1600 m high: the same angle is 0.25 mm per metre longer than at sea level
     to_longitude, to_latitude, _ = Geod(ellps="WGS84").fwd(longitude, latitude, 60.0, 1000.0)
     high, low = (latitude, longitude, 1650.0), (to_latitude, to_longitude, 1600.0)
-    robots = {SENDER: Account(place=high, frame=WGS84), RECEIVER: Account(place=low, frame=WGS84)}
+    robots = {SENDER: PositionSource(place=high, frame=WGS84), RECEIVER: PositionSource(place=low, frame=WGS84)}
     write_accounts(attempt, robots)
     level_m = 1000 * (1 + 1625 / 6_371_000)
     assert mean_m(attempt) == pytest.approx(level_m, abs=0.002)
     (attempt / position_sources.FILE).write_text(
-        position_sources.text(Accounts(robots, heights=True)), encoding="utf-8"
+        position_sources.text(PositionSources(robots, heights=True)), encoding="utf-8"
     )
     assert mean_m(attempt) == pytest.approx(math.hypot(level_m, 50), abs=0.002)
-    without_height = robots | {SENDER: Account(place=(latitude, longitude, None), frame=WGS84)}
+    without_height = robots | {SENDER: PositionSource(place=(latitude, longitude, None), frame=WGS84)}
     (attempt / position_sources.FILE).write_text(
-        position_sources.text(Accounts(without_height, heights=True)), encoding="utf-8"
+        position_sources.text(PositionSources(without_height, heights=True)), encoding="utf-8"
     )
     assert mean_m(attempt) == "heights are required, but some positions have none"
 
@@ -185,7 +189,7 @@ def test_wgs84_heights_are_used_only_if_requested(attempt: Path) -> None:
 FLOATS = st.floats(-1e9, 1e9)
 PLACES = st.tuples(FLOATS, FLOATS, st.none() | FLOATS)
 ACCOUNTS = st.builds(
-    Account,
+    PositionSource,
     place=st.none() | PLACES,
     frame=st.text(max_size=10),
     file=st.sampled_from(["", "track_sender.bag", "track/track_0.db3"]),
@@ -196,7 +200,7 @@ ACCOUNTS = st.builds(
     began_utc_ns=st.integers(0, 2**62 - 1),
 )
 ANY_ACCOUNTS = st.builds(
-    Accounts,
+    PositionSources,
     st.dictionaries(st.sampled_from(FIXED_ROLES), ACCOUNTS),
     st.dictionaries(st.sampled_from(FIXED_ROLES), st.builds(Offset, FLOATS, FLOATS)),
     st.booleans(),
@@ -205,7 +209,7 @@ ANY_ACCOUNTS = st.builds(
 
 @given(ANY_ACCOUNTS)
 def test_accounts_are_read_as_they_were_written(
-    tmp_path_factory: pytest.TempPathFactory, written_accounts: Accounts
+    tmp_path_factory: pytest.TempPathFactory, written_accounts: PositionSources
 ) -> None:
     path = tmp_path_factory.getbasetemp() / position_sources.FILE
     path.write_text(position_sources.text(written_accounts), encoding="utf-8")

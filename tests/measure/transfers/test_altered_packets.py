@@ -74,7 +74,7 @@ def _tcp(change: Change, *, stamped: bool = True) -> tuple[list[Frame], list[Fra
 
 def _why(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> str | None:
     sender, receiver = map(packets, captures)
-    return altered_packets.reason(sender, receiver, transfer(protocol))
+    return altered_packets.incomparability_reason(sender, receiver, transfer(protocol))
 
 
 @pytest.mark.parametrize("protocol", Protocol)

@@ -35,7 +35,7 @@ class World:
     def reverse(self, sent_s: Floats, delay_s: Floats) -> StampPairs:
         return _cut(self.sender_ns(sent_s + delay_s), self.receiver_ns(sent_s))
 
-    def ahead_s(self, receiver_ns: Ints) -> Floats:
+    def offset_at_s(self, receiver_ns: Ints) -> Floats:
         """The true offset at times of the receiver's clock."""
         elapsed_s = ((receiver_ns - START_NS) / 1e9 - self.offset_s) / (1 + self.drift)
         truth: Floats = self.offset_s + self.drift * elapsed_s
@@ -48,7 +48,7 @@ def _cut(sender_ns: Ints, receiver_ns: Ints) -> StampPairs:
 
 
 def _ahead_s(clocks: Clocks, receiver_ns: Ints) -> Floats:
-    return clocks.base_ns / 1e9 + clocks.ahead_s(receiver_ns)
+    return clocks.base_ns / 1e9 + clocks.offset_at_s(receiver_ns)
 
 
 @st.composite
@@ -71,7 +71,7 @@ def test_offset_and_skew_are_within_their_errors(
     assert clocks is not None, "the truth is a line that is possible"
     times = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
     for some in (times, np.array([clocks.middle_ns])):
-        wrong_s = np.abs(_ahead_s(clocks, some) - world.ahead_s(some))
+        wrong_s = np.abs(_ahead_s(clocks, some) - world.offset_at_s(some))
         assert wrong_s.max() <= clocks.error_s(some) + 1e-9
     assert abs(clocks.skew - drift / (1 + drift)) <= clocks.skew_error + 1e-12
 
@@ -106,7 +106,7 @@ def test_the_error_is_that_of_linear_programs_that_each_leave_out_one_packet(
         for sign in (1, -1)
         for left_out in range(len(rows))
     ]
-    best_s = float(clocks.ahead_s(at_ns)[0])
+    best_s = float(clocks.offset_at_s(at_ns)[0])
     assert clocks.error_s(at_ns) == pytest.approx(max(best_s - min(reach_s), max(reach_s) - best_s), abs=1e-6)
 
 
@@ -125,7 +125,7 @@ def test_the_truth_is_within_the_error_with_one_wrong_time_of_any_size(
         return  # withheld, as if a clock was set
     times_ns = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
     for some_ns in (times_ns, np.array([clocks.middle_ns])):
-        wrong_s = np.abs(_ahead_s(clocks, some_ns) - world.ahead_s(some_ns))
+        wrong_s = np.abs(_ahead_s(clocks, some_ns) - world.offset_at_s(some_ns))
         assert wrong_s.max() <= clocks.error_s(some_ns) + 1e-9
     assert abs(clocks.skew - drift / (1 + drift)) <= clocks.skew_error + 1e-12
 
@@ -221,7 +221,7 @@ def test_without_queues_the_skew_is_exact_and_the_error_is_half_a_round_trip() -
     middle = np.array([clocks.middle_ns])
     assert clocks.error_s(middle) == pytest.approx(0.005, abs=0.0005)
     # The delays of the directions differ by 2 ms, which captures cannot show: the estimate is wrong by half of that.
-    assert world.ahead_s(middle)[0] - _ahead_s(clocks, middle)[0] == pytest.approx(0.001, abs=0.0001)
+    assert world.offset_at_s(middle)[0] - _ahead_s(clocks, middle)[0] == pytest.approx(0.001, abs=0.0001)
 
 
 def test_a_growing_queue_is_not_mistaken_for_drift() -> None:
@@ -277,7 +277,9 @@ def test_clocks_decades_apart_lose_no_precision() -> None:
     forward = world.forward(sent_s, delay_s)
     clocks = estimate(forward, world.reverse(sent_s, delay_s))
     assert clocks is not None
-    delays_s = (forward.receiver_ns - forward.sender_ns - clocks.base_ns) / 1e9 - clocks.ahead_s(forward.receiver_ns)
+    delays_s = (forward.receiver_ns - forward.sender_ns - clocks.base_ns) / 1e9 - clocks.offset_at_s(
+        forward.receiver_ns
+    )
     assert delays_s == pytest.approx(delay_s, abs=2e-6)
 
 
@@ -290,5 +292,5 @@ def test_with_many_packets_a_sample_is_used_and_the_truth_stays_possible(count: 
     forward = world.forward(sent_s, random.exponential(0.02, count))
     clocks = estimate(forward, world.reverse(sent_s, random.exponential(0.02, count)))
     assert clocks is not None
-    wrong_s = np.abs(_ahead_s(clocks, forward.receiver_ns) - world.ahead_s(forward.receiver_ns))
+    wrong_s = np.abs(_ahead_s(clocks, forward.receiver_ns) - world.offset_at_s(forward.receiver_ns))
     assert wrong_s.max() <= clocks.error_s(forward.receiver_ns) + 1e-9

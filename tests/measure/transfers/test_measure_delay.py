@@ -227,7 +227,7 @@ def test_one_wrong_time_of_a_frame_that_offload_joined_moves_one_bound_only() ->
     clocks = delay.clocks_between(sender, receiver, SENDER, RECEIVER)
     assert clocks is not None
     at_ns = np.array([clocks.middle_ns])
-    offset_s = clocks.base_ns / 1e9 + clocks.ahead_s(at_ns)[0]
+    offset_s = clocks.base_ns / 1e9 + clocks.offset_at_s(at_ns)[0]
     assert abs(offset_s) <= clocks.error_s(at_ns)
     assert offset_s == pytest.approx(0, abs=1e-4)
 

@@ -120,9 +120,9 @@ def test_times_are_read_as_they_were_written(began_ns: int, ended_ns: int | None
     )
     text = recoveries.fault_times_text(written)
     parsed = recoveries.parse_fault_times(text)
-    assert (parsed.began_ns, parsed.ended_ns, parsed.ahead.keys()) == (began_ns, ended_ns, ahead.keys())
-    for role, offset in parsed.ahead.items():
-        assert offset.offset_s == pytest.approx(written.ahead[role].offset_s, abs=1e-9)
+    assert (parsed.began_ns, parsed.ended_ns, parsed.clock_offsets.keys()) == (began_ns, ended_ns, ahead.keys())
+    for role, offset in parsed.clock_offsets.items():
+        assert offset.offset_s == pytest.approx(written.clock_offsets[role].offset_s, abs=1e-9)
 
 
 @pytest.mark.parametrize(

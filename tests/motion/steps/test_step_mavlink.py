@@ -16,7 +16,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence.track import Separation
 from fieldkit.measure.positions import position_columns, position_sources, trajectories
-from fieldkit.measure.positions.position_sources import Account, Accounts
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import WGS84
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import tlog_reader
@@ -168,10 +168,10 @@ def test_global_positions_with_fixed_position_on_the_earth(tmp_path: Path) -> No
         frames.append((at_ms * 1_000, sender.frame(place)))
     view = attempt(tmp_path, step, stamped(frames), counters={"frames": 102})
     assert not list(step.check(view))
-    fixed = Account(place=(0.0, 0.0, 0.0), frame=WGS84)
+    fixed = PositionSource(place=(0.0, 0.0, 0.0), frame=WGS84)
     robots = {**position_sources.read(tmp_path / position_sources.FILE).robots, Role.SENDER: fixed}
     (tmp_path / position_sources.FILE).write_text(
-        position_sources.text(Accounts(robots, heights=True)), encoding="utf-8"
+        position_sources.text(PositionSources(robots, heights=True)), encoding="utf-8"
     )
     distances = apart(View(SCENE, AttemptEvidence(tmp_path)), 2 - START_S, 8 - START_S)
     assert distances.distance_start_m == pytest.approx(math.hypot(30, 2), abs=0.02)
@@ -198,9 +198,13 @@ def test_incomplete_log_makes_repeat_void(
 
 
 def test_sources_of_steps_inside_are_kept() -> None:
-    placed, topic, file = Account(place=(0.0, 0.0, 0.0)), Account(file="a.bag", topic="/odom"), Account(file="b.tlog")
-    inner = Accounts({Role.SENDER: topic, Role.RECEIVER: placed})
-    outer = Accounts({Role.SENDER: placed, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True)
+    placed, topic, file = (
+        PositionSource(place=(0.0, 0.0, 0.0)),
+        PositionSource(file="a.bag", topic="/odom"),
+        PositionSource(file="b.tlog"),
+    )
+    inner = PositionSources({Role.SENDER: topic, Role.RECEIVER: placed})
+    outer = PositionSources({Role.SENDER: placed, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True)
     both = position_sources.merge(inner, outer)
     assert both.robots == {Role.SENDER: topic, Role.RECEIVER: file}
     assert (both.clocks, both.heights) == (outer.clocks, True)

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.positions import position_files
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import PLACED, WGS84
 from fieldkit.ros.bags import bag_positions
 
@@ -91,7 +91,7 @@ def test_every_message_type_has_positions(
     tmp_path: Path, made: Callable[[int, float, float], Any], frame: str, places: list[list[float]]
 ) -> None:
     path = written(tmp_path, [made(BEGAN_NS, 0.0, 0.0), made(BEGAN_NS + S, 1.0, 2.0)])
-    samples = bag_positions.read_bag(path, Account(topic="/where"))
+    samples = bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert (samples.frame, samples.values.tolist()) == (frame, places)
     assert samples.times_ns.tolist() == [BEGAN_NS, BEGAN_NS + S]
 
@@ -119,27 +119,27 @@ def test_ros_2_bags_and_the_child_frame_of_a_transform_tree(tmp_path: Path) -> N
     tree: Any = STORE2.types[kind]
     both = tree([transform2(1.0, 2.0, "world", "/base"), transform2(5.0, 5.0, "base", "wheel")])
     path = written_ros2(tmp_path, both, kind)
-    samples = bag_positions.read_bag(path, Account(topic="/where", child="base"))
+    samples = bag_positions.read_bag(path, PositionSource(topic="/where", child="base"))
     assert (samples.frame, samples.values.tolist()) == ("frame world", [[1, 2, 0]])
     with pytest.raises(EvidenceError, match="has positions in several frames: base, world"):
-        bag_positions.read_bag(path, Account(topic="/where"))
+        bag_positions.read_bag(path, PositionSource(topic="/where"))
     with pytest.raises(EvidenceError, match="no position in /where"):
-        bag_positions.read_bag(path, Account(topic="/where", child="roof"))
+        bag_positions.read_bag(path, PositionSource(topic="/where", child="roof"))
 
 
 def test_messages_without_a_fix_and_with_equal_times_are_ignored(tmp_path: Path) -> None:
     lost, nan = fix(BEGAN_NS, 0.0, 0.0, status=-1), fix(BEGAN_NS + 2 * S, math.nan, 11.0)
     path = written(tmp_path, [lost, fix(BEGAN_NS + S, 48.0, 11.0), fix(BEGAN_NS + S, 49.0, 11.0), nan])
-    samples = bag_positions.read_bag(path, Account(topic="/where"))
+    samples = bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert (samples.times_ns.tolist(), samples.values.tolist()) == ([BEGAN_NS + S], [[48, 11, 520]])
 
 
 def test_stamps_of_another_clock_are_rejected_unless_times_are_the_recorders(tmp_path: Path) -> None:
     path = written(tmp_path, [stamped(7 * S, 1.0, 1.0)])
     with pytest.raises(EvidenceError, match="the stamps of /where differ by 1795348793 s from") as caught:
-        bag_positions.read_bag(path, Account(topic="/where"))
+        bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert caught.value.remedy == "write times: received, in the step"
-    samples = bag_positions.read_bag(path, Account(topic="/where", stamps="received"))
+    samples = bag_positions.read_bag(path, PositionSource(topic="/where", stamps="received"))
     assert samples.times_ns.tolist() == [BEGAN_NS + 1000]
 
 
@@ -153,19 +153,21 @@ def test_stamps_of_another_clock_are_rejected_unless_times_are_the_recorders(tmp
 )
 def test_topics_without_positions_are_rejected(tmp_path: Path, messages: list[Any], topic: str, message: str) -> None:
     with pytest.raises(EvidenceError, match=message):
-        bag_positions.read_bag(written(tmp_path, messages), Account(topic=topic))
+        bag_positions.read_bag(written(tmp_path, messages), PositionSource(topic=topic))
 
 
 def test_odometry_is_transformed_to_the_robots_place_and_heading(tmp_path: Path) -> None:
     # The robot was driven before the step: its odometry starts 5 m away, turned to the left.
     began = (5.0, 5.0, math.pi / 2)
     messages = [odometry(BEGAN_NS, *began), odometry(BEGAN_NS + S, 5.0, 7.0, math.pi / 2)]
-    odometry_samples = bag_positions.read_bag(written(tmp_path, messages), Account(topic="/where"))
-    account = Account(topic="/where", start=(10.0, 0.0, 0.0), heading_rad=math.pi, began_utc_ns=BEGAN_NS + S // 2)
-    samples = position_files.to_placement_frame(odometry_samples, account)
+    odometry_samples = bag_positions.read_bag(written(tmp_path, messages), PositionSource(topic="/where"))
+    position_source = PositionSource(
+        topic="/where", start=(10.0, 0.0, 0.0), heading_rad=math.pi, began_utc_ns=BEGAN_NS + S // 2
+    )
+    samples = position_files.to_placement_frame(odometry_samples, position_source)
     assert samples.values == pytest.approx(np.array([[10, 0, 0], [8, 0, 0]]), abs=1e-9), "2 m ahead, facing back"
-    late = Account(topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS - 3 * S)
+    late = PositionSource(topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS - 3 * S)
     with pytest.raises(EvidenceError, match=r"/where begins 3\.0 s after the step started"):
         position_files.to_placement_frame(odometry_samples, late)
     with pytest.raises(EvidenceError, match="the robot's initial heading is unknown"):
-        position_files.to_placement_frame(odometry_samples, Account(topic="/where", began_utc_ns=BEGAN_NS))
+        position_files.to_placement_frame(odometry_samples, PositionSource(topic="/where", began_utc_ns=BEGAN_NS))

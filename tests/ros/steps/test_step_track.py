@@ -10,7 +10,7 @@ from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.measure.positions.position_sources import Account
+from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import WGS84
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.ros.steps.track import TrackStep
@@ -89,7 +89,7 @@ def test_odometry_needs_facing() -> None:
     assert not list(track("{sender: {topic: /odom, facing: left}}").refusals(SCENE))
 
 
-def sources_of(step: TrackStep) -> dict[Role, Account]:
+def sources_of(step: TrackStep) -> dict[Role, PositionSource]:
     stored = step._accounts(SCENE, 7, {Role.SENDER: Offset(0.5, 0.1)})
     assert stored.clocks == {Role.SENDER: Offset(0.5, 0.1)}
     return dict(stored.robots)
@@ -109,10 +109,10 @@ def test_stored_source_has_start_and_heading(role: Role, facing: str, heading_ra
     sources = sources_of(track(f"{{{role}: {{topic: /odom, facing: {facing}, gap: 1s, times: received}}}}"))
     place_m = {Role.SENDER: (0.0, 0.0, 0.0), Role.RECEIVER: (10.0, 0.0, 0.0)}
     (other,) = {Role.SENDER, Role.RECEIVER} - {role}
-    assert sources[other] == Account(place=place_m[other])
+    assert sources[other] == PositionSource(place=place_m[other])
     stored_rad = sources[role].heading_rad
     assert stored_rad == pytest.approx(heading_rad)
-    assert sources[role] == Account(
+    assert sources[role] == PositionSource(
         file=f"track_{role}.bag",
         topic="/odom",
         stamps="received",
@@ -126,6 +126,6 @@ def test_stored_source_has_start_and_heading(role: Role, facing: str, heading_ra
 @pytest.mark.motion
 def test_moving_robot_without_source_has_no_position_and_fixed_one_is_stored() -> None:
     sources = sources_of(track("{receiver: {at: {lat: 48.1, lon: 11}}}", MOVE))
-    assert sources == {Role.RECEIVER: Account(place=(48.1, 11.0, None), frame=WGS84)}
+    assert sources == {Role.RECEIVER: PositionSource(place=(48.1, 11.0, None), frame=WGS84)}
     fixed = track("{receiver: {at: {frame: map, x: 1, y: 2.5}}}")
-    assert sources_of(fixed)[Role.RECEIVER] == Account(place=(1.0, 2.5, 0.0), frame="frame map")
+    assert sources_of(fixed)[Role.RECEIVER] == PositionSource(place=(1.0, 2.5, 0.0), frame="frame map")

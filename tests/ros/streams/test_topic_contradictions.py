@@ -331,4 +331,4 @@ def test_constants_equal_those_of_the_agent() -> None:
 def test_every_time_of_a_topic_is_compared_with_the_capture() -> None:
     """Columns added later are included."""
     times = {column.name for column in topic_columns.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
-    assert times | {"topic_deadline_misses"} == topic_captures.SHARE_FIGURES.keys()
+    assert times | {"topic_deadline_misses"} == topic_captures.PROGRAM_DELAY_FIGURES.keys()
