@@ -36,7 +36,7 @@ RATE_HZ: Final = 2.0
 SAMPLES: Final = 16
 PUBLISHER: Final = ("rover-1", "10.42.0.1")
 SUBSCRIBER: Final = ("base", "10.42.0.5")
-WAITS: Final = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"
+MAX_WAIT_SETTING: Final = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"
 """Microseconds for which a publisher with DROP waits for space in its queue, for a fragmented sample; 50,000 by
 default (Zenoh 1.9, DEFAULT_CONFIG.json5)."""
 LONG_WAIT_US: Final = 500_000
@@ -63,8 +63,8 @@ SETTINGS: Final = (
     ImageSetting("plain pair, `DROP`", "", {}),
     ImageSetting("agent, `sensor_data`", "sensor_data", {}),
     ImageSetting("agent, `default` (reliable)", "default", {}),
-    ImageSetting("plain pair, `DROP`, waits 500 ms", "", {WAITS: str(LONG_WAIT_US)}),
-    ImageSetting("agent, `default`, waits 500 ms", "default", {WAITS: str(LONG_WAIT_US)}),
+    ImageSetting("plain pair, `DROP`, waits 500 ms", "", {MAX_WAIT_SETTING: str(LONG_WAIT_US)}),
+    ImageSetting("agent, `default`, waits 500 ms", "default", {MAX_WAIT_SETTING: str(LONG_WAIT_US)}),
     ImageSetting(
         "agent, `default`, tuned (`block_first`)",
         "default",
@@ -136,9 +136,9 @@ class ImageLab:
             }
             ends[verb] = ("-m", "fieldkit.agent", verb, json.dumps(request), f"{verb}.bin")
         self._stream(ends, "up,")
-        return self._logged(PUBLISHER[0], "publish"), self._logged(SUBSCRIBER[0], "subscribe")
+        return self._logged_numbers(PUBLISHER[0], "publish"), self._logged_numbers(SUBSCRIBER[0], "subscribe")
 
-    def _logged(self, robot: str, verb: str) -> list[int]:
+    def _logged_numbers(self, robot: str, verb: str) -> list[int]:
         data = subprocess.run(self.command(robot, "cat", f"{verb}.bin"), check=True, capture_output=True).stdout
         path = self._folder / f"{verb}.bin"
         path.write_bytes(data)

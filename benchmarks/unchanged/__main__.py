@@ -1,4 +1,4 @@
-"""Print whether two commits behave alike; see CONTRIBUTING.md.
+"""Compare the behaviour of two commits; see CONTRIBUTING.md.
 
 `python -m benchmarks.unchanged BASE [HEAD]` exits with 1 on any difference that is not a label.
 """
@@ -27,7 +27,7 @@ PARTS: Final = (*(kind.name.lower() for kind in Class), TESTS, STRUCTURE)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the proof; return 0 if nothing but labels differs, 1 if something does, 2 for a wrong command line."""
+    """Run the comparison; return 0 if only labels differ, 1 if anything else differs, 2 for a wrong command line."""
     arguments = _arguments(argv)
     parts = [part for part in arguments.only or PARTS if part not in arguments.without]
     start_s = time.monotonic()
@@ -58,7 +58,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
         "head", nargs="?", default=trees.WORKING_TREE, help="the commit after the change (default: %(default)s)"
     )
     parser.add_argument(
-        "--only", action="append", choices=PARTS, help="compare this alone; may be given more than once"
+        "--only", action="append", choices=PARTS, help="compare only this class; may be given more than once"
     )
     parser.add_argument("--without", action="append", default=[], choices=PARTS, help="do not compare this")
     parser.add_argument("--labels", type=int, default=40, metavar="N", help="labels that are listed (default: 40)")
@@ -112,7 +112,7 @@ def _print_details(labels: Counter[tuple[str, str]], real: Sequence[str], labels
     for text in real[:_SHOWN]:
         print(f"\nDIFFERENT {text}")
     if len(real) > _SHOWN:
-        print(f"\n... and {len(real) - _SHOWN} differences more")
+        print(f"\n... and {len(real) - _SHOWN} more differences")
 
 
 def _tests(base: Tree, head: Tree) -> bool:

@@ -42,7 +42,7 @@ class Differences:
     """Differences between two outputs.
 
     Attributes:
-        labels: Pairs of words before and after, with their counts.
+        labels: Pairs of words, before and after the change, with their counts.
         real: Differences that are not labels, each with the lines that differ.
     """
 
@@ -226,5 +226,5 @@ def labels(before: str, after: str) -> Iterator[tuple[str, str]]:
 def _diff(before: str, after: str) -> str:
     lines = list(difflib.unified_diff(before.splitlines(), after.splitlines(), n=0, lineterm=""))[2:]
     shown = [line[:300] for line in lines if not line.startswith("@@")]
-    more = [f"... and {len(shown) - _SHOWN_LINES} lines more"] if len(shown) > _SHOWN_LINES else []
+    more = [f"... and {len(shown) - _SHOWN_LINES} more lines"] if len(shown) > _SHOWN_LINES else []
     return "\n".join(shown[:_SHOWN_LINES] + more)

@@ -2,11 +2,10 @@
 
 Runs as a program in an environment in which Python imports that tree: `python -P recorder.py ITEMS RESULTS`, where
 ITEMS is a JSON file of a list of items (`items.Item` as dictionaries) and RESULTS a folder, which is made. With
-`--commands` it prints the commands that the tree has. It imports only the standard library and the public names of
-the
+`--commands` it prints the commands that the tree has. It imports only the standard library and public names of the
 tree: the module `fieldkit`, and `build` and `load_scenario` of `sim_backends.cosim`.
 
-All commands run in this process, one after the other: importing the libraries takes longer than most commands.
+All commands run in this process in sequence, because importing the libraries takes longer than most commands.
 """
 
 import contextlib
@@ -121,7 +120,7 @@ if __name__ == "__main__":
         sys.exit()
     results = Path(sys.argv[2])
     sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115 (open until exit)
-    for number, each in enumerate(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))):
-        record(each, results / str(number))
-        if each["counts_lines"]:
+    for number, item in enumerate(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))):
+        record(item, results / str(number))
+        if item["counts_lines"]:
             (results / "imported_lines.json").write_text(json.dumps(_imported_lines()), encoding="ascii")

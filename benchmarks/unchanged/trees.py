@@ -81,16 +81,16 @@ def _resolved(commit: str) -> str:
         # Makes a commit of the changed files without changing the work tree; prints nothing without changes.
         snapshot = subprocess.run(("git", "stash", "create"), cwd=ROOT, check=True, capture_output=True, text=True)
         commit = snapshot.stdout.strip() or "HEAD"
-    done = subprocess.run(
+    completed = subprocess.run(
         ("git", "rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}"),
         cwd=ROOT,
         check=False,
         capture_output=True,
         text=True,
     )
-    if done.returncode != 0:
+    if completed.returncode != 0:
         raise UnknownCommitError(f"git cannot resolve {commit!r} to a commit")
-    return done.stdout.strip()
+    return completed.stdout.strip()
 
 
 def _declare_entry_points(tree: Tree) -> None:

@@ -12,7 +12,7 @@ from typing import Callable, Iterator
 
 from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.dialect import ARM
-from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.mavlink_frames import ACCEPTED
 from fieldkit.agent.px4 import Px4
 
@@ -133,7 +133,7 @@ def landing_marker(path: str) -> Iterator[None]:
     """Create a marker file and remove it after the body; errors are ignored.
 
     Args:
-        path: The file, see `FlightPlan.landing_marker`; empty for none.
+        path: The file, see `FlightPlan.landing_marker`; empty to create none.
     """
     if path:
         with suppress(OSError):

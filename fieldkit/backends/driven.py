@@ -6,7 +6,7 @@ from fieldkit.backends.protocols import Robot
 
 
 def topic_conflict(robot: Robot, others: Iterable[Robot]) -> str | None:
-    """Return why a robot with `drive` in its profile cannot be driven next to other robots; None if it can.
+    """Return the reason why a robot with `drive` in its profile cannot be driven next to others; None if it can.
 
     Robots that share a ROS master or a ROS 2 domain receive each other's topics. No other robot may subscribe to the
     robot's velocity topic or publish its odometry topic.

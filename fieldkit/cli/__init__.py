@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "_ARGCOMPLETE" in os.environ:  # a shell requests completions
         from fieldkit.cli.commands import completion  # noqa: PLC0415 (needed only for completion)
 
-        completion.answer(parser())
+        completion.write_completions(parser())
     top = parser()
     with hints.completing(top) as options:
         return _run_guarded(top, argv, options)

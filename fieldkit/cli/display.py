@@ -1,4 +1,4 @@
-"""Show events, tables, findings and errors as a live line, as plain lines or as JSON. The only user of rich."""
+"""Show events, tables, findings and errors: live, as plain lines or as JSON. Only this module imports rich."""
 
 import io
 import os
@@ -67,12 +67,12 @@ def _console(*, stderr: bool = False) -> Console:
 
 def show_error(text: str) -> None:
     """Print an error with its remedy on standard error."""
-    _console(stderr=True).print(_harmless(Text.assemble(("error: ", "bold red"), completed(text))))
+    _console(stderr=True).print(_sanitized(Text.assemble(("error: ", "bold red"), completed(text))))
 
 
 def show_note(text: str) -> None:
     """Print a note about the output on standard error."""
-    _console(stderr=True).print(_harmless(Text.assemble(("note: ", "yellow"), completed(text))))
+    _console(stderr=True).print(_sanitized(Text.assemble(("note: ", "yellow"), completed(text))))
 
 
 def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
@@ -157,7 +157,7 @@ def _print_blocks(cells: Sequence[Sequence[str]], title: str, console: Console) 
 
 
 def _fold_words(words: Sequence[str], width: int) -> list[str]:
-    """Return lines of whole words. A word that is longer than `width` gets its own line and is not broken."""
+    """Return lines of whole words. A word that is longer than `width` is put on a separate line and is not broken."""
     lines = [""]
     for word in words:
         longer = f"{lines[-1]} {word}".lstrip()
@@ -193,12 +193,12 @@ def show_findings(findings: Sequence[Finding]) -> None:
             grid.add_column(width=6, justify="right")
             grid.add_column(width=width)
             grid.add_column(overflow="fold")
-            grid.add_row(Text(word, style=style), Text(finding.check), _harmless(Text(finding.detail)))
+            grid.add_row(Text(word, style=style), Text(finding.check), _sanitized(Text(finding.detail)))
             with console.capture() as shown:
                 console.print(grid, soft_wrap=False)
             print("\n".join(line.rstrip() for line in shown.get().splitlines()))
             if finding.remedy:  # not folded, so that it can be copied
-                console.print(_harmless(Text.assemble("        ", (completed(finding.remedy), "cyan"))))
+                console.print(_sanitized(Text.assemble("        ", (completed(finding.remedy), "cyan"))))
     counts = {verdict: sum(finding.status is verdict for finding in findings) for verdict in Verdict}
     names = {Verdict.OK: "ok", Verdict.WARN: "warned", Verdict.FAIL: "failed"}
     worst = max(findings, key=lambda item: list(Verdict).index(item.status)).status
@@ -272,7 +272,7 @@ def _serialize(sink: Sink) -> Sink:
 def shown(event: Event, width: int | None = None) -> Text | None:
     """Return the text of an event for people, or None if only the live line shows it. Raises as `words_of`."""
     parts = words_of(event, width)
-    return _harmless(Text.assemble(*((completed(text), style) for text, style in parts))) if parts else None
+    return _sanitized(Text.assemble(*((completed(text), style) for text, style in parts))) if parts else None
 
 
 def words_of(event: Event, width: int | None = None) -> Words:
@@ -356,15 +356,15 @@ def _fold_below(text: str, width: int) -> str:
     return indent + indent.join(textwrap.wrap(text, max(width - _INDENT, _INDENT)))
 
 
-def _fold_after(text: str, begin: int, width: int) -> str:
-    """Return a text that starts in column `begin` and continues on indented lines."""
+def _fold_after(text: str, start_column: int, width: int) -> str:
+    """Return a text that starts in column `start_column` and continues on indented lines."""
     lines = textwrap.wrap(
-        text, max(width, begin + _INDENT), initial_indent=" " * begin, subsequent_indent=" " * _INDENT
+        text, max(width, start_column + _INDENT), initial_indent=" " * start_column, subsequent_indent=" " * _INDENT
     )
-    return "\n".join(lines)[begin:]
+    return "\n".join(lines)[start_column:]
 
 
-def _harmless(text: Text) -> Text:
+def _sanitized(text: Text) -> Text:
     text.plain = sanitized(text.plain)
     return text
 
@@ -381,11 +381,11 @@ def _print_json(event: Event) -> None:
 
 
 class _LiveLine:
-    """The line at the bottom of the terminal."""
+    """The line at the bottom of the terminal that shows the progress."""
 
     def __init__(self) -> None:
         self.progress = ProgressBar()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         text = Text.assemble(*self.progress.words(options.max_width - 1), no_wrap=True, overflow="crop")
-        yield _harmless(text)
+        yield _sanitized(text)

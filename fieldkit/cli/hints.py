@@ -13,9 +13,9 @@ from typing import Final
 
 from fieldkit.cli.parser import Parser
 
-_CARRIED: Final = ("site", "backend", "topology", "protocol", "repeats", "record")
+_REPEATED_OPTIONS: Final = ("site", "backend", "topology", "protocol", "repeats", "record")
 """Options that select robots and what is measured on them, by their names in the namespace of argparse."""
-_CARRIED_FLAGS: Final = ("allow_motion",)
+_REPEATED_FLAGS: Final = ("allow_motion",)
 """Flags that a trial needs again when it is resumed."""
 
 # Words in lower case: a command of fieldkit, and perhaps its subcommand, such as `lab up`.
@@ -35,11 +35,11 @@ class CliOptions:
 
     def read(self, arguments: argparse.Namespace) -> None:
         """Store the options to repeat from parsed arguments."""
-        for name in _CARRIED:
+        for name in _REPEATED_OPTIONS:
             value = getattr(arguments, name, None)
             values = value if isinstance(value, list) else [] if value is None else [value]
             self._options += [(f"--{name}", str(item)) for item in values]
-        for name in _CARRIED_FLAGS:
+        for name in _REPEATED_FLAGS:
             if getattr(arguments, name, False):
                 self._options.append((f"--{name.replace('_', '-')}", ""))
 
@@ -58,8 +58,8 @@ class CliOptions:
         ]
         if not words or not missing:
             return match[0]
-        begin = f"fieldkit {' '.join(words)}"
-        return f"{begin} {' '.join(missing)}{match[0].removeprefix(begin)}"
+        command = f"fieldkit {' '.join(words)}"
+        return f"{command} {' '.join(missing)}{match[0].removeprefix(command)}"
 
 
 _options: ContextVar[CliOptions | None] = ContextVar("options", default=None)

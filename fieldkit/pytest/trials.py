@@ -107,11 +107,11 @@ def _load_checked(outcome: Outcome) -> Trials:
             where=str(outcome.folder),
             remedy="see its log; to find what the robots lack: fieldkit check",
         )
-    _demand_expected(outcome.judgements)
+    _require_expected(outcome.judgements)
     return load(outcome.folder)
 
 
-def _demand_expected(judgements: Sequence[Judgement]) -> None:
+def _require_expected(judgements: Sequence[Judgement]) -> None:
     __tracebackhide__ = True
     unmet = [
         " ".join(filter(None, wording.judgement_texts(judgement))) for judgement in judgements if not judgement.holds

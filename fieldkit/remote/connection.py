@@ -12,7 +12,7 @@ from fieldkit.core.units import format_duration
 from fieldkit.remote.identity import Address, Credentials
 from fieldkit.remote.link import BROKEN, Connect, Link, LoginRefusedError, Timing
 from fieldkit.remote.login import closed_error, log_in
-from fieldkit.remote.standing import ShellPool
+from fieldkit.remote.persistent_shells import ShellPool
 
 T = TypeVar("T")
 
@@ -57,13 +57,13 @@ class Connection:
         self._timing = timing
         self._connecting = threading.Lock()  # held by the thread that logs in
         self._lock = threading.Lock()  # of the attributes below; no thread waits while it holds this lock
-        self._ended = threading.Event()  # set and replaced by `close`; each wait keeps the event from its start
+        self._ended = threading.Event()  # `close` sets and replaces it; each wait uses the event of its start
         self._link: Link | None = None
         self._was_up = False
         self._lost_at_s: float | None = None
         self._reopened_at_s: float | None = None
         self._pause_s, self._suppress_notices = timing.pause_s, False
-        self._silences: list[Deadline] = []
+        self._silent_periods: list[Deadline] = []
 
     @property
     def ended(self) -> threading.Event:
@@ -124,9 +124,9 @@ class Connection:
     def _wait_for_link(
         self, error: LinkLostError | LoginRefusedError, final: Deadline, ended: threading.Event
     ) -> None:
-        """Return when the link is open again; raise the last error after the patience, or at `final`.
+        """Return when the link is open again; raise the last error after `patience_s`, or at `final`.
 
-        A robot that refuses the login although it accepted it before is treated as one that boots.
+        A robot that refuses the login although it accepted it before is treated as a robot that boots.
         """
         with self._lock:
             if self._link is not None and self._link.alive:
@@ -223,18 +223,18 @@ class Connection:
 
     @contextmanager
     def _block_opening(self, seconds: float) -> Iterator[Deadline]:
-        """Prevent that links, channels or shells are opened during the body, at most for `seconds`.
+        """Allow no thread to open a link, channel or shell during the body, at most for `seconds`.
 
         Several steps may measure at the same time; the latest end applies.
         """
         until = Deadline.after(seconds)
         with self._lock:
-            self._silences.append(until)
+            self._silent_periods.append(until)
         try:
             yield until
         finally:
             with self._lock:
-                self._silences = [silence for silence in self._silences if silence is not until]
+                self._silent_periods = [silence for silence in self._silent_periods if silence is not until]
 
     def _extend_timeout(self, link: Link | None, seconds: float) -> None:
         if link is not None:
@@ -242,8 +242,8 @@ class Connection:
                 link.extend_timeout(seconds)
 
     def _silence_s(self) -> float:
-        """Return the time for which no link, channel or shell may be opened; 0 if they may."""
-        return max((silence.remaining_s for silence in self._silences), default=0.0)
+        """Return the remaining time in which no link, channel or shell may be opened; 0 if they may be opened."""
+        return max((silence.remaining_s for silence in self._silent_periods), default=0.0)
 
     def close(self) -> None:
         """Close the link, and end all waits for it in other threads."""
@@ -251,6 +251,6 @@ class Connection:
             self._ended.set()
             self._ended = threading.Event()
             link, self._link = self._link, None
-            self._was_up, self._lost_at_s, self._silences = False, None, []
+            self._was_up, self._lost_at_s, self._silent_periods = False, None, []
         if link is not None:
             link.close()

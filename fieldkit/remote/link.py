@@ -154,13 +154,13 @@ class Link:
         timing: Timeouts of the connection.
 
     Attributes:
-        doing: The next action of the server, for messages: `FIRST`, or for example `send its SSH banner`.
+        awaited_action: The next action of the server, for messages: `FIRST_ACTION`, or `send its SSH banner`.
     """
 
-    FIRST: Final = "accept the connection"
+    FIRST_ACTION: Final = "accept the connection"
 
     def __init__(self, connect: Connect, timing: Timing) -> None:
-        self.doing = self.FIRST
+        self.awaited_action = self.FIRST_ACTION
         self._connect = connect
         self._timing = timing
         self._lock = threading.Lock()
@@ -192,16 +192,16 @@ class Link:
                 stream.close()
         # The caller has a deadline; these timeouts must only be longer.
         transport.banner_timeout = transport.auth_timeout = 2 * self._timing.connect_s
-        kinds = sorted(_SIGNATURES, key=lambda key_type: key_type != kind)
+        key_types = sorted(_SIGNATURES, key=lambda key_type: key_type != kind)
         options = transport.get_security_options()
-        options.key_types = [name for key_type in kinds for name in _SIGNATURES[key_type]]
+        options.key_types = [name for key_type in key_types for name in _SIGNATURES[key_type]]
         options.ciphers, options.digests = _without_weak(options.ciphers), _without_weak(options.digests)
-        self.doing = "send its SSH banner"
+        self.awaited_action = "send its SSH banner"
         key_exchanged = threading.Event()
         transport.start_client(event=key_exchanged)
         while not key_exchanged.wait(0.02):
             if transport.remote_version:
-                self.doing = "agree on keys"
+                self.awaited_action = "agree on keys"
         if not transport.is_active():
             error = transport.get_exception() or EOFError("it closed the connection")
             if isinstance(error, paramiko.ssh_exception.IncompatiblePeer):
@@ -227,10 +227,10 @@ class Link:
                 where=address.robot,
                 remedy=f"continue only if it was reinstalled: fieldkit enroll {address.robot} --replace",
             )
-        self.doing = "answer the login"
+        self.awaited_action = "answer the login"
         _, transport = self._connected()
         count = 0
-        for attempt in _attempts(transport, address, credentials):
+        for attempt in _login_attempts(transport, address, credentials):
             with contextlib.suppress(paramiko.AuthenticationException):
                 attempt()
             if transport.is_authenticated():
@@ -241,7 +241,7 @@ class Link:
             count += 1
         if not count:
             raise EOFError("it closed the connection")
-        raise _refused(address, credentials, count)
+        raise _refused_error(address, credentials, count)
 
     def begin(self, command: str, deadline: Deadline, ended: threading.Event) -> Channel:
         """Start a command, and return its channel when the server has accepted it.
@@ -370,7 +370,7 @@ def _without_weak(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _enable_keepalive(stream: socket.socket, timing: Timing) -> None:
-    """Let the kernel close the connection if the peer does not answer, also while no data is sent."""
+    """Make the kernel close the connection if the peer does not answer, also while no data is sent."""
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     _set_timeout(stream, timing.dead_s)
     stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -383,7 +383,7 @@ def _set_timeout(stream: socket.socket, seconds: float) -> None:
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(seconds * 1000))
 
 
-def _attempts(
+def _login_attempts(
     transport: paramiko.Transport, address: Address, credentials: Credentials
 ) -> Iterator[Callable[[], object]]:
     """Yield a function for each login method."""
@@ -395,11 +395,11 @@ def _attempts(
         yield lambda key=key: transport.auth_publickey(user, key)  # type: ignore[misc]
 
 
-def _refused(address: Address, credentials: Credentials, count: int) -> LoginRefusedError:
+def _refused_error(address: Address, credentials: Credentials, count: int) -> LoginRefusedError:
     if credentials.password is not None:
-        method, remedy = "the password", f"ssh {address.by_hand}, and log in with that password"
+        method, remedy = "the password", f"ssh {address.ssh_arguments}, and log in with that password"
     else:
-        method, remedy = format_count(count, "key"), f"ssh-copy-id {address.by_hand}"
+        method, remedy = format_count(count, "key"), f"ssh-copy-id {address.ssh_arguments}"
     return LoginRefusedError(
         f"refused the login of {address.user!r} with {method}",
         where=address.robot,

@@ -16,10 +16,10 @@ REBOOTED: Final = "the robot rebooted during the repeat"
 
 
 def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
-    """Yield the problems of the robots that make an attempt void, and the sections that are missing in their notes.
+    """Yield the robots' problems that make an attempt void, and the sections that are missing in their state files.
 
     A section that a robot cannot provide is missing before and after; if it is missing in one of them only, it was
-    lost. Of a robot that a step restarts only the jobs are judged, because its clock starts again.
+    lost. If a step restarts a robot, only its jobs are judged, because its clock starts again.
     """
     restarted_roles = restarted(procedure)
     for role in sorted(procedure.roles()):

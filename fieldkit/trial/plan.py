@@ -140,15 +140,17 @@ class Plan(Strict):
         return sample_size.unmet_requirements(self.procedure.expectations, self.procedure.figures, self.repeats)
 
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
-        """Return descriptions of what the testbed does in one repeat besides running the commands."""
+        """Return the actions of the testbed in one repeat in addition to the commands, one sentence each."""
         on_abort = self.procedure.on_abort.items()
         drones = (f"if it is aborted: {self.cast[role].name} is commanded to {action}" for role, action in on_abort)
         return (*drones, *(line for entry in self.procedure.steps for line in entry.step.dry_run_notes(scene)))
 
     def abort_notes(self, scene: Scene) -> tuple[str, ...]:
-        """Return descriptions of what each robot that moves without a person does if a repeat is aborted."""
-        watched = (role for role in self.procedure.on_abort if role not in self.procedure.moved())
-        commands = (f"{self.cast[role].name} is commanded to {self.procedure.on_abort[role]}" for role in watched)
+        """Return the actions on abort of each robot that moves without a person, one sentence each."""
+        guarded_roles = (role for role in self.procedure.on_abort if role not in self.procedure.moved())
+        commands = (
+            f"{self.cast[role].name} is commanded to {self.procedure.on_abort[role]}" for role in guarded_roles
+        )
         return (*commands, *(line for entry in self.procedure.steps for line in entry.step.abort_notes(scene)))
 
     def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:

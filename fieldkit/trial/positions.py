@@ -60,9 +60,9 @@ def set_positions(
     """
     plan = store.read_plan(folder)
     for role, source in sources.items():
-        _demand_role(plan, role)
+        _require_role(plan, role)
         if isinstance(source, Path):
-            _demand_file(source)
+            _require_file(source)
             position_files.read_file(source)
     # Position files that were added before are replaced, so their changes do not matter.
     changes = {
@@ -71,7 +71,7 @@ def set_positions(
     if changes:
         problem = f"the evidence is not what was measured: {manifest.summarize(changes)}"
         raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
-    with journal.claimed(folder):
+    with journal.locked(folder):
         accounts_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
         if accounts_by_role:
             text = position_sources.text(Accounts(accounts_by_role, heights=heights))
@@ -84,13 +84,13 @@ def set_positions(
     return rebuild(folder)
 
 
-def _demand_role(plan: Plan, role: Role) -> None:
+def _require_role(plan: Plan, role: Role) -> None:
     if role not in plan.cast:
         remedy = did_you_mean(role, plan.cast, f"roles of the trial: {', '.join(plan.cast)}")
         raise ConfigurationError(f"the trial has no role {role}", remedy=remedy)
 
 
-def _demand_file(path: Path) -> None:
+def _require_file(path: Path) -> None:
     if not path.is_file():
         raise ConfigurationError(
             "there is no such file", where=str(path), remedy="name GPX, CSV, or a place: 48.1,11.5"

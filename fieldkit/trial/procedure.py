@@ -127,17 +127,17 @@ class Procedure(catalog.Named):
     def _can_be_measured(self) -> "Procedure":
         """Reject steps that would be measured incorrectly or not at all."""
         robot_files = (name(role) for role in self.roles() for name in (host.before, host.after, link_samples.file))
-        claimed, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
+        used_resources, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
         filled = set[str]()
         for placed in self.walk():
             step = placed.step
             before = [other.step for other in earlier if not placed.runs_beside(other)]
             if why := step.placement_error(before, placed.within):
                 raise schema.validation_error(why, *placed.at)
-            for claim in step.exclusive_resources():
-                if (step.prefix, claim) in claimed:
-                    raise schema.validation_error(_claimed_twice(step, claim), *placed.at)
-                claimed.add((step.prefix, claim))
+            for resource in step.exclusive_resources():
+                if (step.prefix, resource) in used_resources:
+                    raise schema.validation_error(_duplicate_resource_message(step, resource), *placed.at)
+                used_resources.add((step.prefix, resource))
             for name in step.files():
                 if why := _file_conflict(step, name, files):
                     raise schema.validation_error(why, *placed.at)
@@ -145,7 +145,7 @@ class Procedure(catalog.Named):
             if why := next(filter(None, map(placed.port_conflict, earlier)), None):
                 raise schema.validation_error(why, *placed.at, "port")
             for column in columns.of_step(step):
-                if why := columns.clash(column, filled):
+                if why := columns.column_conflict(column, filled):
                     raise schema.validation_error(why, *placed.at)
                 filled.add(column.name)
             earlier.append(placed)
@@ -284,11 +284,13 @@ def _file_conflict(step: Step, name: str, files: Set[str]) -> str | None:
     return f"there is already a file {name}; give it, or its step, another name" if name in files else None
 
 
-def _claimed_twice(step: Step, claim: str) -> str:
-    """Return the message for two steps that claim the same exclusive resource under one name."""
+def _duplicate_resource_message(step: Step, resource: str) -> str:
+    """Return the message for two steps that use the same exclusive resource under one name."""
     if step.prefix:
-        return f"{claim} named {step.prefix} is defined twice; give one another name, inside for: with its variable"
-    return f"{claim} is defined twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
+        return (
+            f"{resource} named {step.prefix} is defined twice; give one another name, inside for: with its variable"
+        )
+    return f"{resource} is defined twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
 
 
 def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[PlacedStep]:

@@ -169,13 +169,12 @@ def assess_candidate(
 
 def _reason(judgement: Judgement) -> str:
     """Return the reason why a judgement does not hold, with the measured values."""
-    unknown, demand = judgement.why or "not shown", judgement.expectation.text
+    unknown, expectation_text = judgement.why or "not shown", judgement.expectation.text
     if judgement.estimate is None or judgement.met is None:
-        return f"{demand}: {unknown}"
+        return f"{expectation_text}: {unknown}"
     why = f"; {judgement.why}" if judgement.why else ""
-    return (
-        f"{demand} in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}{why}"
-    )
+    figures = f"in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}"
+    return f"{expectation_text} {figures}{why}"
 
 
 def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:

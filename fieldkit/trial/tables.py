@@ -65,8 +65,8 @@ def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str
                     remedy="combine only trials in which it is the same",
                 )
             if kept.bounds != column.bounds:
-                (low, high), (least, most) = kept.possible, column.possible
-                merged[column.name] = first, replace(kept, bounds=(min(low, least), max(high, most)))
+                (low, high), (other_low, other_high) = kept.possible, column.possible
+                merged[column.name] = first, replace(kept, bounds=(min(low, other_low), max(high, other_high)))
     return {name: column for name, (_, column) in merged.items()}
 
 

@@ -222,7 +222,7 @@ def test_stop_lands_a_drone_after_fieldkit_was_killed(outside: Outside) -> None:
     stopped = fieldkit(outside.folder, "stop", "--all")
     assert stopped.code == 0, stopped.err
     assert sorted(stopped.out.splitlines()) == [
-        "copter-1: nothing of fieldkit moves it; nothing was sent to it",
+        "copter-1: no program of fieldkit moves it; nothing was sent to it",
         "duckiedrone-1: coming down (land)",
     ]
     assert_landed(outside, Role.RECEIVER, "land: the job was ended")

@@ -264,7 +264,7 @@ def test_server_with_weak_ciphers_only_gets_no_login(
         return transport
 
     shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
-    with pytest.raises(RobotError, match=f"cannot be trusted with a login: {said}") as caught:
+    with pytest.raises(RobotError, match=f"is not secure enough for a login: {said}") as caught:
         shell.run(("true",), deadline=soon())
     assert caught.value.remedy.startswith("update it")
 

@@ -16,7 +16,7 @@ from fieldkit.agent.flight_plan import LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING, LivenessFile
 from fieldkit.agent.flying.loop import GAP_S, HEARTBEAT_S, RATE_HZ
-from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.landing import (
     CANCELLED,
     LEASE_EXPIRED,
@@ -67,7 +67,7 @@ class FlightGuard:
             log_line("ready")
             self._watch()
         except FlightError as error:
-            self._give_up(error)
+            self._abort_flight(error)
             raise
         finally:
             self._state = ENDED
@@ -129,7 +129,7 @@ class FlightGuard:
         is_program = drone.dialect is not None and drone.dialect.is_program_controlled(drone.mode)
         return is_program or drone.mode == self._first_mode
 
-    def _give_up(self, error: FlightError) -> None:
+    def _abort_flight(self, error: FlightError) -> None:
         """Land the drone if the guard may control it; raises as `bring_down`, with an alarm in the log."""
         drone = self._drone
         if not drone.armed or not (self._pilot_flies if self._liveness is not None else self._may_command()):

@@ -19,7 +19,7 @@ PILOT, GUARD = 0, 1
 IDLE, FLYING, LANDING, ENDED = 0, 1, 2, 3
 """State of a program: it waits, flies the drone, lands it, or has ended."""
 
-SILENT_S = 0.8
+SILENCE_TIMEOUT_S = 0.8
 """A program whose counter does not change for this time has stopped."""
 _MAX_POLL_S = 0.2
 """Maximum time that one poll adds to the silence: delays of the polling program must not count."""
@@ -37,13 +37,13 @@ class LifeEntry(NamedTuple):
     Attributes:
         pid: Its process id.
         started: Start time of the process, in clock ticks since boot.
-        turns: Counter of its iterations.
+        iterations: Counter of its iterations.
         state: Its state: `IDLE`, `FLYING`, `LANDING` or `ENDED`.
     """
 
     pid: int
     started: int
-    turns: int
+    iterations: int
     state: int
 
 
@@ -108,7 +108,7 @@ class LivenessFile:
             return "has ended"
         if state in _SUSPENDED_STATES:
             return "is suspended"
-        return f"has not run for {self._silent_s:.1f} s" if self._silent_s > SILENT_S else ""
+        return f"has not run for {self._silent_s:.1f} s" if self._silent_s > SILENCE_TIMEOUT_S else ""
 
     def kill_other(self) -> None:
         """Kill the other program, so that it cannot continue later; never another process that reuses its pid."""

@@ -25,7 +25,7 @@ _MAX_QUEUED_BYTES = 4096
 class FlightDevice(Protocol):
     """An open connection to an autopilot."""
 
-    whole: bool
+    has_whole_frames: bool
     """Whether each read returns complete frames."""
 
     def fileno(self) -> int:
@@ -61,7 +61,7 @@ def check(connection: str) -> None:
     kind, _, rest = connection.partition(":")
     if kind.startswith("/"):
         if not rest.isdigit() or not hasattr(termios, f"B{int(rest)}"):
-            raise ValueError(f"{kind} has no rate of {rest} baud")
+            raise ValueError(f"{kind} does not support {rest} baud")
         return
     host, _, port = rest.rpartition(":")
     if kind not in ("tcp", "udpout", "udpin"):
@@ -98,7 +98,7 @@ class UdpDevice:
         listens: Whether to wait for the first datagram, whose sender becomes the peer.
     """
 
-    whole = True
+    has_whole_frames = True
 
     def __init__(self, address: tuple[str, int], *, listens: bool) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -148,7 +148,7 @@ class StreamDevice:
         descriptor: The file descriptor of the stream; it is closed with the device.
     """
 
-    whole = False
+    has_whole_frames = False
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
         name, backend = cli_options.backend(arguments, sink)
         planned, document = plan.make_plan(arguments.file, name)
         folder = arguments.out / f"campaign_{planned.campaign.name}"
-        started = plan.begun(folder, planned, document)
+        started = plan.started_plan(folder, planned, document)
         campaign = CampaignRun(started or planned, CampaignJournal(folder), backend, sink, failed=arguments.failed)
         campaign.announce()
         if arguments.dry_run:
@@ -53,17 +53,18 @@ def run(arguments: argparse.Namespace) -> int:
         with cli_options.operator(arguments, sink) as operator:
             outcome = campaign.run(operator, stop)
     results.write_junit(arguments, outcome.folders)
-    return _exit_code(outcome, arguments.file, folder)
+    return _report_outcome(outcome, arguments.file, folder)
 
 
-def _exit_code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
+def _report_outcome(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
+    """Print what is not done or not shown, with remedies, and return the exit code."""
     if outcome.failed:
         failed = format_count(outcome.failed, "repeat")
         command = shell_command("fieldkit", "campaign", file, "--failed")
         remedy = f"correct what the reasons name, then add --failed: {command}"
         show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}\n  remedy: {remedy}")
-    if outcome.left:
-        names = ", ".join(map(str, outcome.left))
+    if outcome.remaining:
+        names = ", ".join(map(str, outcome.remaining))
         show_error(f"skipped: {names}\n  remedy: run the same command again for the skipped trials")
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
@@ -72,4 +73,4 @@ def _exit_code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
         )
     if outcome.failed:
         return EvidenceError.exit_code
-    return FieldkitError.exit_code if outcome.left or outcome.unmet else 0
+    return FieldkitError.exit_code if outcome.remaining or outcome.unmet else 0

@@ -26,7 +26,7 @@ def add(parser: Parser) -> None:
         "procedure", metavar="PROCEDURE", nargs="?", default="los", help="name of a procedure (default: los)"
     )
     shared.add_site(parser)
-    shared.add_changes(parser)
+    shared.add_overrides(parser)
     shared.add_json(parser)
     parser.set_defaults(run=run)
 

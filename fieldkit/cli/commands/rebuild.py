@@ -22,9 +22,9 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.trial.rebuild import rebuild
 
     rebuilt = rebuild(arguments.trial)
-    if not rebuilt.is_summed:
+    if not rebuilt.has_manifest:
         show_note(f"{arguments.trial}: there is no manifest to verify its evidence with")
-    if left_out := results.show_summary(rebuilt.cells, every=arguments.all, expected=rebuilt.expected):
+    if left_out := results.show_summary(rebuilt.cells, show_all=arguments.all, expected=rebuilt.expected):
         prose(f"{results.more_rows_note(left_out)}: add --all")
     print_text(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
     return 0

@@ -1,7 +1,8 @@
 """Bridges of a session: `fieldkit bridge` on each robot whose profile requests it (`ros: bridge:`).
 
 A bridge runs from before the first check until the end of the session, so preflight, people and every trial of the
-session use the robot in the same state. It is a normal job: `fieldkit abort` ends it, and a resumed session joins it.
+session use the robot in the same state. It is a normal job: `fieldkit abort` ends it, and a resumed session uses the
+running bridge.
 """
 
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ LIMIT_S: Final = 12 * 3600.0
 _MASTER_S: Final = 5
 _READY_S: Final = 40
 """A small computer needs seconds to load Python, rospy and a middleware."""
-_INSTALLS_S: Final = 30.0
+_INSTALL_TIMEOUT_S: Final = 30.0
 _GRACE_S: Final = 5
 _LOG: Final = "bridge.log"
 
@@ -40,8 +41,8 @@ def folder_of(session: str) -> str:
 def jobs_of(cast: Cast, session: str) -> dict[Role, Job]:
     """Return the bridge job of each robot whose profile requests one.
 
-    Of robots with a common ROS master only the first gets a bridge, which forwards the messages of all of them; a
-    second one would publish each message twice.
+    If robots share a ROS master, only the first gets a bridge, which forwards the messages of all of them; a second
+    bridge would publish each message twice.
     """
     bridges: dict[Role, Job] = {}
     masters: set[str] = set()
@@ -105,7 +106,7 @@ def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator
 
 
 def _start(robot: Robot, shell: Shell, role: Role, job: Job) -> None:
-    jobs.install(shell, Deadline.after(_INSTALLS_S))
+    jobs.install(shell, Deadline.after(_INSTALL_TIMEOUT_S))
     evidence.begin(shell, job.folder, role, robot.profile.radio.interface)
     try:
         jobs.start(shell, job)
@@ -118,14 +119,14 @@ def _start(robot: Robot, shell: Shell, role: Role, job: Job) -> None:
 
 
 def _end(shell: Shell, job: Job) -> str:
-    """Stop a bridge; return a description of what went wrong, empty if nothing did."""
+    """Stop a bridge; return a description of the problem, or an empty text."""
     try:
-        runs = any(f"{job.folder}/" in line for line in jobs.list_running(shell, Deadline.after(jobs.REPLY_S)))
+        was_running = any(f"{job.folder}/" in line for line in jobs.list_running(shell, Deadline.after(jobs.REPLY_S)))
         code = jobs.stop(shell, job, grace_s=_GRACE_S)
         evidence.discard(shell, job.folder.split("/")[-2])
     except TestbedLostError:
         return ""  # it exited with its robot
     except FieldkitError as error:
         return f"was not stopped: {error.what}"
-    early = "" if runs else "early, "
+    early = "" if was_running else "early, "
     return f"exited {early}with exit code {code}" if code or early else ""

@@ -126,7 +126,7 @@ def holder(shell: Shell) -> LockState | None:
     return LockState(Holder(token, who, what), float(match["left"]))
 
 
-def demand(shell: Shell, token: str) -> None:
+def require_lock(shell: Shell, token: str) -> None:
     """Check that a robot with the job script is still locked by this trial.
 
     Raises:
@@ -149,20 +149,20 @@ def _unlock(shell: Shell, holder: Holder, sink: Sink) -> None:
         sink(Note(f"{shell.robot} stays locked until its lock expires: {error.what}"))
 
 
-def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> Mapping[str, Aborted]:
+def abort(robots: Mapping[str, Shell | FieldkitError], user: str) -> Mapping[str, Aborted]:
     """Break the lock of every robot and end all of its jobs, of any trial; return the result for each robot.
 
     Args:
         robots: The robots, from `Backend.persistent_shells`.
-        who: Name that is shown to the users whose trials end, see `runtime.user_at_host`.
+        user: Name that is shown to the users whose trials end, see `runtime.user_at_host`.
     """
-    return dict(zip(robots, run_parallel(lambda name: _abort(robots[name], who), robots), strict=True))
+    return dict(zip(robots, run_parallel(lambda name: _abort(robots[name], user), robots), strict=True))
 
 
-def _abort(robot: Shell | FieldkitError, who: str) -> Aborted:
+def _abort(robot: Shell | FieldkitError, user: str) -> Aborted:
     if isinstance(robot, FieldkitError):
         return Aborted(error=robot)
     try:
-        return jobs.abort(robot, word(who), Deadline.after(4 * REPLY_S))
+        return jobs.abort(robot, word(user), Deadline.after(4 * REPLY_S))
     except FieldkitError as error:
         return Aborted(error=error)

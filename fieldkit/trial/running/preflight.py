@@ -47,7 +47,7 @@ def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
             report.fail(_CONNECTION, error.what, error.remedy)
         return report
 
-    demand(_joined(run_parallel(log_in, cast)))
+    require_passed(_joined(run_parallel(log_in, cast)))
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,11 @@ def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[R
     for finding in findings:
         if finding.status is not Verdict.OK:
             sink(finding)
-    demand(findings)
+    require_passed(findings)
     return checked.variants
 
 
-def demand(findings: Sequence[Finding]) -> None:
+def require_passed(findings: Sequence[Finding]) -> None:
     """Raise an error if a check failed.
 
     Raises:
@@ -154,9 +154,9 @@ def _check(
         report.fail(stage, error.what, error.remedy)
 
 
-def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
+def _judge_jobs(plan: Plan, running_jobs: Sequence[str], report: Report) -> None:
     own_folders = (f"/{plan.trial}/", f"/{bridges.folder_of(plan.session)}/")
-    others = [line for line in left if not any(folder in line for folder in own_folders)]
+    others = [line for line in running_jobs if not any(folder in line for folder in own_folders)]
     for line in others:
         report.fail("jobs", f"a job of an earlier trial runs: {line}", "fieldkit abort")
     if not others:

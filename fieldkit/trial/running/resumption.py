@@ -36,7 +36,7 @@ def resumable(folder: Path) -> Plan:
     return plan
 
 
-def demand_backend(plan: Plan, name: str, folder: Path) -> None:
+def require_backend(plan: Plan, name: str, folder: Path) -> None:
     """Raise an error if a trial would be resumed on another backend.
 
     Args:
@@ -55,7 +55,7 @@ def demand_backend(plan: Plan, name: str, folder: Path) -> None:
         )
 
 
-def demand_cast(plan: Plan, cast: Cast) -> None:
+def require_cast(plan: Plan, cast: Cast) -> None:
     """Raise an error if a trial would be resumed with other robots.
 
     Raises:

@@ -25,7 +25,7 @@ from fieldkit.core.text import encodable
 from fieldkit.core.threads import run_parallel
 from fieldkit.measure.evidence import link_samples, oracle_delays, track
 from fieldkit.remote import evidence, fetching, jobs, programs
-from fieldkit.remote.fetching import FetchProgress, LateError, NoFolderError
+from fieldkit.remote.fetching import FetchProgress, LateJobError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
@@ -194,7 +194,7 @@ class Robots:
         except LinkError as error:
             return error.located, True
         except (RobotError, EvidenceError) as error:
-            return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateError))
+            return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateJobError))
         rebooted = None if clean else self._reboot_message(role)
         return (rebooted, False) if rebooted else None
 
@@ -237,7 +237,7 @@ class Robots:
         if isinstance(self._testbed, Transient):
             self._testbed.check_alive()
 
-    def demand_held(self) -> None:
+    def require_locks(self) -> None:
         """Raise an error if a robot reports that its lock was broken; robots that do not answer are ignored.
 
         Raises:
@@ -246,7 +246,7 @@ class Robots:
 
         def check_lock(role: Role) -> None:
             try:
-                locks.demand(self.shells[role], self._plan.session)
+                locks.require_lock(self.shells[role], self._plan.session)
             except LockLostError:
                 raise
             except FieldkitError:
@@ -283,7 +283,7 @@ class Robots:
         def remove(role: Role) -> None:
             unfetched = self._unfetched[role]
             if remote is None:
-                evidence.discard(self.shells[role], self._plan.trial, but=unfetched)
+                evidence.discard(self.shells[role], self._plan.trial, kept_folders=unfetched)
             elif remote not in unfetched:
                 evidence.discard_attempt(self.shells[role], remote)
 

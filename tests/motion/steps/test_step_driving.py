@@ -236,9 +236,9 @@ class Field(IdleTestbed):
         super().__init__({Role.RECEIVER: cast("Shell", link)})
         self.returns: list[bool] = []
 
-    def bring_back(self, role: Role, *, by_itself: bool) -> None:
+    def bring_back(self, role: Role, *, has_returned: bool) -> None:
         assert role is Role.RECEIVER
-        self.returns.append(by_itself)
+        self.returns.append(has_returned)
 
 
 @pytest.fixture

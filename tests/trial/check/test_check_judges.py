@@ -192,7 +192,7 @@ def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
     whole = size.trial_bytes(PLAN)
     for free, status in ((size.RESERVE_BYTES + whole, OK), (size.RESERVE_BYTES + whole - 1, WARN), (0, FAIL)):
         report = Report("laptop")
-        system.judge_room(PLAN, free, Path("/trials"), report)
+        system.judge_disk_space(PLAN, free, Path("/trials"), report)
         assert only(report.findings, "disk").status is status
 
 

@@ -309,10 +309,10 @@ def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Pat
     shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
     with locked({Role.SENDER: robot}, anna, sink=quiet):
         robots = Robots(plan, IdleTestbed(shells))
-        robots.demand_held()
+        robots.require_locks()
         locks.abort({"turtlebot-1": robot}, "bert@two")
         with pytest.raises(LockLostError, match=r"turtlebot-1: the trial was aborted by bert@two at"):
-            robots.demand_held()
+            robots.require_locks()
 
 
 def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> None:
