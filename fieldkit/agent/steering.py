@@ -253,9 +253,9 @@ class Driver:
         if elapsed_s > GAP_S:
             self._stop(f"its program was suspended for {elapsed_s:.1f} s")
         elif now_s - self._order_s > task.lease_s:
-            self._stop(f"the laptop was silent for {task.lease_s:g} s")
+            self._stop(f"no order from the laptop for {task.lease_s:g} s")
         elif self._pose is not None and now_s - self._odometry_s > task.odometry_s:
-            self._stop(f"odometry was silent for {task.odometry_s:g} s")
+            self._stop(f"no odometry for {task.odometry_s:g} s")
         elif (
             relative_pose is not None
             and self.phase != _WAITS

@@ -243,16 +243,16 @@ class Link:
             raise EOFError("it closed the connection")
         raise _refused_error(address, credentials, count)
 
-    def begin(self, command: str, deadline: Deadline, ended: threading.Event) -> Channel:
+    def begin(self, command: str, deadline: Deadline, close_event: threading.Event) -> Channel:
         """Start a command, and return its channel when the server has accepted it.
 
         Raises:
-            ExpiredError: The deadline passed, or `ended` was set.
+            ExpiredError: The deadline passed, or `close_event` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
         _, transport = self._connected()
-        channel = call_with_deadline(lambda: self._channel(transport), deadline, ended, what="get a channel")
-        call_with_deadline(lambda: channel.exec_command(command), deadline, ended, what="start")
+        channel = call_with_deadline(lambda: self._channel(transport), deadline, close_event, what="get a channel")
+        call_with_deadline(lambda: channel.exec_command(command), deadline, close_event, what="start")
         self.acknowledge()
         assert isinstance(transport.packetizer, _Packetizer)
         # From now on only necessary packets are sent, because the radio under test may be measured.

@@ -22,20 +22,20 @@ def log_in(
     *,
     timing: Timing,
     deadline: Deadline,
-    ended: threading.Event,
+    close_event: threading.Event,
 ) -> Link:
-    """Return a connection that is logged in.
+    """Return a connection that is logged in; the caller can set `close_event` to cancel the login.
 
     Raises:
         LinkLostError: The robot was not reached, or did not answer before the deadline.
-        LinkError: `ended` was set.
+        LinkError: `close_event` was set.
         RobotError: Its host key is not the pinned one.
         LoginRefusedError: It refused the login.
         ConfigurationError: There is no key for the login.
     """
     link = Link(connect, timing)
-    with _converting_errors(link, address, ended):
-        call_with_deadline(lambda: link.log_in(address, credentials), deadline, ended)
+    with _converting_errors(link, address, close_event):
+        call_with_deadline(lambda: link.log_in(address, credentials), deadline, close_event)
     return link
 
 
@@ -51,7 +51,7 @@ def offered_key(address: Address, connect: Connect, *, deadline: Deadline, kind:
 
 
 @contextlib.contextmanager
-def _converting_errors(link: Link, address: Address, ended: threading.Event) -> Iterator[None]:
+def _converting_errors(link: Link, address: Address, close_event: threading.Event) -> Iterator[None]:
     """Close a link that could not be opened, and convert its exception to an error with a remedy."""
     try:
         yield
@@ -59,7 +59,7 @@ def _converting_errors(link: Link, address: Address, ended: threading.Event) -> 
         link.close()
         if isinstance(error, FieldkitError) or not isinstance(error, BROKEN):
             raise
-        if ended.is_set():
+        if close_event.is_set():
             raise closed_error(address) from error
         if isinstance(error, UnfitServerError):
             raise RobotError(

@@ -39,14 +39,14 @@ class ShellPool:
         self._opener: threading.Thread | None = None
 
     def begin(
-        self, link: Link, command_line: str, deadline: Deadline, ended: threading.Event, *, held: bool = False
+        self, link: Link, command_line: str, deadline: Deadline, close_event: threading.Event, *, held: bool = False
     ) -> "RunningCommand | None":
         """Start a command in a shell on `link`; return None if no shell is free, or if the shell has ended.
 
         With `held`, the shell reports the end of the command only after `RunningCommand.request_end`.
 
         Raises:
-            ExpiredError: The deadline passed, or `ended` was set.
+            ExpiredError: The deadline passed, or `close_event` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
         with self._lock:
@@ -55,7 +55,7 @@ class ShellPool:
         if shell is None:
             return None
         full_line = f"held {command_line}" if held else command_line
-        command = call_with_deadline(lambda: shell.start(full_line), deadline, ended, what="start")
+        command = call_with_deadline(lambda: shell.start(full_line), deadline, close_event, what="start")
         link.acknowledge()
         return command
 

@@ -201,7 +201,7 @@ class SshSession:
                 completed = drain(
                     channel, output, stdin=pending_input, deadline=within, limit_bytes=limit_bytes, robot=self._robot
                 )
-                shell_command = f"exec {quote((*CALL, 'stand'))}" if _is_call(self._argv) else None
+                shell_command = f"exec {quote((*CALL, 'command_loop'))}" if _is_call(self._argv) else None
                 self._connection.open_spares(link, shell_command)
                 return completed
 
@@ -231,16 +231,16 @@ def _start(
     """
     # Without `exec`, the login shell would wait for the command and delay the report of its end.
     command_line = quote(argv) if ends_on_request or has_input else f"exec {quote(argv)} </dev/null"
-    ended = connection.ended
+    close_event = connection.close_event
     link = connection.link(deadline)
     try:
         with _converting_errors(connection.address, link, argv):
             running = None
             if _is_call(argv) and not has_input:
                 running = connection.shells.begin(
-                    link, quote(argv[len(CALL) :]), deadline, ended, held=ends_on_request
+                    link, quote(argv[len(CALL) :]), deadline, close_event, held=ends_on_request
                 )
-            return link, running or link.begin(command_line, deadline, ended)
+            return link, running or link.begin(command_line, deadline, close_event)
     except LinkError:
         link.close()  # a server that does not answer this command will not answer the next one
         raise

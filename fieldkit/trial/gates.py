@@ -70,7 +70,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see the docstring)
-            why = f"the evidence of {placed.called} cannot be measured: {raised(error)}"
+            why = f"the evidence of {placed.label} cannot be measured: {raised(error)}"
             step_errors.append("".join(format_exception(error)))
             problems.append(why)
             result = Measured.all_missing(placed.step.output_columns(), why)
@@ -87,7 +87,7 @@ def _step_problem(placed: PlacedStep, why: str) -> str:
 def _unexplained(placed: PlacedStep, measured: Measured) -> Iterator[str]:
     for column in placed.step.output_columns():
         if column.name not in measured.values and column.name not in measured.missing:
-            yield f"{placed.called} gives neither a value nor a reason for {column.name}"
+            yield f"{placed.label} gives neither a value nor a reason for {column.name}"
 
 
 def _impossible(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, str]]:

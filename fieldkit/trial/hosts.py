@@ -75,7 +75,7 @@ def _job_problems(
         try:
             planned_jobs = () if placed.disturbed else tuple(placed.step.own_jobs(scene))
         except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
-            yield f"the commands of {placed.called} cannot be derived: {raised(error)}"
+            yield f"the commands of {placed.label} cannot be derived: {raised(error)}"
             continue
         for planned in planned_jobs:
             if planned.role is not role:

@@ -249,7 +249,7 @@ class PlacedStep:
         return any(nest.disturbs for nest in self.within)
 
     @property
-    def called(self) -> str:
+    def label(self) -> str:
         """Description of the step: `the step transfer up`."""
         return " ".join(filter(None, ("the step", self.kind, self.step.prefix)))
 

@@ -158,13 +158,13 @@ def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: boo
 def test_lost_laptop_stops_it_within_its_lease() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)]))
     assert stopped_after_s(driver, since_s, robot, renews=False, hears=True) <= TASK.lease_s + TICK_S
-    assert driver.stop_reason == "the laptop was silent for 2 s"
+    assert driver.stop_reason == "no order from the laptop for 2 s"
 
 
 def test_silent_odometry_stops_it() -> None:
     driver, robot, since_s = moving()
     assert stopped_after_s(driver, since_s, robot, renews=True, hears=False) <= TASK.odometry_s + TICK_S
-    assert driver.stop_reason == "odometry was silent for 0.5 s"
+    assert driver.stop_reason == "no odometry for 0.5 s"
 
 
 def test_stops_at_its_fence_and_after_its_time_limit() -> None:

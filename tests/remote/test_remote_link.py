@@ -474,7 +474,7 @@ def test_command_whose_link_breaks_is_sent_again(
     assert done.result(SOON).stdout == b"part\nwhole\n"
     assert len(notices) == 2
     assert notices[0].startswith("robot: the link is lost; trying again for ")
-    assert notices[1].startswith("robot: the link is back after ")
+    assert notices[1].startswith("robot: the link is open again after ")
 
 
 def test_link_that_breaks_before_the_expected_output_is_not_an_end(
@@ -607,7 +607,7 @@ def test_link_over_the_radio_is_not_reopened_during_a_measurement(
     waiting.wait_for_starts(2)
     waiting.go.touch()
     assert done.result(SOON).stdout == b"part\nwhole\n"
-    assert notices[1].startswith("robot: the link is back after ")
+    assert notices[1].startswith("robot: the link is open again after ")
     shell.close()
 
 

@@ -65,7 +65,7 @@ class FlightGuard:
             log_line(f"waiting for the heartbeat of an autopilot at {self._plan.connection}")
             self._wait_for_autopilot()
             log_line("ready")
-            self._watch()
+            self._supervise()
         except FlightError as error:
             self._abort_flight(error)
             raise
@@ -89,7 +89,7 @@ class FlightGuard:
         self._orders = Orders(self._plan.orders, (STAY, LEAVE), self._plan.lease_s)
         self._iteration_s = None
 
-    def _watch(self) -> None:
+    def _supervise(self) -> None:
         """Return after the order `leave`; raise `FlightError` if the drone must land."""
         while self._orders.order != LEAVE:
             previous_s, self._iteration_s = self._iteration_s, time.monotonic()

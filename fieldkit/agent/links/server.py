@@ -36,7 +36,7 @@ from fieldkit.agent.mavlink_frames import (
 
 FRAMES, ALIVE, STATE = b"F", b"P", b"S"
 
-_ADDRESS = 245, 194
+_SERVER_ADDRESS = 245, 194
 """System and component id of the server: MAV_COMP_ID_ONBOARD_COMPUTER4, which no client uses."""
 _COMMAND = struct.Struct("<7fHBB")
 _COMMAND_ACK = struct.Struct("<HB5xBB")
@@ -188,7 +188,7 @@ class LinkServer:
         self._device = SharedDevice(connection)
         self._listener = listener
         self._clients: dict[int, LinkClient] = {}
-        self._writer = FrameWriter(*_ADDRESS)
+        self._writer = FrameWriter(*_SERVER_ADDRESS)
         self._intervals = MessageIntervals(self._request)
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
@@ -261,7 +261,7 @@ class LinkServer:
         command, result, *target = _COMMAND_ACK.unpack(
             message.payload[: _COMMAND_ACK.size].ljust(_COMMAND_ACK.size, b"\0")
         )
-        if command == SET_MESSAGE_INTERVAL and tuple(target) in (_ADDRESS, (0, 0)):
+        if command == SET_MESSAGE_INTERVAL and tuple(target) in (_SERVER_ADDRESS, (0, 0)):
             self._intervals.on_answer(source, result, now_s)
 
     def _receive_packet(self, descriptor: int, client: LinkClient) -> None:

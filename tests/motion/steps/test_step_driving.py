@@ -280,8 +280,8 @@ def test_robot_that_returns_is_not_brought_back(stopped: list[str]) -> None:
 
 
 def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "odometry was silent for 0.5 s"}']))
-    with pytest.raises(RobotError, match="it stopped on its path: odometry was silent"):
+    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "no odometry for 0.5 s"}']))
+    with pytest.raises(RobotError, match="it stopped on its path: no odometry"):
         driven(field, lambda: None)
     assert field.returns == [False]
     assert stopped == ["out.drive"]
