@@ -217,7 +217,7 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
     assert str(failed) in event.trials
     assert str(whole) not in event.trials
     with journal.locked(asked):
-        campaign._reopen()
+        campaign._restart_failed()
     (journal.folder / "2").mkdir()
     (journal.folder / "2" / "trial.yaml").touch()
     for kept in (journal, CampaignJournal(journal.folder)):
