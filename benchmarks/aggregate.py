@@ -87,9 +87,11 @@ def _lines(generator: np.random.Generator, number: int) -> Iterator[str]:
         for quantity, arrived in zip(_COUNTED, counts[repeat], strict=False):
             counted = zip(quantity.columns, (f"{1 - arrived / SENT:.9g}", str(arrived), str(SENT)), strict=True)
             fixed |= dict(counted)
-        drawn = zip(columns, shares[repeat], counts[repeat], strict=True)
+        row_values = zip(columns, shares[repeat], counts[repeat], strict=True)
         yield (
-            ",".join(fixed.get(column.name) or _random_value(column, share, count) for column, share, count in drawn)
+            ",".join(
+                fixed.get(column.name) or _random_value(column, share, count) for column, share, count in row_values
+            )
             + "\n"
         )
 

@@ -80,7 +80,7 @@ PATHS: Final = (
 
 
 def dds_plain(name: str, deliver: Deliver | None) -> Write:
-    """Start an end of a topic with the binding of CycloneDDS, with its own data type."""
+    """Start an end of a topic with the binding of CycloneDDS, with a separate data type."""
     from cyclonedds.domain import Domain, DomainParticipant  # noqa: PLC0415
     from cyclonedds.idl import make_idl_struct, types  # noqa: PLC0415
     from cyclonedds.pub import DataWriter  # noqa: PLC0415

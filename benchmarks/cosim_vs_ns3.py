@@ -170,10 +170,13 @@ class Ns3Link:
     def __init__(self, ns3: Ns3, cell: Cell, run: int, peer: Peer) -> None:
         # 802.11a has the modes, slots and times of 802.11g, but no signal extension and no modes of 802.11b.
         standard = "ErpOfdm" if peer == "802.11g" else "Ofdm"
-        chosen = {"mode": f"{standard}Rate{cell.mode[1:] if cell.mode else 6}Mbps", "adapt": int(cell.mode is None)}
+        mode_options = {
+            "mode": f"{standard}Rate{cell.mode[1:] if cell.mode else 6}Mbps",
+            "adapt": int(cell.mode is None),
+        }
         self._control = "Counting{}" if peer == "corrected" else "ns3::{}"
         loss = loss_db(cell.distance_m, wall=cell.wall)
-        self._run = partial(ns3, loss=loss, queue=QUEUE_PACKETS, RngRun=run, **chosen)
+        self._run = partial(ns3, loss=loss, queue=QUEUE_PACKETS, RngRun=run, **mode_options)
 
     def udp(self) -> tuple[float, float]:
         """Return goodput in Mbit/s and loss, as `Link.udp`."""

@@ -76,9 +76,14 @@ def ssh_words(lab: RoverLab) -> tuple[str, ...]:
     entry = re.search(r"box-1: .*port: (\d+), .*key: (\S+), host_key: ([^}]+)}", site)
     assert entry is not None
     port, key, host_key = entry.groups()
-    known = lab.folder / "known_hosts"
-    known.write_text(f"[127.0.0.1]:{port} {host_key}\n", encoding="ascii")
-    options = ("BatchMode=yes", "IdentitiesOnly=yes", "StrictHostKeyChecking=yes", f"UserKnownHostsFile={known}")
+    known_hosts = lab.folder / "known_hosts"
+    known_hosts.write_text(f"[127.0.0.1]:{port} {host_key}\n", encoding="ascii")
+    options = (
+        "BatchMode=yes",
+        "IdentitiesOnly=yes",
+        "StrictHostKeyChecking=yes",
+        f"UserKnownHostsFile={known_hosts}",
+    )
     words = [word for option in options for word in ("-o", option)]
     return ("ssh", "-F", "none", *words, "-i", key, "-p", port, "root@127.0.0.1", "true")
 

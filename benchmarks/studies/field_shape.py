@@ -101,8 +101,8 @@ def read(folder: Path) -> Repeats:
 
 def chart(cells: Sequence[Cell], name: str, panels: Sequence[tuple[str, str, str]]) -> Chart:
     """Return a chart of panels, each given as title, protocol and quantity."""
-    drawn = [_panel(cells, *panel) for panel in panels]
-    return Chart(name=name, title=name, caption="", panels=drawn)
+    drawn_panels = [_panel(cells, *panel) for panel in panels]
+    return Chart(name=name, title=name, caption="", panels=drawn_panels)
 
 
 def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> Panel:

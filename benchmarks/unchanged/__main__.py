@@ -69,8 +69,8 @@ def _behaviour(base: Tree, head: Tree, kinds: Sequence[Class], *, labels_shown: 
     """Record the items with both trees at the same time, and print a line for each class."""
     for tree in (base, head):
         items.prepare(tree)
-    chosen = items.items(base, kinds)
-    recordings = [_start(tree, chosen) for tree in (base, head)]
+    selected_items = items.items(base, kinds)
+    recordings = [_start(tree, selected_items) for tree in (base, head)]
     for recording in recordings:
         if recording.wait() != 0:
             raise RuntimeError("a recorder ended early; its error is above")
@@ -78,7 +78,7 @@ def _behaviour(base: Tree, head: Tree, kinds: Sequence[Class], *, labels_shown: 
     real: list[str] = []
     for kind in kinds:
         counts: Counter[str] = Counter()
-        for number, item in enumerate(chosen):
+        for number, item in enumerate(selected_items):
             if item.kind is not kind:
                 continue
             differences = comparison.compare(item, number, base, head)
@@ -94,8 +94,10 @@ def _behaviour(base: Tree, head: Tree, kinds: Sequence[Class], *, labels_shown: 
     return not real
 
 
-def _start(tree: Tree, chosen: Sequence[Item]) -> "subprocess.Popen[bytes]":
-    listed = [dataclasses.asdict(item) | {"working_folder": str(tree.lab / item.working_folder)} for item in chosen]
+def _start(tree: Tree, selected_items: Sequence[Item]) -> "subprocess.Popen[bytes]":
+    listed = [
+        dataclasses.asdict(item) | {"working_folder": str(tree.lab / item.working_folder)} for item in selected_items
+    ]
     path = tree.folder / "items.json"
     path.write_text(json.dumps(listed), encoding="utf-8")
     command = (*trees.python(), str(Path(recorder.__file__)), str(path), str(tree.results))

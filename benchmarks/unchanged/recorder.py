@@ -29,7 +29,7 @@ def record(item: dict[str, Any], folder: Path) -> None:
     """
     folder.mkdir(parents=True)
     os.chdir(item["working_folder"])
-    made = [name for name in item["outputs"] if not Path(name).exists()]
+    new_outputs = [name for name in item["outputs"] if not Path(name).exists()]
     saved = os.dup(1), os.dup(2)
     with (folder / "stdout").open("wb") as out, (folder / "stderr").open("wb") as error:
         os.dup2(out.fileno(), 1)
@@ -47,10 +47,10 @@ def record(item: dict[str, Any], folder: Path) -> None:
             os.close(saved[1])
     (folder / "exit_code").write_text(f"{code}\n", encoding="ascii")
     os.chdir(item["working_folder"])
-    for name in made:
+    for name in new_outputs:
         if Path(name).exists():
             shutil.move(name, folder / name.replace("/", "+"))
-    for name in set(item["outputs"]) - set(made):
+    for name in set(item["outputs"]) - set(new_outputs):
         shutil.copy(name, folder / name.replace("/", "+"))
 
 

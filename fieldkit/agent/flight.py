@@ -195,7 +195,7 @@ class OffboardPilot:
             raise FlightError(REFUSED, reasons)
 
     def _climb_by_commands(self, commands: Sequence[Command], start_m: Position) -> None:
-        """Let the drone take off by commands, until it is near the target height.
+        """Command the take-off, and wait until the drone is near the target height.
 
         Only the last command must be accepted.
         """

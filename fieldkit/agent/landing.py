@@ -112,17 +112,17 @@ def _wait_for_mode(session: AutopilotSession, each_iteration: Callable[[], None]
 
 def alarm(drone: AutopilotState) -> str:
     """Return the alarm text for a flight that ended without a landing: last known state, and manual action."""
-    where = "ITS POSITION IS UNKNOWN"
+    position_text = "ITS POSITION IS UNKNOWN"
     if drone.last_position_m is not None:
         north_m, east_m, down_m = drone.last_position_m
-        where = (
+        position_text = (
             f"LAST KNOWN {drone.position_age_s:.0f} S AGO {north_m:.1f} M NORTH, {east_m:.1f} M EAST, "
             f"{-down_m:.1f} M UP IN ITS LOCAL FRAME"
         )
     heartbeat = "NO HEARTBEAT"
     if math.isfinite(drone.heartbeat_age_s):
         heartbeat = f"MODE {drone.mode_name}, LAST HEARTBEAT {drone.heartbeat_age_s:.0f} S AGO"
-    return f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {where}, {heartbeat}. {MANUAL_ACTION}"
+    return f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {position_text}, {heartbeat}. {MANUAL_ACTION}"
 
 
 MANUAL_ACTION = "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION."

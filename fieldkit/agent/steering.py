@@ -194,8 +194,8 @@ class Driver:
     def _path_home(self, relative_pose: OdometryPose) -> list[tuple[float, float]] | None:
         """Return the corners of the path back to the origin, or None if the robot is off its path."""
         nearest_m, leg_number = min(
-            (_distance_to_leg_m(relative_pose[:2], begin, end), number)
-            for number, (begin, end) in enumerate(zip(self._corners, self._corners[1:]))
+            (_distance_to_leg_m(relative_pose[:2], leg_start, end), number)
+            for number, (leg_start, end) in enumerate(zip(self._corners, self._corners[1:]))
         )
         return None if nearest_m > OFF_PATH_M else [relative_pose[:2], *reversed(self._corners[: leg_number + 1])]
 
@@ -208,7 +208,9 @@ class Driver:
             math.hypot(relative_pose.x_m, relative_pose.y_m) > START_M or abs(relative_pose.yaw_rad) > START_RAD
         ):
             self._legs = [
-                (begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > ARRIVAL_TOLERANCE_M
+                (leg_start, end)
+                for leg_start, end in zip(path, path[1:])
+                if math.dist(leg_start, end) > ARRIVAL_TOLERANCE_M
             ]
             self.phase, self._phase_s = _RETURNS, now_s
         else:
@@ -298,7 +300,9 @@ class Driver:
             return
         path = [(relative_pose.x_m, relative_pose.y_m), *reversed(passed)]
         self._legs = [
-            (begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > ARRIVAL_TOLERANCE_M
+            (leg_start, end)
+            for leg_start, end in zip(path, path[1:])
+            if math.dist(leg_start, end) > ARRIVAL_TOLERANCE_M
         ]
         self.phase, self._phase_s, self._turning = BACK, now_s, True
 
@@ -307,10 +311,10 @@ class Driver:
         if self.phase in (_WAITS, "there", "home"):
             return ZERO_VELOCITY
         while self._legs:
-            begin, end = self._legs[0]
-            length_m = math.dist(begin, end)
-            direction = (end[0] - begin[0]) / length_m, (end[1] - begin[1]) / length_m
-            offset = relative_pose.x_m - begin[0], relative_pose.y_m - begin[1]
+            leg_start, end = self._legs[0]
+            length_m = math.dist(leg_start, end)
+            direction = (end[0] - leg_start[0]) / length_m, (end[1] - leg_start[1]) / length_m
+            offset = relative_pose.x_m - leg_start[0], relative_pose.y_m - leg_start[1]
             remaining_m = length_m - (offset[0] * direction[0] + offset[1] * direction[1])
             if remaining_m > ARRIVAL_TOLERANCE_M:
                 cross_track_m = direction[0] * offset[1] - direction[1] * offset[0]
@@ -347,10 +351,12 @@ class Driver:
         return DriveVelocity(_clamp(forward, task.speed_m_s), _clamp(turn, task.turn_rad_s))
 
 
-def _distance_to_leg_m(position: tuple[float, float], begin: tuple[float, float], end: tuple[float, float]) -> float:
+def _distance_to_leg_m(
+    position: tuple[float, float], leg_start: tuple[float, float], end: tuple[float, float]
+) -> float:
     """Return the distance of a position from a leg, in metres."""
-    direction = end[0] - begin[0], end[1] - begin[1]
-    offset = position[0] - begin[0], position[1] - begin[1]
+    direction = end[0] - leg_start[0], end[1] - leg_start[1]
+    offset = position[0] - leg_start[0], position[1] - leg_start[1]
     squared_length = direction[0] ** 2 + direction[1] ** 2
     fraction = (
         min(max((offset[0] * direction[0] + offset[1] * direction[1]) / squared_length, 0.0), 1.0)

@@ -107,9 +107,9 @@ def _run_guarded(top: Parser, argv: Sequence[str] | None, options: hints.CliOpti
     except OSError as error:
         # Library functions wrap the errors that they expect. A full disk can make any write fail.
         fix = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct this"
-        where = error.filename or "its output"
+        location = error.filename or "its output"
         _show_error(
-            f"{where}: {error.strerror}\n  remedy: {fix}, then run the command again; finished repeats are saved"
+            f"{location}: {error.strerror}\n  remedy: {fix}, then run the command again; finished repeats are saved"
         )
         return ConfigurationError.exit_code
     except MemoryError:

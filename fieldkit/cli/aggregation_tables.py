@@ -45,7 +45,7 @@ def show(arguments: argparse.Namespace) -> int:
     output_format = arguments.format
     data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
     by = data.condition(arguments.by)
-    chosen, words = data.chosen(arguments.quantity)
+    selected, words = data.chosen(arguments.quantity)
     if words and output_format == "latex":
         raise ConfigurationError(
             f"--quantity: the values of {words[0].name} are words, and latex tables have no column for words",
@@ -55,7 +55,7 @@ def show(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             f"--width: {output_format} has no column for it", remedy="choose --format table, csv or json"
         )
-    quantities = _default_quantities(output_format, data.quantities) if chosen is None else chosen
+    quantities = _default_quantities(output_format, data.quantities) if selected is None else selected
     counted = list(data.words.values()) if words is None else words
     widths = dict(_width(text, quantities) for text in arguments.width)
     _require_units(widths, quantities)
@@ -75,7 +75,7 @@ def show(arguments: argparse.Namespace) -> int:
     else:
         judgements = _judged(data, repeats, cells, quantities)
         expected = {judgement.expectation.quantity for judgement in judgements}
-        show_all = arguments.all or chosen is not None or bool(widths)
+        show_all = arguments.all or selected is not None or bool(widths)
         shown = table_lines.lines(cells, quantities) if show_all else table_lines.operator_lines(cells, expected)
         _show(by, cells, shown, more)
         _show_expected(by, cells, judgements)

@@ -81,8 +81,9 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
     if site is None and arguments.backend is None:
         sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
     name = backend_name(arguments, site)
-    chosen = load_backend(name, site, document)
-    chosen.allow_motion = getattr(arguments, "allow_motion", False)  # only commands that run trials have this option
-    if hasattr(chosen, "allow_motion_after_fault"):  # an optional attribute of a backend with real robots
-        chosen.allow_motion_after_fault = getattr(arguments, "allow_motion_after_fault", False)
-    return name, chosen
+    selected_backend = load_backend(name, site, document)
+    # Only commands that run trials have these options. The second is an optional attribute of a backend with real robots.
+    selected_backend.allow_motion = getattr(arguments, "allow_motion", False)
+    if hasattr(selected_backend, "allow_motion_after_fault"):
+        selected_backend.allow_motion_after_fault = getattr(arguments, "allow_motion_after_fault", False)
+    return name, selected_backend

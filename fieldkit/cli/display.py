@@ -127,9 +127,9 @@ def _render_lines(cells: Sequence[Sequence[str]], widths: Sequence[int], right: 
         grid.add_column(Text(name), justify="right" if index in right else "left", width=width, no_wrap=True)
     for row in rows:
         grid.add_row(*(Text(_fold_cell(cell, width)) for cell, width in zip(row, widths, strict=True)))
-    drawn = io.StringIO()
-    Console(file=drawn, width=_table_width(widths) + 1, color_system=None).print(grid)
-    return [line.rstrip() for line in drawn.getvalue().splitlines() if line.strip()]
+    rendered = io.StringIO()
+    Console(file=rendered, width=_table_width(widths) + 1, color_system=None).print(grid)
+    return [line.rstrip() for line in rendered.getvalue().splitlines() if line.strip()]
 
 
 def _fold_cell(cell: str, width: int) -> str:

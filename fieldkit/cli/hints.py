@@ -54,7 +54,7 @@ class CliOptions:
         missing = [
             shlex.join((option, value) if value else (option,))
             for option, value in self._options
-            if parser.takes(option, value) and f"{option} " not in f"{match[0]} "
+            if parser.accepts(option, value) and f"{option} " not in f"{match[0]} "
         ]
         if not words or not missing:
             return match[0]

@@ -77,7 +77,7 @@ class Parser(argparse.ArgumentParser):
             parser.complete()
         return parser
 
-    def takes(self, option: str, value: str) -> bool:
+    def accepts(self, option: str, value: str) -> bool:
         """Return True if the parser has `option`, and `value` is not its default."""
         action = self._option_string_actions.get(option)
         return action is not None and str(action.default) != value

@@ -123,8 +123,8 @@ def interruptible() -> Iterator[Stop]:
             return
         if number == signal.SIGINT and stop.can_finish and not stop.after_repeat:
             stop.after_repeat = True
-            left = f", about {format_duration(stop.left_s)} more" if stop.left_s else ""
-            _write_message(_FINISHING.format(left=left))
+            remaining_text = f", about {format_duration(stop.left_s)} more" if stop.left_s else ""
+            _write_message(_FINISHING.format(left=remaining_text))
             return
         stopping = True
         _write_message(_STOPPING)

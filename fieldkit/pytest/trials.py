@@ -68,10 +68,10 @@ class TrialRunner:
         """
         __tracebackhide__ = True
         protocols = (protocol,) if isinstance(protocol, str) else tuple(protocol)
-        chosen = topology or self._lab.options.topology
+        topology_name = topology or self._lab.options.topology
         arguments = argparse.Namespace(
             procedure=procedure,
-            topology=chosen and one_of(Topology, chosen, "topology"),
+            topology=topology_name and one_of(Topology, topology_name, "topology"),
             protocol=[one_of(Protocol, name, "protocol") for name in protocols],
             repeats=_positive(repeats),
             record=record,

@@ -177,9 +177,8 @@ def _fetch_small(
         return _unpack(packed, packed.parent, shell.robot, foreign), job_error
     except (EvidenceError, FileNotFoundError) as error:
         if isinstance(job_error, LateJobError):
-            job_error = RobotError(
-                job_error.what, where=job_error.where, remedy=job_error.remedy
-            )  # the archive is incomplete
+            # The archive is incomplete, so the error must not report that all files arrived.
+            job_error = RobotError(job_error.what, where=job_error.where, remedy=job_error.remedy)
         raise job_error or error from None
 
 

@@ -34,9 +34,9 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> I
             if rebooted(before.boot, after.boot):
                 yield f"{name}: {REBOOTED}"
                 continue  # a reboot also ends its jobs and restarts its clock
-            yield from (f"{name}: {why}" for why in _clock_problems(before, after))
+            yield from (f"{name}: {reason}" for reason in _clock_problems(before, after))
         if after is not None and after.endings is not None:
-            yield from (f"{name}: {why}" for why in _job_problems(procedure, scene, role, after, evidence))
+            yield from (f"{name}: {reason}" for reason in _job_problems(procedure, scene, role, after, evidence))
 
 
 def restarted(procedure: Procedure) -> frozenset[Role]:
@@ -62,9 +62,9 @@ def _clock_problems(before: HostState, after: HostState) -> Iterator[str]:
     if (
         before.clock is not None
         and after.clock is not None
-        and (why := clock.step_description(before.clock, after.clock))
+        and (reason := clock.step_description(before.clock, after.clock))
     ):
-        yield why
+        yield reason
 
 
 def _job_problems(
@@ -87,5 +87,5 @@ def _job_problems(
                 and any(evidence.has(file) for file in (planned.job.log, planned.job.stdout) if file)
             ):
                 yield f"its job {planned.job.name} ran, but its exit was not recorded"
-            if ending and (why := endings.termination_error(ending, planned.permitted_causes, planned.least_s)):
-                yield f"its job {planned.job.name} {why}"
+            if ending and (reason := endings.termination_error(ending, planned.permitted_causes, planned.least_s)):
+                yield f"its job {planned.job.name} {reason}"

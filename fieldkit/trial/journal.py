@@ -131,9 +131,9 @@ def history(folder: Path, plan: Plan) -> list[JournalEntry]:
         EvidenceError: As for `read`; or an entry cannot follow those before it, or its repeat is not in the plan.
     """
     entries = read(folder)
-    for line, why in _impossible_entries(entries, plan):
+    for line, reason in _impossible_entries(entries, plan):
         raise EvidenceError(
-            f"impossible entry: {why}",
+            f"impossible entry: {reason}",
             where=f"{folder / JOURNAL_FILE}:{line}",
             remedy="restore the file from a copy",
         )

@@ -113,9 +113,9 @@ def read(folder: Path) -> Sums:
             "no readable manifest", where=str(path), remedy="name the folder of a trial that ran at least one repeat"
         ) from error
     except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else f"not a line of a manifest: {str(error)[:60]}"
+        reason = error.strerror if isinstance(error, OSError) else f"not a line of a manifest: {str(error)[:60]}"
         raise EvidenceError(
-            f"no readable manifest: {why}", where=str(path), remedy="restore the file from a copy"
+            f"no readable manifest: {reason}", where=str(path), remedy="restore the file from a copy"
         ) from error
 
 
@@ -199,10 +199,10 @@ def summarize(problems: Mapping[str, str]) -> str:
 
 
 def _file_differences(names: Iterable[str], listed: Sums, present: Mapping[str, Path]) -> dict[str, str]:
-    wanted = set(names)
-    problems = dict.fromkeys(wanted - present.keys(), "missing")
+    listed_names = set(names)
+    problems = dict.fromkeys(listed_names - present.keys(), "missing")
     problems |= dict.fromkeys(present.keys() - listed.keys(), "not in the manifest")
-    problems |= {name: "changed" for name in wanted & present.keys() if _sha256(present[name]) != listed[name]}
+    problems |= {name: "changed" for name in listed_names & present.keys() if _sha256(present[name]) != listed[name]}
     return problems
 
 

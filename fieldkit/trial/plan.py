@@ -132,8 +132,8 @@ class Plan(Strict):
         """Yield a refusal for each role of `on_abort` whose robot has no autopilot link to land it."""
         for role in self.procedure.on_abort:
             if self.cast[role].profile.mavlink is None:
-                why = "on_abort must bring it down, but its profile has no mavlink"
-                yield Refusal(role, why, f"leave {role} out of on_abort, or use a drone")
+                reason = "on_abort must bring it down, but its profile has no mavlink"
+                yield Refusal(role, reason, f"leave {role} out of on_abort, or use a drone")
 
     def shortfalls(self) -> Iterator[str]:
         """Yield a sentence for each expectation that the plan cannot decide, for example with too few repeats."""

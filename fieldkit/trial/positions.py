@@ -181,11 +181,13 @@ _SMALLEST: Final = "_distance_min_m"
 
 
 def _distances_m(measured: Measured) -> Iterator[tuple[str, tuple[float, float]]]:
-    for name, least in measured.values.items():
+    for name, minimum_m in measured.values.items():
         if name.endswith(_SMALLEST):
             measurement = name.removesuffix(_SMALLEST)
-            yield measurement, (float(least), float(measured.values[f"{measurement}_distance_max_m"]))
+            yield measurement, (float(minimum_m), float(measured.values[f"{measurement}_distance_max_m"]))
 
 
 def _missing(measured: Measured) -> Mapping[str, str]:
-    return {name.removesuffix(_SMALLEST): why for name, why in measured.missing.items() if name.endswith(_SMALLEST)}
+    return {
+        name.removesuffix(_SMALLEST): reason for name, reason in measured.missing.items() if name.endswith(_SMALLEST)
+    }

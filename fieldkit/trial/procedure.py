@@ -132,21 +132,21 @@ class Procedure(catalog.Named):
         for placed in self.walk():
             step = placed.step
             before = [other.step for other in earlier if not placed.runs_beside(other)]
-            if why := step.placement_error(before, placed.within):
-                raise schema.validation_error(why, *placed.at)
+            if reason := step.placement_error(before, placed.within):
+                raise schema.validation_error(reason, *placed.at)
             for resource in step.exclusive_resources():
                 if (step.prefix, resource) in used_resources:
                     raise schema.validation_error(_duplicate_resource_message(step, resource), *placed.at)
                 used_resources.add((step.prefix, resource))
             for name in step.files():
-                if why := _file_conflict(step, name, files):
-                    raise schema.validation_error(why, *placed.at)
+                if reason := _file_conflict(step, name, files):
+                    raise schema.validation_error(reason, *placed.at)
                 files.add(name)
-            if why := next(filter(None, map(placed.port_conflict, earlier)), None):
-                raise schema.validation_error(why, *placed.at, "port")
+            if reason := next(filter(None, map(placed.port_conflict, earlier)), None):
+                raise schema.validation_error(reason, *placed.at, "port")
             for column in columns.of_step(step):
-                if why := columns.column_conflict(column, filled):
-                    raise schema.validation_error(why, *placed.at)
+                if reason := columns.column_conflict(column, filled):
+                    raise schema.validation_error(reason, *placed.at)
                 filled.add(column.name)
             earlier.append(placed)
         return self
@@ -261,19 +261,26 @@ class PlacedStep:
         """
         is_simultaneous = self.runs_beside(other) or any(nest is other.step for nest in self.within)
         is_captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)
-        for mine, theirs in product(self.step.listens(), other.step.listens()):
-            is_exclusive = not (mine.shared and theirs.shared)
-            if is_simultaneous and is_exclusive and (mine.role, mine.port) == (theirs.role, theirs.port):
-                return f"port {mine.port} is used twice at the same time on {mine.role}; give one another {mine.by}"
-            if is_captured and mine.looks_like(theirs):
-                conflict = f"port {mine.port} is used twice in one capture, from {mine.peer} to {mine.role}"
-                return f"{conflict}; give one another {mine.by}, or a separate capture each"
+        for listener, other_listener in product(self.step.listens(), other.step.listens()):
+            is_exclusive = not (listener.shared and other_listener.shared)
+            if (
+                is_simultaneous
+                and is_exclusive
+                and (listener.role, listener.port) == (other_listener.role, other_listener.port)
+            ):
+                conflict = f"port {listener.port} is used twice at the same time on {listener.role}"
+                return f"{conflict}; give one another {listener.by}"
+            if is_captured and listener.looks_like(other_listener):
+                conflict = (
+                    f"port {listener.port} is used twice in one capture, from {listener.peer} to {listener.role}"
+                )
+                return f"{conflict}; give one another {listener.by}, or a separate capture each"
         return None
 
     def runs_beside(self, other: "PlacedStep") -> bool:
         """Return True if an earlier step runs at the same time and neither contains the other."""
         paths = zip((*self.within, self.step), (*other.within, other.step), strict=False)
-        fork = next((index for index, (mine, theirs) in enumerate(paths) if mine is not theirs), 0)
+        fork = next((index for index, (step, other_step) in enumerate(paths) if step is not other_step), 0)
         return fork > 0 and self.within[fork - 1].parallel
 
 
@@ -295,10 +302,10 @@ def _duplicate_resource_message(step: Step, resource: str) -> str:
 
 def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[PlacedStep]:
     for index, entry in enumerate(entries):
-        here = (*at, index, entry.kind)
-        yield PlacedStep(entry.step, entry.kind, within, here)
+        location = (*at, index, entry.kind)
+        yield PlacedStep(entry.step, entry.kind, within, location)
         if isinstance(entry.step, Nest):
-            yield from _walk(entry.step.during, (*here, "during"), (*within, entry.step))
+            yield from _walk(entry.step.during, (*location, "during"), (*within, entry.step))
 
 
 def load_procedure(name: str) -> Procedure:
@@ -320,7 +327,7 @@ def read_procedure(path: Path) -> Procedure:
 
 
 def with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
-    """Return the procedures; those that measure the figure have the expectation in addition to their own.
+    """Return the procedures, with the expectation added to those that measure its figure.
 
     Args:
         procedures: The procedures.

@@ -47,7 +47,7 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
             assert inner is not top or not to_type, f"{path}: {text}"
             seen += inner is not top
             options = [] if inner is top else re.findall(r" (--[a-z-]+)", match["rest"])
-            assert all(inner.takes(option, "x") for option in options), f"{path}: {text}"
+            assert all(inner.accepts(option, "x") for option in options), f"{path}: {text}"
     assert seen > 30
 
 

@@ -80,8 +80,8 @@ class FlightGuard:
             if self._stop_event.is_set():
                 raise FlightError(CANCELLED, "the job was ended")
             if time.monotonic() > start_s + HEARTBEAT_S:
-                where = self._plan.connection
-                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {where} in {HEARTBEAT_S:g} s")
+                connection = self._plan.connection
+                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
             self._exchange()
         self._first_mode = self._drone.mode if self._drone.armed else None
         for kind in (HEARTBEAT, LOCAL_POSITION_NED):

@@ -91,8 +91,8 @@ class FlightLoop:
             if self._stop_event.is_set():
                 raise FlightError(CANCELLED, "the job was ended")
             if time.monotonic() > start_s + HEARTBEAT_S:
-                where = self._plan.connection
-                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {where} in {HEARTBEAT_S:g} s")
+                connection = self._plan.connection
+                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
             self.update()
             self.session.exchange(1 / RATE_HZ)
         for kind in _STREAMS:
@@ -189,8 +189,10 @@ class FlightLoop:
         if self.state != FLYING:
             return
         if drone.heartbeat_age_s > _FLIGHT_HEARTBEAT_TIMEOUT_S:
-            lost = ", its connection is closed" if self.session.link.lost_since_s is not None else ""
-            raise FlightError(REFUSED, f"no heartbeat of the autopilot for {_FLIGHT_HEARTBEAT_TIMEOUT_S:g} s{lost}")
+            connection_note = ", its connection is closed" if self.session.link.lost_since_s is not None else ""
+            raise FlightError(
+                REFUSED, f"no heartbeat of the autopilot for {_FLIGHT_HEARTBEAT_TIMEOUT_S:g} s{connection_note}"
+            )
         if not drone.guided:
             if self._liveness is not None and self._liveness.other_state == LANDING:
                 raise FlightError(PEER_STOPPED, "the guard lands it")

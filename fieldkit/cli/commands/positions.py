@@ -74,8 +74,8 @@ def _lines(attempt_positions: "AttemptPositions") -> list[str]:
     """Return the lines about an attempt, one per distance."""
     source = attempt_positions.source or "positions from the backend"
     lines = [
-        f"{attempt_positions.attempt}  {pair}: {least:.1f} to {most:.1f} m, {source}"
-        for pair, (least, most) in attempt_positions.distances_m.items()
+        f"{attempt_positions.attempt}  {pair}: {minimum_m:.1f} to {maximum_m:.1f} m, {source}"
+        for pair, (minimum_m, maximum_m) in attempt_positions.distances_m.items()
     ]
     return lines + [
         f"{attempt_positions.attempt}  {pair}: no distance, {reason}"

@@ -103,9 +103,11 @@ class Attempts:
                 self._robots.check_alive()
                 self._robots.require_locks()  # an attempt aborted by another user is not counted
         invalid = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
-        why = "; ".join(hosts.without_effects(reasons))
+        reason_text = "; ".join(hosts.without_effects(reasons))
         self._ledger.commit(
-            partial, replace(started, status=invalid if reasons else Status.VALID, reason=why), verdict.measured
+            partial,
+            replace(started, status=invalid if reasons else Status.VALID, reason=reason_text),
+            verdict.measured,
         )
         return failure.remedy if failure else ""
 

@@ -122,8 +122,8 @@ def holder(shell: Shell) -> LockState | None:
     match = _HELD.match(call(shell, "holder", deadline=Deadline.after(REPLY_S)))
     if match is None:
         return None
-    token, who, what = (word(match[name].decode(errors="replace")) for name in ("token", "who", "what"))
-    return LockState(Holder(token, who, what), float(match["left"]))
+    token, user, purpose = (word(match[name].decode(errors="replace")) for name in ("token", "who", "what"))
+    return LockState(Holder(token, user, purpose), float(match["left"]))
 
 
 def require_lock(shell: Shell, token: str) -> None:

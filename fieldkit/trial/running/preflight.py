@@ -168,8 +168,8 @@ def _judge_lock(held: LockState | None, report: Report) -> bool:
     if held is None:
         report.ok("lock", "the robot is not locked")
         return True
-    holder, left = held.holder, format_duration(held.left_s)
-    report.fail("lock", f"{holder.user} holds the robot for {holder.purpose}, at most {left} more", HELD_REMEDY)
+    holder, remaining = held.holder, format_duration(held.left_s)
+    report.fail("lock", f"{holder.user} holds the robot for {holder.purpose}, at most {remaining} more", HELD_REMEDY)
     return False
 
 

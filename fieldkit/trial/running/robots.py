@@ -111,9 +111,9 @@ class Robots:
             self._run_steps(scene, announce)
         finally:
             oracle.record_air(None)
-        after, where, links = oracle.lateness(), oracle.track(since_ns), oracle.links(continue_sampling=False)
+        after, positions, links = oracle.lateness(), oracle.track(since_ns), oracle.links(continue_sampling=False)
         if scene.laptop_folder is not None:
-            (scene.laptop_folder / track.FILE).write_text(track.text(where), encoding="ascii")
+            (scene.laptop_folder / track.FILE).write_text(track.text(positions), encoding="ascii")
             (scene.laptop_folder / link_samples.FILE).write_text(link_samples.text(links), encoding="ascii")
             (scene.laptop_folder / oracle_delays.LATENESS_FILE).write_text(
                 oracle_delays.lateness_text(before, after), encoding="ascii"

@@ -235,8 +235,12 @@ def _judgement_event(judgement: Judgement) -> ExpectationJudged:
 def _report_unfetched(robots: Robots, sink: Sink) -> None:
     """Report evidence that was not fetched and is still on the robots."""
     for robot, folders in robots.unfetched().items():
-        where = ", ".join(f"~/{folder}" for folder in folders)
-        sink(Note(f"{robot}: evidence that was not fetched stays on it; delete it when it is not needed: {where}"))
+        folder_names = ", ".join(f"~/{folder}" for folder in folders)
+        sink(
+            Note(
+                f"{robot}: evidence that was not fetched stays on it; delete it when it is not needed: {folder_names}"
+            )
+        )
 
 
 def _remaining_time(plan: Plan, remaining: Sequence[RepeatId], finished: Sequence[FinishedRepeat]) -> TimeEstimate:
