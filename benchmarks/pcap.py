@@ -104,14 +104,14 @@ def losses_by_fieldkit(sender: Path, receiver: Path) -> int:
     return counts.packets_sent - counts.packets_received
 
 
-def lost(sent: Iterable[Key], received: Iterable[Key]) -> int:
+def lost_count(sent: Iterable[Key], received: Iterable[Key]) -> int:
     """Return the number of keys that arrived less often than they were sent."""
     return (Counter(sent) - Counter(received)).total()
 
 
 def losses_by_dpkt(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets."""
-    return lost(*(list(_keys_by_dpkt(path)) for path in (sender, receiver)))
+    return lost_count(*(list(_keys_by_dpkt(path)) for path in (sender, receiver)))
 
 
 def _keys_by_dpkt(path: Path) -> Iterator[Key]:
@@ -123,7 +123,7 @@ def _keys_by_dpkt(path: Path) -> Iterator[Key]:
 
 def losses_by_tshark(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets."""
-    return lost(*(list(_keys_by_tshark(path)) for path in (sender, receiver)))
+    return lost_count(*(list(_keys_by_tshark(path)) for path in (sender, receiver)))
 
 
 def _keys_by_tshark(path: Path) -> Iterator[Key]:
@@ -148,7 +148,7 @@ def _keys_by_tshark(path: Path) -> Iterator[Key]:
 def losses_by_scapy(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets among the first ones."""
     sent = list(_keys_by_scapy(sender))
-    return lost(sent, _keys_by_scapy(receiver))
+    return lost_count(sent, _keys_by_scapy(receiver))
 
 
 def _keys_by_scapy(path: Path) -> Iterator[Key]:

@@ -112,7 +112,7 @@ class OffboardPilot:
             self._take_off(dialect, start_m, corners_m[0])
             self._fly_path(corners_m)
             if plan.end == "return":
-                self._return(origin)
+                self._fly_to_origin(origin)
         self._start_phase("coming down")
         loop.state = LANDING if loop.has_armed else loop.state
         with landing_marker(plan.landing_marker):
@@ -235,7 +235,7 @@ class OffboardPilot:
                 has_arrived = True
                 self._start_phase("there")
 
-    def _return(self, origin: FlightOrigin) -> None:
+    def _fly_to_origin(self, origin: FlightOrigin) -> None:
         """Fly to the point above the origin."""
         drone = self._drone
         assert drone.last_position_m is not None, "it has risen"

@@ -23,7 +23,7 @@ CAMPAIGN_FILE: Final = laptop_files.CAMPAIGN
 Item = TypeVar("Item")
 
 
-def _distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
+def _require_distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
     def check(items: tuple[Item, ...]) -> tuple[Item, ...]:
         if len({key(item) for item in items}) < len(items):
             raise schema.validation_error("an entry occurs twice")
@@ -32,7 +32,7 @@ def _distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
     return AfterValidator(check)
 
 
-_ONCE: Final = (Field(min_length=1), _distinct(lambda item: item))
+_ONCE: Final = (Field(min_length=1), _require_distinct(lambda item: item))
 
 
 class Exclusion(Strict):
@@ -82,9 +82,9 @@ class CampaignFile(Strict):
         str, schema.pattern_field(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: letters, digits, - and _, 61 in all")
     ]
     procedures: Annotated[tuple[str, ...], *_ONCE]
-    distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda distance: distance.metres)]
+    distances: Annotated[tuple[Span, ...], Field(min_length=1), _require_distinct(lambda distance: distance.metres)]
     topologies: Annotated[tuple[Topology, ...], *_ONCE]
-    protocols: Annotated[tuple[Protocol, ...], _distinct(lambda item: item)] = ()
+    protocols: Annotated[tuple[Protocol, ...], _require_distinct(lambda item: item)] = ()
     repeats: Repeats | None = None
     record: Annotated[Duration, Field(gt=0)] | None = None
     seed: Annotated[Int, Field(ge=0, lt=10**15)]

@@ -15,7 +15,7 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.analysis.sample_size import more_wanted_of
 from fieldkit.analysis.table_lines import TableLine
 from fieldkit.cli import results
-from fieldkit.cli.display import prose, show_note, table
+from fieldkit.cli.display import print_folded, show_note, table
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.text import print_text
@@ -73,7 +73,7 @@ def show(arguments: argparse.Namespace) -> int:
             _require_figures(cells, quantities)
         print_text(_FOR_PAPERS[output_format](by, cells, quantities), end="")
     else:
-        judgements = _judged(data, repeats, cells, quantities)
+        judgements = _judgements_shown(data, repeats, cells, quantities)
         expected = {judgement.expectation.quantity for judgement in judgements}
         show_all = arguments.all or selected is not None or bool(widths)
         shown = table_lines.lines(cells, quantities) if show_all else table_lines.operator_lines(cells, expected)
@@ -132,7 +132,7 @@ def _note_omitted(cells: Sequence[Cell], shown: Sequence[TableLine]) -> None:
     """Print the number of quantities that are not shown."""
     names = {quantity.name for line in shown for quantity in line.quantities}
     if left_out := len({quantity.name for quantity in wording.measured(cells)} - names):
-        prose(f"{results.more_rows_note(left_out)}: add --all")
+        print_folded(f"{results.more_rows_note(left_out)}: add --all")
 
 
 def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], more: _AdditionalRepeats) -> None:
@@ -159,10 +159,10 @@ def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], 
         ]
         _show_table(label, differing, measured_cells, figures, words=1)
     for caution in wording.cautions(cells, {quantity.name for line in shown for quantity in line.quantities}):
-        prose(caution)
+        print_folded(caution)
 
 
-def _judged(
+def _judgements_shown(
     data: Sources, repeats: Repeats, cells: Sequence[Cell], quantities: Sequence[Quantity]
 ) -> Sequence[Judgement]:
     """Return the judgements of the trials' expectations about the quantities that are shown."""

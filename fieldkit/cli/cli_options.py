@@ -82,7 +82,7 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
         sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
     name = backend_name(arguments, site)
     selected_backend = load_backend(name, site, document)
-    # Only commands that run trials have these options. The second is an optional attribute of a backend with real robots.
+    # Only commands that run trials have these options. Only backends with real robots have the second attribute.
     selected_backend.allow_motion = getattr(arguments, "allow_motion", False)
     if hasattr(selected_backend, "allow_motion_after_fault"):
         selected_backend.allow_motion_after_fault = getattr(arguments, "allow_motion_after_fault", False)

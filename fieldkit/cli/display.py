@@ -80,7 +80,7 @@ def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
     return not sys.stdout.isatty() or _table_width(_widths([head, *rows])) <= _console().width
 
 
-def prose(text: str) -> None:
+def print_folded(text: str) -> None:
     """Print a text. On a terminal, lines are folded between words."""
     text = sanitized(text)
     print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
@@ -207,7 +207,7 @@ def show_findings(findings: Sequence[Finding]) -> None:
 
 
 @contextmanager
-def watching(*, as_json: bool) -> Iterator[Sink]:
+def showing_events(*, as_json: bool) -> Iterator[Sink]:
     """Show events while the body runs: as JSON lines, as a live line on a terminal, or as plain lines."""
     if as_json:
         yield _serialize(_print_json)
@@ -221,7 +221,7 @@ def watching(*, as_json: bool) -> Iterator[Sink]:
                 live.start()
             else:
                 live.stop()
-            if (text := shown(event, live.console.width)) is not None:
+            if (text := event_text(event, live.console.width)) is not None:
                 live.console.print(text)
 
         try:
@@ -233,7 +233,7 @@ def watching(*, as_json: bool) -> Iterator[Sink]:
 
 
 @contextmanager
-def working() -> Iterator[Sink]:
+def showing_progress() -> Iterator[Sink]:
     """Show the progress of a computation on standard error while the body runs, if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _: None
@@ -269,13 +269,13 @@ def _serialize(sink: Sink) -> Sink:
     return show
 
 
-def shown(event: Event, width: int | None = None) -> Text | None:
-    """Return the text of an event for people, or None if only the live line shows it. Raises as `words_of`."""
-    parts = words_of(event, width)
+def event_text(event: Event, width: int | None = None) -> Text | None:
+    """Return the text of an event for people, or None if only the live line shows it. Raises as `event_words`."""
+    parts = event_words(event, width)
     return _sanitized(Text.assemble(*((completed(text), style) for text, style in parts))) if parts else None
 
 
-def words_of(event: Event, width: int | None = None) -> Words:
+def event_words(event: Event, width: int | None = None) -> Words:
     """Return the styled texts of an event; empty if only the live line shows the event.
 
     Args:
@@ -296,7 +296,7 @@ def words_of(event: Event, width: int | None = None) -> Words:
         case PhaseStarted(name, repeat=""):
             words = ((f"{name} ...", "dim"),)
         case RepeatEnded():
-            words = _repeat(event, width)
+            words = _repeat_words(event, width)
         case TrialEnded(folder, valid, void, failed):
             counts = (
                 f"{valid} valid"
@@ -308,11 +308,11 @@ def words_of(event: Event, width: int | None = None) -> Words:
             command = f"to continue: {shell_command('fieldkit', 'resume', folder)}"
             words = ((f"stopped, {done} of {total} repeats are done; {command}", "bold"),)
         case CampaignPlanned() | CampaignTrial() | CampaignWent() | CampaignEnded():
-            words = _campaign(event)
+            words = _campaign_words(event)
     return words
 
 
-def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEnded) -> Words:
+def _campaign_words(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEnded) -> Words:
     if isinstance(event, CampaignTrial):
         return ((f"trial {event.number} of {event.total}: {event.trial}", "bold"),)
     done = f"campaign: {event.done} of {event.total} trials are done"
@@ -335,7 +335,7 @@ def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEn
             return ((f"{done}{hint}: {event.folder}", "bold"),)
 
 
-def _repeat(event: RepeatEnded, width: int | None) -> Words:
+def _repeat_words(event: RepeatEnded, width: int | None) -> Words:
     """Return a repeat as one line. On a terminal, a longer line is folded, with the measured figures below it."""
     head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
     measured = f"measured: {event.summary}" if event.reason and event.summary else event.summary
@@ -370,7 +370,7 @@ def _sanitized(text: Text) -> Text:
 
 
 def _print_plain(event: Event) -> None:
-    if (text := shown(event)) is not None:
+    if (text := event_text(event)) is not None:
         print(text.plain, flush=True)
 
 

@@ -67,7 +67,7 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
             location = (scene.folder, role, robot.profile.radio.interface)
             commands = [
                 (0, "begin", quote(evidence.begin_command(*location))),
-                *((0, "put", _copy_command(put, robot, folder)) for put in plan.puts() if put.role is role),
+                *((0, "put", _copy_command(put, robot, folder)) for put in plan.program_copies() if put.role is role),
                 *(
                     (number, planned.job.name, in_shell(planned.job))
                     for number, planned in enumerate(all_jobs, start=1)

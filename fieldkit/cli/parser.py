@@ -144,14 +144,16 @@ class Parser(argparse.ArgumentParser):
     def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (passed to argparse unchanged)
         """Add an argument with one of `choices` as its value; an error about another value names the nearest one."""
         values = tuple(choices)
-        self.add_argument(name, choices=values, type=self._choice(options.get("metavar", name), values), **options)
+        self.add_argument(
+            name, choices=values, type=self._choice_converter(options.get("metavar", name), values), **options
+        )
 
-    def _choice(self, name: str, choices: Sequence[str]) -> Callable[[str], str]:
-        def converted(text: str) -> str:
+    def _choice_converter(self, name: str, choices: Sequence[str]) -> Callable[[str], str]:
+        def convert(text: str) -> str:
             self._require_choice(name, text, choices)
             return text
 
-        return converted
+        return convert
 
     def _require_choice(self, argument: str, typed: str, choices: Iterable[str]) -> None:
         if typed not in choices:

@@ -10,7 +10,7 @@ from fieldkit.analysis import table_lines, wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.table_lines import TableLine
-from fieldkit.cli.display import fits, prose, show_error, table
+from fieldkit.cli.display import fits, print_folded, show_error, table
 from fieldkit.cli.hints import completed
 from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
@@ -59,7 +59,7 @@ def show_summary(cells: Sequence[Cell], *, show_all: bool = False, expected: Col
         for head, rows in tables:
             table(head, rows, title=title, right=range(1, len(head)), fold=fold)
     for caution in wording.cautions(cells, names):
-        prose(caution)
+        print_folded(caution)
     return len(left_out)
 
 

@@ -180,7 +180,7 @@ def end(folder: LabFolder) -> None:
         NoLabError: No lab is up.
         LinkError: It does not exit.
     """
-    with _connected(folder) as lab:
+    with _lab_connection(folder) as lab:
         # The kernel reports which process listens on the socket, so that no other process is killed.
         credentials = lab.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
         process = os.pidfd_open(struct.unpack("3i", credentials)[0])
@@ -195,7 +195,7 @@ def end(folder: LabFolder) -> None:
 
 
 def _request(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -> Answer:
-    with _connected(folder) as lab:
+    with _lab_connection(folder) as lab:
         try:
             lab.sendall(f"{request}\n".encode())
             return read(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
@@ -204,7 +204,7 @@ def _request(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -
 
 
 @contextmanager
-def _connected(folder: LabFolder) -> Iterator[socket.socket]:
+def _lab_connection(folder: LabFolder) -> Iterator[socket.socket]:
     with socket.socket(socket.AF_UNIX) as lab:
         lab.settimeout(_REPLY_TIMEOUT_S)
         try:

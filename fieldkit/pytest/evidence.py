@@ -126,9 +126,11 @@ class EvidenceKeeper:
         if report.failed:
             self._test_folder.has_failed = self._set_up_folder.has_failed = True
             _as_lab_error(item, call, report)
-            report.sections += [(_SECTION, path) for path in self._kept()]
+            report.sections += [(_SECTION, path) for path in self._kept_folders()]
         if call.when == "teardown":
-            report.user_properties += [(PROPERTY, path) for path in self._kept() if self._test_folder.has_failed]
+            report.user_properties += [
+                (PROPERTY, path) for path in self._kept_folders() if self._test_folder.has_failed
+            ]
             self._test_folder.remove_unless_kept(self._keep)
             self._item, self._is_set_up = None, True
 
@@ -139,7 +141,7 @@ class EvidenceKeeper:
             with suppress(OSError):
                 folder.rmdir()
 
-    def _kept(self) -> list[str]:
+    def _kept_folders(self) -> list[str]:
         """Return the evidence folders of the running test that are kept."""
         return [
             str(folder.path)

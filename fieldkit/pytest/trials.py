@@ -73,7 +73,7 @@ class TrialRunner:
             procedure=procedure,
             topology=topology_name and one_of(Topology, topology_name, "topology"),
             protocol=[one_of(Protocol, name, "protocol") for name in protocols],
-            repeats=_positive(repeats),
+            repeats=_require_positive(repeats),
             record=record,
         )
         request = command_line.request(arguments, parse_distance(distance), seed=self._lab.options.seed, notes=notes)
@@ -93,7 +93,7 @@ class TrialRunner:
         return _load_checked(outcome)
 
 
-def _positive(repeats: int | None) -> int | None:
+def _require_positive(repeats: int | None) -> int | None:
     if repeats is not None and repeats < 1:
         raise ConfigurationError(f"{repeats} repeats measure nothing", remedy="write for example repeats=2")
     return repeats

@@ -43,7 +43,7 @@ _REPORT_S: Final = 5.0
 
 _NO_FOLDER: Final = "no folder "
 _LATE_JOB: Final = "job "
-_SUMS: Final = re.compile(r"\.sums-[0-9]{1,10}\Z", re.ASCII)
+_HASH_LIST: Final = re.compile(r"\.sums-[0-9]{1,10}\Z", re.ASCII)
 _LARGE: Final = re.compile(r"\.large-[0-9]{1,10}\Z", re.ASCII)
 _SIZE: Final = re.compile(r"[0-9]{1,15}\Z", re.ASCII)
 # At most 97 characters in total, which every tar writes without an extension.
@@ -238,7 +238,7 @@ class _LargeFile:
                     progress.add(len(content))
             finally:
                 piece.unlink(missing_ok=True)
-        if self._sum() != digest.hexdigest():
+        if self._remote_hash() != digest.hexdigest():
             part.unlink()  # the pieces of an earlier call may be wrong
             raise EvidenceError(f"hash differs: {self.name}", where=self.shell.robot)
         path = _target_path(into, self.name, self.shell.robot)
@@ -259,20 +259,20 @@ class _LargeFile:
             raise EvidenceError(what, where=self.shell.robot)
         return content[:expected]
 
-    def _sum(self) -> str | None:
+    def _remote_hash(self) -> str | None:
         deadline = Deadline.after(_PIECE_S + self.size_bytes / _MIN_HASH_BYTES_PER_S)
-        return _parse_sums(call(self.shell, "sum", self.folder, self.name, deadline=deadline)).get(self.name)
+        return _parse_hashes(call(self.shell, "sum", self.folder, self.name, deadline=deadline)).get(self.name)
 
 
 def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str | None]) -> Mapping[str, int]:
     """Unpack an archive of small files, check them, and return the sizes of the large files by name."""
-    sums: dict[str, str] = {}
+    hashes: dict[str, str] = {}
     large: dict[str, int] = {}
     received: dict[str, str] = {}
     with packed.open("rb") as file:
         for member in archive.members(file, robot):
-            if _SUMS.match(member.name) and not sums:
-                sums = _parse_sums(b"".join(islice(member.chunks, _LIST_CHUNKS)))
+            if _HASH_LIST.match(member.name) and not hashes:
+                hashes = _parse_hashes(b"".join(islice(member.chunks, _LIST_CHUNKS)))
             elif _LARGE.match(member.name) and not large:
                 large = _parse_sizes(b"".join(islice(member.chunks, _LIST_CHUNKS)), robot)
                 for name in large:
@@ -282,7 +282,7 @@ def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str |
             else:
                 _require_own(member.name, robot, foreign)
                 received[member.name] = _write(member, into, robot)
-    wrong = sorted(name for name in sums.keys() | received.keys() if sums.get(name) != received.get(name))
+    wrong = sorted(name for name in hashes.keys() | received.keys() if hashes.get(name) != received.get(name))
     if wrong or not received:
         raise EvidenceError(f"hash differs or file missing: {', '.join(wrong) or 'all files'}", where=robot)
     return large
@@ -329,7 +329,7 @@ def _duplicate_error(name: str, robot: str) -> EvidenceError:
     return EvidenceError(f"sent {name}, which it or another robot sent before", where=robot)
 
 
-def _parse_sums(content: bytes) -> dict[str, str]:
+def _parse_hashes(content: bytes) -> dict[str, str]:
     matches = map(_SUM_LINE.match, content.decode("ascii", "replace").splitlines())
     return {match[2]: match[1] for match in matches if match}
 

@@ -228,7 +228,7 @@ class Link:
                 remedy=f"continue only if it was reinstalled: fieldkit enroll {address.robot} --replace",
             )
         self.awaited_action = "answer the login"
-        _, transport = self._connected()
+        _, transport = self._connection()
         count = 0
         for attempt in _login_attempts(transport, address, credentials):
             with contextlib.suppress(paramiko.AuthenticationException):
@@ -250,7 +250,7 @@ class Link:
             ExpiredError: The deadline passed, or `close_event` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
-        _, transport = self._connected()
+        _, transport = self._connection()
         channel = call_with_deadline(lambda: self._channel(transport), deadline, close_event, what="get a channel")
         call_with_deadline(lambda: channel.exec_command(command), deadline, close_event, what="start")
         self.acknowledge()
@@ -261,12 +261,12 @@ class Link:
 
     def acknowledge(self) -> None:
         """Send the TCP acknowledgement now, so that no delayed one collides with packets of the robot's command."""
-        stream, _ = self._connected()
+        stream, _ = self._connection()
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def extend_timeout(self, seconds: float) -> None:
         """Extend `Timing.dead_s`, the time that the peer may be silent, by some seconds."""
-        stream, _ = self._connected()
+        stream, _ = self._connection()
         _set_timeout(stream, self._timing.dead_s + seconds)
 
     def open_spares(self) -> None:
@@ -274,7 +274,7 @@ class Link:
 
         Must be called after a command has ended. At its start the answers would collide with its packets.
         """
-        _, transport = self._connected()
+        _, transport = self._connection()
         if _closes_spares(transport):
             return
         with self._lock:
@@ -293,7 +293,7 @@ class Link:
         Raises:
             OSError, SSHException, EOFError: The connection broke, or the server refuses more.
         """
-        _, transport = self._connected()
+        _, transport = self._connection()
         if _closes_spares(transport):
             return None
         with self._lock:
@@ -351,7 +351,7 @@ class Link:
             transport.close()
             stream.close()
 
-    def _connected(self) -> tuple[socket.socket, paramiko.Transport]:
+    def _connection(self) -> tuple[socket.socket, paramiko.Transport]:
         if self._stream is None or self._transport is None:
             raise EOFError("not connected")
         return self._stream, self._transport

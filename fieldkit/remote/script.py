@@ -112,13 +112,12 @@ def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> 
     match completed.exit_code:
         case 75 if held := _HELD.match(what):  # exit codes of the script, see common.sh
             age, remaining = (format_duration(float(held[name])) for name in ("age", "rest"))
-            what = (
-                f"{held['who']} holds it since {_since(held)}, {age} ago, for {held['what']}; expires in {remaining}"
-            )
+            holder = f"{held['who']} holds it since {_start_time(held)}, {age} ago, for {held['what']}"
+            what = f"{holder}; expires in {remaining}"
             remedy = HELD_REMEDY
         case 76 if lost := _LOST.match(what):
             raise LockLostError(
-                _LOSS_MESSAGES[lost["kind"]].format(at=_since(lost), **lost.groupdict()), where=shell.robot
+                _LOSS_MESSAGES[lost["kind"]].format(at=_start_time(lost), **lost.groupdict()), where=shell.robot
             )
         case 77:
             remedy = "check its battery and power supply; on the robot: uptime -s"
@@ -139,5 +138,5 @@ def error_message(stderr: bytes) -> str:
     return ": ".join(text for text in (printable(reason), printable(log)) if text)
 
 
-def _since(record: re.Match[str]) -> str:
+def _start_time(record: re.Match[str]) -> str:
     return f"{datetime.fromtimestamp(int(record['since']), UTC):%H:%M:%S UTC}"

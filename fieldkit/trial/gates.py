@@ -58,10 +58,10 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         view = View(scene, evidence, placed.within)
         try:
             result = placed.step.measure(view)
-            impossible = dict(_impossible(placed, result))
+            impossible = dict(_impossible_values(placed, result))
             if not placed.disturbed:
                 problems += (_step_problem(placed, reason) for reason in placed.step.check(view))
-                problems += _unexplained(placed, result)
+                problems += _unexplained_columns(placed, result)
                 problems += impossible.values()
             result = result.without(impossible)
             if placement_problem:
@@ -84,13 +84,13 @@ def _step_problem(placed: PlacedStep, reason: str) -> str:
     return f"{placed.step.prefix}: {reason}" if placed.step.prefix else reason
 
 
-def _unexplained(placed: PlacedStep, measured: Measured) -> Iterator[str]:
+def _unexplained_columns(placed: PlacedStep, measured: Measured) -> Iterator[str]:
     for column in placed.step.output_columns():
         if column.name not in measured.values and column.name not in measured.missing:
             yield f"{placed.label} gives neither a value nor a reason for {column.name}"
 
 
-def _impossible(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, str]]:
+def _impossible_values(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, str]]:
     """Yield each column whose measured value is outside its declared range, and the reason.
 
     Such values are removed, because a table that contains one could not be read again.

@@ -117,7 +117,7 @@ class Plan(Strict):
                     remedy="report it to the author of the step",
                 ) from error
 
-    def puts(self) -> tuple[PutProgram, ...]:
+    def program_copies(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""
         planned = (job for scene in self.scenes() for job in self.jobs(scene))
         return tuple(dict.fromkeys(job.put for job in planned if job.put is not None))

@@ -72,7 +72,9 @@ def set_positions(
         problem = f"the evidence is not what was measured: {manifest.summarize(changes)}"
         raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
     with journal.locked(folder):
-        accounts_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
+        accounts_by_role = {
+            role: _store_source(folder, role, source, offset_s, gap_s) for role, source in sources.items()
+        }
         if accounts_by_role:
             text = position_sources.text(Accounts(accounts_by_role, heights=heights))
             files.write(folder / position_sources.FILE, text.encode())
@@ -100,7 +102,7 @@ def _require_file(path: Path) -> None:
         raise ConfigurationError(problem, where=str(path), remedy="cut it to the time of the trial")
 
 
-def _stored(folder: Path, role: Role, source: Path | Account, offset_s: float, gap_s: float) -> Account:
+def _store_source(folder: Path, role: Role, source: Path | Account, offset_s: float, gap_s: float) -> Account:
     """Copy the position file of a robot into the trial's folder and return its account."""
     if isinstance(source, Account):
         return source

@@ -50,7 +50,7 @@ def rebuild(folder: Path) -> Rebuilt:
     before = {name: _content(folder / name) for name in names}
     entries = journal.history(folder, plan)
     with journal.locked(folder):  # rows that a running trial adds meanwhile would be lost
-        table = rows.to_csv(_measured(folder, plan, entries), plan.table)
+        table = rows.to_csv(_rows(folder, plan, entries), plan.table)
         rows.summary(folder, plan, table)  # if this fails, nothing has been written yet
         rows.write_table(folder, table)
         cells = rows.write_summary(folder, plan, table)
@@ -67,10 +67,10 @@ def measured(folder: Path, plan: Plan) -> list[Row]:
     Raises:
         EvidenceError: As for `journal.history`.
     """
-    return _measured(folder, plan, journal.history(folder, plan))
+    return _rows(folder, plan, journal.history(folder, plan))
 
 
-def _measured(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row]:
+def _rows(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row]:
     attempts = journal.ended(entries)
     return [row(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder))) for attempt in attempts]
 

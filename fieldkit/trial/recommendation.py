@@ -95,7 +95,7 @@ def assess(attempts: Repeats, criterion: LinkCriterion) -> list[Assessment]:
         criterion: The criterion.
     """
     tables: dict[tuple[Candidate, str, float], list[Repeats]] = {}
-    for rows, stream, prefix, rmw in _measured(attempts):
+    for rows, stream, prefix, rmw in _attempts_by_step(attempts):
         if criterion.size_bytes is not None and round(stream.bytes) != round(criterion.size_bytes):
             continue
         for (topology, distance), index in rows.groups(("topology", "distance")).items():
@@ -111,7 +111,7 @@ def assess(attempts: Repeats, criterion: LinkCriterion) -> list[Assessment]:
     ]
 
 
-def _measured(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, str]]:
+def _attempts_by_step(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, str]]:
     """Yield the attempts of each trial with each of its `topics` steps, its column prefix, and its RMW."""
     for folder in dict.fromkeys(attempts.texts[SOURCE]):
         if not folder or not Path(folder).is_dir():

@@ -111,7 +111,7 @@ def make_plan(
         step_packages=step_packages.of_kinds(placed.kind for placed in procedure.walk()),
         columns=freeze((*others, *of_steps(placed.step for placed in procedure.walk()))) or None,
     )
-    plan.puts()  # raises before robots are started if a step of another package cannot give its commands
+    plan.program_copies()  # raises before robots are started if a step of another package cannot give its commands
     return plan
 
 

@@ -84,13 +84,13 @@ class LivenessFile:
     def update(self, state: int) -> None:
         """Increment the counter of this program, and write its state."""
         self._count += 1
-        entry = os.getpid(), _process(os.getpid())[1], self._count, state
+        entry = os.getpid(), _process_state(os.getpid())[1], self._count, state
         _ENTRY.pack_into(self._map, self._own * _ENTRY.size, *entry)
 
     @property
     def other_state(self) -> int:
         """The last state that the other program has written."""
-        return self._other().state
+        return self._other_entry().state
 
     def poll(self) -> str:
         """Check the other program; must be called in each iteration.
@@ -98,12 +98,12 @@ class LivenessFile:
         Returns:
             The reason why it does not run, for example `has ended`; empty while it runs.
         """
-        pid, started, count, _ = self._other()
+        pid, started, count, _ = self._other_entry()
         now_s = time.monotonic()
         passed_s, self._polled_s = min(now_s - self._polled_s, _MAX_POLL_S), now_s
         self._silent_s = self._silent_s + passed_s if count == self._other_count else 0.0
         self._other_count = count
-        state, other_started = _process(pid)
+        state, other_started = _process_state(pid)
         if not pid or other_started != started or state in _ENDED_STATES:
             return "has ended"
         if state in _SUSPENDED_STATES:
@@ -112,16 +112,16 @@ class LivenessFile:
 
     def kill_other(self) -> None:
         """Kill the other program, so that it cannot continue later; never another process that reuses its pid."""
-        pid, started, *_ = self._other()
-        if pid and _process(pid)[1] == started:
+        pid, started, *_ = self._other_entry()
+        if pid and _process_state(pid)[1] == started:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
-    def _other(self) -> LifeEntry:
+    def _other_entry(self) -> LifeEntry:
         return entries(self._map[:])[1 - self._own]
 
 
-def _process(pid: int) -> tuple[str, int]:
+def _process_state(pid: int) -> tuple[str, int]:
     """Return the state of a process and its start time in clock ticks since boot; `X` and 0 if it does not exist."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:  # noqa: PTH123 (Python 3.8)

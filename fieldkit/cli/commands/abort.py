@@ -4,7 +4,7 @@ import argparse
 from typing import Final
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import show_error, watching
+from fieldkit.cli.display import show_error, showing_events
 from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import confirmed
 from fieldkit.core import runtime
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.remote.motion_states import STATE_TEXTS, MotionState
     from fieldkit.trial.running import locks
 
-    with watching(as_json=False) as sink:
+    with showing_events(as_json=False) as sink:
         _, backend = cli_options.backend(arguments, sink)
         with backend.persistent_shells(sink=sink) as robots:
             if not robots:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import show_error, watching
+from fieldkit.cli.display import show_error, showing_events
 from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import interruptible
 from fieldkit.core.errors import EvidenceError, FieldkitError, shell_command
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.campaign.runner import CampaignRun
     from fieldkit.cli import cli_options, results
 
-    with watching(as_json=arguments.json) as sink, interruptible() as stop:
+    with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         planned, document = plan.make_plan(arguments.file, name)
         folder = arguments.out / f"campaign_{planned.campaign.name}"

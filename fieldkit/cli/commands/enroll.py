@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     name, path = arguments.robot, arguments.site
     robot, where = _robot(name, path)
     address = Address(name, robot.host or "", robot.port)
-    pinned = _pinned(name, robot, ignore_invalid=arguments.replace)
+    pinned = _pinned_key(name, robot, ignore_invalid=arguments.replace)
     offered = offered_key(
         address,
         over_tcp(address.host, address.port),
@@ -90,7 +90,7 @@ def _robot(name: str, path: Path) -> "tuple[SiteRobot, str]":
     return site.robots[name], where
 
 
-def _pinned(name: str, robot: "SiteRobot", *, ignore_invalid: bool) -> HostKey | None:
+def _pinned_key(name: str, robot: "SiteRobot", *, ignore_invalid: bool) -> HostKey | None:
     if robot.host_key is None:
         return None
     try:

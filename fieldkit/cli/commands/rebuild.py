@@ -3,7 +3,7 @@
 import argparse
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import prose, show_note
+from fieldkit.cli.display import print_folded, show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core.text import print_text
 
@@ -25,6 +25,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not rebuilt.has_manifest:
         show_note(f"{arguments.trial}: there is no manifest to verify its evidence with")
     if left_out := results.show_summary(rebuilt.cells, show_all=arguments.all, expected=rebuilt.expected):
-        prose(f"{results.more_rows_note(left_out)}: add --all")
+        print_folded(f"{results.more_rows_note(left_out)}: add --all")
     print_text(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
     return 0

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import watching
+from fieldkit.cli.display import showing_events
 from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import interruptible
 from fieldkit.core.events import Note
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         for text in arguments.distances
     ]
     topology = requests[0].chosen_topology
-    with watching(as_json=arguments.json) as sink, interruptible() as stop:
+    with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         cast = backend.cast(topology)
         run_id = secrets.token_hex(8)

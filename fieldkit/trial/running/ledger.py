@@ -63,7 +63,7 @@ class Ledger:
         ended = journal.ended(entries)
         for attempt in ended:
             self._rename(attempt)
-        self.differences = dict(self._differing(ended))
+        self.differences = dict(self._manifest_differences(ended))
         """Differences from the manifest, by file."""
         unchanged = self._unchanged_lines(len(ended))
         remeasured = [attempt for index, attempt in enumerate(ended) if index >= len(unchanged) or attempt.reopened]
@@ -171,7 +171,7 @@ class Ledger:
     def _table(self) -> str:
         return rows.head(self._plan.table) + "".join(self._lines)
 
-    def _differing(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
+    def _manifest_differences(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
         if ended and not (self._folder / store.MANIFEST_FILE).exists():
             yield store.MANIFEST_FILE, "missing, so changes of the evidence cannot be detected"
         if self._manifest.unchanged_lines(store.TRIAL_CSV) is None:

@@ -47,7 +47,7 @@ def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
             report.fail(_CONNECTION, error.what, error.remedy)
         return report
 
-    require_passed(_joined(run_parallel(log_in, cast)))
+    require_passed(_all_findings(run_parallel(log_in, cast)))
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def check(plan: Plan, shells: Shells, out: Path, *, whole: bool) -> Checked:
         reports[refusal.role].fail("tools", refusal.what, refusal.remedy)
     laptop = Report(LAPTOP)
     system.judge_laptop(plan, out, laptop)
-    return Checked(_joined([*reports.values(), laptop]), variants_by_role)
+    return Checked(_all_findings([*reports.values(), laptop]), variants_by_role)
 
 
 def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
@@ -173,5 +173,5 @@ def _judge_lock(held: LockState | None, report: Report) -> bool:
     return False
 
 
-def _joined(reports: Iterable[Report]) -> tuple[Finding, ...]:
+def _all_findings(reports: Iterable[Report]) -> tuple[Finding, ...]:
     return tuple(finding for report in reports for finding in report.findings)

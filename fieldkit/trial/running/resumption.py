@@ -31,7 +31,7 @@ def resumable(folder: Path) -> Plan:
             remedy="resume it with that version, or start a new trial; the repeats that ended are complete: "
             + shell_command("fieldkit", "rebuild", folder),
         )
-    for put in plan.puts():
+    for put in plan.program_copies():
         put.program.content()
     return plan
 

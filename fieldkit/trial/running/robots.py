@@ -79,7 +79,7 @@ class Robots:
             FieldkitError: As for `evidence.begin` and `programs.copy`; or a program of the lab has changed.
         """
         plan = self._plan
-        puts = [(put, put.program.content()) for put in plan.puts()]
+        puts = [(put, put.program.content()) for put in plan.program_copies()]
 
         def make(role: Role) -> None:
             self._boots[role] = evidence.begin(
@@ -96,7 +96,7 @@ class Robots:
                     sha256, executable = put.program.sha256, put.program.executable
                     programs.copy(self.shells[role], remote, put.at, content, sha256, executable=executable)
 
-        self._everywhere(make)
+        self._run_on_all(make)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
         """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""
@@ -120,13 +120,13 @@ class Robots:
             )
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
-        with self._watched(), motion_control.guarded(self._plan, scene, self.shells):
+        with self._monitored_processes(), motion_control.guarded(self._plan, scene, self.shells):
             for entry in self._plan.procedure.steps:
                 with step_errors.reported(entry.kind, scene.laptop_folder):
                     entry.step.run(scene, self._testbed, announce)
 
     @contextmanager
-    def _watched(self) -> Iterator[None]:
+    def _monitored_processes(self) -> Iterator[None]:
         """Unblock the body if a process that the robots need has exited, because no answer can arrive any more."""
         ended = Event()
 
@@ -161,7 +161,7 @@ class Robots:
             The problems, one sentence each.
         """
         self._is_fetch_cancelled = False
-        problems = self._everywhere(lambda role: self._collect(role, remote, into, clean=clean))
+        problems = self._run_on_all(lambda role: self._collect(role, remote, into, clean=clean))
         failed = [(role, *problem) for role, problem in zip(self._roles, problems, strict=True) if problem]
         for role, reason, is_there in failed:
             if is_there:
@@ -252,11 +252,11 @@ class Robots:
             except FieldkitError:
                 return  # the attempt already has reasons for its failure
 
-        self._everywhere(check_lock)
+        self._run_on_all(check_lock)
 
     def end_jobs(self, remote: str) -> None:
         """End every job of an attempt; errors as `evidence.end_jobs`."""
-        self._everywhere(lambda role: evidence.end_jobs(self.shells[role], remote))
+        self._run_on_all(lambda role: evidence.end_jobs(self.shells[role], remote))
 
     def stop_leftover_jobs(self) -> None:
         """End every job of this trial that remains from a killed run; errors as for `evidence.end_all`."""
@@ -265,7 +265,7 @@ class Robots:
             jobs.install(self.shells[role], Deadline.after(jobs.REPLY_S))
             evidence.end_all(self.shells[role], self._plan.trial)
 
-        self._everywhere(end)
+        self._run_on_all(end)
 
     def close_connections(self) -> None:
         """Close every control connection and cancel fetching; the next command opens a new connection."""
@@ -287,10 +287,10 @@ class Robots:
             elif remote not in unfetched:
                 evidence.discard_attempt(self.shells[role], remote)
 
-        self._everywhere(remove)
+        self._run_on_all(remove)
 
     def _interface(self, role: Role) -> str:
         return self._plan.cast[role].profile.radio.interface
 
-    def _everywhere(self, call: Callable[[Role], T]) -> list[T]:
+    def _run_on_all(self, call: Callable[[Role], T]) -> list[T]:
         return run_parallel(call, self._roles, on_interrupt=self.close_connections)

@@ -72,7 +72,7 @@ def test_a_trial_with_a_changed_program_is_not_resumed(tmp_path: Path, monkeypat
     plan = PLAN.model_copy(update={"procedure": procedure})
     (folder / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
     monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
-    assert [put.at for put in resumption.resumable(folder).puts()] == [".put/run/probe"]
+    assert [put.at for put in resumption.resumable(folder).program_copies()] == [".put/run/probe"]
     program.write_bytes(b"2")
     with pytest.raises(ConfigurationError, match="probe: the program has changed since the procedure was read"):
         resumption.resumable(folder)
