@@ -3,8 +3,9 @@
 Publishers and subscribers are separate programs on loopback. Plain pairs use the binding of each middleware as its
 documentation shows; `attached` adds the attachment and the time stamp that rmw_zenoh requires; `agent` uses
 fieldkit's adapters of the same library. A path over `fieldkit bridge` starts or ends at a plain end of ROS 1, and the
-plain pair of ROS 1 is its reference. All paths run in turn: first messages at a fixed rate to measure the delay, then
-as many messages as possible for one second. Each message starts with the time of its creation on the machine's clock.
+plain pair of ROS 1 is its reference. All paths run in sequence: first messages at a fixed rate to measure the delay,
+then as many messages as possible for one second. Each message starts with the time of its creation on the machine's
+clock.
 """
 
 import argparse
@@ -287,7 +288,7 @@ def free_port() -> int:
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Run all paths in turn, round by round; return the measurements of each."""
+    """Run all paths in sequence in each round; return the measurements of each path."""
     measurements: list[dict[str, Any]] = []
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())

@@ -1,8 +1,8 @@
 """The paper's EMANE experiment in a lab: `python -m benchmarks.emane [--rounds 3] [--json]`, as root.
 
-Ten robots; 100 pings of 64 bytes from the first to the tenth, before and after the tenth moves by 100 m in each axis.
-Each radio and round has a new lab, started by the commands of docs/studies/emane.md. ping prints 64 bytes:
-56 of payload and 8 of ICMP header; with the IP header it is 84. All times are round trips in ms; loss is in percent.
+The first of ten robots sends 100 pings of 64 bytes to the tenth, before and after the tenth moves by 100 m along each
+axis. Each radio and round has a new lab, started by the commands of docs/studies/emane.md. ping prints 64 bytes: 56
+of payload and 8 of ICMP header; with the IP header it is 84. All times are round trips in ms; loss is in percent.
 """
 
 import argparse

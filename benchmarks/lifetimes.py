@@ -1,8 +1,8 @@
 """Lifetimes of watched programs in chosen network namespaces, from kernel events and without effect on the programs.
 
 The kernel reports every exec and exit with its time on the monotonic clock (process events connector,
-linux/cn_proc.h). So programs that are started in different ways are timed by the same definition: from the exec of
-the program to the exit of its process.
+linux/cn_proc.h). Therefore programs that are started in different ways are timed by the same definition: from the
+exec of the program to the exit of its process.
 """
 
 import ctypes

@@ -2,7 +2,7 @@
 
 One thread carries streams over loopback and delays every byte by half a round trip. Trips are counted like logical
 clocks: data from this computer has a trip number one above the highest received over any link, and data from a robot
-has the highest number that the robot received. So parallel round trips count once.
+has the highest number that the robot received. Therefore parallel round trips count once.
 """
 
 import contextlib

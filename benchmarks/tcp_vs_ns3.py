@@ -1,9 +1,9 @@
 """TCP of the co-simulation compared with ns-3's, with equal losses on a cable: `python -m benchmarks.tcp_vs_ns3`.
 
-Has the requirements of `radio_vs_ns3`. One station sends to another at full rate, and packets are lost by their
-numbers, so that all differences are due to TCP. With fixed loss patterns the windows after the losses are printed,
-with random losses, equal for all peers, the goodputs. `--events PATTERN CONTROL` prints the events around the first
-difference.
+It has the same requirements as `radio_vs_ns3`. One station sends to another at full rate, and packets are lost by
+their numbers, so that all differences are due to TCP. With fixed loss patterns it prints the windows after the
+losses; with random losses, which are equal for all peers, it prints the goodputs. `--events PATTERN CONTROL` prints
+the events around the first difference.
 """
 
 import argparse

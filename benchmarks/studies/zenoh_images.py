@@ -1,9 +1,9 @@
 """Losses of 1 MB images over Zenoh, per repeat: `python -m benchmarks.studies.zenoh_images [--rounds N] [--page P]`.
 
-As root. Two emulated robots of a separate lab, 20 m apart. The agent of the step `topics` is compared with a plain
-pair of Zenoh sessions on the same robots (benchmarks/studies/zenoh_plain.py, which imports nothing of fieldkit), with
-several settings; each round runs all of them in turn. Losses of this stream are bimodal, so each repeat is printed
-and no mean.
+It needs root. Two emulated robots of a separate lab are 20 m apart. The agent of the step `topics` is compared with a
+plain pair of Zenoh sessions on the same robots (benchmarks/studies/zenoh_plain.py, which imports nothing of
+fieldkit), with several settings; each round runs all of them in sequence. Losses of this stream are bimodal, so each
+repeat is printed and no mean.
 
 A repeat takes 11 s, a round of six settings about 70 s.
 """

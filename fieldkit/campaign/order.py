@@ -117,7 +117,7 @@ def _sweeps(block: list[PlannedTrial]) -> Iterator[list[PlannedTrial]]:
 
 
 def _swapped(order: Order, rng: random.Random) -> Order:
-    """Return the order after a swap of two random blocks of the same larger block, which may be the same block."""
+    """Return the order after a swap of two random blocks of the same larger block; both may be the same block."""
     depth = 1 + _random_index(len(_blocks_of(order[0])), rng)
     blocks = [tuple(block) for _, block in groupby(order, key=lambda trial: _blocks_of(trial)[:depth])]
     parents = [_blocks_of(block[0])[: depth - 1] for block in blocks]

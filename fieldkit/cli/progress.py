@@ -49,7 +49,7 @@ class ProgressBar:
 
     @property
     def is_needed(self) -> bool:
-        """True if there is something to show and no input is expected, which a redrawn line would overwrite."""
+        """True if there is something to show and no input is expected. A redrawn line would overwrite typed input."""
         return bool(self._phase.name) and not self._is_asking
 
     def update(self, event: Event) -> None:

@@ -160,7 +160,7 @@ class OpenedLab:
         return self._testbed
 
     def place(self, distance: str, scenario: str = "los") -> None:
-        """Move the robots to other places, where they stay; a person is asked to carry real robots.
+        """Move the robots to other positions and leave them there; a person is asked to carry real robots.
 
         Args:
             distance: Distance between the robots, or between each of them and the relay: `30ft`.

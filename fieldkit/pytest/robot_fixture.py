@@ -138,8 +138,8 @@ class RobotHandle:
     ) -> ProgramOutput:
         """Run a program and wait until it exits.
 
-        If the connection is lost, it is opened again and the program is run again from its start. So do not run
-        programs that must not run twice.
+        If the connection is lost, it is opened again and the program is run again from its start. Do not use
+        it for programs that must not run twice.
 
         Args:
             argv: The program with its arguments; they are not interpreted by a shell.

@@ -54,7 +54,7 @@ def _name() -> str:
 
 
 def install(shell: Shell) -> None:
-    """Copy the agent to the robot if it is missing there. The job script must be installed, which creates the folder.
+    """Copy the agent to the robot if it is missing there; the installed job script has created the folder.
 
     Raises:
         LinkError: The robot did not answer.

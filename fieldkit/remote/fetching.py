@@ -31,7 +31,7 @@ RESERVE_BYTES: Final = 100 << 20
 """Disk space of this machine that evidence must leave free."""
 
 _PIECE_S: Final = 300.0
-"""Timeout of a piece, which a link with 14 kB/s needs."""
+"""Timeout of a piece: the time that a link with 14 kB/s needs."""
 _MIN_HASH_BYTES_PER_S: Final = 2e6
 """Minimum rate of sha256sum on a robot: a tenth of that on a Raspberry Pi Zero."""
 

@@ -270,7 +270,7 @@ class Link:
         _set_timeout(stream, self._timing.dead_s + seconds)
 
     def open_spares(self) -> None:
-        """Start to open channels for later commands, which then need not wait for one.
+        """Start to open channels in advance, so that later commands need not wait for a channel.
 
         Must be called after a command has ended. At its start the answers would collide with its packets.
         """

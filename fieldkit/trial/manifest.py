@@ -81,7 +81,7 @@ class Manifest:
         self._save()
 
     def renew(self, names: Iterable[str]) -> None:
-        """Compute the checksums of some top-level files again, which are derived from others; the rest is kept."""
+        """Compute the checksums of the top-level files `names` again; all other checksums are kept."""
         self._top_level |= {name: _sha256(self._folder / name) for name in names}
         self._save()
 
@@ -178,7 +178,7 @@ def is_positions(name: str) -> bool:
 
 
 def _unchanged_lines(path: Path, digest: str) -> int | None:
-    """Return the number of lines after which a file has this checksum, or None if it never has."""
+    """Return the number of leading lines of a file that have this checksum, or None if no number of lines has it."""
     hasher, count = hashlib.sha256(), 0
     try:
         lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)

@@ -30,7 +30,7 @@ from fieldkit.ros.ports import MAX_DOMAIN
 from fieldkit.ros.types import Distribution, MessageTypes
 
 MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
-"""The keys of `agent.middleware.ADAPTERS`, which a test compares, without `ros2`.
+"""The keys of `agent.middleware.ADAPTERS` without `ros2`; a test compares them.
 
 That adapter needs the Python of a robot's ROS 2.
 """

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _report_outcome(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
-    """Print what is not done or not shown, with remedies, and return the exit code."""
+    """Print failed repeats, skipped trials and unmet expectations with remedies; return the exit code."""
     if outcome.failed:
         failed = format_count(outcome.failed, "repeat")
         command = shell_command("fieldkit", "campaign", file, "--failed")

@@ -17,7 +17,7 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Rebuild, show the summary, and print which files changed."""
+    """Rebuild the tables; print the summary and the names of the changed files."""
     from fieldkit.cli import results
     from fieldkit.trial.rebuild import rebuild
 

@@ -49,7 +49,7 @@ class Report:
         self.add(check, Verdict.WARN, detail, remedy)
 
     def fail(self, check: str, detail: str, remedy: str) -> None:
-        """Add a problem with which no trial can start."""
+        """Add a problem that prevents a trial."""
         self.add(check, Verdict.FAIL, detail, remedy)
 
     def add(self, check: str, status: Verdict, detail: str, remedy: str) -> None:

@@ -23,7 +23,7 @@ from fieldkit.trial.running.stop import Stop
 
 TABLE_SHARE: Final = 0.01
 """Table and manifest are rewritten when this share of the attempts is missing in them: after each one in a trial of
-up to 100 attempts. So the total amount written grows linearly with the trial, not with its square."""
+up to 100 attempts. Therefore the total amount written grows linearly with the trial, not with its square."""
 
 
 class Ledger:
