@@ -55,7 +55,7 @@ _LOST: Final = re.compile(
 _LOSS_MESSAGES: Final = {
     "aborted": "the trial was aborted by {who} at {at}",
     "stopped": "{who} stopped the robots at {at} (fieldkit stop)",
-    "held": "{who} took the robot at {at} for {what}, after this trial's lock had expired",
+    "held": "{who} locked the robot at {at} for {what}, after this trial's lock had expired",
     "gone": "the lock of this trial is missing; the last lock was that of {who} at {at} for {what}",
 }
 
@@ -122,7 +122,7 @@ def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> 
         case 77:
             remedy = "check its battery and power supply; on the robot: uptime -s"
         case 28:
-            remedy = f"see what fills its disk: df -h; du -sh ~/{HOME}/*; then remove old trials and bags"
+            remedy = f"find what fills its disk: df -h; du -sh ~/{HOME}/*; then remove old trials and bags"
     default_remedy = _READ_ONLY_REMEDY if "Read-only file system" in what else "run the command on the robot by hand"
     raise RobotError(what, where=shell.robot, remedy=remedy or default_remedy)
 

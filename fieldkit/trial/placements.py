@@ -39,8 +39,8 @@ odometry."""
 def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
     """Return the reason why the recorded positions contradict the planned placement, or None.
 
-    Robots are at their places when an attempt starts, even if they move later. Therefore the recorded distance of two robots
-    must equal the planned one at some time of the attempt.
+    Robots are at their places when an attempt starts, even if they move later. Therefore the recorded distance of two
+    robots must equal the planned one at some time of the attempt.
     """
     return next(_contradictions(scene, evidence), None)
 

@@ -26,7 +26,7 @@ _OFFLOADS: Final = {
 _FACTS: Final = {
     "type": r"^[ \t]*type (.{1,30})$",
     "channel": r"^[ \t]*channel ([0-9]{1,3}) \(",
-    "joined": r"^(?:Connected to|Joined IBSS) (\S{1,20}) \(on ",
+    "associated": r"^(?:Connected to|Joined IBSS) (\S{1,20}) \(on ",
     "ssid": r"^[ \t]*(?:SSID:|ssid) (.{1,128})$",
     "rate": r"^[ \t]*tx bitrate:[ \t]*([0-9.]{1,10} MBit/s)",
 }
@@ -69,7 +69,11 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     elif "UP" not in flags["flags"].split(","):
         report.fail(check, "down", f"sudo ip link set {name} up")
     elif "NO-CARRIER" in flags["flags"]:
-        report.fail(check, "up, but joined to nothing: no carrier", f"iw dev {name} link   # then join the network")
+        report.fail(
+            check,
+            "up, but not associated with a network: no carrier",
+            f"iw dev {name} link   # then join the network",
+        )
     elif robot.address not in {address.partition("/")[0] for address in addresses}:
         actual = f"has {', '.join(addresses)}" if addresses else "has no IPv4 address"
         remedy = f"ip addr   # then correct address of {robot.name} in the site file, or join its network"
@@ -119,14 +123,14 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
     wifi_facts = facts(sections)
     interface = robot.profile.radio.interface
     is_access_point = wifi_facts.get("type") == "AP"
-    if "joined" not in wifi_facts and wifi_facts.get("type") == "managed":
-        report.fail("Wi-Fi", "joined to no network", f"sudo wpa_cli -i {interface} reconnect")
+    if "associated" not in wifi_facts and wifi_facts.get("type") == "managed":
+        report.fail("Wi-Fi", "not associated with a network", f"sudo wpa_cli -i {interface} reconnect")
         return
-    stations = "wifi-stations" if is_access_point or "joined" not in wifi_facts else "wifi-link"
+    stations = "wifi-stations" if is_access_point or "associated" not in wifi_facts else "wifi-link"
     signals = [int(signal) for signal in _SIGNAL.findall(sections.get(stations, MISSING_SECTION).text)]
     words = [
         f"{wifi_facts.get('type', 'unknown mode')} {wifi_facts.get('ssid', '')!r}",
-        *([f"at {wifi_facts['joined']}"] if "joined" in wifi_facts else []),
+        *([f"at {wifi_facts['associated']}"] if "associated" in wifi_facts else []),
         *([f"channel {wifi_facts['channel']}"] if "channel" in wifi_facts else []),
         *([f"{len(signals)} stations"] if is_access_point else []),
         *([f"{min(signals)} dBm"] if signals else []),
@@ -135,7 +139,9 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
     weak_dbm = robot.profile.radio.sensitivity_dbm + MARGIN_DB
     if signals and min(signals) < weak_dbm:
         report.warn(
-            "Wi-Fi", f"{', '.join(words)}: weaker than {weak_dbm:g} dBm", f"iw dev {interface} link   # closer?"
+            "Wi-Fi",
+            f"{', '.join(words)}: weaker than {weak_dbm:g} dBm",
+            f"iw dev {interface} link   # is the robot too far away?",
         )
     else:
         report.ok("Wi-Fi", ", ".join(words))

@@ -16,7 +16,7 @@ PROBE_S: Final = 40.0
 """Maximum duration of `probe`: each tool has 6 s, and Python on a small computer needs 3 s to start ros2."""
 
 # POSIX sh: dash, bash, busybox ash. Standard input is empty, and a tool that does not exit is killed.
-_PROBE_FUNCTION: Final = r"""look() {
+_PROBE_FUNCTION: Final = r"""run_tool() {
     printf '==> %s <==\n' "$1"
     shift
     "$@" </dev/null 2>&1 &
@@ -75,7 +75,11 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
         (_USER, ("id", "-u")),
         *(command for tool in probed_tools for command in commands_by_tool[tool]),
     ]
-    return ("sh", "-c", _PROBE_FUNCTION + "".join(f"look {name} {quote(argv)}\n" for name, argv in named_commands))
+    return (
+        "sh",
+        "-c",
+        _PROBE_FUNCTION + "".join(f"run_tool {name} {quote(argv)}\n" for name, argv in named_commands),
+    )
 
 
 def parse(output: bytes, profile: RobotProfile) -> Variants:

@@ -135,7 +135,7 @@ def test_outputs_of_the_kernels_wifi_stack_are_read_in_every_mode() -> None:
     ibss = heard(SENDER, wifi_info=said("iw/info-hwsim-ibss-5.txt"), wifi_link=said("iw/link-hwsim-ibss-6.txt"))
     assert only(ibss, "Wi-Fi").detail == "IBSS 'lawn', at 26:9f:2e:55:bf:8b, channel 6"
     down = heard(SENDER, wifi_info=said("iw/info-hwsim-down-5.txt"), wifi_link=said("iw/link-none.txt"))
-    assert only(down, "Wi-Fi").detail == "joined to no network"
+    assert only(down, "Wi-Fi").detail == "not associated with a network"
 
 
 def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:

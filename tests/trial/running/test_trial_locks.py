@@ -125,7 +125,7 @@ def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShel
     with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (4, "1"))
         with locked({Role.SENDER: robot}, BERT, sink=quiet):
-            with pytest.raises(LockLostError, match=r"bert@two took the robot at .* for trial-b") as caught:
+            with pytest.raises(LockLostError, match=r"bert@two locked the robot at .* for trial-b") as caught:
                 begin(robot, ANNA)
             assert caught.value.exit_code == 3
             begin(robot, BERT)
@@ -270,7 +270,7 @@ def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -
         with locked({Role.SENDER: robot}, BERT, sink=quiet):
             for call in (jobs.start, jobs.run):
                 one = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
-                with pytest.raises(LockLostError, match=r"bert@two took the robot at .* for trial-b"):
+                with pytest.raises(LockLostError, match=r"bert@two locked the robot at .* for trial-b"):
                     call(robot, one)
     assert not (robot.home / FOLDER / "started").exists()
 
