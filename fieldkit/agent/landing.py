@@ -26,11 +26,12 @@ COMMAND_TIMEOUT_S = 5.0
 """Time within which an autopilot must execute a command."""
 _POLL_S = 0.1
 _MODE_WAIT_S = 0.3
-"""Maximum wait for a heartbeat before the first command: the last one may be older than a takeover by a person."""
+"""Maximum wait for a heartbeat before the first command, because the last one may be older than a takeover by a
+person."""
 _LANDING_TIMEOUT_S = 600.0
 """Time for which a drone whose motors turn is commanded to come down."""
 NO_HEARTBEAT_S = 60.0
-"""Time for which commands are sent although no heartbeat arrives: a lost connection may be restored."""
+"""Time for which commands are sent although no heartbeat arrives, because a lost connection may be restored."""
 
 
 class FlightError(Exception):

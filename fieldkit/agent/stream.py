@@ -29,7 +29,7 @@ _CDR_HEADER = b"\0\1\0\0"
 
 _POLL_S = 0.001
 WAIT_S = 0.2
-"""Maximum time of one wait: a signal that the kernel delivers to another thread does not interrupt a wait."""
+"""Maximum time of one wait, because a signal that the kernel delivers to another thread does not interrupt a wait."""
 SETTLING_S = 0.5
 """Delay between the match of a subscription and the first sample: the subscription must match the publisher, too."""
 _DRAIN_TIMEOUT_S = 2.0

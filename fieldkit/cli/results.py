@@ -162,7 +162,7 @@ def _next_commands(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
 
 
 def _lost_all(cell: Cell) -> bool:
-    """Return True if no ping of a cell was answered. Then a longer distance is not suggested."""
+    """Return True if no ping of a cell was answered. In this case a longer distance is not suggested."""
     return any(plain_name(name) == "rtt_loss" and estimate.value >= 1 for name, estimate in cell.estimates.items())
 
 

@@ -13,7 +13,7 @@ from fieldkit.remote.persistent_shells import Execution
 _CHUNK: Final = 1 << 16
 _LINK_ERROR_S: Final = 0.5
 _MAX_WAIT_S: Final = 1.0
-"""Maximum time of one wait: Python handles a Ctrl-C that arrived just before the wait only after it."""
+"""Maximum time of one wait. If Ctrl-C arrives just before a wait, Python handles it only after the wait."""
 
 
 def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, robot: str) -> bool:

@@ -25,7 +25,8 @@ Channel = paramiko.Channel
 Transport = paramiko.Transport
 
 SPARES: Final = 2
-"""Number of channels that are opened in advance: one for the next command, one while its successor is opened."""
+"""Number of channels that are opened in advance: one for the next command, and one for the time in which a further
+channel is opened."""
 
 BROKEN: Final = (paramiko.SSHException, OSError, EOFError)
 """Exceptions of a broken connection."""

@@ -315,7 +315,7 @@ class _Stream:
             elif len(rest) >= _MIN_END_BYTES:
                 raise UnfitServerError("the answer to a command has no valid exit code")
         else:
-            # Only a possible start of the nonce is held back, because a caller may wait for the other output.
+            # Only a possible start of the nonce is kept, because a caller may wait for the output before it.
             held = next((n for n in range(len(self._nonce) - 1, 0, -1) if output.endswith(self._nonce[:n])), 0)
             output, self._incomplete = output[: len(output) - held], output[len(output) - held :]
         self.output += output

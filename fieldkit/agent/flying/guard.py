@@ -78,7 +78,7 @@ class FlightGuard:
         start_s = time.monotonic()
         while not self._drone.alive:
             if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was ended")
+                raise FlightError(CANCELLED, "the job was cancelled")
             if time.monotonic() > start_s + HEARTBEAT_S:
                 connection = self._plan.connection
                 raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
@@ -96,7 +96,7 @@ class FlightGuard:
             if previous_s is not None and (gap_s := self._iteration_s - previous_s) > GAP_S:
                 raise FlightError(LEASE_EXPIRED, f"the guard did not run for {gap_s:.1f} s")
             if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was ended")
+                raise FlightError(CANCELLED, "the job was cancelled")
             self._orders.poll()
             if self._orders.expired:
                 raise FlightError(

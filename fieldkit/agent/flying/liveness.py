@@ -22,7 +22,7 @@ IDLE, FLYING, LANDING, ENDED = 0, 1, 2, 3
 SILENCE_TIMEOUT_S = 0.8
 """A program whose counter does not change for this time has stopped."""
 _MAX_POLL_S = 0.2
-"""Maximum time that one poll adds to the silence: delays of the polling program must not count."""
+"""Maximum time that one poll adds to the silence, because delays of the polling program must not count."""
 _ENTRY = struct.Struct("<QQQQ")
 SIZE = 2 * _ENTRY.size
 """Size of the file in bytes."""

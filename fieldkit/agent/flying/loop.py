@@ -34,7 +34,7 @@ HEARTBEAT_S = 6.0
 """Timeout for the first heartbeat of the autopilot."""
 
 _FLIGHT_HEARTBEAT_TIMEOUT_S = 10.0
-"""Timeout for heartbeats in flight: a lost connection may be restored."""
+"""Timeout for heartbeats in flight. It is long, because a lost connection may be restored."""
 _POSITION_TIMEOUT_S = 5.0
 """Timeout for position reports in flight, which are requested repeatedly during this time."""
 _STREAMS = (HEARTBEAT, LOCAL_POSITION_NED, ATTITUDE)
@@ -89,7 +89,7 @@ class FlightLoop:
         start_s = time.monotonic()
         while not self.drone.alive:
             if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was ended")
+                raise FlightError(CANCELLED, "the job was cancelled")
             if time.monotonic() > start_s + HEARTBEAT_S:
                 connection = self._plan.connection
                 raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
@@ -123,7 +123,7 @@ class FlightLoop:
         while True:
             self._require_no_gap()
             if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was ended")
+                raise FlightError(CANCELLED, "the job was cancelled")
             self.orders.poll()
             if self.orders.expired:
                 raise FlightError(

@@ -17,7 +17,7 @@ from typing import Protocol
 MAX_BYTES = 65_536
 _CONNECT_TIMEOUT_S = 2.0
 _PEER_TIMEOUT_S = 3.0
-"""After this time without a datagram from the peer the next sender replaces it: a restarted peer has a new port."""
+"""If the peer sends no datagram for this time, the next sender replaces it: a restarted peer has a new port."""
 _MAX_QUEUED_BYTES = 4096
 """Maximum number of queued bytes for a slow line: 0.7 s at 57600 baud. Older data would be useless."""
 

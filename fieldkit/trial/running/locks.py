@@ -19,7 +19,8 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
-"""Lifetime of a lock that is not renewed; `evidence.begin` renews it after half. Longer than any attempt or walk."""
+"""Lifetime of a lock that is not renewed; `evidence.begin` renews it after half of this time.
+It is longer than any attempt or walk."""
 
 _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
 
