@@ -54,32 +54,32 @@ class Run:
 
 def write_tables(folder: Path, count: int) -> None:
     """Write `count` trials into a folder."""
-    draw = np.random.default_rng(1)
+    generator = np.random.default_rng(1)
     for number in range(count):
         path = folder / _condition(number)["trial"] / "trial.csv"
         path.parent.mkdir(parents=True)
-        path.write_text("".join((_header(), *_lines(draw, number))), encoding="utf-8")
+        path.write_text("".join((_header(), *_lines(generator, number))), encoding="utf-8")
 
 
 def write_table(path: Path, rows: int) -> None:
     """Write one table of `rows` repeats."""
-    draw = np.random.default_rng(1)
+    generator = np.random.default_rng(1)
     with path.open("w", encoding="utf-8") as file:
         file.write(_header())
         for number in range(rows // REPEATS):
-            file.writelines(_lines(draw, number))
+            file.writelines(_lines(generator, number))
 
 
 def _header() -> str:
     return ",".join(column.name for column in trial_columns()) + "\n"
 
 
-def _lines(draw: np.random.Generator, number: int) -> Iterator[str]:
+def _lines(generator: np.random.Generator, number: int) -> Iterator[str]:
     """Yield the lines of a trial."""
     columns = trial_columns()
     fixed = _condition(number)
-    shares = draw.random((REPEATS, len(columns))).tolist()
-    counts = draw.binomial(SENT, 0.9, (REPEATS, len(columns))).tolist()
+    shares = generator.random((REPEATS, len(columns))).tolist()
+    counts = generator.binomial(SENT, 0.9, (REPEATS, len(columns))).tolist()
     for repeat in range(REPEATS):
         fixed |= {"protocol": ("tcp", "udp")[repeat % 2], "repeat": str(1 + repeat // 2)}
         fixed["status"] = "void" if shares[repeat][0] < 0.03 else "valid"
@@ -87,9 +87,11 @@ def _lines(draw: np.random.Generator, number: int) -> Iterator[str]:
         for quantity, arrived in zip(_COUNTED, counts[repeat], strict=False):
             counted = zip(quantity.columns, (f"{1 - arrived / SENT:.9g}", str(arrived), str(SENT)), strict=True)
             fixed |= dict(counted)
-        drawn = zip(columns, shares[repeat], counts[repeat], strict=True)
+        row_values = zip(columns, shares[repeat], counts[repeat], strict=True)
         yield (
-            ",".join(fixed.get(column.name) or _random_value(column, share, count) for column, share, count in drawn)
+            ",".join(
+                fixed.get(column.name) or _random_value(column, share, count) for column, share, count in row_values
+            )
             + "\n"
         )
 
@@ -171,7 +173,7 @@ def check(ours: Path, theirs: Path) -> None:
         raise RuntimeError("fieldkit and pandas computed different figures")
 
 
-def rounds(base: Path, counts: Sequence[int], number: int, rows: int) -> dict[str, list[Run]]:
+def run_rounds(base: Path, counts: Sequence[int], number: int, rows: int) -> dict[str, list[Run]]:
     """Return the runs of all rounds, by program and number of tables; `rows` as in `--rows`."""
     runs: dict[str, list[Run]] = {}
     for _ in range(number):
@@ -193,13 +195,13 @@ def show(runs_by_name: Mapping[str, Sequence[Run]]) -> None:
     print("| | s, median (lowest to highest) | processor time (s) | repeats/s | peak memory (MB) |")
     print("| --- | --- | --- | --- | --- |")
     for name, runs in runs_by_name.items():
-        walls = [each_run.wall_s for each_run in runs]
+        walls = [run_result.wall_s for run_result in runs]
         wall = statistics.median(walls)
         number, unit = name.split()[-2:]
         repeats = int(number.replace(",", "")) * (1 if unit == "rows" else REPEATS)
-        processor = statistics.median(each_run.processor_s for each_run in runs)
+        processor = statistics.median(run_result.processor_s for run_result in runs)
         spread = f"{wall:.2f} ({min(walls):.2f} to {max(walls):.2f})"
-        peak_mb = max(each_run.peak_mb for each_run in runs)
+        peak_mb = max(run_result.peak_mb for run_result in runs)
         print(f"| {name} | {spread} | {processor:.2f} | {repeats / wall:,.0f} | {peak_mb:.0f} |")
 
 
@@ -218,7 +220,7 @@ def main() -> None:
         if arguments.rows:
             write_table(Path(name) / TABLE, arguments.rows)
         load = os.getloadavg()[0]
-        runs_by_name = rounds(Path(name), arguments.tables, arguments.rounds, arguments.rows)
+        runs_by_name = run_rounds(Path(name), arguments.tables, arguments.rounds, arguments.rows)
     if arguments.json:
         print(
             json.dumps(

@@ -3,8 +3,9 @@
 Publishers and subscribers are separate programs on loopback. Plain pairs use the binding of each middleware as its
 documentation shows; `attached` adds the attachment and the time stamp that rmw_zenoh requires; `agent` uses
 fieldkit's adapters of the same library. A path over `fieldkit bridge` starts or ends at a plain end of ROS 1, and the
-plain pair of ROS 1 is its reference. All paths run in turn: first messages at a fixed rate to measure the delay, then
-as many messages as possible for one second. Each message starts with the time of its creation on the machine's clock.
+plain pair of ROS 1 is its reference. All paths run in sequence: first messages at a fixed rate to measure the delay,
+then as many messages as possible for one second. Each message starts with the time of its creation on the machine's
+clock.
 """
 
 import argparse
@@ -40,7 +41,7 @@ SIZE: Final = 1000
 COUNT: Final = 200
 RATE_HZ: Final = 100.0
 BURST_S: Final = 1.0
-SETTLES_S: Final = 1.0
+SETTLING_S: Final = 1.0
 _CDR: Final = bytes((0, 1, 0, 0)) + bytes(8) + SIZE.to_bytes(4, "little")
 
 Write = Callable[[bytes], Any]
@@ -49,7 +50,7 @@ Deliver = Callable[[bytes], None]
 
 
 @dataclass(frozen=True)
-class Way:
+class MessagePath:
     """A path of messages: a publisher, a subscriber, and perhaps a bridge between them.
 
     Attributes:
@@ -65,22 +66,22 @@ class Way:
     reference: str = ""
 
 
-WAYS: Final = (
-    Way("dds plain", "dds plain", "dds plain"),
-    Way("dds agent", "dds agent", "dds agent", "dds plain"),
-    Way("zenoh plain", "zenoh plain", "zenoh plain"),
-    Way("zenoh attached", "zenoh attached", "zenoh attached", "zenoh plain"),
-    Way("zenoh agent", "zenoh agent", "zenoh agent", "zenoh plain"),
-    Way("ros1 plain", "ros1 plain", "ros1 plain"),
-    Way("ros1 bridged to dds", "ros1 plain", "dds agent", "ros1 plain"),
-    Way("ros1 bridged to zenoh", "ros1 plain", "zenoh agent", "ros1 plain"),
-    Way("dds bridged to ros1", "dds agent", "ros1 plain", "ros1 plain"),
-    Way("zenoh bridged to ros1", "zenoh agent", "ros1 plain", "ros1 plain"),
+PATHS: Final = (
+    MessagePath("dds plain", "dds plain", "dds plain"),
+    MessagePath("dds agent", "dds agent", "dds agent", "dds plain"),
+    MessagePath("zenoh plain", "zenoh plain", "zenoh plain"),
+    MessagePath("zenoh attached", "zenoh attached", "zenoh attached", "zenoh plain"),
+    MessagePath("zenoh agent", "zenoh agent", "zenoh agent", "zenoh plain"),
+    MessagePath("ros1 plain", "ros1 plain", "ros1 plain"),
+    MessagePath("ros1 bridged to dds", "ros1 plain", "dds agent", "ros1 plain"),
+    MessagePath("ros1 bridged to zenoh", "ros1 plain", "zenoh agent", "ros1 plain"),
+    MessagePath("dds bridged to ros1", "dds agent", "ros1 plain", "ros1 plain"),
+    MessagePath("zenoh bridged to ros1", "zenoh agent", "ros1 plain", "ros1 plain"),
 )
 
 
 def dds_plain(name: str, deliver: Deliver | None) -> Write:
-    """Start an end of a topic with the binding of CycloneDDS, with its own data type."""
+    """Start an end of a topic with the binding of CycloneDDS, with a separate data type."""
     from cyclonedds.domain import Domain, DomainParticipant  # noqa: PLC0415
     from cyclonedds.idl import make_idl_struct, types  # noqa: PLC0415
     from cyclonedds.pub import DataWriter  # noqa: PLC0415
@@ -197,47 +198,47 @@ def end(kind: str, name: str, where: str, *, is_subscriber: bool) -> int:
     os._exit(0)  # threads of the middleware may block a normal exit
 
 
-def _send(write: Write, lasts_s: float, rate_hz: float) -> int:
-    """Send for `lasts_s`, at a rate or, if it is 0, as fast as possible; return the number of messages."""
+def _send(write: Write, duration_s: float, rate_hz: float) -> int:
+    """Send for `duration_s`, at a rate or, if it is 0, as fast as possible; return the number of messages."""
     padding = random.Random(1).randbytes(SIZE - HEAD.size)
     started_s, number = time.monotonic(), 0
-    while (now_s := time.monotonic() - started_s) < lasts_s:
-        if rate_hz and (early_s := number / rate_hz - now_s) > 0:
-            time.sleep(early_s)
+    while (now_s := time.monotonic() - started_s) < duration_s:
+        if rate_hz and (wait_s := number / rate_hz - now_s) > 0:
+            time.sleep(wait_s)
         write(HEAD.pack(MAGIC, number, time.time_ns()) + padding)
         number += 1
     return number
 
 
-class Running:
+class RunningPath:
     """A path whose ends are running."""
 
-    def __init__(self, stack: ExitStack, way: Way, environment: dict[str, str]) -> None:
-        self.way, port = way, free_port()
-        name = "/" + way.name.replace(" ", "_")
-        source, target = way.publisher.split()[0], way.subscriber.split()[0]
+    def __init__(self, stack: ExitStack, message_path: MessagePath, environment: dict[str, str]) -> None:
+        self.message_path, port = message_path, free_port()
+        name = "/" + message_path.name.replace(" ", "_")
+        source, target = message_path.publisher.split()[0], message_path.subscriber.split()[0]
 
         def start(verb: str, mode: str = "listen") -> "subprocess.Popen[str]":
-            kind = way.subscriber if verb == "hear" else way.publisher
+            kind = message_path.subscriber if verb == "subscribe" else message_path.publisher
             return stack.enter_context(_program(("--end", kind, name, f"{mode}:{port}", verb), environment))
 
         if source == target:
-            self.subscriber, self.publisher = start("hear"), start("say", "connect")
+            self.subscriber, self.publisher = start("subscribe"), start("publish", "connect")
             return
         # The end that does not use ROS 1 starts first, because the bridge connects to it.
-        verbs = ("hear", "say") if source == "ros1" else ("say", "hear")
+        verbs = ("subscribe", "publish") if source == "ros1" else ("publish", "subscribe")
         other = target if source == "ros1" else source
         to = ("--router", f"{HOST}:{port}") if other == "zenoh" else ("--peer", HOST)
         line = ("bridge", "--from", source, "--to", target, f"{name}:{TYPE}", "--domain", str(DOMAIN), *to)
         ends = {verbs[0]: start(verbs[0])}
         stack.enter_context(_bridge((*line, "--node", f"bridge_{source}_{target}"), environment))
         ends[verbs[1]] = start(verbs[1])
-        self.subscriber, self.publisher = ends["hear"], ends["say"]
+        self.subscriber, self.publisher = ends["subscribe"], ends["publish"]
 
-    def run(self, lasts_s: float, rate_hz: float) -> tuple[int, list[tuple[int, int]]]:
+    def run(self, duration_s: float, rate_hz: float) -> tuple[int, list[tuple[int, int]]]:
         """Send; return the number of messages, and the arrival time and delay of each received one in ns."""
-        sent = int(_query(self.publisher, f"{lasts_s} {rate_hz}"))
-        time.sleep(SETTLES_S)
+        sent = int(_query(self.publisher, f"{duration_s} {rate_hz}"))
+        time.sleep(SETTLING_S)
         return sent, json.loads(_query(self.subscriber, "report"))
 
 
@@ -287,7 +288,7 @@ def free_port() -> int:
 
 
 def measure(rounds: int) -> list[dict[str, Any]]:
-    """Run all paths in turn, round by round; return the measurements of each."""
+    """Run all paths in sequence in each round; return the measurements of each path."""
     measurements: list[dict[str, Any]] = []
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -298,9 +299,9 @@ def measure(rounds: int) -> list[dict[str, Any]]:
             subprocess.Popen(("rosmaster", "--core", "-p", str(port)), stdout=log, stderr=log, env=environment)
         )
         stack.callback(master.terminate)
-        paths = [Running(stack, way, environment) for way in WAYS]
+        paths = [RunningPath(stack, message_path, environment) for message_path in PATHS]
         for path in paths:
-            path.run(SETTLES_S, RATE_HZ)  # until the ends have discovered each other
+            path.run(SETTLING_S, RATE_HZ)  # until the ends have discovered each other
         for number in range(rounds):
             for path in paths if number % 2 else reversed(paths):
                 sent, received = path.run(COUNT / RATE_HZ, RATE_HZ)
@@ -309,7 +310,7 @@ def measure(rounds: int) -> list[dict[str, Any]]:
                 measurements.append(
                     {
                         "round": number,
-                        "way": path.way.name,
+                        "way": path.message_path.name,
                         "sent": sent,
                         "came": len(received),
                         "delay_ms": median(delay_ns for _, delay_ns in received) / 1e6,
@@ -330,20 +331,24 @@ def main() -> int:
     options = parser.parse_args()
     if options.end:
         kind, name, where, verb = options.end
-        return end(kind, name, where, is_subscriber=verb == "hear")
+        return end(kind, name, where, is_subscriber=verb == "subscribe")
     measurements = measure(options.rounds)
     if options.json:
         print(json.dumps(measurements))
         return 0
     print(f"{'path':22} {'delay, ms':>24} {'more than the reference':>32} {'messages/s':>26} {'of a burst':>10}")
     references = {(row["way"], row["round"]): row["delay_ms"] for row in measurements}
-    for way in WAYS:
-        rows = [row for row in measurements if row["way"] == way.name]
+    for message_path in PATHS:
+        rows = [row for row in measurements if row["way"] == message_path.name]
         delays = [row["delay_ms"] for row in rows]
-        more = [row["delay_ms"] - references[way.reference, row["round"]] for row in rows] if way.reference else []
+        more = (
+            [row["delay_ms"] - references[message_path.reference, row["round"]] for row in rows]
+            if message_path.reference
+            else []
+        )
         received = sum(row["burst_came"] for row in rows) / sum(row["burst_sent"] for row in rows)
         rates = [row["per_s"] for row in rows]
-        print(f"{way.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {received:>10.0%}")
+        print(f"{message_path.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {received:>10.0%}")
     return 0
 
 

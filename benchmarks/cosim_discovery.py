@@ -27,7 +27,7 @@ COUNT: Final = 20
 RADIUS_M: Final = 10.0
 SECOND_NS: Final = 10**9
 STEP_NS: Final = SECOND_NS // 100
-LONGEST_NS: Final = 60 * SECOND_NS
+TIMEOUT_NS: Final = 60 * SECOND_NS
 STANDARD: Final = "802.11n"
 SEEDS: Final = range(1, 7)
 
@@ -61,7 +61,7 @@ def discover(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:
     network = RadioNetwork(radio, names, transports={"topic": transport})
     network.log_ip(log)
     states = {name: State(place_m) for name, place_m in places_m.items()}
-    for to_ns in range(STEP_NS, LONGEST_NS + 1, STEP_NS):
+    for to_ns in range(STEP_NS, TIMEOUT_NS + 1, STEP_NS):
         network.advance(to_ns, (), states)
         if to_ns >= SECOND_NS and topics[0].matched:
             return sum(at_ns < SECOND_NS for at_ns in sent_ns), to_ns / SECOND_NS

@@ -131,15 +131,15 @@ class PlainLoop:
     def run(self, to_ns: int) -> None:
         """Advance to `to_ns`, window by window."""
         physics, network, wakes, in_transit = self._physics, self._network, self._wakes, self._in_transit
-        mail: dict[str, list[Received]] = {}
+        received_by_name: dict[str, list[Received]] = {}
         now_ns = 0
         while now_ns < to_ns:
             packets: list[Packet] = []
-            if mail:
+            if received_by_name:
                 states = physics.advance(now_ns, {})
-                for name, received in mail.items():
+                for name, received in received_by_name.items():
                     packets += self._wake(name, now_ns, states, received)
-                mail = {}
+                received_by_name = {}
             now_ns = min(now_ns + WINDOW_NS, to_ns)
             while wakes and wakes[0][0] <= now_ns:
                 at_ns, name = heapq.heappop(wakes)
@@ -149,7 +149,7 @@ class PlainLoop:
             for arrival in arrivals:
                 packet, payload = in_transit.pop(arrival.packet_id)
                 received_packet = Received(packet.source, payload, packet.sent_ns, arrival.at_ns)
-                mail.setdefault(arrival.receiver, []).append(received_packet)
+                received_by_name.setdefault(arrival.receiver, []).append(received_packet)
                 self.arrived.append((*packet.identity, arrival.at_ns))
             for drop in drops:
                 del in_transit[drop.packet_id]

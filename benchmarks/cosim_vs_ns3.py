@@ -2,7 +2,7 @@
 
 Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. One station sends to another, in sight or behind
 a wall, over 802.11g with the same power, noise, path loss, queue and slots in both. UDP sends 2 Mbit/s, and its loss
-is measured; TCP sends as fast as it can. The loss of the wall is computed here, and ns-3 gets the total path loss.
+is measured; TCP sends at full rate. The loss of the wall is computed here, and ns-3 gets the total path loss.
 
 There are three variants of ns-3: unchanged in 802.11g; unchanged in 802.11a, which has no signal extension that ns-3
 models wrongly; and the latter with a corrected TCP, where ns-3 deviates from the standards at the edge of a link
@@ -43,7 +43,7 @@ SECONDS: Final = 10.0
 TRACE_S: Final = 20.0
 QUEUE_PACKETS: Final = 100
 BATCH, MAX_RUNS, NARROW = 2, 48, 0.08
-"""Runs per batch, most runs, and the relative half-width of the interval of the ratio at which runs end."""
+"""Runs per batch, maximum number of runs, and the relative half-width of the ratio's interval at which runs end."""
 RATE_MBIT_S: Final = 2.0
 PAYLOAD_BYTES: Final = 1000
 MESSAGE_BYTES: Final = 14480
@@ -133,7 +133,7 @@ class Link:
         """Return goodput in Mbit/s and loss of a stream of datagrams."""
         every_ns = round(8e3 * PAYLOAD_BYTES / RATE_MBIT_S)
         at_ns = range(every_ns, round(SECONDS * 1e9), every_ns)
-        packets = [self._packet(number, PAYLOAD_BYTES, "udp", each_ns) for number, each_ns in enumerate(at_ns)]
+        packets = [self._packet(number, PAYLOAD_BYTES, "udp", sent_ns) for number, sent_ns in enumerate(at_ns)]
         network = RadioNetwork(self._radio, "ab", transports={"udp": Udp})
         arrivals, _ = network.advance(round((SECONDS + 5) * 1e9), packets, self._states)
         return len(arrivals) * PAYLOAD_BYTES * 8 / SECONDS / 1e6, 1 - len(arrivals) / len(packets)
@@ -170,10 +170,13 @@ class Ns3Link:
     def __init__(self, ns3: Ns3, cell: Cell, run: int, peer: Peer) -> None:
         # 802.11a has the modes, slots and times of 802.11g, but no signal extension and no modes of 802.11b.
         standard = "ErpOfdm" if peer == "802.11g" else "Ofdm"
-        chosen = {"mode": f"{standard}Rate{cell.mode[1:] if cell.mode else 6}Mbps", "adapt": int(cell.mode is None)}
+        mode_options = {
+            "mode": f"{standard}Rate{cell.mode[1:] if cell.mode else 6}Mbps",
+            "adapt": int(cell.mode is None),
+        }
         self._control = "Counting{}" if peer == "corrected" else "ns3::{}"
         loss = loss_db(cell.distance_m, wall=cell.wall)
-        self._run = partial(ns3, loss=loss, queue=QUEUE_PACKETS, RngRun=run, **chosen)
+        self._run = partial(ns3, loss=loss, queue=QUEUE_PACKETS, RngRun=run, **mode_options)
 
     def udp(self) -> tuple[float, float]:
         """Return goodput in Mbit/s and loss, as `Link.udp`."""
@@ -219,17 +222,21 @@ def ratio_of(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float, float]
 
 
 def points_of(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
-    """Return the difference of two mean shares in percent points, and half of its 95 % interval."""
+    """Return the difference of two mean shares in percentage points, and half of its 95 % interval."""
     spread = math.sqrt(sum(runs.var(ddof=1) / len(runs) for runs in (ours, theirs)))
     return 100 * float(ours.mean() - theirs.mean()), 100 * float(student.ppf(0.975, 2 * len(ours) - 2)) * spread
 
 
-def rows(ns3: Ns3, wanted: Sequence[str]) -> Iterable[Row]:
+def rows(ns3: Ns3, name_parts: Sequence[str]) -> Iterable[Row]:
     """Yield the results of links whose name contains one of the given texts."""
-    cells = [Cell(mode, wall, each_m) for (mode, wall), distances_m in DISTANCES_M.items() for each_m in distances_m]
+    cells = [
+        Cell(mode, wall, distance_m)
+        for (mode, wall), distances_m in DISTANCES_M.items()
+        for distance_m in distances_m
+    ]
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         for cell in cells:
-            if any(text in str(cell) for text in wanted):
+            if any(text in str(cell) for text in name_parts):
                 yield measure_link(ns3, cell, pool)
 
 

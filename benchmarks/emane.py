@@ -1,8 +1,8 @@
 """The paper's EMANE experiment in a lab: `python -m benchmarks.emane [--rounds 3] [--json]`, as root.
 
-Ten robots; 100 pings of 64 bytes from the first to the tenth, before and after the tenth moves by 100 m in each axis.
-Each radio and round has a new lab, started by the commands of docs/studies/emane.md. ping prints 64 bytes:
-56 of payload and 8 of ICMP header; with the IP header it is 84. All times are round trips in ms; loss is in percent.
+The first of ten robots sends 100 pings of 64 bytes to the tenth, before and after the tenth moves by 100 m along each
+axis. Each radio and round has a new lab, started by the commands of docs/studies/emane.md. ping prints 64 bytes: 56
+of payload and 8 of ICMP header; with the IP header it is 84. All times are round trips in ms; loss is in percent.
 """
 
 import argparse
@@ -49,33 +49,37 @@ REFERENCES: Final = {
 Figures = dict[str, float | None]
 
 
-def fieldkit(here: Path, *words: str) -> str:
+def fieldkit(lab_folder: Path, *words: str) -> str:
     """Return the output of a `fieldkit lab` command. A ping without any reply exits with 1."""
-    done = subprocess.run(
-        (sys.executable, "-m", "fieldkit", "lab", *words), cwd=here, stdout=subprocess.PIPE, text=True, check=False
+    completed = subprocess.run(
+        (sys.executable, "-m", "fieldkit", "lab", *words),
+        cwd=lab_folder,
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
     )
-    if done.returncode not in ({0, 1} if "ping" in words else {0}):
-        raise SystemExit(f"fieldkit lab {' '.join(words)} exited with {done.returncode}")
-    return done.stdout
+    if completed.returncode not in ({0, 1} if "ping" in words else {0}):
+        raise SystemExit(f"fieldkit lab {' '.join(words)} exited with {completed.returncode}")
+    return completed.stdout
 
 
 @contextmanager
 def lab(radio: str) -> Iterator[Path]:
     """Yield the folder of a lab that is up."""
     with tempfile.TemporaryDirectory() as name:
-        here = Path(name)
-        (here / "fieldkit.yaml").write_text(SITE.format(radio=radio), encoding="utf-8")
-        fieldkit(here, "up", "--robots", str(ROBOTS))
+        lab_folder = Path(name)
+        (lab_folder / "fieldkit.yaml").write_text(SITE.format(radio=radio), encoding="utf-8")
+        fieldkit(lab_folder, "up", "--robots", str(ROBOTS))
         try:
-            yield here
+            yield lab_folder
         finally:
-            fieldkit(here, "down")
+            fieldkit(lab_folder, "down")
 
 
-def measure_pings(here: Path) -> Figures:
+def measure_pings(lab_folder: Path) -> Figures:
     """Return the results of 100 pings; None for times without a reply, and for the SNR of fixed links."""
     words = ("ping", "-c", str(PINGS), "-i", "0.1", "-W", "1", "-s", "56", f"robot-{ROBOTS}")
-    ping_output = parse(fieldkit(here, "shell", "robot-1", *words))
+    ping_output = parse(fieldkit(lab_folder, "shell", "robot-1", *words))
     rtt_ms = [1e3 * value for value in ping_output.rtt_s]
     times: Figures = dict.fromkeys(("min", "mean", "median", "p99"))
     if rtt_ms:
@@ -85,17 +89,17 @@ def measure_pings(here: Path) -> Figures:
             "median": statistics.median(rtt_ms),
             "p99": quantile(rtt_ms, 0.99),
         }
-    links = requests.overview(folder.of_directory(here)).links
+    links = requests.overview(folder.of_directory(lab_folder)).links
     snr_db = next((link.snr_db for link in links if link.ends == ("robot-1", f"robot-{ROBOTS}")), None)
     return {**times, "loss": 100 * (1 - len(rtt_ms) / PINGS), "snr_db": snr_db}
 
 
 def measure_round(radio: str) -> dict[str, Figures]:
     """Return the figures of one round, before and after the move."""
-    with lab(radio) as here:
-        before = measure_pings(here)
-        fieldkit(here, "move", f"robot-{ROBOTS}", "--by", "100m", "100m", "100m")
-        return dict(zip(POSITIONS, (before, measure_pings(here)), strict=True))
+    with lab(radio) as lab_folder:
+        before = measure_pings(lab_folder)
+        fieldkit(lab_folder, "move", f"robot-{ROBOTS}", "--by", "100m", "100m", "100m")
+        return dict(zip(POSITIONS, (before, measure_pings(lab_folder)), strict=True))
 
 
 def spread(values: list[float | None]) -> str:

@@ -40,7 +40,7 @@ class Row:
     case: str
     passed: bool
     observation: str
-    lasted_s: float
+    duration_s: float
 
 
 class CaseFailed(Exception):  # noqa: N818 (a result)
@@ -73,13 +73,13 @@ class Bench:
         }
         request, end_s = json.dumps({"connection": self._connection, "needs": needs}), time.monotonic() + _BOOT_S
         while True:
-            done = self._run("arming", request)
-            lines = [json.loads(line) for line in done.stdout.splitlines()]
+            completed = self._run("arming", request)
+            lines = [json.loads(line) for line in completed.stdout.splitlines()]
             problems = [line["what"] for line in lines if line.get("grave")]
-            if done.returncode == 0 and lines and not problems:
+            if completed.returncode == 0 and lines and not problems:
                 return f"{lines[-1]['autopilot']}, battery {lines[-1]['charge']}"
             if time.monotonic() > end_s:
-                raise CaseFailed("; ".join(problems) or done.stderr.strip())
+                raise CaseFailed("; ".join(problems) or completed.stderr.strip())
             time.sleep(1.0)
 
     def record(self) -> str:
@@ -115,11 +115,11 @@ class Bench:
             self._write_order("climb", lease_s=60.0)
             self._wait_for_phase(process, "up")
             self._write_order("stay", lease_s=1.0)
-            began_s = time.monotonic()
+            start_s = time.monotonic()
             code = process.wait(_FLIGHT_S)
         if not code or "landed" not in self._log_text():
             raise CaseFailed(f"code {code}, {self._last_log_line()}")
-        return f"landed {time.monotonic() - began_s:.0f} s after the last order"
+        return f"landed {time.monotonic() - start_s:.0f} s after the last order"
 
     def terminate(self) -> str:
         """Terminate the program by SIGTERM while the drone is in the air; check that the drone lands."""
@@ -225,12 +225,12 @@ def rows(connection: str) -> Iterator[Row]:
             "program is terminated in the air": bench.terminate,
         }
         for name, case in cases.items():
-            began_s = time.monotonic()
+            start_s = time.monotonic()
             try:
                 observation, passed = case(), True
             except (CaseFailed, subprocess.TimeoutExpired) as failure:
                 observation, passed = str(failure), False
-            yield Row(name, passed, observation, time.monotonic() - began_s)
+            yield Row(name, passed, observation, time.monotonic() - start_s)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -243,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for row in rows(connection):
         failed = failed or not row.passed
         result = "passed" if row.passed else "FAILED"
-        sys.stdout.write(f"| {row.case} | {result} | {row.observation} | {row.lasted_s:.0f} |\n")
+        sys.stdout.write(f"| {row.case} | {result} | {row.observation} | {row.duration_s:.0f} |\n")
         sys.stdout.flush()
     return int(failed)
 

@@ -16,7 +16,7 @@ class Memory:
     """Memory of a process tree, in bytes.
 
     Attributes:
-        own: Pages that no process outside of the tree has, each counted once.
+        own: Unique set size (USS): pages that no process outside of the tree has, each counted once.
         pss: Proportional set size: own pages, and one n-th of each page that n processes of this machine share.
     """
 

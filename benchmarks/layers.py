@@ -1,10 +1,10 @@
 """Cost of each layer of the radio model: `python -m benchmarks.layers [--json]`, as root.
 
-First the engine alone, in virtual time, as layers are added: processor time per packet of 64 bytes of UDP payload
-between two stations, one of which always has packets to send, and its share of the packets' air time (above 100 % a
-saturated channel does not run in real time). Then all layers with more stations, which are in range of each other and
-send to the first one. Then the medium: round trips of ping between two namespaces, and their mean without the delays
-from the model.
+The engine alone is measured first, in virtual time, as layers are added: processor time per packet of 64 bytes of UDP
+payload between two stations, one of which always has packets to send, and its share of the packets' air time (above
+100 % a saturated channel does not run in real time). Then all layers are measured with more stations, which are in
+range of each other and send to the first one. Then the medium is measured: round trips of ping between two
+namespaces, and their mean without the delays from the model.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from sim_backends.radio.world_channel import antenna_of
 from sim_backends.world.world import World, load_world
 
 PACKET_BYTES: Final = PAYLOAD_BYTES + 28
-WAITING: Final = 10
+QUEUED: Final = 10
 PACKETS: Final = 5_000
 PINGS: Final = 300
 STATIONS: Final = (2, 10, 50)
@@ -90,15 +90,15 @@ def measure_engine(layer: Layer, stations: int, packets: int) -> Figures:
     model = layer.model(stations)
     receiver, *senders = _places(stations)
     model.place(0, _places(stations), None)
-    for number in range(WAITING * len(senders)):
+    for number in range(QUEUED * len(senders)):
         model.send(0, senders[number % len(senders)], number, PACKET_BYTES, receiver)
     # The first packets create tables and random streams, which are not measured.
-    _carry(model, receiver, packets // 10)
-    cpu_s, air_s = _carry(model, receiver, packets)
+    _transmit(model, receiver, packets // 10)
+    cpu_s, air_s = _transmit(model, receiver, packets)
     return {"cpu_us": 1e6 * cpu_s / packets, "core_percent": 100 * cpu_s / air_s}
 
 
-def _carry(model: RadioModel[int], receiver: str, packets: int) -> tuple[float, float]:
+def _transmit(model: RadioModel[int], receiver: str, packets: int) -> tuple[float, float]:
     """Return processor time and virtual time in s of a number of packets; each arrival triggers another one."""
     arrived, first_ns, now_ns, started_s = 0, model.next_event_ns() or 0, 0, time.process_time()
     while arrived < packets:

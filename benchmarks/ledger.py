@@ -33,7 +33,7 @@ REPEATS: Final = (1_000, 5_000, 10_000)
 LAST: Final = 100
 NEXT: Final = 10
 SPARE: Final = 100
-"""Repeats that are planned in addition, to be run after reopening."""
+"""Repeats that are trial_plan in addition, to be run after reopening."""
 
 _PROCEDURE: Final = """\
 name: small
@@ -52,7 +52,7 @@ _PING: Final = (
 )
 
 
-def planned(repeats: int) -> Plan:
+def trial_plan(repeats: int) -> Plan:
     """Return the plan of a trial."""
     profile = load_profile("turtlebot3_burger")
     cast = {role: Robot(name=role, address="10.0.0.1", profile=profile) for role in (Role.SENDER, Role.RECEIVER)}
@@ -76,7 +76,7 @@ def store_attempt(ledger: Ledger, plan: Plan, folder: Path, repeat: RepeatId) ->
 
 def run(out: Path, repeats: int) -> Path:
     """Run a trial with the given number of repeats, print the times, and return its folder."""
-    plan = planned(repeats)
+    plan = trial_plan(repeats)
     folder = store.create(out, plan)
     (folder / journal.JOURNAL_FILE).touch()
     ledger = Ledger(plan, folder, Stop())
@@ -100,7 +100,7 @@ def reopen(folder: Path) -> None:
     opened_s = time.perf_counter()
     done = ledger.done
     counted_s = time.perf_counter()
-    remaining = [repeat for repeat in plan.order() if not ledger.is_over(repeat)]
+    remaining = [repeat for repeat in plan.order() if not ledger.is_finished(repeat)]
     times_s = [store_attempt(ledger, plan, folder, repeat) for repeat in remaining[:NEXT]]
     print(
         f"{done:>7} repeats: opened in {opened_s - started_s:7.2f} s, counted in {1e3 * (counted_s - opened_s):9.2f} "

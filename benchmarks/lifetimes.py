@@ -1,8 +1,8 @@
 """Lifetimes of watched programs in chosen network namespaces, from kernel events and without effect on the programs.
 
 The kernel reports every exec and exit with its time on the monotonic clock (process events connector,
-linux/cn_proc.h). So programs that are started in different ways are timed by the same definition: from the exec of
-the program to the exit of its process.
+linux/cn_proc.h). Therefore programs that are started in different ways are timed by the same definition: from the
+exec of the program to the exit of its process.
 """
 
 import ctypes
@@ -91,7 +91,7 @@ class Lines:
 
 
 class Watch:
-    """Watches while the context is open, in a separate process.
+    """Records the lifetimes of programs while the context is open, in a separate process.
 
     It runs at real-time priority, because a short-lived program must be identified before it exits.
 
@@ -102,9 +102,9 @@ class Watch:
 
     def __init__(self, pids: Sequence[int], programs: Sequence[str]) -> None:
         namespaces = ",".join(str(_namespace(pid)) for pid in pids)
-        dies_with_us = ("setpriv", "--pdeathsig", "KILL", "--", "chrt", "--fifo", _REALTIME_PRIORITY)
+        killed_with_parent = ("setpriv", "--pdeathsig", "KILL", "--", "chrt", "--fifo", _REALTIME_PRIORITY)
         self._process = subprocess.Popen(
-            [*dies_with_us, sys.executable, "-m", "benchmarks.lifetimes", namespaces, *programs],
+            [*killed_with_parent, sys.executable, "-m", "benchmarks.lifetimes", namespaces, *programs],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             start_new_session=True,

@@ -1,10 +1,11 @@
 """Cost of the medium, compared with a bare veth pair: `python -m benchmarks.medium [--json]`, as root.
 
-Two namespaces without robots. Per round and path, in this order: round-trip time at zero delay (ping), TCP throughput
-(iperf3), 64-byte UDP payloads at full rate (iperf3: packets at the receiver's interface, and packets received by its
-program, which on two cores is starved first), and the error of a 5 ms delay: a sender stamps a datagram every 2 ms,
-and the receiver's kernel stamps its arrival on the same clock. The column of the bare timer shows the machine's part:
-the lateness of a 5 ms sleep at the same priority.
+It uses two namespaces without robots. Each round measures for each path, in this order: round-trip time at zero delay
+(ping), TCP throughput (iperf3), 64-byte UDP payloads at full rate (iperf3: packets at the receiver's interface, and
+packets received by its program, which on two cores gets too little processor time first), and the error of a 5 ms
+delay: a sender writes its send time into a datagram every 2 ms, and the receiver's kernel records the arrival time by
+the same clock. The column of the bare timer shows the machine's part: the lateness of a 5 ms sleep at the same
+priority.
 """
 
 import argparse
@@ -163,8 +164,8 @@ def quantile(values: Sequence[float], share: float) -> float:
 
 def errors(name: str, errors_ms: Sequence[float]) -> Figures:
     """Return median and 99th percentile of the magnitude of `errors_ms`."""
-    sizes = [abs(value) for value in errors_ms]
-    return {f"{name}_median_ms": statistics.median(sizes), f"{name}_p99_ms": quantile(sizes, 0.99)}
+    magnitudes = [abs(value) for value in errors_ms]
+    return {f"{name}_median_ms": statistics.median(magnitudes), f"{name}_p99_ms": quantile(magnitudes, 0.99)}
 
 
 def measure_round(seconds: float, probes: int) -> dict[str, Figures]:

@@ -59,12 +59,12 @@ class Namespace:
 
     def tun(self, name: str, address: str) -> int:
         """Create the TUN interface `name` in the namespace, bring it up with `address`, return its descriptor."""
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            argv = [sys.executable, "-c", _OPEN_TUN, str(theirs.fileno()), name]
-            with self.start(*argv, pass_fds=[theirs.fileno()]) as opener:
-                theirs.close()
-                _, (fd,), _, _ = socket.recv_fds(ours, 1, 1)
+        receiver, sender = socket.socketpair()
+        with receiver, sender:
+            argv = [sys.executable, "-c", _OPEN_TUN, str(sender.fileno()), name]
+            with self.start(*argv, pass_fds=[sender.fileno()]) as opener:
+                sender.close()
+                _, (fd,), _, _ = socket.recv_fds(receiver, 1, 1)
             assert opener.returncode == 0
         self.ip("address", "add", address, "dev", name)
         self.ip("link", "set", name, "up")

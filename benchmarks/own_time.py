@@ -1,4 +1,4 @@
-"""The own time of a repeat by phase: its wall time minus the time of the tools on the robots."""
+"""The own time of a repeat by phase, which is its wall time minus the time of the tools on the robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Final
 from benchmarks.lifetimes import Lifetime
 
 TOOLS: Final = {"rosbag": 1, "tcpdump": 2, "nc.traditional": 2, "ping": 1, "tar": 2}
-"""Tools on the robots in one repeat, and their numbers."""
+"""Tools on the robots in one repeat, and how often each runs."""
 
 
 @dataclass(frozen=True)

@@ -72,10 +72,10 @@ def fragments() -> Iterator[bytes]:
     for ip_id in range(PACKETS // 6 + 1):
         for offset, size in ((0, 1480), (1480, 1480), (2960, 1480), (4440, 1480), (5920, 1480), (7400, 800)):
             part = offset // 8 | (0x2000 if size == 1480 else 0)
-            head = struct.pack(">BBHHHBBH", 0x45, 0, 20 + size, ip_id & 0xFFFF, part, 64, 17, 0)
+            header = struct.pack(">BBHHHBBH", 0x45, 0, 20 + size, ip_id & 0xFFFF, part, 64, 17, 0)
             udp_header = struct.pack(">HHHH", 40000, 1234, 8200, 0) if offset == 0 else bytes(8)
             addresses = bytes((10, 0, 0, 1, 10, 0, 0, 2))
-            yield bytes(12) + b"\x08\x00" + head + addresses + udp_header + bytes(86)
+            yield bytes(12) + b"\x08\x00" + header + addresses + udp_header + bytes(86)
 
 
 def record(index: int, frame: bytes, wire_bytes: int) -> bytes:
@@ -86,9 +86,9 @@ def record(index: int, frame: bytes, wire_bytes: int) -> bytes:
 
 def write_captures(folder: Path) -> tuple[Path, Path]:
     """Write the captures of sender and receiver."""
-    draw = random.Random(1)
+    generator = random.Random(1)
     sent = [record(index, frame, 1514) for index, frame in enumerate(islice(fragments(), PACKETS))]
-    received = [frame for frame in sent if draw.random() >= LOSS]
+    received = [frame for frame in sent if generator.random() >= LOSS]
     paths = folder / "sender.pcap", folder / "receiver.pcap"
     for path, records in zip(paths, (sent, received), strict=True):
         path.write_bytes(FILE_HEADER + b"".join(records))
@@ -104,14 +104,14 @@ def losses_by_fieldkit(sender: Path, receiver: Path) -> int:
     return counts.packets_sent - counts.packets_received
 
 
-def lost(sent: Iterable[Key], received: Iterable[Key]) -> int:
+def lost_count(sent: Iterable[Key], received: Iterable[Key]) -> int:
     """Return the number of keys that arrived less often than they were sent."""
     return (Counter(sent) - Counter(received)).total()
 
 
 def losses_by_dpkt(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets."""
-    return lost(*(list(_keys_by_dpkt(path)) for path in (sender, receiver)))
+    return lost_count(*(list(_keys_by_dpkt(path)) for path in (sender, receiver)))
 
 
 def _keys_by_dpkt(path: Path) -> Iterator[Key]:
@@ -123,7 +123,7 @@ def _keys_by_dpkt(path: Path) -> Iterator[Key]:
 
 def losses_by_tshark(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets."""
-    return lost(*(list(_keys_by_tshark(path)) for path in (sender, receiver)))
+    return lost_count(*(list(_keys_by_tshark(path)) for path in (sender, receiver)))
 
 
 def _keys_by_tshark(path: Path) -> Iterator[Key]:
@@ -148,7 +148,7 @@ def _keys_by_tshark(path: Path) -> Iterator[Key]:
 def losses_by_scapy(sender: Path, receiver: Path) -> int:
     """Return the number of lost packets among the first ones."""
     sent = list(_keys_by_scapy(sender))
-    return lost(sent, _keys_by_scapy(receiver))
+    return lost_count(sent, _keys_by_scapy(receiver))
 
 
 def _keys_by_scapy(path: Path) -> Iterator[Key]:
@@ -168,17 +168,17 @@ def first_packets(source: Path, count: int) -> Path:
 
 
 def write_big(path: Path) -> int:
-    """Write a sparse capture of 10 GB with unshortened super-frames; return its number of packets."""
-    head = bytes(12) + b"\x08\x00" + struct.pack(">BBHHHBBH", 0x45, 0, 0, 1, 0, 64, 6, 0) + bytes((10, 0, 0, 1) * 2)
-    kept = 262_144
-    count = BIG_BYTES // (16 + kept)
+    """Write a sparse capture of 10 GB with super-frames that are not truncated; return its number of packets."""
+    header = bytes(12) + b"\x08\x00" + struct.pack(">BBHHHBBH", 0x45, 0, 0, 1, 0, 64, 6, 0) + bytes((10, 0, 0, 1) * 2)
+    captured_bytes = 262_144
+    count = BIG_BYTES // (16 + captured_bytes)
     with path.open("wb") as file:
         file.write(FILE_HEADER)
         for index in range(count):
-            start = len(FILE_HEADER) + index * (16 + kept)
+            start = len(FILE_HEADER) + index * (16 + captured_bytes)
             file.seek(start)
-            file.write(struct.pack("<4I", 1_700_000_000 + index, 0, kept, kept) + head)
-        file.truncate(len(FILE_HEADER) + count * (16 + kept))
+            file.write(struct.pack("<4I", 1_700_000_000 + index, 0, captured_bytes, captured_bytes) + header)
+        file.truncate(len(FILE_HEADER) + count * (16 + captured_bytes))
     return count
 
 
@@ -191,10 +191,10 @@ def big_file(folder: Path) -> dict[str, float]:
     count, before, peak = json.loads(subprocess.run(argv, capture_output=True, text=True, check=True).stdout)
     if count != expected:
         raise RuntimeError(f"{path} has {expected} packets, {count} were read")
-    taken = time.perf_counter() - start
+    elapsed_s = time.perf_counter() - start
     size = path.stat().st_size
     path.unlink()
-    return {"file_gb": size / 1e9, "seconds": taken, "rss_before_mb": before / 1e3, "peak_rss_mb": peak / 1e3}
+    return {"file_gb": size / 1e9, "seconds": elapsed_s, "rss_before_mb": before / 1e3, "peak_rss_mb": peak / 1e3}
 
 
 def whole_file(folder: Path, mib: int) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 One thread carries streams over loopback and delays every byte by half a round trip. Trips are counted like logical
 clocks: data from this computer has a trip number one above the highest received over any link, and data from a robot
-has the highest number that the robot received. So parallel round trips count once.
+has the highest number that the robot received. Therefore parallel round trips count once.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from sim_backends.emulated.nodes import EmulatedRobot
 Connect = Callable[[float], socket.socket]
 
 _CHUNK: Final = 1 << 16
-_IN_FLIGHT: Final = 1 << 12
+_MAX_IN_FLIGHT: Final = 1 << 12
 _CONNECT_S: Final = 10.0
 
 
@@ -32,22 +32,22 @@ class _Direction:
     Attributes:
         source: Socket from which bytes are read.
         sink: Socket to which they are written.
-        flight: Delayed chunks: due time, trip number, and the bytes, which are empty at the end of the stream.
+        in_flight: Delayed chunks: due time, trip number, and the bytes, which are empty at the end of the stream.
         ended: Whether the source has reached its end.
     """
 
     source: socket.socket
     sink: socket.socket
-    flight: deque[tuple[float, int, bytes]] = field(default_factory=deque)
+    in_flight: deque[tuple[float, int, bytes]] = field(default_factory=deque)
     ended: bool = False
 
 
 @dataclass(eq=False)
 class _Stream:
-    """Both directions of a stream: `there` to the robot, `back` to this computer; `trip` is the robot's number."""
+    """Both directions of a stream. `trip` is the highest trip number that the robot has received."""
 
-    there: _Direction
-    back: _Direction
+    to_robot: _Direction
+    from_robot: _Direction
     trip: int = 0
 
 
@@ -64,7 +64,7 @@ class SlowLinks:
         self._streams: list[_Stream] = []
         self._listeners: dict[socket.socket, Connect] = {}
         self._lock = threading.Lock()
-        self._wake, self._woken = socket.socketpair()
+        self._wake_sender, self._wake_receiver = socket.socketpair()
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="slow links")
 
@@ -74,11 +74,11 @@ class SlowLinks:
 
     def __exit__(self, *_: object) -> None:
         self._closed = True
-        self._wake.send(b"x")
+        self._wake_sender.send(b"x")
         self._thread.join()
         for stream in list(self._streams):
             self._end(stream)
-        for opened in (*self._listeners, self._wake, self._woken):
+        for opened in (*self._listeners, self._wake_sender, self._wake_receiver):
             opened.close()
 
     def carry(self, far: socket.socket) -> socket.socket:
@@ -93,7 +93,7 @@ class SlowLinks:
         listener = socket.create_server(("127.0.0.1", 0))
         with self._lock:
             self._listeners[listener] = connect
-        self._wake.send(b"x")
+        self._wake_sender.send(b"x")
         port: int = listener.getsockname()[1]
         return port
 
@@ -103,7 +103,7 @@ class SlowLinks:
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
             self._streams.append(_Stream(_Direction(near, far), _Direction(far, near)))
-        self._wake.send(b"x")
+        self._wake_sender.send(b"x")
 
     def _run(self) -> None:
         while not self._closed:
@@ -113,12 +113,12 @@ class SlowLinks:
                     for stream, direction in self._directions()
                     if self._is_readable(direction)
                 }
-                due_s = [direction.flight[0][0] for _, direction in self._directions() if direction.flight]
+                due_s = [direction.in_flight[0][0] for _, direction in self._directions() if direction.in_flight]
                 listeners = dict(self._listeners)
             wait_s = max(0.0, min(due_s) - time.monotonic()) if due_s else None
-            readable, _, _ = select.select([self._woken, *listeners, *sources], [], [], wait_s)
+            readable, _, _ = select.select([self._wake_receiver, *listeners, *sources], [], [], wait_s)
             for ready in readable:
-                if ready is self._woken:
+                if ready is self._wake_receiver:
                     ready.recv(_CHUNK)
                 elif ready in listeners:
                     self._add(ready.accept()[0], listeners[ready](_CONNECT_S))
@@ -129,28 +129,28 @@ class SlowLinks:
 
     def _directions(self) -> Iterator[tuple[_Stream, _Direction]]:
         for stream in list(self._streams):
-            yield stream, stream.there
-            yield stream, stream.back
+            yield stream, stream.to_robot
+            yield stream, stream.from_robot
 
     def _is_readable(self, direction: _Direction) -> bool:
-        return not direction.ended and len(direction.flight) < _IN_FLIGHT
+        return not direction.ended and len(direction.in_flight) < _MAX_IN_FLIGHT
 
     def _read(self, stream: _Stream, direction: _Direction) -> None:
-        trip = self.trips + 1 if direction is stream.there else stream.trip
+        trip = self.trips + 1 if direction is stream.to_robot else stream.trip
         try:
             chunk = direction.source.recv(_CHUNK)
         except OSError:
             chunk = b""
         direction.ended = not chunk
-        direction.flight.append((time.monotonic() + self._delay_s, trip, chunk))
+        direction.in_flight.append((time.monotonic() + self._delay_s, trip, chunk))
 
     def _deliver(self, stream: _Stream, direction: _Direction) -> None:
-        while direction.flight and direction.flight[0][0] <= time.monotonic():
-            _, trip, chunk = direction.flight.popleft()
+        while direction.in_flight and direction.in_flight[0][0] <= time.monotonic():
+            _, trip, chunk = direction.in_flight.popleft()
             if not chunk:
                 self._end(stream)
                 return
-            if direction is stream.there:
+            if direction is stream.to_robot:
                 stream.trip = max(stream.trip, trip)
             else:
                 self.trips = max(self.trips, trip)
@@ -163,8 +163,8 @@ class SlowLinks:
     def _end(self, stream: _Stream) -> None:
         with self._lock, contextlib.suppress(ValueError):
             self._streams.remove(stream)
-        stream.there.source.close()
-        stream.there.sink.close()
+        stream.to_robot.source.close()
+        stream.to_robot.sink.close()
 
 
 @contextlib.contextmanager

@@ -32,9 +32,11 @@ _TAB: Final = {
 }
 # By default OpenBLAS starts a thread per core that spins. fieldkit disables this, so the reference must, too.
 _ONE_THREAD: Final = {"OPENBLAS_NUM_THREADS": "1"}
-_SHOW: Final = "rich.console, rich.live, rich.table, rich.text"
+_DISPLAY_LIBRARIES: Final = "rich.console, rich.live, rich.table, rich.text"
 # pydantic imports the modules of its names at first access.
-_CHECK: Final = "yaml, pydantic; from pydantic import BaseModel, Field, PlainSerializer, StrictInt, TypeAdapter"
+_VALIDATION_LIBRARIES: Final = (
+    "yaml, pydantic; from pydantic import BaseModel, Field, PlainSerializer, StrictInt, TypeAdapter"
+)
 
 
 @dataclass(frozen=True)
@@ -57,13 +59,15 @@ COMMANDS: Final = {
     "--help": Command(["--help"], "argparse"),
     "trial --help": Command(["trial", "--help"], "argparse"),
     "fieldkit tr<TAB>": Command([], "argparse, argcomplete", _TAB),
-    "columns": Command(["columns"], f"argparse, numpy, {_SHOW}, {_CHECK}"),
+    "columns": Command(["columns"], f"argparse, numpy, {_DISPLAY_LIBRARIES}, {_VALIDATION_LIBRARIES}"),
     # pydantic imports importlib.metadata for its first model.
     "trial --dry-run": Command(
         ["trial", "los", "30ft", "--backend", "emulated", "--dry-run"],
-        f"argparse, numpy, importlib.metadata, {_SHOW}, {_CHECK}",
+        f"argparse, numpy, importlib.metadata, {_DISPLAY_LIBRARIES}, {_VALIDATION_LIBRARIES}",
     ),
-    "aggregate": Command(["aggregate", str(_TABLE)], f"argparse, numpy, pyarrow.csv, {_SHOW}, {_CHECK}"),
+    "aggregate": Command(
+        ["aggregate", str(_TABLE)], f"argparse, numpy, pyarrow.csv, {_DISPLAY_LIBRARIES}, {_VALIDATION_LIBRARIES}"
+    ),
 }
 
 
@@ -143,15 +147,15 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print single values as JSON")
     parser.add_argument("--peer", metavar="PYTHON", help="Python of another checkout's environment")
     arguments = parser.parse_args()
-    chosen = runs(arguments.peer)
-    costs: dict[str, list[Cost]] = {name: [] for name in chosen}
+    commands = runs(arguments.peer)
+    costs: dict[str, list[Cost]] = {name: [] for name in commands}
     for number in range(arguments.rounds + 1):
-        for name, (argv, environment) in chosen.items():
+        for name, (argv, environment) in commands.items():
             cost = measure(argv, environment)
             if number:  # the first round fills the file cache
                 costs[name].append(cost)
     if arguments.json:
-        print(json.dumps({name: [asdict(cost) for cost in several] for name, several in costs.items()}))
+        print(json.dumps({name: [asdict(cost) for cost in command_costs] for name, command_costs in costs.items()}))
     else:
         print(table(costs))
 

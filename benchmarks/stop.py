@@ -27,13 +27,13 @@ from tests.helpers.runs import finish, start
 _PATH_M: Final = 25.0
 _BRAKING_SHARE: Final = 0.9
 """Below this share of its speed a robot counts as braking: it has received a velocity of zero."""
-_LONG_S: Final = 60.0
+_TIMEOUT_S: Final = 60.0
 FIGURES: Final = {
     "ssh": "`ssh box-1 true` (OpenSSH)",
     "idle": "`fieldkit stop box-1`, which no program moves",
     "brakes": "`fieldkit stop rover-1`, until the base brakes",
     "stationary": "until the robot is stationary",
-    "printed": "until `stopped (standing)` is printed",
+    "printed": "until `stopped (stationary)` is printed",
     "ended": "until the command has exited",
 }
 
@@ -52,9 +52,9 @@ def measure(lab: RoverLab, out: str) -> dict[str, float]:
                 assert stop.stdout is not None
                 line = stop.stdout.readline()
                 times["printed"] = time.monotonic() - started_s
-                code = stop.wait(_LONG_S)
+                code = stop.wait(_TIMEOUT_S)
                 times["ended"] = time.monotonic() - started_s
-            if code != 0 or line != "rover-1: stopped (standing)\n":
+            if code != 0 or line != "rover-1: stopped (stationary)\n":
                 raise SystemExit(f"fieldkit stop exited with {code}: {line!r}")
             finish(trial)
         finally:
@@ -76,9 +76,14 @@ def ssh_words(lab: RoverLab) -> tuple[str, ...]:
     entry = re.search(r"box-1: .*port: (\d+), .*key: (\S+), host_key: ([^}]+)}", site)
     assert entry is not None
     port, key, host_key = entry.groups()
-    known = lab.folder / "known_hosts"
-    known.write_text(f"[127.0.0.1]:{port} {host_key}\n", encoding="ascii")
-    options = ("BatchMode=yes", "IdentitiesOnly=yes", "StrictHostKeyChecking=yes", f"UserKnownHostsFile={known}")
+    known_hosts = lab.folder / "known_hosts"
+    known_hosts.write_text(f"[127.0.0.1]:{port} {host_key}\n", encoding="ascii")
+    options = (
+        "BatchMode=yes",
+        "IdentitiesOnly=yes",
+        "StrictHostKeyChecking=yes",
+        f"UserKnownHostsFile={known_hosts}",
+    )
     words = [word for option in options for word in ("-o", option)]
     return ("ssh", "-F", "none", *words, "-i", key, "-p", port, "root@127.0.0.1", "true")
 
@@ -89,7 +94,7 @@ def _stop_words(robot: str) -> tuple[str, ...]:
 
 def _duration_s(words: Sequence[str]) -> float:
     started_s = time.monotonic()
-    subprocess.run(words, check=True, stdout=subprocess.DEVNULL, timeout=_LONG_S)
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL, timeout=_TIMEOUT_S)
     return time.monotonic() - started_s
 
 

@@ -34,7 +34,7 @@ DELAYS: Final = ("10ms", "50ms")
 RATE: Final = "100Mbit/s"
 KERNEL: Final = "cubic"
 MESSAGE_BYTES: Final = 10 * TcpOptions().segment_bytes
-_SAFELY_BIT_S: Final = 100_000_000
+_MAX_GOODPUT_BIT_S: Final = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def cosim_bit_s(link: Link, congestion: Congestion, seconds: float, seed: int) -
         ("near", "far"),
         transports={"tcp": partial(Tcp, options=TcpOptions(congestion=congestion))},
     )
-    count = math.ceil(_SAFELY_BIT_S * seconds / (8 * MESSAGE_BYTES))
+    count = math.ceil(_MAX_GOODPUT_BIT_S * seconds / (8 * MESSAGE_BYTES))
     stream = [Packet(number, "near", "far", MESSAGE_BYTES, ("s", number), 0, 0, "tcp") for number in range(count)]
     states = {"near": State((0.0, 0.0, 0.0)), "far": State((9.0, 0.0, 0.0))}
     arrivals, _ = network.advance(round(seconds * 1e9), stream, states)
@@ -70,23 +70,25 @@ def kernel_bit_s(link: Link, control: str, seconds: float, seed: int) -> float:
         return iperf(near, seconds, "--congestion", control)["sum_received"]["bits_per_second"]
 
 
-def ratio(mine: np.ndarray, peers: np.ndarray) -> tuple[float, float]:
+def ratio(cosim_runs: np.ndarray, kernel_array: np.ndarray) -> tuple[float, float]:
     """Return the ratio of two means of independent runs, and half of its 95 % interval (delta method, Welch's df)."""
-    value = float(mine.mean() / peers.mean())
-    shares = [float(runs.var(ddof=1) / len(runs) / runs.mean() ** 2) for runs in (mine, peers)]
+    value = float(cosim_runs.mean() / kernel_array.mean())
+    shares = [float(runs.var(ddof=1) / len(runs) / runs.mean() ** 2) for runs in (cosim_runs, kernel_array)]
     total = sum(shares)
-    freedom = total**2 / sum(share**2 / (len(runs) - 1) for share, runs in zip(shares, (mine, peers), strict=True))
-    return value, float(student.ppf(0.975, freedom)) * value * math.sqrt(total)
+    degrees_of_freedom = total**2 / sum(
+        share**2 / (len(runs) - 1) for share, runs in zip(shares, (cosim_runs, kernel_array), strict=True)
+    )
+    return value, float(student.ppf(0.975, degrees_of_freedom)) * value * math.sqrt(total)
 
 
 def row(link: Link, kernel_runs: Sequence[float], controls: Sequence[Congestion], seconds: float) -> Iterator[str]:
     """Yield the parts of a row of the table."""
-    peers = np.array(kernel_runs)
-    yield f"{link.loss:>5} {link.delay:>5}  kernel {peers.mean() / 1e6:6.3f} Mbit/s ({len(peers)} runs)"
+    kernel_array = np.array(kernel_runs)
+    yield f"{link.loss:>5} {link.delay:>5}  kernel {kernel_array.mean() / 1e6:6.3f} Mbit/s ({len(kernel_array)} runs)"
     for control in controls:
-        mine = np.array([cosim_bit_s(link, control, seconds, seed) for seed in range(2 * len(peers))])
-        value, half = ratio(mine, peers)
-        yield f"{control} {mine.mean() / 1e6:6.3f} {value:.2f} [{value - half:.2f}, {value + half:.2f}]"
+        cosim_runs = np.array([cosim_bit_s(link, control, seconds, seed) for seed in range(2 * len(kernel_array))])
+        value, half = ratio(cosim_runs, kernel_array)
+        yield f"{control} {cosim_runs.mean() / 1e6:6.3f} {value:.2f} [{value - half:.2f}, {value + half:.2f}]"
 
 
 def main() -> None:

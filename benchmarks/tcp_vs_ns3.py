@@ -1,9 +1,9 @@
 """TCP of the co-simulation compared with ns-3's, with equal losses on a cable: `python -m benchmarks.tcp_vs_ns3`.
 
-Has the requirements of `radio_vs_ns3`. One station sends to another at full rate, and packets are lost by their
-numbers, so that all differences are due to TCP. With fixed loss patterns the windows after the losses are printed,
-with random losses, equal for all peers, the goodputs. `--events PATTERN CONTROL` prints the events around the first
-difference.
+It has the same requirements as `radio_vs_ns3`. One station sends to another at full rate, and packets are lost by
+their numbers, so that all differences are due to TCP. With fixed loss patterns it prints the windows after the
+losses; with random losses, which are equal for all peers, it prints the goodputs. `--events PATTERN CONTROL` prints
+the events around the first difference.
 """
 
 import argparse
@@ -56,7 +56,7 @@ PATTERNS: Final = {
 }
 """The longest burst is the rest of a window, all packets that its ACKs release, and retransmissions twice."""
 
-CHANCES: Final = {
+RANDOM_LOSSES: Final = {
     "2 % of data": (0.02, 0.0, SECONDS),
     "14 % of data": (0.14, 0.0, SECONDS),
     "7 % each way": (0.07, 0.07, SECONDS),
@@ -191,10 +191,10 @@ def pattern_lines(ns3: Ns3) -> Iterator[str]:
                 yield f"{control:9}{name:14}{peer:9}{windows}  {run.mbit_s:.2f} Mbit/s"
 
 
-def chance_lines(ns3: Ns3) -> Iterator[str]:
+def random_loss_lines(ns3: Ns3) -> Iterator[str]:
     """Yield goodputs under random losses, the same for all."""
     for control in CONTROLS:
-        for name, (data, acks, seconds) in CHANCES.items():
+        for name, (data, acks, seconds) in RANDOM_LOSSES.items():
             goodputs: dict[str, list[float]] = {peer: [] for peer in (*PEERS, "ours")}
             for seed in range(SEEDS):
                 losses = random_losses(seed, data, acks)
@@ -234,7 +234,7 @@ def main() -> None:
         parser.error(f"patterns: {', '.join(PATTERNS)}; controls: {', '.join(CONTROLS)}")
     with tempfile.TemporaryDirectory() as folder:
         ns3 = build(Path(folder))
-        tables = (pattern_lines(ns3), chance_lines(ns3))
+        tables = (pattern_lines(ns3), random_loss_lines(ns3))
         lines = event_lines(ns3, *arguments.events) if arguments.events else chain(*tables)
         for line in lines:
             print(line, flush=True)

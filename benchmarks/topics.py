@@ -23,7 +23,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from benchmarks.bridge import HOST, SIZE, TYPE, Running, Way, free_port, spread
+from benchmarks.bridge import HOST, SIZE, TYPE, MessagePath, RunningPath, free_port, spread
 from fieldkit.analysis import statistics
 from fieldkit.core.threads import run_parallel
 from fieldkit.ros.interfaces import topics
@@ -34,7 +34,7 @@ from fieldkit.ros.streams import topic_samples
 PLAIN: Final = {"dds": ("plain",), "zenoh": ("plain", "attached"), "ros1": ("plain",)}
 """Pairs of each middleware that are compared with the agent's."""
 RATES_HZ: Final = (200.0, 197.0, 203.0)
-LASTS_S: Final = 4.0
+STREAM_S: Final = 4.0
 BURST_S: Final = 1.0
 BURST_EVERY: Final = 3
 FASTEST_HZ: Final = 1e9
@@ -58,11 +58,11 @@ class AgentPair:
         self._over, self._master_port, self._folder = over, master_port, folder
 
     @contextmanager
-    def stream(self, lasts_s: float, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
+    def stream(self, duration_s: float, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
         """Stream while the body runs, until the stream ends; yield the running publisher."""
         port = free_port()
-        with self._end("subscribe", port, lasts_s, rate_hz) as subscriber:
-            with self._end("publish", port, lasts_s, rate_hz) as publisher:
+        with self._end("subscribe", port, duration_s, rate_hz) as subscriber:
+            with self._end("publish", port, duration_s, rate_hz) as publisher:
                 yield publisher
                 if publisher.wait() != 0:
                     raise RuntimeError(f"the publisher over {self._over} exited with {publisher.returncode}")
@@ -74,9 +74,9 @@ class AgentPair:
         return list(zip(samples.at_ns.tolist(), (samples.at_ns - samples.sent_ns).tolist(), strict=True))
 
     @contextmanager
-    def _end(self, verb: str, port: int, lasts_s: float, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
+    def _end(self, verb: str, port: int, duration_s: float, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
         request = json.dumps({"network": self._network(verb, port), "topic": self._topic(verb), "stream": {
-            "over": self._over, "size_bytes": SIZE, "rate_hz": rate_hz, "duration_s": lasts_s, "patience_s": 20.0,
+            "over": self._over, "size_bytes": SIZE, "rate_hz": rate_hz, "duration_s": duration_s, "patience_s": 20.0,
         }})  # fmt: skip
         command = (sys.executable, "-m", "fieldkit.agent", verb, request, str(self._log(verb)))
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
@@ -110,7 +110,7 @@ class AgentPair:
         return self._folder / f"{self._over}-{verb}.bin"
 
 
-def stream_together(plain: Sequence[Running], agent_pair: AgentPair, rates_hz: Sequence[float]) -> list[Times]:
+def stream_together(plain: Sequence[RunningPath], agent_pair: AgentPair, rates_hz: Sequence[float]) -> list[Times]:
     """Send over all pairs of a middleware at the same time; return the arrivals of each while all pairs sent.
 
     Args:
@@ -118,9 +118,9 @@ def stream_together(plain: Sequence[Running], agent_pair: AgentPair, rates_hz: S
         agent_pair: The agent's pair.
         rates_hz: Rates of the pairs, the agent's last.
     """
-    with agent_pair.stream(LASTS_S, rates_hz[-1]):
+    with agent_pair.stream(STREAM_S, rates_hz[-1]):
         plain_arrivals = run_parallel(
-            lambda pair: pair[0].run(LASTS_S, pair[1])[1], list(zip(plain, rates_hz, strict=False))
+            lambda pair: pair[0].run(STREAM_S, pair[1])[1], list(zip(plain, rates_hz, strict=False))
         )
     streams = [*plain_arrivals, agent_pair.arrived()]
     first_ns = max(times[0][0] for times in streams)
@@ -134,7 +134,7 @@ def measure_round(over: str, number: int, agent_pair: AgentPair, environment: di
     rates_hz = [RATES_HZ[(place + number) % len(pairs)] for place in range(len(pairs))]
     with ExitStack() as stack:
         ways = [f"{over} {pair}" for pair in PLAIN[over]]
-        plain = [Running(stack, Way(way, way, way), environment) for way in ways]
+        plain = [RunningPath(stack, MessagePath(way, way, way), environment) for way in ways]
         delays = stream_together(plain, agent_pair, rates_hz)
         bursts: list[Times] = []
         if number % BURST_EVERY == 0:

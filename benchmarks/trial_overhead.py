@@ -82,7 +82,7 @@ SCRIPT_LIMIT_S: Final = 120.0
 
 
 @dataclass
-class Turns:
+class AlternatingPeers:
     """Alternates fieldkit and the script. As the sink of a trial it runs the script after each repeat.
 
     Attributes:
@@ -150,17 +150,19 @@ class Turns:
 
 
 @contextmanager
-def open_match(testbed: EmulatedTestbed, out: Path, record_s: float, slow: SlowLinks | None) -> Iterator[Turns]:
+def open_peers(
+    testbed: EmulatedTestbed, out: Path, record_s: float, slow: SlowLinks | None
+) -> Iterator[AlternatingPeers]:
     """Yield both peers, connected to the robots of `testbed`; the script writes its evidence to `out`."""
     addresses = [testbed.robots[role].spec.ip for role in ROLES]
     with ExitStack() as stack:
         connections = stack.enter_context(connected(testbed, ROLES, slow))
         watch = stack.enter_context(Watch([testbed.robots[role].pid for role in ROLES], list(TOOLS)))
         words = [str(out), *addresses, f"{record_s:g}", IDLE_S, PINGS, PING_INTERVAL_S]
-        yield Turns(watch, stack.enter_context(BashPeer(connections, words)), slow)
+        yield AlternatingPeers(watch, stack.enter_context(BashPeer(connections, words)), slow)
 
 
-def measure(rounds: int, record_s: float, round_trip_s: float) -> Turns:
+def measure(rounds: int, record_s: float, round_trip_s: float) -> AlternatingPeers:
     """Return the results of `rounds` rounds: one repeat by fieldkit and one by the script per protocol."""
     document = schema.parse(SITE, source="site")
     backend = EmulatedBackend(schema.validate(document, Site), document)
@@ -174,9 +176,9 @@ def measure(rounds: int, record_s: float, round_trip_s: float) -> Turns:
         backend.open(cast, seed=1, sink=lambda _: None, operator=Unattended()) as testbed,
     ):
         assert isinstance(testbed, EmulatedTestbed)
-        with open_match(testbed, Path(folder), record_s, slow) as match:
-            run_trial(plan, testbed, Path(folder), match)
-            return match
+        with open_peers(testbed, Path(folder), record_s, slow) as peers:
+            run_trial(plan, testbed, Path(folder), peers)
+            return peers
 
 
 def show(repeats: Sequence[Repeat]) -> None:
@@ -214,7 +216,7 @@ def spread(values: Sequence[float]) -> str:
     return f"{statistics.median(values):.0f} ({min(values):.0f} to {max(values):.0f})"
 
 
-def leave(_number: int, _frame: FrameType | None) -> None:
+def exit_with_cleanup(_number: int, _frame: FrameType | None) -> None:
     """Exit on SIGTERM with clean-up."""
     sys.exit(143)
 
@@ -232,19 +234,19 @@ def main() -> None:
         help="round-trip times of the control links (default: 0s 100ms)",
     )
     options = parser.parse_args()
-    signal.signal(signal.SIGTERM, leave)
+    signal.signal(signal.SIGTERM, exit_with_cleanup)
     rows = []
     for text in options.round_trips:
         load_before = os.getloadavg()[0]
-        match = measure(options.rounds, parse_duration_s(options.record), parse_duration_s(text))
+        peers = measure(options.rounds, parse_duration_s(options.record), parse_duration_s(text))
         if options.json:
-            repeats = [asdict(repeat) for repeat in match.repeats]
-            rows.append({"round_trip": text, "load_before": load_before, "unseen": match.unseen, "repeats": repeats})
+            repeats = [asdict(repeat) for repeat in peers.repeats]
+            rows.append({"round_trip": text, "load_before": load_before, "unseen": peers.unseen, "repeats": repeats})
             continue
         print(f"control links with {text} of round trip")
         print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
-        print(f"repeats that could not be timed: {match.unseen}\n")
-        show(match.repeats)
+        print(f"repeats that could not be timed: {peers.unseen}\n")
+        show(peers.repeats)
         print()
     if options.json:
         print(json.dumps(rows, indent=2))

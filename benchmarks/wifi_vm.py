@@ -99,7 +99,7 @@ def running(lab: Path) -> Iterator[Sequence[int]]:
     machine = subprocess.Popen(argv, cwd=lab, stdin=subprocess.DEVNULL)
     try:
         until_s = time.monotonic() + BOOT_S
-        while not all(_greets(port) for port in ports):
+        while not all(_is_ssh_server(port) for port in ports):
             if machine.poll() is not None or time.monotonic() > until_s:
                 sys.exit(f"the machine did not come up: see {lab / 'console.txt'}")
             time.sleep(1)
@@ -128,7 +128,7 @@ def _free_ports(count: int) -> Sequence[int]:
         return [opened.getsockname()[1] for opened in sockets]
 
 
-def _greets(port: int) -> bool:
+def _is_ssh_server(port: int) -> bool:
     """Return True if an SSH server answers on a port; QEMU accepts connections before the server is up."""
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=30) as connection:

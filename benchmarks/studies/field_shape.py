@@ -101,8 +101,8 @@ def read(folder: Path) -> Repeats:
 
 def chart(cells: Sequence[Cell], name: str, panels: Sequence[tuple[str, str, str]]) -> Chart:
     """Return a chart of panels, each given as title, protocol and quantity."""
-    drawn = [_panel(cells, *panel) for panel in panels]
-    return Chart(name=name, title=name, caption="", panels=drawn)
+    drawn_panels = [_panel(cells, *panel) for panel in panels]
+    return Chart(name=name, title=name, caption="", panels=drawn_panels)
 
 
 def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> Panel:
@@ -120,7 +120,7 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
             Series(
                 label=f"{topology}, {'in sight' if scenario == 'los' else 'behind the wall'}",
                 style=style,
-                x=[feet(cell) + (rank - 1.5) * DODGE_FT for cell in series_cells],
+                x=[distance_ft(cell) + (rank - 1.5) * DODGE_FT for cell in series_cells],
                 y=[factor * item.value for item in estimates],
                 low=[_end(item, item.low, factor) for item in estimates],
                 high=[_end(item, item.high, factor) for item in estimates],
@@ -137,7 +137,7 @@ def _end(source: Estimate, end: float | None, factor: float) -> float | None:
     return None if end is None or source.value == 0 else factor * end
 
 
-def feet(cell: Cell) -> float:
+def distance_ft(cell: Cell) -> float:
     """Return a cell's distance in feet."""
     metres = cell.key["distance_m"]
     assert isinstance(metres, float)

@@ -2,8 +2,8 @@
 
 Trials of four layouts and two hello intervals on emulated robots without fading, with five repeats each, run in
 sequence unless FOLDER already has them; 2 hours in all. Then a table of `rtt_gap_s`, with the bound of 13.7 hello
-intervals (docs/studies/mesh.md), and a figure. The layout `row` has no other path, so its time starts when the robot
-is back.
+intervals (docs/studies/mesh.md), and a figure are made. The layout `row` has no other path, so its time starts when
+the robot is back.
 """
 
 import argparse

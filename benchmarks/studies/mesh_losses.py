@@ -105,20 +105,22 @@ def lab(detour: Detour) -> Iterator[DetourLab]:
     robots = {name: LabRobot(name, profile, f"10.42.0.{at}", ()) for at, name in enumerate(detour.places, 1)}
     mesh = {"daemon": "babeld", "hello": f"{HELLO_S}s"}
     options = EmulatedOptions.model_validate({"radio": {"fading": detour.fading}, "mesh": mesh})
-    with running_robots(robots, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1) as up:
-        up.medium.place({name: (*place, ANTENNA_M) for name, place in detour.places.items()})
+    with running_robots(
+        robots, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1
+    ) as lab_robots:
+        lab_robots.medium.place({name: (*place, ANTENNA_M) for name, place in detour.places.items()})
         sender = SshShell(
             "sender",
-            connect=up.robots["sender"].connect,
+            connect=lab_robots.robots["sender"].connect,
             user=USER,
-            host_key=up.host_keys["sender"],
-            private_key=up.private_key,
+            host_key=lab_robots.host_keys["sender"],
+            private_key=lab_robots.private_key,
         )
         with closing(sender):
-            yield DetourLab(up.robots, sender)
+            yield DetourLab(lab_robots.robots, sender)
 
 
-def heal_s(lab_robots: DetourLab, lost: Sequence[str]) -> float | None:
+def healing_time_s(lab_robots: DetourLab, lost: Sequence[str]) -> float | None:
     """Switch off the next hop, once it is one of `lost`; return the time until the receiver answers again.
 
     Returns:
@@ -141,11 +143,11 @@ def heal_s(lab_robots: DetourLab, lost: Sequence[str]) -> float | None:
         lab_robots.robots[hop].switch_on()
 
 
-def heals_s(lab_robots: DetourLab, detour: Detour, losses: int) -> list[float | None]:
-    """Return `heal_s` of each loss, and print each result."""
+def healing_times_s(lab_robots: DetourLab, detour: Detour, losses: int) -> list[float | None]:
+    """Return `healing_time_s` of each loss, and print each result."""
     times_s = []
     for number in range(losses):
-        times_s.append(heal_s(lab_robots, detour.lost))
+        times_s.append(healing_time_s(lab_robots, detour.lost))
         print(f"{detour.label}, fading {detour.fading}, {number + 1}/{losses}: {times_s[-1]}", file=sys.stderr)
     return times_s
 
@@ -169,7 +171,7 @@ def main() -> None:
     with ExitStack() as stack:
         labs = [stack.enter_context(lab(detour)) for detour in DETOURS]
         pool = stack.enter_context(ThreadPoolExecutor(len(labs)))
-        times_by_lab = list(pool.map(heals_s, labs, DETOURS, [options.losses] * len(labs)))
+        times_by_lab = list(pool.map(healing_times_s, labs, DETOURS, [options.losses] * len(labs)))
     print(f"| detour | fading | losses | median | most | above {BOUND_HELLOS * HELLO_S:.2f} s |")
     print("| --- " * 6 + "|")
     print("\n".join(map(row, DETOURS, times_by_lab)))

@@ -114,7 +114,7 @@ def run(folder: Path, names: Sequence[str]) -> None:
             print(f"{name}: exit code {process.returncode}, see {folder / name}.log", file=sys.stderr)
 
 
-def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:
+def by_distance(findings: MiddlewareFindings, name: str, drawn_figure: "DrawnFigure") -> Chart:
     """Return a chart of two robots: a row of panels per size, best effort on the left and reliable on the right."""
     pairs = [cell for cell in findings.cells if cell.robots == 2]
     distances_m = [cell.distance_m for cell in pairs] or [0.0]
@@ -127,8 +127,12 @@ def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -
                     cell for cell in pairs if (cell.kind, cell.middleware, cell.size_bytes) == (kind, label, size)
                 ]
                 shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
-                series.append(_series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], drawn))
-            panel = drawn.panel(f"{SIZES[size]}, {quality}{_sample_count_text(pairs, size)}", "distance (m)", series)
+                series.append(
+                    _series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], drawn_figure)
+                )
+            panel = drawn_figure.panel(
+                f"{SIZES[size]}, {quality}{_sample_count_text(pairs, size)}", "distance (m)", series
+            )
             panels.append(replace(panel, left=min(distances_m) - MARGIN_M, right=max(distances_m) + MARGIN_M))
     return Chart(name=name, title=name, caption="", panels=panels)
 
@@ -136,7 +140,7 @@ def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -
 def by_robots(findings: MiddlewareFindings) -> Chart:
     """Return a chart of loss and delay by the number of robots that publish to one."""
     panels = []
-    for drawn in (LOST, LATE):
+    for drawn_figure in (LOSS_FIGURE, DELAY_FIGURE):
         for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
             for size in sorted({cell.size_bytes for cell in _comparable(findings, metres)}):
                 size_cells = [cell for cell in _comparable(findings, metres) if cell.size_bytes == size]
@@ -149,24 +153,26 @@ def by_robots(findings: MiddlewareFindings) -> Chart:
                             for cell in size_cells
                             if cell.middleware == label
                         ],
-                        drawn,
+                        drawn_figure,
                     )
                     for rank, label in enumerate(STYLES)
                 ]
-                panel = drawn.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
+                panel = drawn_figure.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
                 panels.append(replace(panel, x_ticks=[(number, str(number)) for number in numbers]))
     return Chart(name="middleware-robots", title="", caption="", panels=panels)
 
 
-def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "DrawnFigure") -> Series:
+def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn_figure: "DrawnFigure") -> Series:
     """Return the points of a middleware with their intervals; no line joins them, as intervals are too wide."""
-    measured = sorted(((x, cell) for x, cell in points if drawn.value(cell) is not None), key=lambda pair: pair[0])
-    ends = [drawn.interval(cell) for _, cell in measured]
+    measured = sorted(
+        ((x, cell) for x, cell in points if drawn_figure.value(cell) is not None), key=lambda pair: pair[0]
+    )
+    ends = [drawn_figure.interval(cell) for _, cell in measured]
     return Series(
         label,
         STYLES[label],
         [x for x, _ in measured],
-        [drawn.value(cell) or 0.0 for _, cell in measured],
+        [drawn_figure.value(cell) or 0.0 for _, cell in measured],
         low=[low for low, _ in ends],
         high=[high for _, high in ends],
         join="none",
@@ -232,8 +238,8 @@ class DrawnFigure:
         return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
 
 
-LOST: Final = DrawnFigure("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
-LATE: Final = DrawnFigure("delay, 95 % (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
+LOSS_FIGURE: Final = DrawnFigure("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
+DELAY_FIGURE: Final = DrawnFigure("delay, 95 % (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
 
 
 BIMODAL: Final = " *"
@@ -260,15 +266,18 @@ def tables(findings: MiddlewareFindings, conditions: str) -> Iterator[str]:
 
 
 def _table(
-    cells: Sequence[MiddlewareCell], across: str, head: Callable[[float], str], text: Callable[[MiddlewareCell], str]
+    cells: Sequence[MiddlewareCell],
+    column_attribute: str,
+    head: Callable[[float], str],
+    text: Callable[[MiddlewareCell], str],
 ) -> Iterator[str]:
-    columns = sorted({getattr(cell, across) for cell in cells})
+    columns = sorted({getattr(cell, column_attribute) for cell in cells})
     yield "| " + " | ".join(["data", "kind", "middleware", *map(head, columns)]) + " |"
     yield "| " + " | ".join(["---"] * (3 + len(columns))) + " |"
     rows = {(cell.size_bytes, cell.kind, cell.middleware) for cell in cells}
     for size, kind, name in sorted(rows, key=lambda row: (row[0], row[1], list(STYLES).index(row[2]))):
         by_column = {
-            getattr(cell, across): cell
+            getattr(cell, column_attribute): cell
             for cell in cells
             if (cell.size_bytes, cell.kind, cell.middleware) == (size, kind, name)
         }
@@ -338,8 +347,8 @@ def main() -> None:
 def draw(findings: MiddlewareFindings, folder: Path) -> None:
     """Write the figures of docs/studies/middleware.md into a folder."""
     for chart in (
-        by_distance(findings, "middleware-loss", LOST),
-        by_distance(findings, "middleware-delay", LATE),
+        by_distance(findings, "middleware-loss", LOSS_FIGURE),
+        by_distance(findings, "middleware-delay", DELAY_FIGURE),
         by_robots(findings),
     ):
         files.write(folder / f"{chart.name}.svg", figures.paper(chart, "svg"))

@@ -1,9 +1,9 @@
 """Losses of 1 MB images over Zenoh, per repeat: `python -m benchmarks.studies.zenoh_images [--rounds N] [--page P]`.
 
-As root. Two emulated robots of a separate lab, 20 m apart. The agent of the step `topics` is compared with a plain
-pair of Zenoh sessions on the same robots (benchmarks/studies/zenoh_plain.py, which imports nothing of fieldkit), with
-several settings; each round runs all of them in turn. Losses of this stream are bimodal, so each repeat is printed
-and no mean.
+It needs root. Two emulated robots of a separate lab are 20 m apart. The agent of the step `topics` is compared with a
+plain pair of Zenoh sessions on the same robots (benchmarks/studies/zenoh_plain.py, which imports nothing of
+fieldkit), with several settings; each round runs all of them in sequence. Losses of this stream are bimodal, so each
+repeat is printed and no mean.
 
 A repeat takes 11 s, a round of six settings about 70 s.
 """
@@ -37,7 +37,7 @@ RATE_HZ: Final = 2.0
 SAMPLES: Final = 16
 PUBLISHER: Final = ("rover-1", "10.42.0.1")
 SUBSCRIBER: Final = ("base", "10.42.0.5")
-WAITS: Final = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"
+MAX_WAIT_SETTING: Final = "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"
 """Microseconds for which a publisher with DROP waits for space in its queue, for a fragmented sample; 50,000 by
 default (Zenoh 1.9, DEFAULT_CONFIG.json5)."""
 LONG_WAIT_US: Final = 500_000
@@ -64,8 +64,8 @@ SETTINGS: Final = (
     ImageSetting("plain pair, `DROP`", "", {}),
     ImageSetting("agent, `sensor_data`", "sensor_data", {}),
     ImageSetting("agent, `default` (reliable)", "default", {}),
-    ImageSetting("plain pair, `DROP`, waits 500 ms", "", {WAITS: str(LONG_WAIT_US)}),
-    ImageSetting("agent, `default`, waits 500 ms", "default", {WAITS: str(LONG_WAIT_US)}),
+    ImageSetting("plain pair, `DROP`, waits 500 ms", "", {MAX_WAIT_SETTING: str(LONG_WAIT_US)}),
+    ImageSetting("agent, `default`, waits 500 ms", "default", {MAX_WAIT_SETTING: str(LONG_WAIT_US)}),
     ImageSetting(
         "agent, `default`, tuned (`block_first`)",
         "default",
@@ -137,9 +137,9 @@ class ImageLab:
             }
             ends[verb] = ("-m", "fieldkit.agent", verb, json.dumps(request), f"{verb}.bin")
         self._stream(ends, "up,")
-        return self._logged(PUBLISHER[0], "publish"), self._logged(SUBSCRIBER[0], "subscribe")
+        return self._logged_numbers(PUBLISHER[0], "publish"), self._logged_numbers(SUBSCRIBER[0], "subscribe")
 
-    def _logged(self, robot: str, verb: str) -> list[int]:
+    def _logged_numbers(self, robot: str, verb: str) -> list[int]:
         data = subprocess.run(self.command(robot, "cat", f"{verb}.bin"), check=True, capture_output=True).stdout
         path = self._folder / f"{verb}.bin"
         path.write_bytes(data)

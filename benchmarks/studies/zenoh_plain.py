@@ -14,8 +14,8 @@ from typing import Any, Final
 import zenoh
 
 HEAD: Final = struct.Struct("<qq")
-SETTLES_S: Final = 0.5
-DRAINS_S: Final = 2.0
+SETTLING_S: Final = 0.5
+DRAIN_S: Final = 2.0
 
 
 def subscribe(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (untyped)
@@ -37,7 +37,7 @@ def publish(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (unt
     publisher = session.declare_publisher(request["key"], congestion_control=zenoh.CongestionControl.DROP)
     while not publisher.matching_status.matching:
         time.sleep(0.01)
-    time.sleep(SETTLES_S)
+    time.sleep(SETTLING_S)
     started_s = time.monotonic()
     padding = bytes(request["bytes"] - HEAD.size)
     for number in range(request["samples"]):
@@ -45,7 +45,7 @@ def publish(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (unt
         sent_ns = time.time_ns()
         publisher.put(HEAD.pack(number, sent_ns) + padding)
         print(json.dumps([number, sent_ns, time.time_ns()]), flush=True)
-    time.sleep(DRAINS_S)
+    time.sleep(DRAIN_S)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Print whether two commits behave alike; see CONTRIBUTING.md.
+"""Compare the behaviour of two commits; see CONTRIBUTING.md.
 
 `python -m benchmarks.unchanged BASE [HEAD]` exits with 1 on any difference that is not a label.
 """
@@ -27,7 +27,7 @@ PARTS: Final = (*(kind.name.lower() for kind in Class), TESTS, STRUCTURE)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the proof; return 0 if nothing but labels differs, 1 if something does, 2 for a wrong command line."""
+    """Run the comparison; return 0 if only labels differ, 1 if anything else differs, 2 for a wrong command line."""
     arguments = _arguments(argv)
     parts = [part for part in arguments.only or PARTS if part not in arguments.without]
     start_s = time.monotonic()
@@ -58,7 +58,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
         "head", nargs="?", default=trees.WORKING_TREE, help="the commit after the change (default: %(default)s)"
     )
     parser.add_argument(
-        "--only", action="append", choices=PARTS, help="compare this alone; may be given more than once"
+        "--only", action="append", choices=PARTS, help="compare only this class; may be given more than once"
     )
     parser.add_argument("--without", action="append", default=[], choices=PARTS, help="do not compare this")
     parser.add_argument("--labels", type=int, default=40, metavar="N", help="labels that are listed (default: 40)")
@@ -69,8 +69,8 @@ def _behaviour(base: Tree, head: Tree, kinds: Sequence[Class], *, labels_shown: 
     """Record the items with both trees at the same time, and print a line for each class."""
     for tree in (base, head):
         items.prepare(tree)
-    chosen = items.items(base, kinds)
-    recordings = [_start(tree, chosen) for tree in (base, head)]
+    selected_items = items.items(base, kinds)
+    recordings = [_start(tree, selected_items) for tree in (base, head)]
     for recording in recordings:
         if recording.wait() != 0:
             raise RuntimeError("a recorder ended early; its error is above")
@@ -78,7 +78,7 @@ def _behaviour(base: Tree, head: Tree, kinds: Sequence[Class], *, labels_shown: 
     real: list[str] = []
     for kind in kinds:
         counts: Counter[str] = Counter()
-        for number, item in enumerate(chosen):
+        for number, item in enumerate(selected_items):
             if item.kind is not kind:
                 continue
             differences = comparison.compare(item, number, base, head)
@@ -94,8 +94,10 @@ def _behaviour(base: Tree, head: Tree, kinds: Sequence[Class], *, labels_shown: 
     return not real
 
 
-def _start(tree: Tree, chosen: Sequence[Item]) -> "subprocess.Popen[bytes]":
-    listed = [dataclasses.asdict(item) | {"working_folder": str(tree.lab / item.working_folder)} for item in chosen]
+def _start(tree: Tree, selected_items: Sequence[Item]) -> "subprocess.Popen[bytes]":
+    listed = [
+        dataclasses.asdict(item) | {"working_folder": str(tree.lab / item.working_folder)} for item in selected_items
+    ]
     path = tree.folder / "items.json"
     path.write_text(json.dumps(listed), encoding="utf-8")
     command = (*trees.python(), str(Path(recorder.__file__)), str(path), str(tree.results))
@@ -112,7 +114,7 @@ def _print_details(labels: Counter[tuple[str, str]], real: Sequence[str], labels
     for text in real[:_SHOWN]:
         print(f"\nDIFFERENT {text}")
     if len(real) > _SHOWN:
-        print(f"\n... and {len(real) - _SHOWN} differences more")
+        print(f"\n... and {len(real) - _SHOWN} more differences")
 
 
 def _tests(base: Tree, head: Tree) -> bool:

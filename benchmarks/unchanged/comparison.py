@@ -42,7 +42,7 @@ class Differences:
     """Differences between two outputs.
 
     Attributes:
-        labels: Pairs of words before and after, with their counts.
+        labels: Pairs of words, before and after the change, with their counts.
         real: Differences that are not labels, each with the lines that differ.
     """
 
@@ -80,17 +80,17 @@ def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
         )
     for name in sorted(names[0] & names[1]):
         contents = [(top / name).read_bytes() for top in (before, after)]
-        texts = [_stable(content, tree) for content, tree in zip(contents, (base, head), strict=True)]
+        texts = [_without_variable_parts(content, tree) for content, tree in zip(contents, (base, head), strict=True)]
         if contents[0] == contents[1] or (None not in texts and texts[0] == texts[1]):
             continue
         if texts[0] is None or texts[1] is None:
             differences.real.append(f"{name}: other bytes")
         else:
-            differences.add(_texts(name, texts[0], texts[1], exact=_exact(item, name)))
+            differences.add(_texts(name, texts[0], texts[1], exact=_must_be_equal(item, name)))
     return differences
 
 
-def _stable(content: bytes, tree: Tree) -> str | None:
+def _without_variable_parts(content: bytes, tree: Tree) -> str | None:
     """Return a text without parts that vary between runs, or None if the content is not text."""
     try:
         text = content.decode()
@@ -102,7 +102,7 @@ def _stable(content: bytes, tree: Tree) -> str | None:
     return text
 
 
-def _exact(item: Item, name: str) -> bool:
+def _must_be_equal(item: Item, name: str) -> bool:
     if name == "exit_code" or item.simulation is not None:
         return True
     if name == "stdout":
@@ -156,11 +156,11 @@ def _values(where: str, old: Any, new: Any) -> Differences:  # noqa: ANN401 (any
         for old_item, new_item in zip(old, new, strict=True):
             differences.add(_values(where, old_item, new_item))
     else:
-        differences.real.append(f"{where}:\n- {_short(old)}\n+ {_short(new)}")
+        differences.real.append(f"{where}:\n- {_shortened(old)}\n+ {_shortened(new)}")
     return differences
 
 
-def _short(value: object) -> str:
+def _shortened(value: object) -> str:
     text = json.dumps(value)
     return text if len(text) <= 300 else f"{text[:300]}..."
 
@@ -168,14 +168,14 @@ def _short(value: object) -> str:
 def _trials(before: Path, after: Path) -> Differences:
     """Compare two runs of an emulated trial, whose numbers differ: events, their fields, files, and CSV headers."""
     differences = Differences()
-    for name, shapes in {"exit code": _codes, "events": _event_shapes, "files": _file_shapes}.items():
+    for name, shapes in {"exit code": _exit_codes, "events": _event_shapes, "files": _file_shapes}.items():
         old, new = ("\n".join(sorted(shapes(top))) for top in (before, after))
         if old != new:
             differences.real.append(f"{name}:\n{_diff(old, new)}")
     return differences
 
 
-def _codes(result: Path) -> Iterator[str]:
+def _exit_codes(result: Path) -> Iterator[str]:
     yield (result / "exit_code").read_text(encoding="ascii")
 
 
@@ -226,5 +226,5 @@ def labels(before: str, after: str) -> Iterator[tuple[str, str]]:
 def _diff(before: str, after: str) -> str:
     lines = list(difflib.unified_diff(before.splitlines(), after.splitlines(), n=0, lineterm=""))[2:]
     shown = [line[:300] for line in lines if not line.startswith("@@")]
-    more = [f"... and {len(shown) - _SHOWN_LINES} lines more"] if len(shown) > _SHOWN_LINES else []
+    more = [f"... and {len(shown) - _SHOWN_LINES} more lines"] if len(shown) > _SHOWN_LINES else []
     return "\n".join(shown[:_SHOWN_LINES] + more)

@@ -93,7 +93,7 @@ def shipped(tree: Tree, kind: str) -> list[str]:
     return sorted(path.stem for path in (tree.code / kind).glob("*.yaml"))
 
 
-def own(kind: str) -> list[str]:
+def proof_names(kind: str) -> list[str]:
     """Return the names of the robots or procedures of the proof."""
     return sorted(path.stem for path in (LAB / kind).glob("*.yaml"))
 
@@ -126,7 +126,7 @@ WRONG: Final = (
     ("topics-missing", "robots/husky.yaml", '"{topics}"]', "]"),
 )
 
-TYPED: Final = """\
+COMMAND_LINES: Final = """\
 trial los 30
 trial los 30feet
 trial los 0m
@@ -218,7 +218,7 @@ def prepare(tree: Tree) -> None:
     shutil.copytree(BAGS, tree.lab / "bags")
     for name in ("empty", "emulated"):
         (tree.lab / name).mkdir()
-    for profile in (*shipped(tree, "robots"), *own("robots")):
+    for profile in (*shipped(tree, "robots"), *proof_names("robots")):
         _site_folder(tree, profile, site(profile))
         _site_folder(tree, f"{profile}-field", site(profile, field=True))
         _site_folder(tree, f"{profile}-master", site(profile, more=SHARED_MASTER))
@@ -268,7 +268,7 @@ def _trials(tree: Tree) -> list[str]:
 
 def _tables(tree: Tree) -> Iterator[Item]:
     trials = _trials(tree)
-    olds = [f"old/{version}/trial.csv" for version in ("1", "2", "3", "4")]
+    old_tables = [f"old/{version}/trial.csv" for version in ("1", "2", "3", "4")]
     for trial in trials:
         for name in ("trial.csv", "summary.csv"):
             yield Item(Class.TABLES, ("rebuild", trial), outputs=(f"{trial}/{name}",))
@@ -278,7 +278,7 @@ def _tables(tree: Tree) -> Iterator[Item]:
         if form != "latex":
             yield Item(Class.TABLES, ("aggregate", "trials", "--all", "--format", form))
             yield Item(Class.TABLES, ("compare", *_comparable(trials), "--force", "--format", form))
-    for old in olds:
+    for old in old_tables:
         yield Item(Class.TABLES, ("aggregate", old, "--all", "--format", "csv"))
     for trial in trials:
         yield Item(Class.TABLES, ("positions", trial))
@@ -308,8 +308,8 @@ def _exports(tree: Tree) -> Iterator[Item]:
 
 
 def _dry_runs(tree: Tree) -> Iterator[Item]:
-    for profile in (*shipped(tree, "robots"), *own("robots")):
-        for procedure in (*shipped(tree, "procedures"), *own("procedures")):
+    for profile in (*shipped(tree, "robots"), *proof_names("robots")):
+        for procedure in (*shipped(tree, "procedures"), *proof_names("procedures")):
             words = ("trial", procedure, "30ft", "--dry-run", "--json")
             yield Item(Class.DRY_RUNS, words, profile, succeeds=False)
             yield Item(Class.DRY_RUNS, (*words, "--allow-motion"), f"{profile}-field", succeeds=False)
@@ -318,7 +318,7 @@ def _dry_runs(tree: Tree) -> Iterator[Item]:
 
 
 def _command_lines(_: Tree) -> Iterator[Item]:
-    for line in TYPED.splitlines():
+    for line in COMMAND_LINES.splitlines():
         yield Item(Class.COMMAND_LINES, tuple(line.split()), succeeds=False)
     for bag in sorted(BAGS.glob("*.bag")):
         for verb in ("info", "check"):

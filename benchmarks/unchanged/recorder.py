@@ -2,11 +2,10 @@
 
 Runs as a program in an environment in which Python imports that tree: `python -P recorder.py ITEMS RESULTS`, where
 ITEMS is a JSON file of a list of items (`items.Item` as dictionaries) and RESULTS a folder, which is made. With
-`--commands` it prints the commands that the tree has. It imports only the standard library and the public names of
-the
+`--commands` it prints the commands that the tree has. It imports only the standard library and public names of the
 tree: the module `fieldkit`, and `build` and `load_scenario` of `sim_backends.cosim`.
 
-All commands run in this process, one after the other: importing the libraries takes longer than most commands.
+All commands run in this process in sequence, because importing the libraries takes longer than most commands.
 """
 
 import contextlib
@@ -30,7 +29,7 @@ def record(item: dict[str, Any], folder: Path) -> None:
     """
     folder.mkdir(parents=True)
     os.chdir(item["working_folder"])
-    made = [name for name in item["outputs"] if not Path(name).exists()]
+    new_outputs = [name for name in item["outputs"] if not Path(name).exists()]
     saved = os.dup(1), os.dup(2)
     with (folder / "stdout").open("wb") as out, (folder / "stderr").open("wb") as error:
         os.dup2(out.fileno(), 1)
@@ -48,10 +47,10 @@ def record(item: dict[str, Any], folder: Path) -> None:
             os.close(saved[1])
     (folder / "exit_code").write_text(f"{code}\n", encoding="ascii")
     os.chdir(item["working_folder"])
-    for name in made:
+    for name in new_outputs:
         if Path(name).exists():
             shutil.move(name, folder / name.replace("/", "+"))
-    for name in set(item["outputs"]) - set(made):
+    for name in set(item["outputs"]) - set(new_outputs):
         shutil.copy(name, folder / name.replace("/", "+"))
 
 
@@ -121,7 +120,7 @@ if __name__ == "__main__":
         sys.exit()
     results = Path(sys.argv[2])
     sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115 (open until exit)
-    for number, each in enumerate(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))):
-        record(each, results / str(number))
-        if each["counts_lines"]:
+    for number, item in enumerate(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))):
+        record(item, results / str(number))
+        if item["counts_lines"]:
             (results / "imported_lines.json").write_text(json.dumps(_imported_lines()), encoding="ascii")

@@ -15,7 +15,7 @@ MAX_METHODS: Final = 12
 MAX_PAGE_BYTES: Final = 20_000
 MAX_NAMESAKES: Final = 2
 
-DIALECT: Final = {
+AVOIDED_WORDS: Final = {
     "tell, told": r"\b(tells?|told|telling)\b",
     "who, whoever": r"\bwho(ever|se|m)?\b",
     "nobody, somebody, anybody": r"\b(nobody|somebody|anybody)\b",
@@ -64,7 +64,7 @@ def numbers(tree: Path) -> Iterator[tuple[str, str]]:
     yield "documentation, kB", f"{sum(sizes) / 1000:.0f}; at most 300"
     yield "pages over 20 kB", f"{sum(size > MAX_PAGE_BYTES for size in sizes)}; 0"
     prose = [page.read_text(encoding="utf-8") for page in pages]
-    for name, expression in DIALECT.items():
+    for name, expression in AVOIDED_WORDS.items():
         pattern = re.compile(expression)
         in_code, in_docs = (sum(len(pattern.findall(text)) for text in group) for group in (texts, prose))
         yield f"'{name}' in code", f"{in_code}"

@@ -91,30 +91,32 @@ def compare(before: Path, after: Path) -> Changes:
     Raises:
         SyntaxError: A file is not valid Python.
     """
-    olds, news = list(units(before)), list(units(after))
-    pairs, olds, news = _match_by_shape(olds, news)
+    old_units, new_units = list(units(before)), list(units(after))
+    pairs, old_units, new_units = _match_by_shape(old_units, new_units)
     changes = Changes(same=sum(old.is_test for old in pairs))
-    named, olds, news = _match_by_name(olds, news)
+    named, old_units, new_units = _match_by_name(old_units, new_units)
     for old, new in named:
-        _add(changes, old, new)
-    changes.removed = [str(old) for old in olds if old.is_test or old.assertions]
-    changes.added = sum(new.is_test for new in news)
+        _add_differences(changes, old, new)
+    changes.removed = [str(old) for old in old_units if old.is_test or old.assertions]
+    changes.added = sum(new.is_test for new in new_units)
     return changes
 
 
-def _match_by_shape(olds: Sequence[Unit], news: Sequence[Unit]) -> tuple[list[Unit], list[Unit], list[Unit]]:
+def _match_by_shape(
+    old_units: Sequence[Unit], new_units: Sequence[Unit]
+) -> tuple[list[Unit], list[Unit], list[Unit]]:
     """Return the old units that have a partner of the same shape, and the unmatched units of both."""
     # Units of the same name are matched first, so that a remaining copy is the removed one. A test is matched
     # only with a test, because pytest does not run functions with other names.
     partners: defaultdict[tuple[str, bool], list[Unit]] = defaultdict(list)
-    for new in news:
+    for new in new_units:
         partners[new.shape, new.is_test].append(new)
     matched: list[Unit] = []
-    unmatched = olds
-    for is_alike in (lambda a, b: str(a) == str(b), lambda a, b: a.name == b.name, lambda *_: True):
+    unmatched = old_units
+    for is_match in (lambda a, b: str(a) == str(b), lambda a, b: a.name == b.name, lambda *_: True):
         still_unmatched = []
         for old in unmatched:
-            partner = next((new for new in partners[old.shape, old.is_test] if is_alike(old, new)), None)
+            partner = next((new for new in partners[old.shape, old.is_test] if is_match(old, new)), None)
             if partner is None:
                 still_unmatched.append(old)
             else:
@@ -125,26 +127,28 @@ def _match_by_shape(olds: Sequence[Unit], news: Sequence[Unit]) -> tuple[list[Un
 
 
 def _match_by_name(
-    olds: Sequence[Unit], news: Sequence[Unit]
+    old_units: Sequence[Unit], new_units: Sequence[Unit]
 ) -> tuple[list[tuple[Unit, Unit]], list[Unit], list[Unit]]:
     """Return pairs of units of the same file and name, or of the same name alone, and the units of both without."""
     pairs = []
-    unmatched_news = list(news)
-    unmatched: list[Unit] = list(olds)
+    unmatched_new_units = list(new_units)
+    unmatched: list[Unit] = list(old_units)
     for key in (str, lambda unit: unit.name if unit.is_test else None):
         still_unmatched = []
         for old in unmatched:
-            partner = next((new for new in unmatched_news if key(old) is not None and key(old) == key(new)), None)
+            partner = next(
+                (new for new in unmatched_new_units if key(old) is not None and key(old) == key(new)), None
+            )
             if partner is None:
                 still_unmatched.append(old)
             else:
-                unmatched_news.remove(partner)
+                unmatched_new_units.remove(partner)
                 pairs.append((old, partner))
         unmatched = still_unmatched
-    return pairs, unmatched, unmatched_news
+    return pairs, unmatched, unmatched_new_units
 
 
-def _add(changes: Changes, old: Unit, new: Unit) -> None:
+def _add_differences(changes: Changes, old: Unit, new: Unit) -> None:
     lost = old.assertions - new.assertions
     if lost:
         gained = [new.sources[shape] for shape in new.assertions - old.assertions]

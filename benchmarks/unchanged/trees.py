@@ -65,7 +65,7 @@ def export(commit: str, folder: Path) -> Tree:
     Raises:
         UnknownCommitError: git cannot resolve `commit`.
     """
-    tree = Tree(folder, _resolved(commit))
+    tree = Tree(folder, _resolve(commit))
     tree.code.mkdir(parents=True)
     archive = subprocess.run(
         ("git", "archive", "--format=tar", tree.commit), cwd=ROOT, check=True, stdout=subprocess.PIPE
@@ -76,21 +76,21 @@ def export(commit: str, folder: Path) -> Tree:
     return tree
 
 
-def _resolved(commit: str) -> str:
+def _resolve(commit: str) -> str:
     if commit == WORKING_TREE:
         # Makes a commit of the changed files without changing the work tree; prints nothing without changes.
         snapshot = subprocess.run(("git", "stash", "create"), cwd=ROOT, check=True, capture_output=True, text=True)
         commit = snapshot.stdout.strip() or "HEAD"
-    done = subprocess.run(
+    completed = subprocess.run(
         ("git", "rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}"),
         cwd=ROOT,
         check=False,
         capture_output=True,
         text=True,
     )
-    if done.returncode != 0:
+    if completed.returncode != 0:
         raise UnknownCommitError(f"git cannot resolve {commit!r} to a commit")
-    return done.stdout.strip()
+    return completed.stdout.strip()
 
 
 def _declare_entry_points(tree: Tree) -> None:

@@ -89,7 +89,7 @@ def _record(arguments: Arguments, stop_event: threading.Event, path: str) -> int
 
 
 def _drive(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
-    """Drive a robot along its path; return the exit code: 0 if it came back to its origin, 4 if it stopped before."""
+    """Drive a robot along its path; return the exit code: 0 if it is back at its origin, 4 if it stopped before."""
     session = middleware.adapter(arguments["over"])(Network(**arguments["network"]))
     try:
         _report(f"up, {session.version}")
@@ -112,7 +112,7 @@ def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
 
 
 def _check_arming(arguments: Arguments, stop_event: threading.Event) -> int:
-    """Print the reasons against a flight; return the exit code."""
+    """Print the faults that prevent a flight; return the exit code."""
     from fieldkit.agent import arming, flight_plan  # noqa: PLC0415 (loaded only if needed)
 
     with _naming_connection(arguments["connection"]):
@@ -120,7 +120,7 @@ def _check_arming(arguments: Arguments, stop_event: threading.Event) -> int:
 
 
 def _survey(arguments: Arguments, stop_event: threading.Event) -> int:
-    """Print whether a connection works, and other possible connections; return the exit code."""
+    """Test a connection; print the result and other possible connections; return the exit code."""
     from fieldkit.agent.links import survey  # noqa: PLC0415 (loaded only if needed)
 
     with _naming_connection(arguments["connection"]):

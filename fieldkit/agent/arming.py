@@ -1,4 +1,4 @@
-"""Check whether an autopilot can be armed for a flight, and report each reason against it with a remedy."""
+"""Check that an autopilot can be armed for a flight; each fault is reported with a remedy."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import sys
 import threading
 import time
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Iterator
 
 from fieldkit.agent.autopilot import PREFLIGHT, AutopilotState
 from fieldkit.agent.dialect import PREARM_CHECKS
 from fieldkit.agent.flight_plan import FlightNeeds
-from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.mavlink_frames import HOME_POSITION, LOCAL_POSITION_NED, SYS_STATUS
 
 _POLL_S = 0.1
@@ -60,17 +60,17 @@ position; only the assumption that the vehicle does not move (CONST_POS_MODE).""
 
 @dataclass(frozen=True)
 class ArmingFault:
-    """A reason against a flight.
+    """A reason why a flight must not start.
 
     Attributes:
         what: The reason, one sentence without a full stop.
         remedy: The remedy.
-        grave: True if it prevents the flight; False if it may not apply in the mode in which the drone is flown.
+        prevents_flight: True if the flight is refused; False if the fault may not apply in the mode of the flight.
     """
 
     what: str
     remedy: str
-    grave: bool = True
+    prevents_flight: bool = True
 
 
 class ArmingCheck:
@@ -108,11 +108,11 @@ class ArmingCheck:
             drone.command(PREARM_CHECKS)
         if self._needs.returns and not drone.has_home:
             drone.request_once(HOME_POSITION)
-        for name in self._missing():
+        for name in self._missing_parameters():
             drone.request_parameter(name)
 
-    def _missing(self) -> list[str]:
-        """Return the names of the parameters that it has not reported."""
+    def _missing_parameters(self) -> list[str]:
+        """Return the names of the requested parameters that the autopilot has not reported."""
         dialect = self._drone.dialect
         alternatives = [names.split("|") for names in dialect.limit_parameters] if dialect else []
         reported = self._drone.parameters.keys()
@@ -120,26 +120,26 @@ class ArmingCheck:
 
     @property
     def is_starting(self) -> bool:
-        """Whether its position estimate is not ready, which takes about 30 s after it was switched on."""
+        """Whether the position estimate is not ready yet; an autopilot needs about 30 s for it after power-on."""
         warned = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
         return self._drone.dialect is not None and (warned or any(True for _ in self._position()))
 
     @property
     def is_complete(self) -> bool:
         """Whether all reports were received, or the time for them has passed."""
-        drone, lasted_s = self._drone, time.monotonic() - self._start_s
-        if drone.dialect is None or lasted_s > _TIMEOUT_S:
+        drone, elapsed_s = self._drone, time.monotonic() - self._start_s
+        if drone.dialect is None or elapsed_s > _TIMEOUT_S:
             return True
         if drone.status is None or drone.position_m is None:
             return False
-        if lasted_s > _OPTIONAL_TIMEOUT_S:
+        if elapsed_s > _OPTIONAL_TIMEOUT_S:
             return True
         home = drone.has_home or not self._needs.returns
         checked = self._checked_s is not None and drone.status.received_s > self._checked_s + _RESULT_DELAY_S
-        return checked and home and drone.estimate is not None and not self._missing()
+        return checked and home and drone.estimate is not None and not self._missing_parameters()
 
     def faults(self) -> Iterator[ArmingFault]:
-        """Yield the reasons against the flight."""
+        """Yield the faults that were detected."""
         drone = self._drone
         if drone.dialect is None:
             what = "its autopilot is neither PX4 nor ArduCopter ({}, {})".format(*drone.family)
@@ -195,7 +195,7 @@ class ArmingCheck:
         )
         what = f"{drone.dialect.name} refuses to be armed: {', '.join(reasons) or 'it gives no reason'}"
         remedy = "remove the cause; a ground station (QGroundControl, MAVProxy) shows the same"
-        yield ArmingFault(what, remedy, grave=drone.guided or not drone.dialect.checks_present_mode)
+        yield ArmingFault(what, remedy, prevents_flight=drone.guided or not drone.dialect.checks_present_mode)
 
     def _limits(self) -> Iterator[ArmingFault]:
         drone, needs = self._drone, self._needs
@@ -207,7 +207,7 @@ class ArmingCheck:
         ):
             if limit_m is not None and needed_m > limit_m:
                 yield ArmingFault(
-                    f"its own fence ends {limit_m:g} m {what}, but the flight needs {needed_m:g} m",
+                    f"the fence of its autopilot ends {limit_m:g} m {what}, but the flight needs {needed_m:g} m",
                     "shorten the flight in the procedure, or widen the fence: "
                     + ", ".join(drone.dialect.limit_parameters),
                 )
@@ -240,7 +240,10 @@ def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Even
                     break
                 check = ArmingCheck(session.drone, needs)
     dialect, status = session.drone.dialect, session.drone.status
-    lines = [json.dumps(asdict(fault)) for fault in check.faults()]
+    lines = [
+        json.dumps({"what": fault.what, "remedy": fault.remedy, "grave": fault.prevents_flight})
+        for fault in check.faults()
+    ]
     reported = {"autopilot": dialect.name if dialect else "", "charge": status.charge if status else None}
     sys.stdout.write("\n".join([*lines, json.dumps(reported), ""]))
     return 0

@@ -32,8 +32,8 @@ from fieldkit.agent.mavlink_frames import (
     STATUSTEXT,
     SYS_STATUS,
     FrameWriter,
-    head,
     is_intact,
+    parse_frame,
 )
 from fieldkit.agent.mavlink_links import FlightLink
 from fieldkit.agent.px4 import Px4
@@ -102,9 +102,9 @@ class AutopilotState:
 
     def __init__(self, link: FlightLink, component: int = PILOT) -> None:
         self.link = link
-        self._own = _OWN_SYSTEM, component
+        self._own_address = _OWN_SYSTEM, component
         self._source: tuple[int, int] | None = None
-        self._writer = FrameWriter(*self._own)
+        self._writer = FrameWriter(*self._own_address)
         self._heartbeat_s = self._position_s = self._attitude_s = self._latitude_longitude_s = -math.inf
         self._position_m = (0.0, 0.0, 0.0)
         self._latitude_longitude = (0.0, 0.0)
@@ -201,7 +201,7 @@ class AutopilotState:
         for frame in self.link.receive():
             if not is_intact(frame):
                 continue
-            message = head(frame)
+            message = parse_frame(frame)
             source, payload = (message.system, message.component), message.payload.ljust(_MAX_PAYLOAD_BYTES, b"\0")
             if message.kind == HEARTBEAT:
                 self._on_heartbeat(source, payload)
@@ -237,13 +237,13 @@ class AutopilotState:
     def _on_command_ack(self, payload: bytes) -> None:
         """Store a final result for this program or for all programs (COMMAND_ACK of MAVLink 1 has no target)."""
         command, result, _, _, *target = _COMMAND_ACK.unpack_from(payload)
-        is_for_us = all(number in (0, own) for number, own in zip(target, self._own))
-        if is_for_us and result != IN_PROGRESS:
+        is_for_this_program = all(number in (0, own_number) for number, own_number in zip(target, self._own_address))
+        if is_for_this_program and result != IN_PROGRESS:
             self.command_results[command] = result
 
     def _on_status(self, payload: bytes) -> None:
-        present, enabled, health, *_, left = _STATUS.unpack_from(payload)
-        charge = left / 100 if left >= 0 else None
+        present, enabled, health, *_, remaining_percent = _STATUS.unpack_from(payload)
+        charge = remaining_percent / 100 if remaining_percent >= 0 else None
         self.status = SystemStatus(present & enabled & ~health, charge, time.monotonic())
 
     def _on_estimate(self, payload: bytes, layout: str) -> None:

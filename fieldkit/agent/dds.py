@@ -29,10 +29,11 @@ from cyclonedds.topic import Topic as DdsTopic
 from fieldkit.agent import graph
 from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Quality, Topic, version_of
 
-BLOCKS_NS = 1_000_000_000
-"""Time for which a write may block if a reliable reader is too slow and all samples are kept; ROS 2 has no limit."""
+MAX_BLOCKING_NS = 1_000_000_000
+"""`max_blocking_time` of reliable writers: a write may block for this time if a reader is too slow and all samples
+are kept. ROS 2 has no limit."""
 
-_ANY = SampleState.Any | ViewState.Any | InstanceState.Any
+_ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
 _BATCH = 256
 _MAX_ENDPOINTS = 4096
 _OPERATION_COUNT = 14
@@ -102,7 +103,7 @@ def quality(requested: Quality, user_data: str, *, writes: bool) -> Qos:
     """Return a quality of service as DDS policies of a writer or a reader."""
     policies = [Policy.DataRepresentation(use_cdrv0_representation=True)]
     if requested.reliability == "reliable":
-        policies.append(Policy.Reliability.Reliable(BLOCKS_NS))
+        policies.append(Policy.Reliability.Reliable(MAX_BLOCKING_NS))
     elif requested.reliability == "best_effort":
         policies.append(Policy.Reliability.BestEffort)
     if requested.history == "keep_all":
@@ -135,12 +136,12 @@ def struct_type(topic: Topic) -> type:
     return _make_struct(topic.type, topic, {})
 
 
-def _make_struct(name: str, topic: Topic, made: dict[str, type]) -> type:
-    if name in made:
-        return made[name]
+def _make_struct(name: str, topic: Topic, struct_by_name: dict[str, type]) -> type:
+    if name in struct_by_name:
+        return struct_by_name[name]
     annotations: dict[str, Any] = {}
     for member, kind, count in topic.members[name]:
-        value_type = _make_struct(kind, topic, made) if kind in topic.members else _PRIMITIVE_TYPES[kind]
+        value_type = _make_struct(kind, topic, struct_by_name) if kind in topic.members else _PRIMITIVE_TYPES[kind]
         if count is None:
             annotations[member] = value_type
         elif count > 0:
@@ -149,8 +150,8 @@ def _make_struct(name: str, topic: Topic, made: dict[str, type]) -> type:
             annotations[member] = types.sequence[value_type, -count] if count else types.sequence[value_type]
     # The binding converts dots to the double colons of IDL.
     typename = topic.dds_types[name].replace("::", ".")
-    made[name] = make_idl_struct(name.rpartition("/")[2], typename, annotations)
-    return made[name]
+    struct_by_name[name] = make_idl_struct(name.rpartition("/")[2], typename, annotations)
+    return struct_by_name[name]
 
 
 def padded(data: bytes) -> bytes:
@@ -216,17 +217,17 @@ class DdsMiddleware:
 
     def _topic(self, topic: Topic) -> DdsTopic:
         if topic.name not in self._topics:
-            made = DdsTopic(self._participant, topic.dds_topic, struct_type(topic))
-            self._type_tables.append(hide_type_description(made))
-            self._topics[topic.name] = made
+            dds_topic = DdsTopic(self._participant, topic.dds_topic, struct_type(topic))
+            self._type_tables.append(hide_type_description(dds_topic))
+            self._topics[topic.name] = dds_topic
         return self._topics[topic.name]
 
     def publisher(self, topic: Topic) -> DdsWriter:
         """Create a data writer for a topic."""
-        made = self._writer(topic)
-        self._writers.append(made.guid.bytes)
+        writer = self._writer(topic)
+        self._writers.append(writer.guid.bytes)
         self._publish_node_info()
-        return DdsWriter(made)
+        return DdsWriter(writer)
 
     def _writer(self, topic: Topic) -> DataWriter:
         qos = quality(topic.quality, topic.user_data, writes=True)
@@ -267,7 +268,7 @@ class DdsMiddleware:
         while not self._closing.is_set():
             wait_set.wait(_WAIT_NS)
             while True:
-                samples = ddspy_take(reader._ref, _ANY, _BATCH)
+                samples = ddspy_take(reader._ref, _ANY_STATE, _BATCH)
                 at_ns = time.time_ns()
                 if isinstance(samples, int) or not samples:
                     break

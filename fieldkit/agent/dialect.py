@@ -59,7 +59,7 @@ class FlightDialect(Protocol):
         """Return True if it follows set-points in a mode, which is the custom mode of its heartbeat."""
 
     def is_program_controlled(self, mode: int) -> bool:
-        """Return True if set-points, a mission or commands control it in a mode, and not a person."""
+        """Return True if set-points, a mission or commands control it in a mode, instead of a person."""
 
     def lands_or_returns(self, mode: int) -> bool:
         """Return True if it lands, or returns and lands, automatically in a mode."""

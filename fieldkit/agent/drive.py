@@ -69,8 +69,8 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
             poses.append((now_s(), pose))
 
     middleware.subscribe(Topic.from_json(arguments["odometry"]), on_odometry)
-    _wait(arguments["command"]["name"] + " has no subscription", lambda: publisher.matched() > 0, stop_event)
-    _wait("no odometry arrives on " + arguments["odometry"]["name"], lambda: bool(poses), stop_event)
+    _wait_until(arguments["command"]["name"] + " has no subscription", lambda: publisher.matched() > 0, stop_event)
+    _wait_until("no odometry arrives on " + arguments["odometry"]["name"], lambda: bool(poses), stop_event)
     task = DriveTask.from_json(arguments["task"])
     driver = Driver(task, now_s())
     orders, status = Orders(arguments["orders"], ORDERS, task.lease_s), Path(arguments["status"])
@@ -90,7 +90,7 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
                 if orders.poll():
                     driver.on_order(iteration_s, orders.order)
                 velocity = driver.tick(iteration_s)
-                if stop_event.is_set():  # the signal may have come while this process was suspended
+                if stop_event.is_set():  # the signal may have arrived while this process was suspended
                     velocity = ZERO_VELOCITY
                 publisher.write(twist(velocity, cdr=cdr))
                 if iteration_s - logged_s >= _LOG_INTERVAL_S:
@@ -99,9 +99,9 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
                 stop_event.wait(1 / RATE_HZ)
         finally:
             _stop_robot(publisher, poses, arguments.get("stationary", ""), cdr=cdr)
-        stopped = driver.stopped or ("" if driver.phase == "home" else "ordered to stop")
-        _report(driver, ZERO_VELOCITY, lines, status, ended=stopped or "home")
-    return stopped
+        stop_reason = driver.stop_reason or ("" if driver.phase == "home" else "ordered to stop")
+        _report(driver, ZERO_VELOCITY, lines, status, ended=stop_reason or "home")
+    return stop_reason
 
 
 def twist(velocity: DriveVelocity, *, cdr: bool) -> bytes:
@@ -135,7 +135,7 @@ def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
     return OdometryPose(x_m, y_m, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
-def _wait(message: str, condition: Callable[[], bool], stop_event: threading.Event) -> None:
+def _wait_until(message: str, condition: Callable[[], bool], stop_event: threading.Event) -> None:
     deadline_s = time.monotonic() + _TIMEOUT_S
     while not condition():
         if stop_event.wait(0.02) or time.monotonic() > deadline_s:
@@ -150,11 +150,11 @@ def _stop_robot(
     Args:
         publisher: The publisher of the velocity topic.
         poses: Poses of the odometry, which other threads append.
-        stationary_file: A file that is created when the robot is stationary; empty for none.
+        stationary_file: A file that is created when the robot is stationary; empty to create none.
         cdr: Whether messages are encoded in CDR.
     """
     start_s, standstill, is_confirmed = time.monotonic(), Standstill(), False
-    poses.clear()  # poses from before the first zero
+    poses.clear()  # these poses are older than the first zero Twist
     while True:
         publisher.write(twist(ZERO_VELOCITY, cdr=cdr))
         while poses:
@@ -171,14 +171,14 @@ def _stop_robot(
 
 
 def _report(driver: Driver, velocity: DriveVelocity, lines: NumberedLines, status: Path, ended: str = "") -> None:
-    """Write the state of the drive to the log, from the start of the path on, and to the status file for the laptop.
+    """Write the state of the drive to the status file for the laptop, and during the path also to the log.
 
     The status contains in addition: `pose` in the frame of the odometry; `frame_id`; `ready`, whether the robot is
     stationary and may start; `refused`, whether it did not start because it is not at the required place.
     """
     relative_pose, pose = driver.relative_pose, driver.pose
     if relative_pose is None or pose is None:
-        return  # before its origin is known
+        return  # its origin is not known yet
     line = {
         "utc_ns": time.time_ns(),
         "at_s": round(driver.lasted_s, 3),

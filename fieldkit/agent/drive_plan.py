@@ -16,17 +16,17 @@ ORDERS = (WAIT, OUT, BACK, END)
 START_M = 0.3
 START_RAD = 0.3
 """Maximum distance and angle between a robot and its origin at a start: more than the error after a drive back
-(`ARRIVED_M`, `FACES_RAD`, and braking), and less than that of a robot that was moved."""
+(`ARRIVAL_TOLERANCE_M`, `HEADING_TOLERANCE_RAD`, and braking), and less than that of a robot that was moved."""
 OFF_PATH_M = 1.0
 """A robot that is farther from its path than this does not drive back to its origin automatically."""
 GAP_S = 0.5
 """Maximum time between two iterations of the loop. After a longer gap (a suspended program) the drive ends."""
 
-ARRIVED_M = 0.02
-"""Distance at which a corner is reached."""
-FACES_RAD = 0.05
-"""Angle at which a heading is reached."""
-TURNS_UP_S = 0.5
+ARRIVAL_TOLERANCE_M = 0.02
+"""A corner is reached at this distance."""
+HEADING_TOLERANCE_RAD = 0.05
+"""A heading is reached at this angle."""
+TURN_RAMP_S = 0.5
 """Time in which the turn rate rises from 0 to its limit."""
 _TURN_GAIN_PER_S = 2.0
 _STEP_S = 0.01
@@ -46,7 +46,7 @@ class DriveTask:
         odometry_s: Maximum time without odometry.
         limit_s: Maximum time for the path in one direction.
         origin: Its origin in the frame of its odometry: x and y in m, heading in rad; None for its present pose.
-        last: Pose at the end of its last motion, as `origin`; None if unknown.
+        last: Pose at the end of its last motion, in the format of `origin`; None if unknown.
         frame_id: The boot ID of its computer when the origin was recorded; empty without an origin.
         may_return: Whether it may first drive back to its origin along its path.
     """
@@ -84,9 +84,9 @@ def path_duration_s(task: DriveTask) -> float:
 def _turn_duration_s(angle_rad: float, turn_rad_s: float) -> float:
     """Return the duration of a turn in place, by a simulation of the `Driver`."""
     remaining_rad, rate_rad_s, duration_s = abs(angle_rad), 0.0, 0.0
-    while remaining_rad > FACES_RAD:
+    while remaining_rad > HEADING_TOLERANCE_RAD:
         rate_rad_s = min(
-            rate_rad_s + turn_rad_s / TURNS_UP_S * _STEP_S, turn_rad_s, turn_rate_rad_s(remaining_rad, turn_rad_s)
+            rate_rad_s + turn_rad_s / TURN_RAMP_S * _STEP_S, turn_rad_s, turn_rate_rad_s(remaining_rad, turn_rad_s)
         )
         remaining_rad -= rate_rad_s * _STEP_S
         duration_s += _STEP_S
@@ -97,16 +97,16 @@ def _leg_duration_s(length_m: float, task: DriveTask) -> float:
     """Return the duration of a leg: acceleration, constant speed, and braking with half of the acceleration."""
     acceleration = task.acceleration_m_s2
     speed_m_s = min(task.speed_m_s, math.sqrt(acceleration * length_m / 1.5))
-    final_m_s = min(speed_m_s, math.sqrt(acceleration * ARRIVED_M))
+    final_m_s = min(speed_m_s, math.sqrt(acceleration * ARRIVAL_TOLERANCE_M))
     constant_speed_m = length_m - 1.5 * speed_m_s**2 / acceleration
     return (speed_m_s + 2 * (speed_m_s - final_m_s)) / acceleration + constant_speed_m / speed_m_s
 
 
 def turn_rate_rad_s(remaining_rad: float, turn_rad_s: float) -> float:
     """Return the turn rate for a remaining angle: half of the angular acceleration must suffice to stop there."""
-    return min(_TURN_GAIN_PER_S * remaining_rad, math.sqrt(turn_rad_s / TURNS_UP_S * remaining_rad))
+    return min(_TURN_GAIN_PER_S * remaining_rad, math.sqrt(turn_rad_s / TURN_RAMP_S * remaining_rad))
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """Return an angle, normalized to -pi to pi."""
+    """Return an angle that is normalized to the range from -pi to pi."""
     return math.remainder(angle_rad, 2 * math.pi)

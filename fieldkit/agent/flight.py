@@ -68,7 +68,7 @@ class OffboardPilot:
             self._fly()
         except Exception as error:
             if self._loop.state == FLYING:
-                self._give_up(error)
+                self._abort_flight(error)
             elif self._loop.state == LANDING:
                 log_line(alarm(self._drone))
             raise
@@ -77,7 +77,7 @@ class OffboardPilot:
             self._loop.update()
             self._loop.session.close()
 
-    def _give_up(self, error: Exception) -> None:
+    def _abort_flight(self, error: Exception) -> None:
         """Land the drone after an error unless another party flies it; raises as `bring_down`, and logs an alarm."""
         drone = self._drone
         if isinstance(error, FlightError) and error.code == TAKEN_OVER:
@@ -112,7 +112,7 @@ class OffboardPilot:
             self._take_off(dialect, start_m, corners_m[0])
             self._fly_path(corners_m)
             if plan.end == "return":
-                self._return(origin)
+                self._fly_to_origin(origin)
         self._start_phase("coming down")
         loop.state = LANDING if loop.has_armed else loop.state
         with landing_marker(plan.landing_marker):
@@ -174,7 +174,7 @@ class OffboardPilot:
             self._climb_by_commands(commands, start_m)
         path_m, start_s = [drone.position_m or start_m, (*start_m[:2], top_m[2]), top_m], time.monotonic()
         loop.run_until(
-            lambda: _near(drone.position_m, top_m) or loop.orders.order == HOME,
+            lambda: _is_near(drone.position_m, top_m) or loop.orders.order == HOME,
             set_point=lambda: point_on_path(path_m, (time.monotonic() - start_s) * self._plan.climb_m_s),
         )
         self._start_phase("up")
@@ -195,7 +195,7 @@ class OffboardPilot:
             raise FlightError(REFUSED, reasons)
 
     def _climb_by_commands(self, commands: Sequence[Command], start_m: Position) -> None:
-        """Let the drone take off by commands, until it is near the target height.
+        """Command the take-off, and wait until the drone is near the target height.
 
         Only the last command must be accepted.
         """
@@ -213,7 +213,7 @@ class OffboardPilot:
             drone.command_results.pop(int(command[0]), None)
         for command in preceding:
             self._loop.command_until(
-                partial(drone.command, *command), partial(self._has_result, command[0]), "a speed to climb"
+                partial(drone.command, *command), partial(self._has_result, command[0]), "a climb speed"
             )
         # The acknowledgement may be lost, and a second command to take off is refused in the air.
         is_accepted = lambda: drone.command_results.get(int(last[0])) == ACCEPTED or risen_m() > _LIFTED_M  # noqa: E731
@@ -231,11 +231,11 @@ class OffboardPilot:
         for _ in loop.iterate(lambda: point_on_path(corners_m, (time.monotonic() - start_s) * self._plan.speed_m_s)):
             if loop.orders.order == HOME:
                 return
-            if not has_arrived and _near(self._drone.position_m, corners_m[-1]):
+            if not has_arrived and _is_near(self._drone.position_m, corners_m[-1]):
                 has_arrived = True
                 self._start_phase("there")
 
-    def _return(self, origin: FlightOrigin) -> None:
+    def _fly_to_origin(self, origin: FlightOrigin) -> None:
         """Fly to the point above the origin."""
         drone = self._drone
         assert drone.last_position_m is not None, "it has risen"
@@ -244,7 +244,7 @@ class OffboardPilot:
         path_m = [here_m, above_m]
         self._start_phase("coming back")
         self._loop.run_until(
-            lambda: _near(drone.position_m, above_m) and drone.speed_m_s < _SLOW_M_S,
+            lambda: _is_near(drone.position_m, above_m) and drone.speed_m_s < _SLOW_M_S,
             set_point=lambda: point_on_path(path_m, (time.monotonic() - start_s) * self._plan.speed_m_s),
         )
 
@@ -274,9 +274,9 @@ def fly(plan: FlightPlan, stop_event: threading.Event) -> int:
 
 
 def _fault_text(check: ArmingCheck) -> str:
-    """Return the reasons against a flight with their remedies; empty if there are none."""
-    return "; ".join(f"{fault.what} ({fault.remedy})" for fault in check.faults() if fault.grave)
+    """Return the faults that prevent a flight, with their remedies; empty if there are none."""
+    return "; ".join(f"{fault.what} ({fault.remedy})" for fault in check.faults() if fault.prevents_flight)
 
 
-def _near(position_m: Position | None, goal_m: Position) -> bool:
+def _is_near(position_m: Position | None, goal_m: Position) -> bool:
     return position_m is not None and math.dist(position_m, goal_m) < _NEAR_M

@@ -16,7 +16,7 @@ class FlightLog:
     """Writes one JSON object per line. Write errors stop the log, not the flight: a full disk must not land a drone.
 
     Args:
-        path: The file; empty for none.
+        path: The file; empty to write none.
 
     Attributes:
         phase: Phase of the flight: `standing`, `climbing`, `up`, `flying`, `there`, `coming back` or `coming down`.

@@ -55,7 +55,7 @@ class FlightPlan:
         fence_m: Maximum horizontal distance from the origin.
         least_charge: Minimum charge of the battery before the take-off, from 0 to 1.
         origin: Values of the `FlightOrigin` of the trial; None at the first start, which becomes the origin.
-        log: The log file of positions; empty for none.
+        log: The log file of positions; empty to write none.
         liveness: The file that pilot and guard share (`LivenessFile`); empty if only one of them runs.
         landing_marker: A file that exists while the program lands a drone, so that the program is not killed.
     """
@@ -108,14 +108,14 @@ class FlightPlan:
 
 def point_on_path(corners_m: Sequence[Position], distance_m: float) -> Position:
     """Return the point at a distance along a path, or its end if the path is shorter."""
-    for begin, end in zip(corners_m, corners_m[1:]):
-        length_m = math.dist(begin, end)
+    for leg_start, end in zip(corners_m, corners_m[1:]):
+        length_m = math.dist(leg_start, end)
         if distance_m < length_m:
-            return _interpolate(begin, end, distance_m / length_m)
+            return _interpolate(leg_start, end, distance_m / length_m)
         distance_m -= length_m
     return corners_m[-1]
 
 
-def _interpolate(begin: Position, end: Position, share: float) -> Position:
-    n, e, d = (b + share * (a - b) for b, a in zip(begin, end))
-    return n, e, d
+def _interpolate(leg_start: Position, end: Position, fraction: float) -> Position:
+    north_m, east_m, down_m = (start_m + fraction * (end_m - start_m) for start_m, end_m in zip(leg_start, end))
+    return north_m, east_m, down_m

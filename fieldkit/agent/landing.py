@@ -12,7 +12,7 @@ from typing import Callable, Iterator
 
 from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.dialect import ARM
-from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.mavlink_frames import ACCEPTED
 from fieldkit.agent.px4 import Px4
 
@@ -26,11 +26,12 @@ COMMAND_TIMEOUT_S = 5.0
 """Time within which an autopilot must execute a command."""
 _POLL_S = 0.1
 _MODE_WAIT_S = 0.3
-"""Maximum wait for a heartbeat before the first command: the last one may be older than a takeover by a person."""
+"""Maximum wait for a heartbeat before the first command, because the last one may be older than a takeover by a
+person."""
 _LANDING_TIMEOUT_S = 600.0
 """Time for which a drone whose motors turn is commanded to come down."""
 NO_HEARTBEAT_S = 60.0
-"""Time for which commands are sent although no heartbeat arrives: a lost connection may be restored."""
+"""Time for which commands are sent although no heartbeat arrives, because a lost connection may be restored."""
 
 
 class FlightError(Exception):
@@ -112,17 +113,17 @@ def _wait_for_mode(session: AutopilotSession, each_iteration: Callable[[], None]
 
 def alarm(drone: AutopilotState) -> str:
     """Return the alarm text for a flight that ended without a landing: last known state, and manual action."""
-    where = "ITS POSITION IS UNKNOWN"
+    position_text = "ITS POSITION IS UNKNOWN"
     if drone.last_position_m is not None:
         north_m, east_m, down_m = drone.last_position_m
-        where = (
+        position_text = (
             f"LAST KNOWN {drone.position_age_s:.0f} S AGO {north_m:.1f} M NORTH, {east_m:.1f} M EAST, "
             f"{-down_m:.1f} M UP IN ITS LOCAL FRAME"
         )
     heartbeat = "NO HEARTBEAT"
     if math.isfinite(drone.heartbeat_age_s):
         heartbeat = f"MODE {drone.mode_name}, LAST HEARTBEAT {drone.heartbeat_age_s:.0f} S AGO"
-    return f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {where}, {heartbeat}. {MANUAL_ACTION}"
+    return f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {position_text}, {heartbeat}. {MANUAL_ACTION}"
 
 
 MANUAL_ACTION = "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION."
@@ -133,7 +134,7 @@ def landing_marker(path: str) -> Iterator[None]:
     """Create a marker file and remove it after the body; errors are ignored.
 
     Args:
-        path: The file, see `FlightPlan.landing_marker`; empty for none.
+        path: The file, see `FlightPlan.landing_marker`; empty to create none.
     """
     if path:
         with suppress(OSError):

@@ -18,16 +18,16 @@ from dataclasses import dataclass
 from typing import Any, Mapping
 
 from fieldkit.agent.links.client import SharedLink
-from fieldkit.agent.links.intervals import LATER
+from fieldkit.agent.links.intervals import RETRY_RESULTS
 from fieldkit.agent.mavlink_frames import (
     ACCEPTED,
     HEARTBEAT,
     NO_AUTOPILOT,
     SET_MESSAGE_INTERVAL,
-    FrameHead,
     FrameWriter,
-    head,
+    ParsedFrame,
     is_intact,
+    parse_frame,
 )
 from fieldkit.agent.mavlink_links import open_link
 
@@ -83,9 +83,9 @@ class FlightRecorder:
         self._refused: dict[int, int] = {}
         self._slow_s = dict.fromkeys(self._missing, 0.0)
         self._writer = FrameWriter()
-        self._frames = self._bytes = self._left_out = self._checksum = 0
+        self._frames = self._bytes = self._dropped_frames = self._checksum = 0
         self._next_heartbeat_s = self._next_request_s = 0.0
-        self._rates_s = self._heard_s = time.monotonic()
+        self._rates_s = self._first_heartbeat_s = time.monotonic()
         self._was_ready = False
 
     @property
@@ -100,7 +100,7 @@ class FlightRecorder:
         Raises:
             MissingMessageError: A message has not arrived in time.
         """
-        if not self.ready and self._autopilot is not None and time.monotonic() - self._heard_s > _TIMEOUT_S:
+        if not self.ready and self._autopilot is not None and time.monotonic() - self._first_heartbeat_s > _TIMEOUT_S:
             missing = ", ".join(str(kind) for kind in sorted(self._missing - set(self._refused)))
             raise MissingMessageError(
                 f"the autopilot has not sent the requested message {missing} in {_TIMEOUT_S:g} s "
@@ -113,11 +113,11 @@ class FlightRecorder:
             return
         for frame in self._link.receive():
             self._write(frame)
-            self._process(head(frame), intact=is_intact(frame))
+            self._process(parse_frame(frame), intact=is_intact(frame))
 
     def _write(self, frame: bytes) -> None:
         if self._bytes + len(frame) + _STAMP.size > MAX_BYTES:
-            self._left_out += 1
+            self._dropped_frames += 1
             return
         record = _STAMP.pack(time.time_ns() // 1000) + frame
         self._log.write(record)
@@ -125,7 +125,7 @@ class FlightRecorder:
         self._frames += 1
         self._bytes += len(record)
 
-    def _process(self, message: FrameHead, *, intact: bool) -> None:
+    def _process(self, message: ParsedFrame, *, intact: bool) -> None:
         """Identify the autopilot by its heartbeat, and register the arrival of requested messages."""
         source = message.system, message.component
         if self._autopilot is None:
@@ -133,7 +133,7 @@ class FlightRecorder:
                 message.kind == HEARTBEAT and len(message.payload) > 5 and message.payload[5] != NO_AUTOPILOT
             )
             if intact and is_heartbeat and self._system in (0, message.system):
-                self._autopilot, self._heard_s = source, time.monotonic()
+                self._autopilot, self._first_heartbeat_s = source, time.monotonic()
         elif source == self._autopilot:
             self._missing.discard(message.kind)
 
@@ -154,7 +154,7 @@ class FlightRecorder:
         """Update the refused messages, and for each message the time for which it was too slow after `ready`."""
         elapsed_s, self._rates_s = now_s - self._rates_s, now_s
         for kind, rate in self._link.messages.items():
-            if rate.result not in (None, ACCEPTED, *LATER):
+            if rate.result not in (None, ACCEPTED, *RETRY_RESULTS):
                 self._refused[kind] = rate.result
             elif self.ready and kind in self._slow_s and rate.hz * self._requested[kind] < _MIN_FRACTION * 1e6:
                 self._slow_s[kind] += elapsed_s
@@ -167,7 +167,7 @@ class FlightRecorder:
             "frames": self._frames,
             "bytes": self._bytes,
             "crc32": self._checksum,
-            "left_out": self._left_out + self._link.left_out,
+            "left_out": self._dropped_frames + self._link.dropped_frames,
             "ended_us": time.time_ns() // 1000,
             "refused": {str(kind): result for kind, result in self._refused.items()},
             "slow_s": {str(kind): round(slow_s, 3) for kind, slow_s in self._slow_s.items()},
@@ -181,7 +181,7 @@ def record(recording: FlightRecording, path: str, stop_event: threading.Event) -
 
     Raises:
         OSError: The connection cannot be opened.
-        MissingMessageError: A requested message did not come.
+        MissingMessageError: A requested message did not arrive.
     """
     link = open_link(recording.connection)
     _report(f"waiting for the heartbeat of an autopilot at {recording.connection}")

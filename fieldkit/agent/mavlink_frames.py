@@ -30,7 +30,7 @@ _ACTIVE = 4
 """MAV_STATE_ACTIVE."""
 _VERSION = 3
 """MAVLink version in heartbeats."""
-EXTRA = {
+CRC_EXTRA = {
     HEARTBEAT: 50,
     ATTITUDE: 39,
     LOCAL_POSITION_NED: 185,
@@ -46,7 +46,7 @@ EXTRA = {
     ESTIMATOR_STATUS: 163,
     HOME_POSITION: 104,
 }
-"""CRC_EXTRA of each message, a byte that depends on its definition (mavlink.io, serialization)."""
+"""Each message's CRC_EXTRA, a byte that depends on its definition (mavlink.io, serialization)."""
 
 
 def frame_bytes(buffer: bytes | bytearray) -> int | None:
@@ -90,12 +90,12 @@ def checksum(data: bytes) -> int:
 
 
 def is_intact(frame: bytes) -> bool:
-    """Return True if the checksum of a complete frame is correct; False for messages that are not in `EXTRA`."""
-    message = head(frame)
-    if message.kind not in EXTRA:
+    """Return True if the checksum of a complete frame is correct; False for messages that are not in `CRC_EXTRA`."""
+    message = parse_frame(frame)
+    if message.kind not in CRC_EXTRA:
         return False
     end = (6 if frame[0] == _MAGIC_1 else 10) + frame[1]
-    expected = checksum(frame[1:end] + bytes((EXTRA[message.kind],)))
+    expected = checksum(frame[1:end] + bytes((CRC_EXTRA[message.kind],)))
     return int.from_bytes(frame[end : end + 2], "little") == expected
 
 
@@ -114,10 +114,10 @@ class FrameWriter:
     def frame(self, kind: int, payload: bytes) -> bytes:
         """Return the next frame of MAVLink 2 with this message; trailing zeros of the payload are omitted."""
         payload = payload.rstrip(b"\0") or payload[:1]
-        head = (len(payload), 0, 0, self._sequence, *self._address)
+        header = (len(payload), 0, 0, self._sequence, *self._address)
         self._sequence = (self._sequence + 1) % 256
-        body = bytes(head) + kind.to_bytes(3, "little") + payload
-        return bytes((_MAGIC_2,)) + body + checksum(body + bytes((EXTRA[kind],))).to_bytes(2, "little")
+        body = bytes(header) + kind.to_bytes(3, "little") + payload
+        return bytes((_MAGIC_2,)) + body + checksum(body + bytes((CRC_EXTRA[kind],))).to_bytes(2, "little")
 
     def heartbeat(self, vehicle: int = TYPE_LOG) -> bytes:
         """Return a heartbeat. The default type is a logger, whose loss no autopilot treats as a lost pilot."""
@@ -130,7 +130,7 @@ class FrameWriter:
 
 
 @dataclass(frozen=True)
-class FrameHead:
+class ParsedFrame:
     """Message id, sender and payload of a frame."""
 
     kind: int
@@ -139,9 +139,9 @@ class FrameHead:
     payload: bytes
 
 
-def head(frame: bytes) -> FrameHead:
+def parse_frame(frame: bytes) -> ParsedFrame:
     """Return the message id, the sender and the payload of a complete frame."""
     size = frame[1]
     if frame[0] == _MAGIC_1:
-        return FrameHead(frame[5], frame[3], frame[4], frame[6 : 6 + size])
-    return FrameHead(int.from_bytes(frame[7:10], "little"), frame[5], frame[6], frame[10 : 10 + size])
+        return ParsedFrame(frame[5], frame[3], frame[4], frame[6 : 6 + size])
+    return ParsedFrame(int.from_bytes(frame[7:10], "little"), frame[5], frame[6], frame[10 : 10 + size])

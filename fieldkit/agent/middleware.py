@@ -144,7 +144,7 @@ class Middleware(Protocol):
         """
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the names of different types that other participants use for the topic, in their spelling."""
+        """Return the names of different types that other participants use for the topic, as they announce them."""
 
     def close(self) -> None:
         """Close all endpoints and stop the middleware."""
@@ -154,7 +154,7 @@ def version_of(package: str) -> str:
     """Return the name and installed version of a package, or only its name if the version is unknown."""
     try:
         return f"{package} {metadata.version(package)}"
-    except metadata.PackageNotFoundError:  # built by hand
+    except metadata.PackageNotFoundError:  # it was not installed as a package
         return package
 
 

@@ -19,7 +19,7 @@ class NumberedLines:
 
     def __init__(self, lines: IO[str]) -> None:
         self._lines = lines
-        self._count = self._sum = 0
+        self._count = self._checksum = 0
 
     def write(self, values: Mapping[str, Any]) -> str:
         """Write a line with its number as `n`, and return it; raises `OSError` if it cannot be written."""
@@ -32,7 +32,7 @@ class NumberedLines:
             OSError: It cannot be written.
         """
         line = self._numbered(values)
-        total = zlib.crc32(line.encode("ascii"), self._sum)
+        total = zlib.crc32(line.encode("ascii"), self._checksum)
         return self._append(f'{line[:-1]}, "crc32": {total}}}')
 
     def _numbered(self, values: Mapping[str, Any]) -> str:
@@ -41,6 +41,6 @@ class NumberedLines:
     def _append(self, line: str) -> str:
         self._lines.write(line + "\n")
         self._lines.flush()
-        self._sum = zlib.crc32((line + "\n").encode("ascii"), self._sum)
+        self._checksum = zlib.crc32((line + "\n").encode("ascii"), self._checksum)
         self._count += 1
         return line

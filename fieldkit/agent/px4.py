@@ -51,25 +51,25 @@ class Px4:
 
     def is_guided(self, mode: int) -> bool:
         """Return True in OFFBOARD."""
-        return _parts(mode)[0] == _OFFBOARD
+        return _mode_parts(mode)[0] == _OFFBOARD
 
     def is_program_controlled(self, mode: int) -> bool:
         """Return True in OFFBOARD and in AUTO modes for programs; AUTO.LOITER follows each take-off and each move."""
-        main, sub = _parts(mode)
+        main, sub = _mode_parts(mode)
         return main == _OFFBOARD or (main == _AUTO and sub in (_TAKEOFF, _LOITER, _MISSION))
 
     def lands_or_returns(self, mode: int) -> bool:
         """Return True in AUTO.RTL, AUTO.LAND and AUTO.PRECLAND."""
-        main, sub = _parts(mode)
+        main, sub = _mode_parts(mode)
         return main == _AUTO and sub in (_RTL, _LAND, _PRECLAND)
 
     def is_failsafe_hold(self, mode: int) -> bool:
         """Return True in AUTO.LOITER, its failsafe mode without a remote control (COM_OBL_RC_ACT)."""
-        return _parts(mode) == (_AUTO, _LOITER)
+        return _mode_parts(mode) == (_AUTO, _LOITER)
 
     def mode_name(self, mode: int) -> str:
         """Return the name of a mode, for example `AUTO.LAND`, or its number if the mode is unknown."""
-        main, sub = _parts(mode)
+        main, sub = _mode_parts(mode)
         if main not in _MAIN:
             return str(mode)
         return f"AUTO.{_SUB.get(sub, sub)}" if main == _AUTO else _MAIN[main]
@@ -95,6 +95,6 @@ class Px4:
         )
 
 
-def _parts(mode: int) -> tuple[int, int]:
+def _mode_parts(mode: int) -> tuple[int, int]:
     """Return the main mode and the sub-mode of a custom mode."""
     return mode >> 16 & 0xFF, mode >> 24 & 0xFF

@@ -1,9 +1,9 @@
-"""The log of a publisher or subscriber: a magic number and records of fixed size, stored so that a kill loses none.
+"""The log of a publisher or subscriber: a magic number and records of fixed size, of which a kill loses none.
 
 The log is mapped into memory. A store into the mapping survives the process, as data passed to `write`, but needs no
-system call, so that logging does not delay samples. The file grows by pieces that are allocated on disk before they
-are mapped: a full disk raises an error then, instead of a signal at a later store. (A failing disk still causes a
-signal.) If a log was not closed, zeros follow its last record.
+system call, so that logging does not delay samples. The file grows in pieces that are allocated on disk before they
+are mapped: a full disk causes an error then, instead of SIGBUS at a later store. (A failing disk still causes
+SIGBUS.) If a log was not closed, zeros follow its last record.
 
 `fieldkit.ros.streams.topic_samples` reads it.
 """
@@ -117,8 +117,8 @@ class Log:
             LogError: The disk is full.
         """
         with self._lock:
-            blank = RECORD.pack(END, 0, 0, self._samples, CHECKED, at_ns)
-            self._write(RECORD.pack(END, 0, self._checksum(blank), self._samples, CHECKED, at_ns))
+            unchecked_record = RECORD.pack(END, 0, 0, self._samples, CHECKED, at_ns)
+            self._write(RECORD.pack(END, 0, self._checksum(unchecked_record), self._samples, CHECKED, at_ns))
             self._piece.close()
             os.ftruncate(self._file, self._piece_start + self._offset)
             os.fsync(self._file)

@@ -12,25 +12,25 @@ import math
 from typing import NamedTuple
 
 from fieldkit.agent.drive_plan import (
-    ARRIVED_M,
+    ARRIVAL_TOLERANCE_M,
     BACK,
     END,
-    FACES_RAD,
     GAP_S,
+    HEADING_TOLERANCE_RAD,
     OFF_PATH_M,
     OUT,
     START_M,
     START_RAD,
-    TURNS_UP_S,
+    TURN_RAMP_S,
     DriveTask,
     turn_rate_rad_s,
     wrap_angle,
 )
 
 _TURN_IN_PLACE_RAD = 0.6
-"""Heading error above which a robot stops and turns in place; it drives again below `FACES_RAD`."""
+"""Heading error above which a robot stops and turns in place; it drives again below `HEADING_TOLERANCE_RAD`."""
 _LOOKAHEAD_M = 0.5
-_CREEP_M_S = 0.03
+_MIN_SPEED_M_S = 0.03
 """Minimum speed at which the motors of a robot turn."""
 _MAX_JUMP_M = 0.5
 """A larger change between two poses, beyond the possible motion, is an error of the odometry."""
@@ -63,14 +63,14 @@ ZERO_VELOCITY = DriveVelocity()
 class Driver:
     """Steers one robot along the legs of a task, and back.
 
-    A stop is final: `stopped` contains the reason, and every later velocity is zero.
+    A stop is final: `stop_reason` contains the reason, and every later velocity is zero.
 
     Args:
         task: The path and its limits.
-        now_s: Start time by a monotonic clock, which all times of its methods are from.
+        now_s: Start time by a monotonic clock; all times that its methods receive are by the same clock.
 
     Attributes:
-        stopped: The reason of an early stop; empty before.
+        stop_reason: The reason of an early stop; empty before a stop.
         phase: `waits` until it is stationary and ordered to start; `returns` while it drives to its origin first;
             then `out`, `there`, `back`, `home`.
         driven_m: Distance since the start of `out`.
@@ -78,7 +78,7 @@ class Driver:
     """
 
     def __init__(self, task: DriveTask, now_s: float) -> None:
-        self.stopped = ""
+        self.stop_reason = ""
         self.phase = _WAITS
         self.driven_m = 0.0
         self.refused = False
@@ -129,7 +129,7 @@ class Driver:
     @property
     def is_finished(self) -> bool:
         """Whether the drive has ended: at its origin, or by an early stop."""
-        return bool(self.stopped) or self.phase == "home"
+        return bool(self.stop_reason) or self.phase == "home"
 
     @property
     def remaining_m(self) -> float:
@@ -151,15 +151,15 @@ class Driver:
                 self._stop(f"odometry jumped by {moved_m:.2f} m")
             self.driven_m += moved_m
         self._pose, self._odometry_s = pose, now_s
-        if self.phase == _WAITS and not self.stopped:
-            self._before_start(now_s, pose)
+        if self.phase == _WAITS and not self.stop_reason:
+            self._check_start(now_s, pose)
 
     def refuse(self, reason: str) -> None:
         """Stop because the robot is not at the required place for a start."""
-        self.refused = self.refused or not self.stopped
+        self.refused = self.refused or not self.stop_reason
         self._stop(reason)
 
-    def _before_start(self, now_s: float, pose: OdometryPose) -> None:
+    def _check_start(self, now_s: float, pose: OdometryPose) -> None:
         """Check that the robot is stationary, and at the required place; the first such pose is its origin."""
         reference = self._reference
         if (
@@ -193,11 +193,11 @@ class Driver:
 
     def _path_home(self, relative_pose: OdometryPose) -> list[tuple[float, float]] | None:
         """Return the corners of the path back to the origin, or None if the robot is off its path."""
-        nearest_m, before = min(
-            (_distance_to_leg_m(relative_pose[:2], begin, end), number)
-            for number, (begin, end) in enumerate(zip(self._corners, self._corners[1:]))
+        nearest_m, leg_number = min(
+            (_distance_to_leg_m(relative_pose[:2], leg_start, end), number)
+            for number, (leg_start, end) in enumerate(zip(self._corners, self._corners[1:]))
         )
-        return None if nearest_m > OFF_PATH_M else [relative_pose[:2], *reversed(self._corners[: before + 1])]
+        return None if nearest_m > OFF_PATH_M else [relative_pose[:2], *reversed(self._corners[: leg_number + 1])]
 
     def _start_driving(self, now_s: float) -> None:
         """Start to drive out, or first back to the origin if the robot is not there."""
@@ -207,7 +207,11 @@ class Driver:
         if path is not None and (
             math.hypot(relative_pose.x_m, relative_pose.y_m) > START_M or abs(relative_pose.yaw_rad) > START_RAD
         ):
-            self._legs = [(begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > ARRIVED_M]
+            self._legs = [
+                (leg_start, end)
+                for leg_start, end in zip(path, path[1:])
+                if math.dist(leg_start, end) > ARRIVAL_TOLERANCE_M
+            ]
             self.phase, self._phase_s = _RETURNS, now_s
         else:
             self._go_out(now_s)
@@ -222,7 +226,7 @@ class Driver:
         self._order_s = now_s
         if order == END and not self.is_finished:
             self._stop("ordered to stop")
-        elif order == BACK and self._order != BACK and not self.stopped:
+        elif order == BACK and self._order != BACK and not self.stop_reason:
             self._order = BACK
             self._turn_back(now_s)
         elif order == OUT and not self._order and self.ready:
@@ -236,7 +240,7 @@ class Driver:
         relative_pose = self.relative_pose
         desired = (
             ZERO_VELOCITY
-            if self.stopped or relative_pose is None or not self._order
+            if self.stop_reason or relative_pose is None or not self._order
             else self._desired_velocity(relative_pose)
         )
         must_stop = desired == ZERO_VELOCITY  # a stop is immediate, without a ramp
@@ -251,9 +255,9 @@ class Driver:
         if elapsed_s > GAP_S:
             self._stop(f"its program was suspended for {elapsed_s:.1f} s")
         elif now_s - self._order_s > task.lease_s:
-            self._stop(f"the laptop was silent for {task.lease_s:g} s")
+            self._stop(f"no order from the laptop for {task.lease_s:g} s")
         elif self._pose is not None and now_s - self._odometry_s > task.odometry_s:
-            self._stop(f"odometry was silent for {task.odometry_s:g} s")
+            self._stop(f"no odometry for {task.odometry_s:g} s")
         elif (
             relative_pose is not None
             and self.phase != _WAITS
@@ -261,7 +265,7 @@ class Driver:
         ):
             self._stop(f"beyond the fence, {task.fence_m:g} m from its place")
         elif self._order and self.phase in (_RETURNS, OUT, BACK) and now_s - self._phase_s > task.limit_s:
-            self._stop(f"not there after {task.limit_s:g} s")
+            self._stop(f"the path was not finished in {task.limit_s:g} s")
         elif relative_pose is not None and not self._makes_progress(relative_pose, elapsed_s):
             self._stop(
                 f"{self._commanded_m:.1f} m were commanded, but by its odometry the robot drove {self._moved_m:.1f} m"
@@ -282,7 +286,7 @@ class Driver:
         return True
 
     def _stop(self, reason: str) -> None:
-        self.stopped = self.stopped or reason
+        self.stop_reason = self.stop_reason or reason
 
     def _turn_back(self, now_s: float) -> None:
         """Start to drive back along the passed corners."""
@@ -295,26 +299,30 @@ class Driver:
             self.phase, self._phase_s = BACK, now_s
             return
         path = [(relative_pose.x_m, relative_pose.y_m), *reversed(passed)]
-        self._legs = [(begin, end) for begin, end in zip(path, path[1:]) if math.dist(begin, end) > ARRIVED_M]
+        self._legs = [
+            (leg_start, end)
+            for leg_start, end in zip(path, path[1:])
+            if math.dist(leg_start, end) > ARRIVAL_TOLERANCE_M
+        ]
         self.phase, self._phase_s, self._turning = BACK, now_s, True
 
     def _desired_velocity(self, relative_pose: OdometryPose) -> DriveVelocity:
-        """Return the desired velocity before limits apply; select the next leg if the present one is finished."""
+        """Return the desired velocity, not yet limited; select the next leg if the present one is finished."""
         if self.phase in (_WAITS, "there", "home"):
             return ZERO_VELOCITY
         while self._legs:
-            begin, end = self._legs[0]
-            length_m = math.dist(begin, end)
-            direction = (end[0] - begin[0]) / length_m, (end[1] - begin[1]) / length_m
-            offset = relative_pose.x_m - begin[0], relative_pose.y_m - begin[1]
+            leg_start, end = self._legs[0]
+            length_m = math.dist(leg_start, end)
+            direction = (end[0] - leg_start[0]) / length_m, (end[1] - leg_start[1]) / length_m
+            offset = relative_pose.x_m - leg_start[0], relative_pose.y_m - leg_start[1]
             remaining_m = length_m - (offset[0] * direction[0] + offset[1] * direction[1])
-            if remaining_m > ARRIVED_M:
+            if remaining_m > ARRIVAL_TOLERANCE_M:
                 cross_track_m = direction[0] * offset[1] - direction[1] * offset[0]
                 heading_rad = math.atan2(direction[1], direction[0]) - math.atan2(cross_track_m, _LOOKAHEAD_M)
                 return self._leg_velocity(remaining_m, wrap_angle(heading_rad - relative_pose.yaw_rad))
             del self._legs[0]
             self._turning = True
-        if self.phase in (_RETURNS, BACK) and abs(wrap_angle(relative_pose.yaw_rad)) > FACES_RAD:
+        if self.phase in (_RETURNS, BACK) and abs(wrap_angle(relative_pose.yaw_rad)) > HEADING_TOLERANCE_RAD:
             return DriveVelocity(0.0, self._turn_rad_s(wrap_angle(-relative_pose.yaw_rad)))
         if self.phase == _RETURNS:
             self._go_out(self._now_s)
@@ -324,12 +332,12 @@ class Driver:
 
     def _leg_velocity(self, remaining_m: float, error_rad: float) -> DriveVelocity:
         """Return the desired velocity for a remaining length of a leg and an error of the heading."""
-        self._turning = abs(error_rad) > (FACES_RAD if self._turning else _TURN_IN_PLACE_RAD)
+        self._turning = abs(error_rad) > (HEADING_TOLERANCE_RAD if self._turning else _TURN_IN_PLACE_RAD)
         turn_rad_s = self._turn_rad_s(error_rad)
         if self._turning:
             return DriveVelocity(0.0, turn_rad_s)
         speed_m_s = min(self._task.speed_m_s, math.sqrt(self._task.acceleration_m_s2 * remaining_m))
-        return DriveVelocity(max(speed_m_s * math.cos(error_rad), _CREEP_M_S), turn_rad_s)
+        return DriveVelocity(max(speed_m_s * math.cos(error_rad), _MIN_SPEED_M_S), turn_rad_s)
 
     def _turn_rad_s(self, error_rad: float) -> float:
         return math.copysign(turn_rate_rad_s(abs(error_rad), self._task.turn_rad_s), error_rad)
@@ -337,16 +345,18 @@ class Driver:
     def _ramp(self, desired: DriveVelocity, elapsed_s: float) -> DriveVelocity:
         """Return the velocity nearest to the desired one that the limits allow after this time."""
         task = self._task
-        max_change, max_turn_change = task.acceleration_m_s2 * elapsed_s, task.turn_rad_s / TURNS_UP_S * elapsed_s
+        max_change, max_turn_change = task.acceleration_m_s2 * elapsed_s, task.turn_rad_s / TURN_RAMP_S * elapsed_s
         forward = _approach(self._velocity.forward_m_s, desired.forward_m_s, max_change)
         turn = _approach(self._velocity.turn_rad_s, desired.turn_rad_s, max_turn_change)
         return DriveVelocity(_clamp(forward, task.speed_m_s), _clamp(turn, task.turn_rad_s))
 
 
-def _distance_to_leg_m(position: tuple[float, float], begin: tuple[float, float], end: tuple[float, float]) -> float:
+def _distance_to_leg_m(
+    position: tuple[float, float], leg_start: tuple[float, float], end: tuple[float, float]
+) -> float:
     """Return the distance of a position from a leg, in metres."""
-    direction = end[0] - begin[0], end[1] - begin[1]
-    offset = position[0] - begin[0], position[1] - begin[1]
+    direction = end[0] - leg_start[0], end[1] - leg_start[1]
+    offset = position[0] - leg_start[0], position[1] - leg_start[1]
     squared_length = direction[0] ** 2 + direction[1] ** 2
     fraction = (
         min(max((offset[0] * direction[0] + offset[1] * direction[1]) / squared_length, 0.0), 1.0)

@@ -29,10 +29,10 @@ _CDR_HEADER = b"\0\1\0\0"
 
 _POLL_S = 0.001
 WAIT_S = 0.2
-"""Maximum time of one wait: a signal that the kernel delivers to another thread does not interrupt a wait."""
-SETTLES_S = 0.5
+"""Maximum time of one wait, because a signal that the kernel delivers to another thread does not interrupt a wait."""
+SETTLING_S = 0.5
 """Delay between the match of a subscription and the first sample: the subscription must match the publisher, too."""
-_DRAINS_S = 2.0
+_DRAIN_TIMEOUT_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class SampleCodec:
 def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:
     """Wait for a subscription, publish samples at their scheduled times, and log each of them.
 
-    A sample whose time has passed while the previous one was written is skipped, as by the timers of robots.
+    A sample whose time has passed while the previous one was written is skipped, as timers of robots do.
 
     Args:
         middleware: The middleware, which is started.
@@ -104,7 +104,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
         if time.monotonic() > deadline_s or stop_event.wait(_POLL_S):
             return
     log.note(records.MATCHED, time.time_ns())
-    stop_event.wait(SETTLES_S)
+    stop_event.wait(SETTLING_S)
     start_s, sequence, tick, ticks = time.monotonic(), 0, 0, round(stream.duration_s * stream.rate_hz)
     while tick < ticks:
         wait_s = start_s + tick / stream.rate_hz - time.monotonic()
@@ -119,8 +119,8 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
         if due_tick > tick + 1:
             log.note(records.SKIPPED, time.time_ns(), sequence=due_tick - tick - 1)
         tick = max(tick + 1, due_tick)
-    publisher.drain(_DRAINS_S)
-    stop_event.wait(SETTLES_S)
+    publisher.drain(_DRAIN_TIMEOUT_S)
+    stop_event.wait(SETTLING_S)
 
 
 def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:

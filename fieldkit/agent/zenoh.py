@@ -55,10 +55,10 @@ def configuration(network: Network, mode: str) -> dict[str, Any]:
         # The other robot may not be ready yet.
         config["connect/timeout_ms"] = -1
         config["connect/exit_on_failure"] = False
-    return {**config, **{path: _value(text) for path, text in network.settings.items()}}
+    return {**config, **{path: _parse_setting(text) for path, text in network.settings.items()}}
 
 
-def _value(text: str) -> Any:  # noqa: ANN401 (of JSON)
+def _parse_setting(text: str) -> Any:  # noqa: ANN401 (of JSON)
     try:
         return json.loads(text)
     except ValueError:

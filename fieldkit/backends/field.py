@@ -116,7 +116,7 @@ class FieldBackend:
 
     def _shell(self, name: str, sink: Sink) -> Shell:
         robot = self._site.robots[name]
-        if name not in self._passwords:  # looked up once per run
+        if name not in self._passwords:  # requested once per run
             self._passwords[name] = field_shells.find_password(name, robot, self._ask)
         return field_shells.open_shell(
             name,
@@ -128,9 +128,9 @@ class FieldBackend:
         )
 
 
-def _shell_or_error(make: Callable[[], Shell]) -> Shell | FieldkitError:
+def _shell_or_error(open_shell: Callable[[], Shell]) -> Shell | FieldkitError:
     try:
-        return make()
+        return open_shell()
     except FieldkitError as error:
         return error
 
@@ -170,7 +170,7 @@ class FieldTestbed:
         names, topology = {role: robot.name for role, robot in self._cast.items()}, placement.topology
         sender, receiver = names[Role.SENDER], names[Role.RECEIVER]
         distance = format_distance(placement.distance)
-        behind = placement.scenario is Scenario.NLOS
+        is_nlos = placement.scenario is Scenario.NLOS
         if topology is Topology.MASTER:
             text = f"move {sender} and {receiver} to {distance} from {names[Role.RELAY]}, on opposite sides of it"
             wall = f"{sender} behind the wall"
@@ -189,7 +189,7 @@ class FieldTestbed:
             if key in robot.abilities and section.placement
         )
         return self.operator.ask(
-            f"{text}, {wall if behind else 'nothing between them'}{posts}{directions}", may_skip=True
+            f"{text}, {wall if is_nlos else 'nothing between them'}{posts}{directions}", may_skip=True
         )
 
     def inject(self, fault: Fault) -> float | None:
@@ -201,13 +201,13 @@ class FieldTestbed:
         match fault.kind:
             case FaultKind.LINK_DOWN:
                 self.operator.ask(f"switch the Wi-Fi of {name} off")
-                began_s = time.monotonic()
+                start_s = time.monotonic()
                 time.sleep(fault.duration_s)
                 self.operator.ask(f"switch the Wi-Fi of {name} on again")
-                return time.monotonic() - began_s
+                return time.monotonic() - start_s
             case FaultKind.OUT_OF_RANGE:
                 self.operator.ask(f"carry {name} out of range, wait {fault.duration_s:g} s, and carry it back")
-                return None  # the operator cannot see where the range ends
+                return None  # the operator cannot observe where the radio range ends
             case FaultKind.REBOOT:
                 self.operator.ask(f"reboot {name}")
             case FaultKind.KILL:
@@ -230,9 +230,9 @@ class FieldTestbed:
             raise
         self._bring_back(name)
 
-    def bring_back(self, role: Role, *, by_itself: bool) -> None:
-        """Ask the operator to bring back a robot that did not drive back; see `Testbed.bring_back`."""
-        if not by_itself:
+    def bring_back(self, role: Role, *, has_returned: bool) -> None:
+        """Ask the operator to bring a robot back that did not drive back; see `Testbed.bring_back`."""
+        if not has_returned:
             self._bring_back(self._cast[role].name)
 
     def _bring_back(self, name: str) -> None:

@@ -1,4 +1,4 @@
-"""Protocols of backends: `Backend` provides robots, `Testbed` is the running robots, `Oracle` a modelled radio."""
+"""Protocols of backends: `Backend` provides robots, `Testbed` controls them, `Oracle` has a modelled radio's data."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -63,7 +63,7 @@ class Robot(Strict):
 
     @property
     def ros_graph(self) -> str:
-        """Text for the ROS domain or master of its topics; empty if it shares topics with no other robot."""
+        """A text that names the ROS domain or master of its topics; empty if it shares topics with no other robot."""
         ros = self.profile.ros
         if ros is not None and ros.variant == "ros2":
             return f"ROS domain {ros.domain}{' over Zenoh' if ros.middleware == 'zenoh' else ''}"
@@ -172,7 +172,7 @@ class Testbed(Protocol):
         ...
 
     def place(self, placement: Placement) -> Answer:
-        """Bring the robots to their places; return when they are there.
+        """Bring the robots to their positions; return when they are there.
 
         Returns:
             The operator's answer: a note, or the decision to postpone this placement.
@@ -207,12 +207,12 @@ class Testbed(Protocol):
         """
         ...
 
-    def bring_back(self, role: Role, *, by_itself: bool) -> None:
+    def bring_back(self, role: Role, *, has_returned: bool) -> None:
         """Bring a robot that drove automatically back to its place.
 
         Args:
             role: Role of the robot.
-            by_itself: Whether the robot reports that it has driven back.
+            has_returned: Whether the robot has reported that it has driven back.
 
         Raises:
             FieldkitError: The robot could not be brought back.
@@ -235,7 +235,7 @@ class Transient(Protocol):
 
 @runtime_checkable
 class Attended(Protocol):
-    """Optional capability of a `Testbed` with real robots: a person can allow motion again after a fault.
+    """Optional capability of a `Testbed` with real robots: a person can permit motion again after a fault.
 
     Without it no robot moves automatically again after a fault.
     """

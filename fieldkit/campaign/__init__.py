@@ -1,1 +1,1 @@
-"""Campaigns: many trials in an order that limits walking, which can be interrupted and resumed."""
+"""Campaigns: many trials that can be interrupted and resumed, in an order that limits walking."""

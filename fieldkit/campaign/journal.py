@@ -75,8 +75,8 @@ class CampaignJournal:
         self._entries = self._read()
 
     @contextmanager
-    def claimed(self, plan: CampaignPlan) -> Iterator[None]:
-        """Store the journal on disk and lock the campaign against other processes while the body runs.
+    def locked(self, plan: CampaignPlan) -> Iterator[None]:
+        """Lock the campaign against other processes while the body runs, and store its plan on disk.
 
         Raises:
             ConfigurationError: Another process runs the campaign, or the folder cannot be written.
@@ -101,7 +101,7 @@ class CampaignJournal:
         self._entries.append(entry)
 
     def ended(self) -> dict[str, CampaignEntry]:
-        """Return the last entry of each trial that has ended; a trial that was started again is left out."""
+        """Return the last entry of each trial that has ended; a trial that was started again is omitted."""
         ended: dict[str, CampaignEntry] = {}
         for entry in self._entries:
             if entry.progress is TrialProgress.ENDED:

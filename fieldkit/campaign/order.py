@@ -1,9 +1,9 @@
 """The order of a campaign: random, within a limit on the walking distance.
 
 Slow changes during a day (sun, batteries, other Wi-Fi networks) must not look like an effect of distance, so the
-order is random. Setting up robots for another topology takes longest, and carrying them takes long, so the order is
-random within blocks: all trials of a topology; in it all of a scenario; in it all at a distance. The total path is
-limited.
+order is random. Setting up robots for another topology takes longest, and carrying robots takes long. Therefore the
+order is random within blocks: all trials of a topology; in it all of a scenario; in it all at a distance. The total
+path is limited.
 """
 
 import random
@@ -58,10 +58,10 @@ def walk_m(trials: Iterable[PlannedTrial]) -> float:
     """
     total_m = 0.0
     for topology, block in groupby(trials, key=lambda trial: trial.topology):
-        at_m = 0.0
+        position_m = 0.0
         for trial in block:
-            total_m += _WALKERS[topology] * abs(trial.distance.metres - at_m)
-            at_m = trial.distance.metres
+            total_m += _WALKERS[topology] * abs(trial.distance.metres - position_m)
+            position_m = trial.distance.metres
     return total_m
 
 
@@ -107,27 +107,27 @@ def _blocks(trials: Sequence[PlannedTrial]) -> Iterator[list[PlannedTrial]]:
 def _sweeps(block: list[PlannedTrial]) -> Iterator[list[PlannedTrial]]:
     scenarios = dict.fromkeys(trial.scenario for trial in block)
     for order in permutations(scenarios):
-        for down in product((False, True), repeat=len(order)):
+        for directions in product((False, True), repeat=len(order)):
             yield [
                 trial
-                for scenario, reverse in zip(order, down, strict=True)
+                for scenario, reverse in zip(order, directions, strict=True)
                 for trial in sorted(block, key=lambda trial: trial.distance.metres, reverse=reverse)
                 if trial.scenario is scenario
             ]
 
 
 def _swapped(order: Order, rng: random.Random) -> Order:
-    """Return the order after a swap of two random blocks of the same larger block, which may be the same block."""
-    depth = 1 + _below(len(_blocks_of(order[0])), rng)
+    """Return the order after a swap of two random blocks of the same larger block; both may be the same block."""
+    depth = 1 + _random_index(len(_blocks_of(order[0])), rng)
     blocks = [tuple(block) for _, block in groupby(order, key=lambda trial: _blocks_of(trial)[:depth])]
     parents = [_blocks_of(block[0])[: depth - 1] for block in blocks]
-    first = _below(len(blocks), rng)
+    first = _random_index(len(blocks), rng)
     siblings = [index for index, parent in enumerate(parents) if parent == parents[first]]
-    second = siblings[_below(len(siblings), rng)]
+    second = siblings[_random_index(len(siblings), rng)]
     blocks[first], blocks[second] = blocks[second], blocks[first]
     return tuple(chain.from_iterable(blocks))
 
 
-def _below(count: int, rng: random.Random) -> int:
+def _random_index(count: int, rng: random.Random) -> int:
     # Only `random` of random.Random returns the same numbers in every version of Python.
     return int(rng.random() * count)

@@ -23,7 +23,7 @@ CAMPAIGN_FILE: Final = laptop_files.CAMPAIGN
 Item = TypeVar("Item")
 
 
-def _distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
+def _require_distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
     def check(items: tuple[Item, ...]) -> tuple[Item, ...]:
         if len({key(item) for item in items}) < len(items):
             raise schema.validation_error("an entry occurs twice")
@@ -32,11 +32,11 @@ def _distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
     return AfterValidator(check)
 
 
-_ONCE: Final = (Field(min_length=1), _distinct(lambda item: item))
+_ONCE: Final = (Field(min_length=1), _require_distinct(lambda item: item))
 
 
-class LeftOut(Strict):
-    """Trials that a campaign leaves out: those that match all given keys.
+class Exclusion(Strict):
+    """Trials that a campaign excludes: those that match all given keys.
 
     Attributes:
         procedure: Name of a procedure.
@@ -48,8 +48,8 @@ class LeftOut(Strict):
     topology: Topology | None = None
     distance: Span | None = None
 
-    def covers(self, trial: PlannedTrial) -> bool:
-        """Return True if it leaves out a trial."""
+    def matches(self, trial: PlannedTrial) -> bool:
+        """Return True if the trial is excluded."""
         return (
             self.procedure in {None, trial.procedure}
             and self.topology in {None, trial.topology}
@@ -82,14 +82,14 @@ class CampaignFile(Strict):
         str, schema.pattern_field(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: letters, digits, - and _, 61 in all")
     ]
     procedures: Annotated[tuple[str, ...], *_ONCE]
-    distances: Annotated[tuple[Span, ...], Field(min_length=1), _distinct(lambda distance: distance.metres)]
+    distances: Annotated[tuple[Span, ...], Field(min_length=1), _require_distinct(lambda distance: distance.metres)]
     topologies: Annotated[tuple[Topology, ...], *_ONCE]
-    protocols: Annotated[tuple[Protocol, ...], _distinct(lambda item: item)] = ()
+    protocols: Annotated[tuple[Protocol, ...], _require_distinct(lambda item: item)] = ()
     repeats: Repeats | None = None
     record: Annotated[Duration, Field(gt=0)] | None = None
     seed: Annotated[Int, Field(ge=0, lt=10**15)]
     walk: Length | None = None
-    left_out: tuple[LeftOut, ...] = Field(default=(), alias="except")
+    left_out: tuple[Exclusion, ...] = Field(default=(), alias="except")
     expect: tuple[str, ...] = Field(default=(), exclude_if=schema.is_empty)
 
 
@@ -130,14 +130,14 @@ def trials_of(
         for procedure in procedures
         for distance in campaign.distances
     ]
-    for index, left_out in enumerate(campaign.left_out):
-        if not any(map(left_out.covers, combinations)):
+    for index, exclusion in enumerate(campaign.left_out):
+        if not any(map(exclusion.matches, combinations)):
             raise ConfigurationError(
                 "this leaves out no trial: no trial of the campaign matches",
                 where=document.where(("except", index)),
                 remedy="use values of procedures, topologies and distances",
             )
-    kept = tuple(trial for trial in combinations if not _is_left_out(trial, campaign.left_out))
+    kept = tuple(trial for trial in combinations if not _is_excluded(trial, campaign.left_out))
     if not kept:
         raise ConfigurationError(
             "except leaves out every trial", where=document.where(("except",)), remedy="leave out fewer"
@@ -145,8 +145,8 @@ def trials_of(
     return kept
 
 
-def _is_left_out(trial: PlannedTrial, left_out: Iterable[LeftOut]) -> bool:
-    return any(rule.covers(trial) for rule in left_out)
+def _is_excluded(trial: PlannedTrial, exclusions: Iterable[Exclusion]) -> bool:
+    return any(exclusion.matches(trial) for exclusion in exclusions)
 
 
 class CampaignPlan(Strict):
@@ -207,12 +207,12 @@ def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
     return plan, document
 
 
-def begun(folder: Path, asked: CampaignPlan, document: Document) -> CampaignPlan | None:
+def started_plan(folder: Path, current_plan: CampaignPlan, document: Document) -> CampaignPlan | None:
     """Return the frozen plan of the campaign in `folder`, or None if it has not started.
 
     Args:
         folder: The campaign's folder.
-        asked: The plan of its file now.
+        current_plan: The plan of its file now.
         document: The document of the file.
 
     Raises:
@@ -221,8 +221,8 @@ def begun(folder: Path, asked: CampaignPlan, document: Document) -> CampaignPlan
     if not (folder / CAMPAIGN_FILE).is_file():
         return None
     plan = schema.load(folder / CAMPAIGN_FILE, CampaignPlan)
-    before, now = _keys(plan), _keys(asked)
-    changed = [key for key in now if now[key] != before[key]]
+    frozen, current = _keys(plan), _keys(current_plan)
+    changed = [key for key in current if current[key] != frozen[key]]
     if changed:
         raise ConfigurationError(
             f"changed since the campaign started: {', '.join(changed)}",
@@ -250,7 +250,7 @@ def unmeasured(paths: Iterable[Path], sources: Collection[str], note: Note) -> I
         sources: Folders of the trials that have attempts.
         note: Receives a sentence about each campaign whose plan cannot be read.
     """
-    for folder in dict.fromkeys(candidate for path in paths for candidate in (path, *_below(path))):
+    for folder in dict.fromkeys(candidate for path in paths for candidate in (path, *_subfolders(path))):
         if (folder / CAMPAIGN_FILE).is_file():
             try:
                 yield from _unmeasured_trials(folder, sources)
@@ -258,7 +258,7 @@ def unmeasured(paths: Iterable[Path], sources: Collection[str], note: Note) -> I
                 note(f"the missing trials are not known: {error.located}")
 
 
-def _below(path: Path) -> list[Path]:
+def _subfolders(path: Path) -> list[Path]:
     return sorted(child for child in path.iterdir() if child.is_dir()) if path.is_dir() else []
 
 

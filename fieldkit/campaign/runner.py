@@ -23,13 +23,13 @@ from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running.opening import opened
-from fieldkit.trial.running.resumption import demand_cast, resumable
+from fieldkit.trial.running.resumption import require_cast, resumable
 from fieldkit.trial.running.runner import begin, continue_trial, place
 from fieldkit.trial.running.stop import Stop
 from fieldkit.trial.size import trial_bytes
 
 PLACING_S: Final = 60.0
-"""Assumed duration of carrying the robots to a place, before the first was measured."""
+"""Assumed duration of carrying the robots to a place until the first duration was measured."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class CampaignOutcome:
     """Result of a campaign.
 
     Attributes:
-        left: Trials that have not ended.
+        remaining: Trials that have not ended.
         failed: Number of failed repeats in the others.
         unmet: Number of expectations that their figures do not prove.
         folders: Folders of the trials that have ended.
     """
 
-    left: tuple[PlannedTrial, ...]
+    remaining: tuple[PlannedTrial, ...]
     failed: int
     unmet: int
     folders: tuple[Path, ...]
@@ -69,7 +69,7 @@ class CampaignRun:
         self._plan = plan
         self._journal = journal
         self._backend = backend
-        self._failed = self._redoes = failed
+        self._failed = self._includes_failed = failed
         self._sink = sink
         self._trials = plan.trials()
         self._set_up_topology: Topology | None = None
@@ -77,27 +77,27 @@ class CampaignRun:
         self._plans = {trial: self._trial_plan(trial, backend.cast(trial.topology)) for trial in self._trials}
 
     def announce(self) -> None:
-        """Report the remaining work, and what the campaign reduces or cannot decide compared with its procedures."""
-        left = self._left()
-        needed_bytes, free_bytes = self._needed_and_free_bytes(left)
-        lasts = self._estimate(left)
+        """Report the remaining work, reduced settings of the procedures, and expectations that cannot be decided."""
+        remaining = self._remaining_trials()
+        needed_bytes, free_bytes = self._needed_and_free_bytes(remaining)
+        duration = self._estimate(remaining)
         self._sink(
             CampaignPlanned(
                 name=self._plan.campaign.name,
-                trials=tuple(map(str, left)),
+                trials=tuple(map(str, remaining)),
                 needed_bytes=needed_bytes,
                 free_bytes=free_bytes,
-                done=len(self._trials) - len(left),
+                done=len(self._trials) - len(remaining),
                 total=len(self._trials),
-                walk_m=walk_m(left),
-                left_s=lasts.likely_s,
-                left_most_s=lasts.most_s,
+                walk_m=walk_m(remaining),
+                left_s=duration.likely_s,
+                left_most_s=duration.most_s,
             )
         )
         shortened = (
-            line for trial in left for line in self._plan.procedure(trial).adjustments(self._plans[trial].cast)
+            line for trial in remaining for line in self._plan.procedure(trial).adjustments(self._plans[trial].cast)
         )
-        shortfalls = (line for trial in left for line in self._plans[trial].shortfalls())
+        shortfalls = (line for trial in remaining for line in self._plans[trial].shortfalls())
         for line in dict.fromkeys((*shortened, *shortfalls)):
             self._sink(Note(line))
 
@@ -112,25 +112,25 @@ class CampaignRun:
             ConfigurationError: The folder cannot be written or has too little space, or an interrupted trial cannot
                 be resumed.
             LinkError: A robot did not answer.
-            RobotError: A robot cannot do what a trial needs.
+            RobotError: A robot does not meet the requirements of a trial.
             KeyboardInterrupt: A stop was requested.
         """
-        with self._journal.claimed(self._plan):
+        with self._journal.locked(self._plan):
             try:
-                self._demand_space()
-                self._reopen()
-                self._offer(self._left(), operator, stop)
+                self._require_space()
+                self._restart_failed()
+                self._run_trials(self._remaining_trials(), operator, stop)
                 # Only skipped trials remain; this does nothing if there are none.
-                self._offer(self._left(), operator, stop)
+                self._run_trials(self._remaining_trials(), operator, stop)
             finally:
-                done = len(self._trials) - len(self._left())
+                done = len(self._trials) - len(self._remaining_trials())
                 self._sink(CampaignEnded(str(self._journal.folder), done, len(self._trials)))
         ended = self._journal.ended().values()
         failed, unmet = (sum(getattr(entry, field) for entry in ended) for field in ("failed", "unmet"))
         folders = tuple(self._journal.folder / entry.trial for entry in ended)
-        return CampaignOutcome(self._left(), failed, unmet, folders)
+        return CampaignOutcome(self._remaining_trials(), failed, unmet, folders)
 
-    def _offer(self, trials: Sequence[PlannedTrial], operator: Operator, stop: Stop) -> None:
+    def _run_trials(self, trials: Sequence[PlannedTrial], operator: Operator, stop: Stop) -> None:
         for topology, block in groupby(trials, key=lambda trial: trial.topology):
             topology_trials = list(block)
             cast = {role: robot for trial in topology_trials for role, robot in self._plans[trial].cast.items()}
@@ -155,14 +155,14 @@ class CampaignRun:
 
     def _run(self, trial: PlannedTrial, cast: Cast, testbed: Testbed, stop: Stop) -> None:
         total = len(self._trials)
-        self._sink(CampaignTrial(str(trial), total - len(self._left()) + 1, total))
+        self._sink(CampaignTrial(str(trial), total - len(self._remaining_trials()) + 1, total))
         folder = self._journal.interrupted(trial)
         if folder is None:
             plan = self._trial_plan(trial, cast)
             self._journal.add(trial, TrialProgress.STARTED, trial=plan.trial)
         else:
             plan = resumable(folder)
-            demand_cast(plan, cast)
+            require_cast(plan, cast)
         placement = place(plan, testbed, self._sink)
         progress = TrialProgress.SKIPPED if placement.answer.skip else TrialProgress.PLACED
         self._journal.add(trial, progress, note=placement.answer.note, took_s=placement.took_s)
@@ -176,29 +176,31 @@ class CampaignRun:
             trial_name, valid, failed = outcome.folder.name, outcome.valid, outcome.failed
             unmet = sum(not judgement.holds for judgement in outcome.judgements)
             self._journal.add(trial, TrialProgress.ENDED, trial=trial_name, valid=valid, failed=failed, unmet=unmet)
-        left = self._left()
-        lasts = self._estimate(left)
-        self._sink(CampaignWent(str(trial), total - len(left), total, lasts.likely_s, lasts.most_s))
+        remaining = self._remaining_trials()
+        duration = self._estimate(remaining)
+        self._sink(CampaignWent(str(trial), total - len(remaining), total, duration.likely_s, duration.most_s))
 
-    def _reopen(self) -> None:
+    def _restart_failed(self) -> None:
         """Record a new start of the trials with failed repeats, if these are repeated."""
-        over = self._journal.ended()
-        for trial in self._left():
-            if entry := over.get(str(trial)):
+        ended = self._journal.ended()
+        for trial in self._remaining_trials():
+            if entry := ended.get(str(trial)):
                 self._journal.add(trial, TrialProgress.STARTED, trial=entry.trial)
-        self._redoes = False
+        self._includes_failed = False
 
-    def _left(self) -> tuple[PlannedTrial, ...]:
-        """Return the trials that have not ended; with `--failed`, until `_reopen`, also those with failed repeats."""
-        ended = {name for name, entry in self._journal.ended().items() if not (self._redoes and entry.failed)}
+    def _remaining_trials(self) -> tuple[PlannedTrial, ...]:
+        """Return the trials that have not ended; before `_restart_failed` also failed ones to repeat."""
+        ended = {
+            name for name, entry in self._journal.ended().items() if not (self._includes_failed and entry.failed)
+        }
         return tuple(trial for trial in self._trials if str(trial) not in ended)
 
     def _needed_and_free_bytes(self, trials: Sequence[PlannedTrial]) -> tuple[int, int]:
         """Return the bytes that trials need, and the bytes that are free in the campaign's folder."""
         return sum(trial_bytes(self._plans[trial]) for trial in trials), files.free_bytes(self._journal.folder)
 
-    def _demand_space(self) -> None:
-        needed_bytes, free_bytes = self._needed_and_free_bytes(self._left())
+    def _require_space(self) -> None:
+        needed_bytes, free_bytes = self._needed_and_free_bytes(self._remaining_trials())
         if free_bytes < needed_bytes:
             raise ConfigurationError(
                 f"the evidence may need {format_bytes(needed_bytes)}, {format_bytes(free_bytes)} are free",

@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "_ARGCOMPLETE" in os.environ:  # a shell requests completions
         from fieldkit.cli.commands import completion  # noqa: PLC0415 (needed only for completion)
 
-        completion.answer(parser())
+        completion.write_completions(parser())
     top = parser()
     with hints.completing(top) as options:
         return _run_guarded(top, argv, options)
@@ -107,9 +107,9 @@ def _run_guarded(top: Parser, argv: Sequence[str] | None, options: hints.CliOpti
     except OSError as error:
         # Library functions wrap the errors that they expect. A full disk can make any write fail.
         fix = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct this"
-        where = error.filename or "its output"
+        location = error.filename or "its output"
         _show_error(
-            f"{where}: {error.strerror}\n  remedy: {fix}, then run the command again; finished repeats are saved"
+            f"{location}: {error.strerror}\n  remedy: {fix}, then run the command again; finished repeats are saved"
         )
         return ConfigurationError.exit_code
     except MemoryError:

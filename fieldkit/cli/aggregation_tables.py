@@ -15,7 +15,7 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.analysis.sample_size import additional_repeats_by_cell
 from fieldkit.analysis.table_lines import TableLine
 from fieldkit.cli import results
-from fieldkit.cli.display import prose, show_note, table
+from fieldkit.cli.display import print_folded, show_note, table
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.text import print_text
@@ -23,34 +23,39 @@ from fieldkit.core.units import parse_quantity
 from fieldkit.trial import sources
 from fieldkit.trial.sources import Sources
 
-_More = Sequence[Mapping[str, int]]
+_AdditionalRepeats = Sequence[Mapping[str, int]]
 """For each cell, the number of additional repeats per quantity; empty unless `--width` is given."""
 
 _FOR_PROGRAMS: Final = MappingProxyType({"csv": result_tables.to_csv, "json": result_tables.to_json})
 _FOR_PAPERS: Final = MappingProxyType({"markdown": result_tables.to_markdown, "latex": result_tables.to_latex})
-# A table in a paper has room for one delay and one loss. Each protocol has one of these two losses.
-_PAPER: Final = ("rtt_median_s", "ip_loss", "tcp_byte_loss")
-_VALUE: Final = MappingProxyType(
+# A table in a paper has space for one delay and one loss. Each protocol has one of these two losses.
+_PAPER_COLUMNS: Final = ("rtt_median_s", "ip_loss", "tcp_byte_loss")
+_VALUE_HEADS: Final = MappingProxyType(
     {Kind.COUNTED: "share", Kind.FLAG: "share", Kind.MEAN: "mean", Kind.MEDIAN: "median"}
 )
-_WORDS: Final = "choose --format table, markdown, csv or json"
-_WIDTHS: Final = "give 2% for shares, 1ms for times, 100kbit/s for rates; or choose other columns with --quantity"
+_WORDS_REMEDY: Final = "choose --format table, markdown, csv or json"
+_WIDTH_REMEDY: Final = (
+    "give 2% for shares, 1ms for times, 100kbit/s for rates; or choose other columns with --quantity"
+)
 _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a rate"})
 
 
 def show(arguments: argparse.Namespace) -> int:
     """Print the cells."""
-    form = arguments.format
+    output_format = arguments.format
     data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
     by = data.condition(arguments.by)
-    chosen, words = data.chosen(arguments.quantity)
-    if words and form == "latex":
+    selected, words = data.chosen(arguments.quantity)
+    if words and output_format == "latex":
         raise ConfigurationError(
-            f"--quantity: the values of {words[0].name} are words, for which latex has no column", remedy=_WORDS
+            f"--quantity: the values of {words[0].name} are words, and latex tables have no column for words",
+            remedy=_WORDS_REMEDY,
         )
-    if arguments.width and form in _FOR_PAPERS:
-        raise ConfigurationError(f"--width: {form} has no column for it", remedy="choose --format table, csv or json")
-    quantities = _default_quantities(form, data.quantities) if chosen is None else chosen
+    if arguments.width and output_format in _FOR_PAPERS:
+        raise ConfigurationError(
+            f"--width: {output_format} has no column for it", remedy="choose --format table, csv or json"
+        )
+    quantities = _default_quantities(output_format, data.quantities) if selected is None else selected
     counted = list(data.words.values()) if words is None else words
     widths = dict(_width(text, quantities) for text in arguments.width)
     _require_units(widths, quantities)
@@ -61,31 +66,33 @@ def show(arguments: argparse.Namespace) -> int:
         show_note(mixture.removesuffix("."))
     cells = aggregate(repeats, by, quantities=quantities, words=counted)
     more = additional_repeats_by_cell(cells, widths) if widths else ()
-    if form in _FOR_PROGRAMS:
-        print_text(_FOR_PROGRAMS[form](by, cells, more), end="")
-    elif form in _FOR_PAPERS:
-        if form == "latex":
+    if output_format in _FOR_PROGRAMS:
+        print_text(_FOR_PROGRAMS[output_format](by, cells, more), end="")
+    elif output_format in _FOR_PAPERS:
+        if output_format == "latex":
             _require_figures(cells, quantities)
-        print_text(_FOR_PAPERS[form](by, cells, quantities), end="")
+        print_text(_FOR_PAPERS[output_format](by, cells, quantities), end="")
     else:
-        judgements = _judged(data, repeats, cells, quantities)
+        judgements = _judgements_shown(data, repeats, cells, quantities)
         expected = {judgement.expectation.quantity for judgement in judgements}
-        show_all = arguments.all or chosen is not None or bool(widths)
+        show_all = arguments.all or selected is not None or bool(widths)
         shown = table_lines.lines(cells, quantities) if show_all else table_lines.operator_lines(cells, expected)
         _show(by, cells, shown, more)
         _show_expected(by, cells, judgements)
-        _note_rest(cells, shown)
+        _note_omitted(cells, shown)
     available = {name for cell in cells for name in (*cell.estimates, *cell.tallies)}
     if missing := [name for name in arguments.quantity if name not in available]:
         show_note(f"no valid repeat has {' or '.join(missing)}")
     return 0
 
 
-def _default_quantities(form: str, available: Mapping[str, Quantity]) -> list[Quantity]:
+def _default_quantities(output_format: str, available: Mapping[str, Quantity]) -> list[Quantity]:
     """Return the quantities to aggregate without `--quantity`: all, or for latex those that fit into a paper."""
-    if form != "latex":
+    if output_format != "latex":
         return list(available.values())
-    return [quantity for name in _PAPER for quantity in available.values() if plain_name(quantity.name) == name]
+    return [
+        quantity for name in _PAPER_COLUMNS for quantity in available.values() if plain_name(quantity.name) == name
+    ]
 
 
 def _require_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) -> None:
@@ -93,7 +100,7 @@ def _require_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) 
         names = [quantity.name for quantity in quantities]
         raise ConfigurationError(
             f"--width: none of these is {_UNITS[next(iter(widths))]}: {', '.join(names)}",
-            remedy=_WIDTHS,
+            remedy=_WIDTH_REMEDY,
         )
 
 
@@ -114,21 +121,21 @@ def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
     unit = next((unit for unit in (*PER_UNIT, *other_units) if symbol in symbols(unit)), None)
     if unit is None:
         parse_quantity(text, {symbol: 1.0 for unit in (*PER_UNIT, *other_units) for symbol in symbols(unit)}, "width")
-        raise ConfigurationError(f"--width: {text!r} is not a width", remedy=_WIDTHS)
+        raise ConfigurationError(f"--width: {text!r} is not a width", remedy=_WIDTH_REMEDY)
     width = parse_amount(text, unit, "width")
     if width <= 0:
         raise ConfigurationError(f"--width: {text!r} is not above zero", remedy="write for example --width 2%")
     return unit, width
 
 
-def _note_rest(cells: Sequence[Cell], shown: Sequence[TableLine]) -> None:
-    """Print how many quantities are not shown."""
+def _note_omitted(cells: Sequence[Cell], shown: Sequence[TableLine]) -> None:
+    """Print the number of quantities that are not shown."""
     names = {quantity.name for line in shown for quantity in line.quantities}
     if left_out := len({quantity.name for quantity in wording.measured(cells)} - names):
-        prose(f"{results.more_rows_note(left_out)}: add --all")
+        print_folded(f"{results.more_rows_note(left_out)}: add --all")
 
 
-def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], more: _More) -> None:
+def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], more: _AdditionalRepeats) -> None:
     """Print a table of the repeats, and a table for each line of `shown`."""
     counts = [{"valid": str(cell.n_valid), "void": str(cell.n_void), "failed": str(cell.n_failed)} for cell in cells]
     _show_table("repeats", by, cells, counts)
@@ -147,15 +154,15 @@ def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], 
     for name, label in wording.word_labels(cells).items():
         measured_cells = [cell for cell in cells if name in cell.tallies]
         figures = [
-            {"n": _n(cell.tallies[name].n, cell), "repeats with each": wording.tally(cell, name)}
+            {"n": _repeat_count(cell.tallies[name].n, cell), "repeats with each": wording.tally(cell, name)}
             for cell in measured_cells
         ]
         _show_table(label, differing, measured_cells, figures, words=1)
     for caution in wording.cautions(cells, {quantity.name for line in shown for quantity in line.quantities}):
-        prose(caution)
+        print_folded(caution)
 
 
-def _judged(
+def _judgements_shown(
     data: Sources, repeats: Repeats, cells: Sequence[Cell], quantities: Sequence[Quantity]
 ) -> Sequence[Judgement]:
     """Return the judgements of the trials' expectations about the quantities that are shown."""
@@ -172,7 +179,7 @@ def _judged(
 
 
 def _show_expected(by: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]) -> None:
-    """Print for each condition if its expectations hold. Without expectations, print nothing."""
+    """Print for each condition whether its expectations are shown to hold; without expectations, print nothing."""
     differing, _ = wording.varying_and_common(by, cells)
     rows = []
     for judgement in judgements:
@@ -205,7 +212,7 @@ def _additional_repeats(line: TableLine, cell: Cell, more: Mapping[str, int]) ->
     return more.get(estimate.quantity.name, "") if estimate else ""
 
 
-def _n(n: int, cell: Cell) -> str:
+def _repeat_count(n: int, cell: Cell) -> str:
     """Return the number of valid repeats with a value: `5`, or `4 of 5`."""
     return table_lines.part_of(n, cell) or str(n)
 
@@ -217,7 +224,7 @@ def _figures(line: TableLine, cell: Cell, scale: wording.Scale) -> dict[str, str
     """
     estimate, quantity = line.estimate(cell), line.quantities[0]
     kind = quantity.kind
-    heads = ["n", *(("sent",) if kind is Kind.COUNTED else ()), _VALUE[kind], "95 % interval"]
+    heads = ["n", *(("sent",) if kind is Kind.COUNTED else ()), _VALUE_HEADS[kind], "95 % interval"]
     if kind is not Kind.FLAG:
         heads += ["Wilson" if kind is Kind.COUNTED else "mean", "median", "p95"]
     if quantity.at_least:
@@ -225,13 +232,13 @@ def _figures(line: TableLine, cell: Cell, scale: wording.Scale) -> dict[str, str
     if estimate is None:
         return dict.fromkeys(heads, "") | {"n": table_lines.part_of(0, cell)}
     figures = {
-        "n": _n(estimate.n, cell),
+        "n": _repeat_count(estimate.n, cell),
         "sent": "" if estimate.trials is None else str(estimate.trials),
         "Wilson": scale.interval(estimate.wilson_low, estimate.wilson_high),
         "mean": wording.number(scale, estimate, estimate.mean),
         "median": scale.number(estimate.median),
         "p95": wording.number(scale, estimate, estimate.p95),
-        _VALUE[kind]: wording.number(scale, estimate),
+        _VALUE_HEADS[kind]: wording.number(scale, estimate),
         "95 % interval": wording.interval(scale, estimate),
         "not ended": f"{estimate.n_censored} of {estimate.n}",
     }

@@ -73,7 +73,7 @@ def _open_answers(path: str) -> TextIO:
 
 
 def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
-    """Return the name of the backend that the options and the site file choose, and the backend.
+    """Return the name of the backend that the options and the site file select, and the backend.
 
     Raises:
         ConfigurationError: As `load_site` and `load_backend`.

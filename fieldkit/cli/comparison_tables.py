@@ -16,7 +16,7 @@ from fieldkit.core.errors import ConfigurationError, did_you_mean, shell_command
 from fieldkit.core.text import print_text
 from fieldkit.trial import sources
 
-MISSED: Final = 1
+THRESHOLD_MISSED: Final = 1
 
 _VARIED: Final = "A and B differ in this, which may explain differences between their figures"
 
@@ -44,12 +44,12 @@ def show(arguments: argparse.Namespace) -> int:
             "or, to compare them anyway, add --force",
         )
     for concern in comparison.concerns:
-        show_note(f"{_weight(comparison, concern)}: {concern}")
+        show_note(f"{_concern_text(comparison, concern)}: {concern}")
     if arguments.format == "table":
         _table(comparison)
     else:
         print_text(_FORMATS[arguments.format](comparison), end="")
-    return MISSED if comparison.exceeds_threshold else 0
+    return THRESHOLD_MISSED if comparison.exceeds_threshold else 0
 
 
 def _require_two(paths: Sequence[Path]) -> None:
@@ -58,7 +58,7 @@ def _require_two(paths: Sequence[Path]) -> None:
         raise ConfigurationError(
             f"compare takes two runs, A and B, and {len(paths)} are given",
             remedy="for a run of several trials give their folder, or their table from fieldkit export; "
-            f"to show all of these side by side: {command}",
+            f"to show all of these in one table: {command}",
         )
 
 
@@ -84,7 +84,7 @@ def _threshold(text: str, quantities: Mapping[str, Quantity]) -> tuple[str, floa
     return name, limit
 
 
-def _weight(comparison: Comparison, concern: Concern) -> str:
+def _concern_text(comparison: Comparison, concern: Concern) -> str:
     """Return the effect of a difference between the conditions of A and B, in words."""
     if concern.refuses:
         return "not comparable"
@@ -156,7 +156,7 @@ def _markdown(comparison: Comparison) -> str:
     notes = [
         _DELTA,
         *wording.conclusions(comparison),
-        *(f"{_weight(comparison, concern)}: {concern}" for concern in differing),
+        *(f"{_concern_text(comparison, concern)}: {concern}" for concern in differing),
     ]
     return (
         "".join(map(result_tables.markdown_line, rows))

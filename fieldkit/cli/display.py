@@ -1,4 +1,4 @@
-"""Show events, tables, findings and errors as a live line, as plain lines or as JSON. The only user of rich."""
+"""Show events, tables, findings and errors: live, as plain lines or as JSON. Only this module imports rich."""
 
 import io
 import os
@@ -67,12 +67,12 @@ def _console(*, stderr: bool = False) -> Console:
 
 def show_error(text: str) -> None:
     """Print an error with its remedy on standard error."""
-    _console(stderr=True).print(_harmless(Text.assemble(("error: ", "bold red"), completed(text))))
+    _console(stderr=True).print(_sanitized(Text.assemble(("error: ", "bold red"), completed(text))))
 
 
 def show_note(text: str) -> None:
     """Print a note about the output on standard error."""
-    _console(stderr=True).print(_harmless(Text.assemble(("note: ", "yellow"), completed(text))))
+    _console(stderr=True).print(_sanitized(Text.assemble(("note: ", "yellow"), completed(text))))
 
 
 def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
@@ -80,7 +80,7 @@ def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
     return not sys.stdout.isatty() or _table_width(_widths([head, *rows])) <= _console().width
 
 
-def prose(text: str) -> None:
+def print_folded(text: str) -> None:
     """Print a text. On a terminal, lines are folded between words."""
     text = sanitized(text)
     print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
@@ -127,9 +127,9 @@ def _render_lines(cells: Sequence[Sequence[str]], widths: Sequence[int], right: 
         grid.add_column(Text(name), justify="right" if index in right else "left", width=width, no_wrap=True)
     for row in rows:
         grid.add_row(*(Text(_fold_cell(cell, width)) for cell, width in zip(row, widths, strict=True)))
-    drawn = io.StringIO()
-    Console(file=drawn, width=_table_width(widths) + 1, color_system=None).print(grid)
-    return [line.rstrip() for line in drawn.getvalue().splitlines() if line.strip()]
+    rendered = io.StringIO()
+    Console(file=rendered, width=_table_width(widths) + 1, color_system=None).print(grid)
+    return [line.rstrip() for line in rendered.getvalue().splitlines() if line.strip()]
 
 
 def _fold_cell(cell: str, width: int) -> str:
@@ -157,7 +157,7 @@ def _print_blocks(cells: Sequence[Sequence[str]], title: str, console: Console) 
 
 
 def _fold_words(words: Sequence[str], width: int) -> list[str]:
-    """Return lines of whole words. A word that is longer than `width` gets its own line and is not broken."""
+    """Return lines of whole words. A word that is longer than `width` is put on a separate line and is not broken."""
     lines = [""]
     for word in words:
         longer = f"{lines[-1]} {word}".lstrip()
@@ -193,12 +193,12 @@ def show_findings(findings: Sequence[Finding]) -> None:
             grid.add_column(width=6, justify="right")
             grid.add_column(width=width)
             grid.add_column(overflow="fold")
-            grid.add_row(Text(word, style=style), Text(finding.check), _harmless(Text(finding.detail)))
+            grid.add_row(Text(word, style=style), Text(finding.check), _sanitized(Text(finding.detail)))
             with console.capture() as shown:
                 console.print(grid, soft_wrap=False)
             print("\n".join(line.rstrip() for line in shown.get().splitlines()))
             if finding.remedy:  # not folded, so that it can be copied
-                console.print(_harmless(Text.assemble("        ", (completed(finding.remedy), "cyan"))))
+                console.print(_sanitized(Text.assemble("        ", (completed(finding.remedy), "cyan"))))
     counts = {verdict: sum(finding.status is verdict for finding in findings) for verdict in Verdict}
     names = {Verdict.OK: "ok", Verdict.WARN: "warned", Verdict.FAIL: "failed"}
     worst = max(findings, key=lambda item: list(Verdict).index(item.status)).status
@@ -207,7 +207,7 @@ def show_findings(findings: Sequence[Finding]) -> None:
 
 
 @contextmanager
-def watching(*, as_json: bool) -> Iterator[Sink]:
+def showing_events(*, as_json: bool) -> Iterator[Sink]:
     """Show events while the body runs: as JSON lines, as a live line on a terminal, or as plain lines."""
     if as_json:
         yield _serialize(_print_json)
@@ -221,7 +221,7 @@ def watching(*, as_json: bool) -> Iterator[Sink]:
                 live.start()
             else:
                 live.stop()
-            if (text := shown(event, live.console.width)) is not None:
+            if (text := event_text(event, live.console.width)) is not None:
                 live.console.print(text)
 
         try:
@@ -233,7 +233,7 @@ def watching(*, as_json: bool) -> Iterator[Sink]:
 
 
 @contextmanager
-def working() -> Iterator[Sink]:
+def showing_progress() -> Iterator[Sink]:
     """Show the progress of a computation on standard error while the body runs, if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _: None
@@ -269,13 +269,13 @@ def _serialize(sink: Sink) -> Sink:
     return show
 
 
-def shown(event: Event, width: int | None = None) -> Text | None:
-    """Return the text of an event for people, or None if only the live line shows it. Raises as `words_of`."""
-    parts = words_of(event, width)
-    return _harmless(Text.assemble(*((completed(text), style) for text, style in parts))) if parts else None
+def event_text(event: Event, width: int | None = None) -> Text | None:
+    """Return the text of an event for people, or None if only the live line shows it. Raises as `event_words`."""
+    parts = event_words(event, width)
+    return _sanitized(Text.assemble(*((completed(text), style) for text, style in parts))) if parts else None
 
 
-def words_of(event: Event, width: int | None = None) -> Words:
+def event_words(event: Event, width: int | None = None) -> Words:
     """Return the styled texts of an event; empty if only the live line shows the event.
 
     Args:
@@ -296,7 +296,7 @@ def words_of(event: Event, width: int | None = None) -> Words:
         case PhaseStarted(name, repeat=""):
             words = ((f"{name} ...", "dim"),)
         case RepeatEnded():
-            words = _repeat(event, width)
+            words = _repeat_words(event, width)
         case TrialEnded(folder, valid, void, failed):
             counts = (
                 f"{valid} valid"
@@ -308,11 +308,11 @@ def words_of(event: Event, width: int | None = None) -> Words:
             command = f"to continue: {shell_command('fieldkit', 'resume', folder)}"
             words = ((f"stopped, {done} of {total} repeats are done; {command}", "bold"),)
         case CampaignPlanned() | CampaignTrial() | CampaignWent() | CampaignEnded():
-            words = _campaign(event)
+            words = _campaign_words(event)
     return words
 
 
-def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEnded) -> Words:
+def _campaign_words(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEnded) -> Words:
     if isinstance(event, CampaignTrial):
         return ((f"trial {event.number} of {event.total}: {event.trial}", "bold"),)
     done = f"campaign: {event.done} of {event.total} trials are done"
@@ -335,7 +335,7 @@ def _campaign(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEn
             return ((f"{done}{hint}: {event.folder}", "bold"),)
 
 
-def _repeat(event: RepeatEnded, width: int | None) -> Words:
+def _repeat_words(event: RepeatEnded, width: int | None) -> Words:
     """Return a repeat as one line. On a terminal, a longer line is folded, with the measured figures below it."""
     head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
     measured = f"measured: {event.summary}" if event.reason and event.summary else event.summary
@@ -356,21 +356,21 @@ def _fold_below(text: str, width: int) -> str:
     return indent + indent.join(textwrap.wrap(text, max(width - _INDENT, _INDENT)))
 
 
-def _fold_after(text: str, begin: int, width: int) -> str:
-    """Return a text that starts in column `begin` and continues on indented lines."""
+def _fold_after(text: str, start_column: int, width: int) -> str:
+    """Return a text that starts in column `start_column` and continues on indented lines."""
     lines = textwrap.wrap(
-        text, max(width, begin + _INDENT), initial_indent=" " * begin, subsequent_indent=" " * _INDENT
+        text, max(width, start_column + _INDENT), initial_indent=" " * start_column, subsequent_indent=" " * _INDENT
     )
-    return "\n".join(lines)[begin:]
+    return "\n".join(lines)[start_column:]
 
 
-def _harmless(text: Text) -> Text:
+def _sanitized(text: Text) -> Text:
     text.plain = sanitized(text.plain)
     return text
 
 
 def _print_plain(event: Event) -> None:
-    if (text := shown(event)) is not None:
+    if (text := event_text(event)) is not None:
         print(text.plain, flush=True)
 
 
@@ -381,11 +381,11 @@ def _print_json(event: Event) -> None:
 
 
 class _LiveLine:
-    """The line at the bottom of the terminal."""
+    """The line at the bottom of the terminal that shows the progress."""
 
     def __init__(self) -> None:
         self.progress = ProgressBar()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         text = Text.assemble(*self.progress.words(options.max_width - 1), no_wrap=True, overflow="crop")
-        yield _harmless(text)
+        yield _sanitized(text)

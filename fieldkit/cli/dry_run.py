@@ -19,18 +19,18 @@ def print_commands(plan: Plan) -> None:
 
     Jobs are shown as a person would type them. In a trial `job.sh` starts them detached.
     """
-    each = f"{format_count(plan.repeats, 'repeat')} per protocol"
-    print_text(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {each}")
+    repeats_text = f"{format_count(plan.repeats, 'repeat')} per protocol"
+    print_text(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {repeats_text}")
     for remark in _remarks(plan):
         print_text(f"# {remark}")
     commands = list(_commands(plan))
     for protocol in plan.protocols:
         for role, robot in plan.cast.items():
-            own_commands = [command for command in commands if (command.protocol, command.role) == (protocol, role)]
+            robot_commands = [command for command in commands if (command.protocol, command.role) == (protocol, role)]
             print_text(f"\n## {protocol}: {robot.name} ({role}, {robot.address}), in {_folder(plan, protocol)}")
-            if not own_commands:
+            if not robot_commands:
                 print_text("only the checks before repeat 1")
-            for command in own_commands:
+            for command in robot_commands:
                 print_text(f"{command.number}. {command.name}: {command.command}")
 
 
@@ -43,7 +43,7 @@ def report_commands(plan: Plan, sink: Sink) -> None:
 
 
 def _remarks(plan: Plan) -> Iterator[str]:
-    """Yield the remarks that the plan alone implies, without a query to any robot."""
+    """Yield the remarks that follow from the plan alone, without a query to any robot."""
     for refusal in plan.refusals({}):
         name = plan.cast[refusal.role].name
         yield f"if {name} is as its profile says, this will be refused: {refusal.what}; {refusal.remedy}"
@@ -67,7 +67,7 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
             location = (scene.folder, role, robot.profile.radio.interface)
             commands = [
                 (0, "begin", quote(evidence.begin_command(*location))),
-                *((0, "put", _copy_command(put, robot, folder)) for put in plan.puts() if put.role is role),
+                *((0, "put", _copy_command(put, robot, folder)) for put in plan.program_copies() if put.role is role),
                 *(
                     (number, planned.job.name, in_shell(planned.job))
                     for number, planned in enumerate(all_jobs, start=1)
@@ -90,4 +90,4 @@ def in_shell(job: Job) -> str:
     text = quote((("sudo", "-n") if job.as_root else ()) + job.argv)
     text += f" < {quote((job.stdin,))}" if job.stdin else ""
     text += (f" > {quote((job.stdout,))}" if job.stdout else "") + f" 2> {quote((job.log,))}"
-    return text + (f"  # at most {job.output_limit_bytes} bytes of each" if job.output_limit_bytes else "")
+    return text + (f"  # at most {job.output_limit_bytes} bytes of repeats_text" if job.output_limit_bytes else "")

@@ -14,7 +14,7 @@ from typing import Final
 from fieldkit.cli.parser import Parser
 from fieldkit.core import permissions
 
-_CARRIED: Final = ("site", "backend", "topology", "protocol", "repeats", "record")
+_REPEATED_OPTIONS: Final = ("site", "backend", "topology", "protocol", "repeats", "record")
 """Options that select robots and what is measured on them, by their names in the namespace of argparse."""
 
 # Words in lower case: a command of fieldkit, and perhaps its subcommand, such as `lab up`.
@@ -34,7 +34,7 @@ class CliOptions:
 
     def read(self, arguments: argparse.Namespace) -> None:
         """Store the options to repeat from parsed arguments."""
-        for name in _CARRIED:
+        for name in _REPEATED_OPTIONS:
             value = getattr(arguments, name, None)
             values = value if isinstance(value, list) else [] if value is None else [value]
             self._options += [(f"--{name}", str(item)) for item in values]
@@ -52,12 +52,12 @@ class CliOptions:
         missing = [
             shlex.join((option, value) if value else (option,))
             for option, value in self._options
-            if parser.takes(option, value) and f"{option} " not in f"{match[0]} "
+            if parser.accepts(option, value) and f"{option} " not in f"{match[0]} "
         ]
         if not words or not missing:
             return match[0]
-        begin = f"fieldkit {' '.join(words)}"
-        return f"{begin} {' '.join(missing)}{match[0].removeprefix(begin)}"
+        command = f"fieldkit {' '.join(words)}"
+        return f"{command} {' '.join(missing)}{match[0].removeprefix(command)}"
 
 
 _options: ContextVar[CliOptions | None] = ContextVar("options", default=None)

@@ -14,7 +14,7 @@ from fieldkit.remote.ssh import SshShell
 
 @contextmanager
 def opened(folder: LabFolder) -> Iterator[dict[str, SshShell]]:
-    """Yield the connection to each robot by its name, without any if no lab is up. They connect at first use.
+    """Yield the connections to the robots by name; empty if no lab is up. A connection is opened at its first use.
 
     Raises:
         ConfigurationError: The lab's folder is incomplete.

@@ -1,6 +1,6 @@
 """Parse command lines, and list the commands of installed packages by their entry points.
 
-A usage error is raised as every other error is, with a suggestion if there is a similar word. A package is imported
+A usage error is raised like every other error; it suggests a similar word if there is one. A package is imported
 when its command is used. `NAME = "package.module:function"` names a function that gets the command's `Parser` and
 declares the arguments of the command, as `add` does in the modules of `fieldkit.cli.commands`. It must set the
 default `run` to `package.module:function`, the function that runs the command.
@@ -77,7 +77,7 @@ class Parser(argparse.ArgumentParser):
             parser.complete()
         return parser
 
-    def takes(self, option: str, value: str) -> bool:
+    def accepts(self, option: str, value: str) -> bool:
         """Return True if the parser has `option`, and `value` is not its default."""
         action = self._option_string_actions.get(option)
         return action is not None and str(action.default) != value
@@ -117,10 +117,11 @@ class Parser(argparse.ArgumentParser):
         """Return the error for an unknown word, with the most similar option."""
         name = word.partition("=")[0]
         for parser in filter(None, (self, *map(self.command, self.subcommands()))):
-            if near := difflib.get_close_matches(name, parser._options(), n=1):  # noqa: SLF001 (of another Parser)
+            if similar := difflib.get_close_matches(name, parser._options(), n=1):  # noqa: SLF001 (of another Parser)
                 command = "" if parser is self else f"{parser.prog} "
                 return ConfigurationError(
-                    f"{self.prog} has no option or argument {word!r}", remedy=f"did you mean {command + near[0]!r}?"
+                    f"{self.prog} has no option or argument {word!r}",
+                    remedy=f"did you mean {command + similar[0]!r}?",
                 )
         return ConfigurationError(f"{self.prog} has no option or argument {word!r}", remedy=f"{self.prog} --help")
 
@@ -143,14 +144,16 @@ class Parser(argparse.ArgumentParser):
     def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (passed to argparse unchanged)
         """Add an argument with one of `choices` as its value; an error about another value names the nearest one."""
         values = tuple(choices)
-        self.add_argument(name, choices=values, type=self._choice(options.get("metavar", name), values), **options)
+        self.add_argument(
+            name, choices=values, type=self._choice_converter(options.get("metavar", name), values), **options
+        )
 
-    def _choice(self, name: str, choices: Sequence[str]) -> Callable[[str], str]:
-        def converted(text: str) -> str:
+    def _choice_converter(self, name: str, choices: Sequence[str]) -> Callable[[str], str]:
+        def convert(text: str) -> str:
             self._require_choice(name, text, choices)
             return text
 
-        return converted
+        return convert
 
     def _require_choice(self, argument: str, typed: str, choices: Iterable[str]) -> None:
         if typed not in choices:

@@ -24,16 +24,16 @@ Words = tuple[tuple[str, str], ...]
 """Texts with their styles, in order."""
 
 _BARS: Final = {100: 24, 60: 12, 0: 6}
-"""Width of the bar by the least width of the line. Fixed widths keep the bar from moving when texts change."""
-_APART: Final = "  "
-_CUT: Final = "..."
+"""Width of the bar by the minimum width of the line. Fixed widths keep the bar from moving when texts change."""
+_SEPARATOR: Final = "  "
+_ELLIPSIS: Final = "..."
 _FULL: Final = "\N{BOX DRAWINGS HEAVY HORIZONTAL}"
 _EMPTY: Final = "\N{BOX DRAWINGS LIGHT HORIZONTAL}"
 
 
 def shortened(text: str, width: int) -> str:
     """Return a text of at most `width` characters. A shortened text ends in `...`."""
-    return text if len(text) <= width else f"{text[: max(width - len(_CUT), 0)]}{_CUT}"[:width]
+    return text if len(text) <= width else f"{text[: max(width - len(_ELLIPSIS), 0)]}{_ELLIPSIS}"[:width]
 
 
 class ProgressBar:
@@ -41,65 +41,65 @@ class ProgressBar:
 
     def __init__(self) -> None:
         self._phase = PhaseStarted("")
-        self._phase_began_s = 0.0
+        self._phase_start_s = 0.0
         self._trial = ""
         self._done, self._total, self._unit = 0.0, 0.0, ""
-        self._ends_s: float | None = None
-        self._asking = False
+        self._end_s: float | None = None
+        self._is_asking = False
 
     @property
     def is_needed(self) -> bool:
-        """True if there is something to show and no input is expected, which a redrawn line would overwrite."""
-        return bool(self._phase.name) and not self._asking
+        """True if there is something to show and no input is expected. A redrawn line would overwrite typed input."""
+        return bool(self._phase.name) and not self._is_asking
 
     def update(self, event: Event) -> None:
         """Update the progress by an event."""
         # Other threads may send events while the operator types.
         is_question = isinstance(event, Request | Asked)
-        self._asking = is_question or (self._asking and not isinstance(event, Answered | Entered))
+        self._is_asking = is_question or (self._is_asking and not isinstance(event, Answered | Entered))
         match event:
             case PhaseStarted():
-                self._phase, self._phase_began_s = event, time.monotonic()
+                self._phase, self._phase_start_s = event, time.monotonic()
             case Progress():
                 if event.what != self._phase.name:
-                    self._phase, self._phase_began_s = PhaseStarted(event.what), time.monotonic()
+                    self._phase, self._phase_start_s = PhaseStarted(event.what), time.monotonic()
                 self._done, self._total, self._unit = event.done, event.total, f" {event.unit}"
-                self._ends_s = None if event.left_s is None else time.monotonic() + event.left_s
+                self._end_s = None if event.left_s is None else time.monotonic() + event.left_s
             case CampaignTrial():
                 self._trial = f"trial {event.number} of {event.total}"
             case TrialStarted():
-                self._done, self._total, self._ends_s = event.done, event.total, None
+                self._done, self._total, self._end_s = event.done, event.total, None
             case RepeatEnded():
                 self._done, self._total = event.done, event.total
-                self._ends_s = time.monotonic() + event.left_s
+                self._end_s = time.monotonic() + event.left_s
             case TrialEnded() | TrialStopped() | CampaignEnded():
-                self._phase, self._done, self._total, self._ends_s = PhaseStarted(""), 0, 0, None
+                self._phase, self._done, self._total, self._end_s = PhaseStarted(""), 0, 0, None
 
     def words(self, width: int) -> Words:
         """Return the line, at most `width` columns long.
 
-        If space is short, the least important texts are left out.
+        If there is too little space, the least important texts are omitted.
         """
         now_s = time.monotonic()
         count = f"{self._done:g}/{self._total:g}{self._unit}" if self._total else ""
-        total_left_s = 0.0 if self._ends_s is None else self._ends_s - now_s
+        total_left_s = 0.0 if self._end_s is None else self._end_s - now_s
         total_left = f"{format_duration(total_left_s)} left" if total_left_s > 0 else ""
-        spent_s = now_s - self._phase_began_s
-        left_s = (self._phase.expected_s or 0.0) - spent_s
+        elapsed_s = now_s - self._phase_start_s
+        left_s = (self._phase.expected_s or 0.0) - elapsed_s
         phase = f"{self._phase.repeat} {self._phase.name}".strip()
-        phase_time = f"{format_duration(left_s)} left" if left_s > 0 else f"for {format_duration(spent_s)}"
-        pieces = [(self._trial, "bold"), (count, ""), (total_left, "dim"), (phase, "cyan"), (phase_time, "dim")]
-        for left_out in (None, self._trial, total_left, phase_time, count):
-            pieces = [piece for piece in pieces if piece[0] and piece[0] is not left_out]
-            free = width - len(_APART.join(text for text, _ in pieces))
+        phase_time = f"{format_duration(left_s)} left" if left_s > 0 else f"for {format_duration(elapsed_s)}"
+        parts = [(self._trial, "bold"), (count, ""), (total_left, "dim"), (phase, "cyan"), (phase_time, "dim")]
+        for omitted in (None, self._trial, total_left, phase_time, count):
+            parts = [part for part in parts if part[0] and part[0] is not omitted]
+            free = width - len(_SEPARATOR.join(text for text, _ in parts))
             if free >= 0:
                 break
-        bar = next(bar for least, bar in _BARS.items() if width >= least)
+        bar = next(bar for min_width, bar in _BARS.items() if width >= min_width)
         words: list[tuple[str, str]] = []
-        for text, style in pieces:
-            words += [(_APART, "")] * bool(words)
-            if text is count and bar + len(_APART) <= free:
+        for text, style in parts:
+            words += [(_SEPARATOR, "")] * bool(words)
+            if text is count and bar + len(_SEPARATOR) <= free:
                 full = int(bar * self._done / self._total)
-                words += [(_FULL * full, "green"), (_EMPTY * (bar - full), "dim"), (_APART, "")]
+                words += [(_FULL * full, "green"), (_EMPTY * (bar - full), "dim"), (_SEPARATOR, "")]
             words.append((shortened(text, width), style))
         return tuple(words)

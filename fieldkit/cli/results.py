@@ -10,7 +10,7 @@ from fieldkit.analysis import table_lines, wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.table_lines import TableLine
-from fieldkit.cli.display import fits, prose, show_error, table
+from fieldkit.cli.display import fits, print_folded, show_error, table
 from fieldkit.cli.hints import completed
 from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
@@ -25,7 +25,7 @@ _SummaryTable = tuple[Row, list[Row]]
 """Head and rows of a table."""
 
 
-def show_summary(cells: Sequence[Cell], *, every: bool = False, expected: Collection[str] = ()) -> int:
+def show_summary(cells: Sequence[Cell], *, show_all: bool = False, expected: Collection[str] = ()) -> int:
     """Print a table per condition, each value with its 95 % interval, and return the number of omitted quantities.
 
     If the terminal is too narrow for that, each protocol has a separate table; if that is still too wide, intervals
@@ -33,7 +33,7 @@ def show_summary(cells: Sequence[Cell], *, every: bool = False, expected: Collec
 
     Args:
         cells: The cells to show.
-        every: True to show all quantities, not only those of `table_lines.operator_lines`.
+        show_all: True to show all quantities, not only those of `table_lines.operator_lines`.
         expected: Names of quantities with an expectation. They are always shown.
     """
     groups: dict[tuple[str | float | None, ...], list[Cell]] = {}
@@ -45,7 +45,7 @@ def show_summary(cells: Sequence[Cell], *, every: bool = False, expected: Collec
         title = ", ".join(str(part) for part in condition)
         shown = (
             table_lines.lines(group)
-            if every
+            if show_all
             else table_lines.with_radio_loss(table_lines.operator_lines(group, expected), group)
         )
         names |= (group_names := {quantity.name for line in shown for quantity in line.quantities})
@@ -53,21 +53,21 @@ def show_summary(cells: Sequence[Cell], *, every: bool = False, expected: Collec
         layouts: Sequence[tuple[list[_SummaryTable], Sequence[int]]] = (
             ([_summary(group, shown)], ()),
             ([_summary([cell], shown) for cell in group], ()),
-            ([_summary([cell], shown, between="\n") for cell in group], (0,)),
+            ([_summary([cell], shown, separator="\n") for cell in group], (0,)),
         )
         tables, fold = next((layout for layout in layouts if all(fits(*part) for part in layout[0])), layouts[-1])
         for head, rows in tables:
             table(head, rows, title=title, right=range(1, len(head)), fold=fold)
     for caution in wording.cautions(cells, names):
-        prose(caution)
+        print_folded(caution)
     return len(left_out)
 
 
-def _summary(group: Sequence[Cell], shown: Sequence[TableLine], between: str = " ") -> _SummaryTable:
-    """Return the head and the rows of a table of one condition, with `between` between the parts of a cell."""
-    figures = [(line.label, *(line.amount(cell, line.scale(group), between) for cell in group)) for line in shown]
+def _summary(group: Sequence[Cell], shown: Sequence[TableLine], separator: str = " ") -> _SummaryTable:
+    """Return the head and the rows of a table of one condition, with `separator` between the parts of a cell."""
+    figures = [(line.label, *(line.amount(cell, line.scale(group), separator) for cell in group)) for line in shown]
     words = [
-        (label, *(wording.tally(cell, name, f",{between}") for cell in group))
+        (label, *(wording.tally(cell, name, f",{separator}") for cell in group))
         for name, label in wording.word_labels(group).items()
     ]
     sent = [(label, *counts) for label, counts in table_lines.sent_counts(group).items()]
@@ -96,7 +96,7 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
     for outcome in ended:
         if not is_json:
             expected = {judgement.expectation.quantity for judgement in outcome.judgements}
-            left_out = max(left_out, show_summary(outcome.cells, every=arguments.all, expected=expected))
+            left_out = max(left_out, show_summary(outcome.cells, show_all=arguments.all, expected=expected))
             expectation_table(outcome.judgements)
         if outcome.failed:
             reasons = outcome.folder / store.TRIAL_CSV
@@ -156,17 +156,17 @@ def _next_commands(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
     if left_out:
         yield f"{shell_command('fieldkit', 'aggregate', *folders, '--all')}  # {more_rows_note(left_out)}"
     cells = [cell for outcome in ended for cell in outcome.cells[:1]]
-    farther = _farther([str(cell.key["distance"]) for cell in cells])
+    farther = _next_distance([str(cell.key["distance"]) for cell in cells])
     if farther and not any(_lost_all(cell) for outcome in ended for cell in outcome.cells):
         yield f"{shell_command('fieldkit', 'trial', cells[-1].key['procedure'], farther)}  # another distance"
 
 
 def _lost_all(cell: Cell) -> bool:
-    """Return True if no ping of a cell was answered. Then a longer distance is not suggested."""
+    """Return True if no ping of a cell was answered. In this case a longer distance is not suggested."""
     return any(plain_name(name) == "rtt_loss" and estimate.value >= 1 for name, estimate in cell.estimates.items())
 
 
-def _farther(distances: Sequence[str]) -> str:
+def _next_distance(distances: Sequence[str]) -> str:
     """Return the last distance plus its difference to the one before, or an empty string if distances are words."""
     matches = [match for distance in distances[-2:] if (match := _LENGTH.fullmatch(distance))]
     if not matches:

@@ -38,7 +38,7 @@ def add_operator(parser: Parser) -> None:
     """Add the options for questions to the operator, and one for each permission."""
     answers = parser.add_mutually_exclusive_group()
     answers.add_argument("--yes", action="store_true", help="ask nothing: the robots are at their positions")
-    answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: from standard input")
+    answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: read from standard input")
     for name, permission in permissions.installed().items():
         parser.add_argument(permissions.option(name), action="store_true", help=permission.help_line)
 
@@ -80,7 +80,7 @@ def add_out(parser: Parser, what: str) -> None:
     )
 
 
-def add_changes(parser: Parser) -> None:
+def add_overrides(parser: Parser) -> None:
     """Add the options that override settings of the procedure."""
     parser.add_choice("--topology", map(str, Topology), help="default: the procedure's")
     parser.add_choice("--protocol", map(str, Protocol), action="append", help=_PROTOCOL_HELP)
@@ -104,7 +104,7 @@ def add_trial(parser: Parser, help_line: str = "folder of a trial") -> None:
 
 
 def add_paths(parser: Parser) -> None:
-    """Add PATH... and `--rebuild`, which `sources.find` takes."""
+    """Add PATH... and `--rebuild`, which `sources.find` reads."""
     parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=PATH_HELP)
     add_rebuild(parser)
 

@@ -1,4 +1,4 @@
-"""The person at the terminal: questions to them, and their Ctrl-C."""
+"""The person at the terminal: questions to this person, and Ctrl-C."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ from fieldkit.trial.running.stop import Stop
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _FINISHING: Final = "finishing the repeat that runs{left}; Ctrl-C again stops it now"
 _STOPPING: Final = "stopping: terminating the programs on the robots"
-_ABANDONED: Final = "no longer waiting for confirmations; the order to stop was sent"
+_WAIT_CANCELLED: Final = "no longer waiting for confirmations; the order to stop was sent"
 _CLEAR_LINE: Final = "\r\x1b[K"
 
 
@@ -61,7 +61,7 @@ class Terminal:
 
 def _require_terminal(what: str, remedy: str) -> None:
     if not sys.stdin.isatty():
-        raise ConfigurationError(f"{what}, and there is no terminal to ask at", remedy=remedy)
+        raise ConfigurationError(f"{what}, but standard input is not a terminal", remedy=remedy)
 
 
 def confirmed(question: str, *, remedy: str) -> bool:
@@ -72,7 +72,7 @@ def confirmed(question: str, *, remedy: str) -> bool:
         remedy: The remedy if there is no terminal.
 
     Raises:
-        ConfigurationError: There is no terminal to ask at.
+        ConfigurationError: Standard input is not a terminal.
     """
     if not sys.stdin.isatty():
         raise ConfigurationError(f"a person must confirm: {question}", remedy=remedy)
@@ -114,20 +114,20 @@ def interruptible() -> Iterator[Stop]:
         if stopping:
             if stop.motions.is_ordered:
                 stop.motions.abandon()
-                _say(_ABANDONED)
+                _write_message(_WAIT_CANCELLED)
             return
-        if stop.motions.order_stop(_say):
+        if stop.motions.order_stop(_write_message):
             stopping = stop.after_saving = True
             if not stop.saving:
                 raise KeyboardInterrupt
             return
         if number == signal.SIGINT and stop.can_finish and not stop.after_repeat:
             stop.after_repeat = True
-            left = f", about {format_duration(stop.left_s)} more" if stop.left_s else ""
-            _say(_FINISHING.format(left=left))
+            remaining_text = f", about {format_duration(stop.left_s)} more" if stop.left_s else ""
+            _write_message(_FINISHING.format(left=remaining_text))
             return
         stopping = True
-        _say(_STOPPING)
+        _write_message(_STOPPING)
         stop.after_saving = True
         if not stop.saving:
             raise KeyboardInterrupt
@@ -149,7 +149,7 @@ def _stop_thread(stop: Stop) -> Iterator[None]:
     def watch() -> None:
         while numbers := receiver.recv(64):
             if any(number in _SIGNALS for number in numbers):
-                stop.motions.order_stop(_say)
+                stop.motions.order_stop(_write_message)
 
     thread = threading.Thread(target=watch, name="signals", daemon=True)
     with receiver, sender:
@@ -164,7 +164,7 @@ def _stop_thread(stop: Stop) -> Iterator[None]:
             thread.join()
 
 
-def _say(text: str) -> None:
+def _write_message(text: str) -> None:
     """Write unbuffered over the live line, because the signal may have interrupted another write."""
     start = _CLEAR_LINE if sys.stderr.isatty() else "\n"
     try:

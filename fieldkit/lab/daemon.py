@@ -1,4 +1,4 @@
-"""The lab's process: moves to the background, starts the robots, answers on a Unix socket, and stops the robots."""
+"""The lab's process: starts the robots, detaches from the terminal, answers requests, and stops the robots."""
 
 import os
 import shlex
@@ -39,21 +39,21 @@ def run_detached(work: Callable[[OnReady], int]) -> int:
     Returns:
         0 if start-up is complete, the exit code of `work` if it exited before.
     """
-    reader, writer = os.pipe()
+    ready_reader, ready_writer = os.pipe()
     sys.stdout.flush()  # otherwise the child would write the buffered text again
     pid = os.fork()
     if pid == 0:
-        os.close(reader)
+        os.close(ready_reader)
         code = 1
         try:
-            code = work(lambda log: _leave(writer, log))
-        except BaseException:  # noqa: BLE001 (reported as by the interpreter; the parent does its own clean-up)
+            code = work(lambda log: _detach(ready_writer, log))
+        except BaseException:  # noqa: BLE001 (reported as the interpreter reports it; only the parent cleans up)
             sys.excepthook(*sys.exc_info())
         sys.stdout.flush()
         os._exit(code)
-    os.close(writer)
+    os.close(ready_writer)
     try:
-        with os.fdopen(reader, "rb") as ready:
+        with os.fdopen(ready_reader, "rb") as ready:
             if ready.read() == _READY:
                 return 0
     except BaseException:
@@ -63,7 +63,7 @@ def run_detached(work: Callable[[OnReady], int]) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
-def _leave(writer: int, log: Path) -> None:
+def _detach(ready_writer: int, log: Path) -> None:
     """Detach from the terminal and the current directory, and notify the parent that start-up is complete."""
     sys.stdout.flush()
     os.setsid()
@@ -74,8 +74,8 @@ def _leave(writer: int, log: Path) -> None:
         os.dup2(source, target)
     os.close(null)
     os.close(output)
-    os.write(writer, _READY)
-    os.close(writer)
+    os.write(ready_writer, _READY)
+    os.close(ready_writer)
 
 
 REQUEST_S: Final = 5.0
@@ -102,24 +102,24 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready:
     """
     with (
         _until_signal(),
-        _claimed(folder),
+        _lab_lock(folder),
         _listening(folder) as listener,
         backend.open_lab(seed=seed, sink=sink) as robots,
     ):
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         write_ssh_config(folder, robots.login)
         ready(robots)
         while True:
             client, _ = listener.accept()
-            _serve(client, robots, began_s)
+            _serve(client, robots, start_s)
 
 
 @contextmanager
-def _claimed(folder: LabFolder) -> Iterator[None]:
+def _lab_lock(folder: LabFolder) -> Iterator[None]:
     """Hold the lock that allows only one lab per directory."""
     with ExitStack() as stack:
         try:
-            stack.enter_context(runtime.hold_lock(folder.claim))
+            stack.enter_context(runtime.hold_lock(folder.lock_name))
         except NameHeldError as error:
             raise ConfigurationError("this directory has a lab that is up", remedy="fieldkit lab down") from error
         yield
@@ -159,7 +159,7 @@ def _until_signal() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _serve(client: socket.socket, robots: Lab, began_s: float) -> None:
+def _serve(client: socket.socket, robots: Lab, start_s: float) -> None:
     """Answer one request; errors of the connection and invalid requests are ignored."""
     with closing(client):
         client.settimeout(REQUEST_S)
@@ -169,7 +169,7 @@ def _serve(client: socket.socket, robots: Lab, began_s: float) -> None:
                 case "connect":
                     _pass_socket(client, robots, arguments)
                 case "state":
-                    client.sendall(requests.pack_state(_state(robots, time.monotonic() - began_s)))
+                    client.sendall(requests.pack_state(_state(robots, time.monotonic() - start_s)))
                 case "overview":
                     client.sendall(requests.pack_overview(robots.overview()))
                 case "move":

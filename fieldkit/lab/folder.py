@@ -45,7 +45,7 @@ class LabFolder:
         return self.path / "log"
 
     @property
-    def claim(self) -> str:
+    def lock_name(self) -> str:
         """Name of the lock that only one process can hold, see `runtime.hold_lock`."""
         return f"lab-{self.path.name}"
 

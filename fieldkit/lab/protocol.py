@@ -105,7 +105,7 @@ class Overview:
         area_m: Its extent, metres east and north from the origin.
         outlines: Obstacles in drawing order: an obstacle that covers others comes after them.
         robots: Position of each robot.
-        links: Links between each two robots; empty if the radio does not depend on positions.
+        links: The link of each pair of robots; empty if the radio does not depend on positions.
     """
 
     world: str
@@ -163,7 +163,7 @@ class LabBackend(Protocol):
     """A backend that can start all robots of its site file together, with or without roles."""
 
     def open_lab(self, *, seed: int, sink: Sink) -> AbstractContextManager[Lab]:
-        """Start every robot, in radio range of the others if the world allows it.
+        """Start all robots, within radio range of each other if the world allows it.
 
         Raises:
             FieldkitError: A permission or a program is missing, or a robot did not start.

@@ -17,7 +17,7 @@ from fieldkit.core.model import Vector
 from fieldkit.lab.folder import LabFolder
 from fieldkit.lab.protocol import Destination, Overview
 
-_FAMILIES: Final = {family.__name__: family for family in (ConfigurationError, LinkError)}
+_ERROR_CLASSES: Final = {error_class.__name__: error_class for error_class in (ConfigurationError, LinkError)}
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class _Place:
 
 
 @dataclass(frozen=True)
-class _Refusal:
+class _ErrorAnswer:
     error: str
     what: str
     remedy: str
@@ -72,7 +72,7 @@ _STATE: Final = Codec(LabState)
 _OVERVIEW: Final = Codec(Overview)
 _DESTINATION: Final = Codec(Destination)
 _PLACE: Final = Codec(_Place)
-_REFUSAL: Final = Codec(_Refusal)
+_ERROR_ANSWER: Final = Codec(_ErrorAnswer)
 
 
 def pack_state(state: LabState) -> bytes:
@@ -97,8 +97,8 @@ def pack_place(place_m: Vector) -> bytes:
 
 def pack_error(error: FieldkitError) -> bytes:
     """Return an error as JSON, which the client raises."""
-    family = type(error).__name__ if type(error).__name__ in _FAMILIES else LinkError.__name__
-    return json.dumps(_REFUSAL.dump(_Refusal(family, error.what, error.remedy))).encode()
+    error_class = type(error).__name__ if type(error).__name__ in _ERROR_CLASSES else LinkError.__name__
+    return json.dumps(_ERROR_ANSWER.dump(_ErrorAnswer(error_class, error.what, error.remedy))).encode()
 
 
 def unpack_state(answer: bytes) -> LabState:
@@ -133,15 +133,15 @@ def unpack_destination(request: str) -> Destination:
 def _read(answer: bytes) -> object:
     content = json.loads(answer)
     if isinstance(content, dict) and "error" in content:
-        refusal = _REFUSAL.parse(content)
-        raise _FAMILIES.get(refusal.error, LinkError)(refusal.what, remedy=refusal.remedy)
+        error_answer = _ERROR_ANSWER.parse(content)
+        raise _ERROR_CLASSES.get(error_answer.error, LinkError)(error_answer.what, remedy=error_answer.remedy)
     return content
 
 
 Answer = TypeVar("Answer")
 
-_REPLY_S: Final = 20.0
-_END_S: Final = 20.0
+_REPLY_TIMEOUT_S: Final = 20.0
+_EXIT_TIMEOUT_S: Final = 20.0
 _NO_LAB: Final = "this directory has no lab that is up"
 
 
@@ -180,22 +180,22 @@ def end(folder: LabFolder) -> None:
         NoLabError: No lab is up.
         LinkError: It does not exit.
     """
-    with _connected(folder) as lab:
+    with _lab_connection(folder) as lab:
         # The kernel reports which process listens on the socket, so that no other process is killed.
         credentials = lab.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
         process = os.pidfd_open(struct.unpack("3i", credentials)[0])
     try:
         for number in (signal.SIGTERM, signal.SIGKILL):
             signal.pidfd_send_signal(process, number)
-            if select.select([process], [], [], _END_S)[0]:
+            if select.select([process], [], [], _EXIT_TIMEOUT_S)[0]:
                 return
     finally:
         os.close(process)
-    raise LinkError("the lab does not exit, not even after SIGKILL", remedy="see what blocks it: ps axf")
+    raise LinkError("the lab does not exit, not even after SIGKILL", remedy="find the process that blocks it: ps axf")
 
 
 def _request(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -> Answer:
-    with _connected(folder) as lab:
+    with _lab_connection(folder) as lab:
         try:
             lab.sendall(f"{request}\n".encode())
             return read(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
@@ -204,9 +204,9 @@ def _request(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -
 
 
 @contextmanager
-def _connected(folder: LabFolder) -> Iterator[socket.socket]:
+def _lab_connection(folder: LabFolder) -> Iterator[socket.socket]:
     with socket.socket(socket.AF_UNIX) as lab:
-        lab.settimeout(_REPLY_S)
+        lab.settimeout(_REPLY_TIMEOUT_S)
         try:
             lab.connect(str(folder.socket))
         except OSError as error:

@@ -23,7 +23,7 @@ PROPERTY: Final = "fieldkit_evidence"
 """Property of a failed test in JUnit XML with the path of its folder."""
 
 _SHARED: Final = "set-up"
-_LONGEST: Final = 100
+_MAX_NAME_LENGTH: Final = 100
 _SECTION: Final = "fieldkit evidence"
 
 
@@ -58,7 +58,7 @@ class EvidenceFolder:
         return self._created
 
     @property
-    def is_there(self) -> bool:
+    def exists(self) -> bool:
         """Whether the folder was created."""
         return self._created is not None
 
@@ -68,7 +68,7 @@ class EvidenceFolder:
         with (self.path / LOG).open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now(UTC):%H:%M:%S.%f} {lines}\n")
 
-    def settle(self, keep: Keep) -> None:
+    def remove_unless_kept(self, keep: Keep) -> None:
         """Remove the folder unless it must be kept; later content gets a new folder."""
         if self._created is not None and (keep is Keep.NONE or (keep is Keep.FAILED and not self.has_failed)):
             shutil.rmtree(self._created, ignore_errors=True)
@@ -109,42 +109,44 @@ class EvidenceKeeper:
         file, _, name = item.nodeid.partition("::")
         of_file = self._run / _as_name(file)
         if item.path != self._file:
-            self._set_up_folder.settle(self._keep)
+            self._set_up_folder.remove_unless_kept(self._keep)
             self._file, self._set_up_folder = item.path, EvidenceFolder(of_file / _SHARED)
         self._test_folder = EvidenceFolder(of_file / _as_name(name))
         self._item, self._is_set_up = item, True
 
-    def call(self, item: pytest.Item) -> None:
-        """Assign evidence from now on to the test itself instead of to the set-up, which several tests may share."""
+    def begin_test(self, item: pytest.Item) -> None:
+        """Assign later evidence to the test instead of the set-up, which several tests may share."""
         if item is self._item:
             self._is_set_up = False
 
-    def judge(self, item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:
+    def process_report(self, item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:
         """Process the report of a phase of a test: add the evidence folders of a failure, clean up after the test."""
         if item is not self._item:
             return
         if report.failed:
             self._test_folder.has_failed = self._set_up_folder.has_failed = True
             _as_lab_error(item, call, report)
-            report.sections += [(_SECTION, path) for path in self._kept()]
+            report.sections += [(_SECTION, path) for path in self._kept_folders()]
         if call.when == "teardown":
-            report.user_properties += [(PROPERTY, path) for path in self._kept() if self._test_folder.has_failed]
-            self._test_folder.settle(self._keep)
+            report.user_properties += [
+                (PROPERTY, path) for path in self._kept_folders() if self._test_folder.has_failed
+            ]
+            self._test_folder.remove_unless_kept(self._keep)
             self._item, self._is_set_up = None, True
 
     def end(self) -> None:
         """Clean up the evidence of the last module, and remove empty folders."""
-        self._set_up_folder.settle(self._keep)
+        self._set_up_folder.remove_unless_kept(self._keep)
         for folder in (self._run, self._run.parent):
             with suppress(OSError):
                 folder.rmdir()
 
-    def _kept(self) -> list[str]:
+    def _kept_folders(self) -> list[str]:
         """Return the evidence folders of the running test that are kept."""
         return [
             str(folder.path)
             for folder in (self._test_folder, self._set_up_folder)
-            if folder.is_there and self._keep is not Keep.NONE
+            if folder.exists and self._keep is not Keep.NONE
         ]
 
 
@@ -180,11 +182,11 @@ def _line(event: Event) -> str:
 
 
 def _as_name(text: str) -> str:
-    """Return text as the name of a folder; long texts are cut and get a hash."""
+    """Return text as the name of a folder; a long text is truncated and a hash is added."""
     name = re.sub(r"[^\w.-]+", "-", text).strip("-.") or "tests"
-    if len(name) <= _LONGEST:
+    if len(name) <= _MAX_NAME_LENGTH:
         return name
-    return f"{name[:_LONGEST]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+    return f"{name[:_MAX_NAME_LENGTH]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def _new_folder(requested: Path) -> Path:

@@ -53,19 +53,19 @@ class Uncaptured:
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:  # noqa: ARG002 (a test cannot be skipped here)
         """Ask a person to do something, as `Operator.ask`."""
-        return self._uncaptured(request, lambda: self._terminal.ask(request))
+        return self._ask_uncaptured(request, lambda: self._terminal.ask(request))
 
     def enter(self, question: Question) -> str:
         """Ask a person a question, as `Operator.enter`."""
-        return self._uncaptured(f"answer: {question.text}", lambda: self._terminal.enter(question))
+        return self._ask_uncaptured(f"answer: {question.text}", lambda: self._terminal.enter(question))
 
-    def _uncaptured(self, task: str, ask: Callable[[], T]) -> T:
+    def _ask_uncaptured(self, task: str, ask: Callable[[], T]) -> T:
         if self._capture is not None:
             self._capture.suspend(in_=True)
         try:
             if not sys.stdin.isatty():
                 raise ConfigurationError(
-                    f"a person must {task}, but there is no terminal to ask at",
+                    f"a person must {task}, but standard input is not a terminal",
                     remedy="place the robots first, then add --fieldkit-yes",
                 )
             return ask()
@@ -160,7 +160,7 @@ class OpenedLab:
         return self._testbed
 
     def place(self, distance: str, scenario: str = "los") -> None:
-        """Move the robots to other places, where they stay; a person is asked to carry real robots.
+        """Move the robots to other positions and leave them there; a person is asked to carry real robots.
 
         Args:
             distance: Distance between the robots, or between each of them and the relay: `30ft`.

@@ -66,7 +66,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_call(item: pytest.Item) -> None:
     """Separate the evidence of the test itself from that of its set-up, which it may share with other tests."""
     if keeper := item.config.stash.get(_KEEPER, None):
-        keeper.call(item)
+        keeper.begin_test(item)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -76,7 +76,7 @@ def pytest_runtest_makereport(
     """Report the evidence of a failed test, and remove that of a passed one."""
     report = yield
     if keeper := item.config.stash.get(_KEEPER, None):
-        keeper.judge(item, call, report)
+        keeper.process_report(item, call, report)
     return report
 
 

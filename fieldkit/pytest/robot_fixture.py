@@ -17,8 +17,8 @@ from fieldkit.measure.evidence import link_samples
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.shell import Completed, Shell
 
-# The inner shell becomes the program, which therefore receives SIGINT as from Ctrl-C. The signal is sent when our end
-# of standard input closes, also because this process was killed. The outer shell returns an exit code in any case.
+# The inner shell becomes the program, which therefore receives SIGINT as from Ctrl-C. The signal is sent when
+# standard input is closed, also if this process was killed. The outer shell returns an exit code in any case.
 _UNTIL_CLOSED: Final = (
     'exec 3<&0; { cat <&3 >/dev/null; kill -INT "$$"; sleep 2; kill -TERM "$$"; sleep 2; kill -KILL "$$"; } '
     '>/dev/null 2>&1 & exec "$@" 3<&- </dev/null'
@@ -138,8 +138,8 @@ class RobotHandle:
     ) -> ProgramOutput:
         """Run a program and wait until it exits.
 
-        If the connection is lost, it is opened again and the program is run again from its start. So do not run
-        programs that must not run twice.
+        If the connection is lost, it is opened again and the program is run again from its start. Do not use
+        it for programs that must not run twice.
 
         Args:
             argv: The program with its arguments; they are not interpreted by a shell.
@@ -239,8 +239,8 @@ class RobotHandle:
         if testbed.oracle is not None:
             return testbed.oracle.links(continue_sampling=False)[self.role][-1]
         command = ("iw", "dev", self._robot.profile.radio.interface, "station", "dump")
-        done = self._shell.run(command, deadline=Deadline.after(TIMEOUT_S), check=False)
-        return LinkSample(time.time_ns(), link_samples.parse_stations(done.stdout.decode(errors="replace")))
+        completed = self._shell.run(command, deadline=Deadline.after(TIMEOUT_S), check=False)
+        return LinkSample(time.time_ns(), link_samples.parse_stations(completed.stdout.decode(errors="replace")))
 
     @property
     def _robot(self) -> Robot:
@@ -275,20 +275,20 @@ class RobotHandle:
     def _result(self, argv: Sequence[str], wait: Callable[[], Completed], *, check: bool = False) -> ProgramOutput:
         """Return the result of a program; a timeout fails the test and is not an error of the robot."""
         __tracebackhide__ = True
-        words = f"{self.name} $ {quote(argv)}"
+        command_text = f"{self.name} $ {quote(argv)}"
         try:
-            done = wait()
+            completed = wait()
         except LinkLostError:
             raise
         except LinkError as error:
-            self._lab.log(f"{words}\n{error.what}")
+            self._lab.log(f"{command_text}\n{error.what}")
             raise ProgramError(f"{self.name}: {error.what}") from None
-        out, err = (text.decode(errors="replace") for text in (done.stdout, done.stderr))
-        self._lab.log(f"{words}\n{out}{err}exit code {done.exit_code}")
-        if check and done.exit_code != 0:
+        out, err = (text.decode(errors="replace") for text in (completed.stdout, completed.stderr))
+        self._lab.log(f"{command_text}\n{out}{err}exit code {completed.exit_code}")
+        if check and completed.exit_code != 0:
             excerpt = sanitized((err or out).strip())[-_MAX_SHOWN_CHARACTERS:] or "it printed nothing"
-            raise ProgramError(f"{self.name}: `{quote(argv)}` exited with code {done.exit_code}: {excerpt}")
-        return ProgramOutput(tuple(argv), done.exit_code, out, err)
+            raise ProgramError(f"{self.name}: `{quote(argv)}` exited with code {completed.exit_code}: {excerpt}")
+        return ProgramOutput(tuple(argv), completed.exit_code, out, err)
 
 
 class RobotHandles:

@@ -68,12 +68,12 @@ class TrialRunner:
         """
         __tracebackhide__ = True
         protocols = (protocol,) if isinstance(protocol, str) else tuple(protocol)
-        chosen = topology or self._lab.options.topology
+        topology_name = topology or self._lab.options.topology
         arguments = argparse.Namespace(
             procedure=procedure,
-            topology=chosen and one_of(Topology, chosen, "topology"),
+            topology=topology_name and one_of(Topology, topology_name, "topology"),
             protocol=[one_of(Protocol, name, "protocol") for name in protocols],
-            repeats=_positive(repeats),
+            repeats=_require_positive(repeats),
             record=record,
         )
         request = command_line.request(arguments, parse_distance(distance), seed=self._lab.options.seed, notes=notes)
@@ -93,7 +93,7 @@ class TrialRunner:
         return _load_checked(outcome)
 
 
-def _positive(repeats: int | None) -> int | None:
+def _require_positive(repeats: int | None) -> int | None:
     if repeats is not None and repeats < 1:
         raise ConfigurationError(f"{repeats} repeats measure nothing", remedy="write for example repeats=2")
     return repeats
@@ -107,11 +107,11 @@ def _load_checked(outcome: Outcome) -> Trials:
             where=str(outcome.folder),
             remedy="see its log; to find what the robots lack: fieldkit check",
         )
-    _demand_expected(outcome.judgements)
+    _require_expected(outcome.judgements)
     return load(outcome.folder)
 
 
-def _demand_expected(judgements: Sequence[Judgement]) -> None:
+def _require_expected(judgements: Sequence[Judgement]) -> None:
     __tracebackhide__ = True
     unmet = [
         " ".join(filter(None, wording.judgement_texts(judgement))) for judgement in judgements if not judgement.holds

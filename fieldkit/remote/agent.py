@@ -15,7 +15,7 @@ _INSTALL_S: Final = 30.0
 
 _ROOT: Final = Path(__file__).parents[1]
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
-_CHECK_SCRIPT: Final = '[ -O "$1" ] && [ ! -L "$1" ] && said=$(sha256sum <"$1") && [ "${said%% *}" = "$2" ]'
+_CHECK_SCRIPT: Final = '[ -O "$1" ] && [ ! -L "$1" ] && actual=$(sha256sum <"$1") && [ "${actual%% *}" = "$2" ]'
 _COPY_SCRIPT: Final = 'umask 077 && cat >"$1.$$" && mv "$1.$$" "$1"'
 _START: Final = "import sys\nfrom fieldkit.agent.__main__ import main\nsys.exit(main(sys.argv[1:]))\n"
 
@@ -54,7 +54,7 @@ def _name() -> str:
 
 
 def install(shell: Shell) -> None:
-    """Copy the agent to the robot if it is missing there. The job script must be installed, which creates the folder.
+    """Copy the agent to the robot if it is missing there; the installed job script has created the folder.
 
     Raises:
         LinkError: The robot did not answer.

@@ -1,4 +1,4 @@
-"""Reader of the tar archives that robots send, which may contain regular files with short names only.
+"""Reader of the tar archives that robots send. They may contain only regular files with short names.
 
 Header layout: POSIX.1-2017, pax, "ustar Interchange Format". The reader of the standard library supports many
 extensions, each of which would let a robot send unexpected content.

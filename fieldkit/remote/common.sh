@@ -44,7 +44,7 @@
 #                                        `silent`, or `alarm` (a drone may be in the air)
 #   job.sh life_signs FILE               print FILE and the time since boot
 #   job.sh needs                         fail if a program is missing that this script calls
-#   job.sh stand                         print `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`, as
+#   job.sh command_loop                  print `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`, as
 #                                        if the script was called with it. On both streams NONCE precedes the output, and
 #                                        NONCE and the exit code follow it; with `held` only after another line was read
 #

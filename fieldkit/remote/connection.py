@@ -12,7 +12,7 @@ from fieldkit.core.units import format_duration
 from fieldkit.remote.identity import Address, Credentials
 from fieldkit.remote.link import BROKEN, Connect, Link, LoginRefusedError, Timing
 from fieldkit.remote.login import closed_error, log_in
-from fieldkit.remote.standing import ShellPool
+from fieldkit.remote.persistent_shells import ShellPool
 
 T = TypeVar("T")
 
@@ -57,22 +57,22 @@ class Connection:
         self._timing = timing
         self._connecting = threading.Lock()  # held by the thread that logs in
         self._lock = threading.Lock()  # of the attributes below; no thread waits while it holds this lock
-        self._ended = threading.Event()  # set and replaced by `close`; each wait keeps the event from its start
+        self._close_event = threading.Event()  # `close` sets and replaces it; each wait uses the event of its start
         self._link: Link | None = None
         self._was_up = False
         self._lost_at_s: float | None = None
         self._reopened_at_s: float | None = None
         self._pause_s, self._suppress_notices = timing.pause_s, False
-        self._silences: list[Deadline] = []
+        self._silent_periods: list[Deadline] = []
 
     @property
-    def ended(self) -> threading.Event:
+    def close_event(self) -> threading.Event:
         """An event that the next call of `close` sets."""
-        return self._ended
+        return self._close_event
 
     def link(self, deadline: Deadline) -> Link:
         """Return the link, which is opened again if it is not alive; raises as `log_in`."""
-        ended, within = self._ended, deadline.earlier_of(self._timing.connect_s)
+        close_event, within = self._close_event, deadline.earlier_of(self._timing.connect_s)
         if not self._connecting.acquire(timeout=within.remaining_s):
             raise LinkLostError("another command is still connecting", where=self.address.robot)
         try:
@@ -82,10 +82,15 @@ class Connection:
             if self._was_up and self._silence_s():
                 raise LinkLostError("the link is lost, and the radio is being measured", where=self.address.robot)
             link = log_in(
-                self.address, self._connect, self._credentials, timing=self._timing, deadline=within, ended=ended
+                self.address,
+                self._connect,
+                self._credentials,
+                timing=self._timing,
+                deadline=within,
+                close_event=close_event,
             )
             with self._lock:
-                if ended.is_set():
+                if close_event.is_set():
                     link.close()
                     raise closed_error(self.address)
                 lost_at_s, self._lost_at_s = self._lost_at_s, None
@@ -95,7 +100,7 @@ class Connection:
             self._connecting.release()
         if lost_at_s is not None and not self._suppress_notices:
             duration = format_duration(time.monotonic() - lost_at_s)
-            self._notice(f"{self.address.robot}: the link is back after {duration}")
+            self._notice(f"{self.address.robot}: the link is open again after {duration}")
         return link
 
     def run_with_retries(self, attempt: Callable[[Deadline], T], deadline: Deadline) -> T:
@@ -109,24 +114,24 @@ class Connection:
             LinkError: The deadline passed with an open link, the link was not restored, or `close` was called.
             FieldkitError: As `attempt` and `log_in`.
         """
-        ended, final = self._ended, Deadline(deadline.at_s + self._patience_s)
+        close_event, final = self._close_event, Deadline(deadline.at_s + self._patience_s)
         while True:
             try:
                 return attempt(deadline)
             except (LinkError, LoginRefusedError) as error:
-                if ended.is_set():
+                if close_event.is_set():
                     raise closed_error(self.address) from error
                 if not isinstance(error, (LinkLostError, LoginRefusedError)) or not self._was_up:
                     raise
-                self._wait_for_link(error, final, ended)
+                self._wait_for_link(error, final, close_event)
             deadline = deadline.later_of(self._timing.reply_s)
 
     def _wait_for_link(
-        self, error: LinkLostError | LoginRefusedError, final: Deadline, ended: threading.Event
+        self, error: LinkLostError | LoginRefusedError, final: Deadline, close_event: threading.Event
     ) -> None:
-        """Return when the link is open again; raise the last error after the patience, or at `final`.
+        """Return when the link is open again; raise the last error after `patience_s`, or at `final`.
 
-        A robot that refuses the login although it accepted it before is treated as one that boots.
+        A robot that refuses the login although it accepted it before is treated as a robot that boots.
         """
         with self._lock:
             if self._link is not None and self._link.alive:
@@ -135,13 +140,13 @@ class Connection:
             if is_first:
                 self._register_loss()
             lost_at_s = self._lost_at_s = self._lost_at_s or time.monotonic()
-        silence_s = self._wait_for_silence(error, ended, notify=is_first)
+        silence_s = self._wait_for_silence(error, close_event, notify=is_first)
         until = Deadline(min(final.at_s, lost_at_s + silence_s + self._patience_s))
         if is_first and not silence_s and not self._suppress_notices:
             self._notify_lost(until)
         pause_s = self._pause_s
         while not until.expired:
-            if ended.wait(min(pause_s, until.remaining_s)):
+            if close_event.wait(min(pause_s, until.remaining_s)):
                 raise closed_error(self.address) from error
             try:
                 self.link(until.later_of(self._timing.connect_s))
@@ -170,14 +175,14 @@ class Connection:
             patience = format_duration(until.remaining_s)
             self._notice(f"{self.address.robot}: the link is lost; trying again for {patience}")
 
-    def _wait_for_silence(self, error: Exception, ended: threading.Event, *, notify: bool) -> float:
+    def _wait_for_silence(self, error: Exception, close_event: threading.Event, *, notify: bool) -> float:
         """Wait until the radio is not measured any more; return the maximum seconds that this could take."""
         initial_s = self._silence_s()
         if initial_s and notify:
             wait = format_duration(initial_s)
             self._notice(f"{self.address.robot}: the link is lost; for {wait} at most its radio is being measured")
         while silence_s := self._silence_s():
-            if ended.wait(min(_POLL_S, silence_s)):
+            if close_event.wait(min(_POLL_S, silence_s)):
                 raise closed_error(self.address) from error
         return initial_s
 
@@ -223,18 +228,18 @@ class Connection:
 
     @contextmanager
     def _block_opening(self, seconds: float) -> Iterator[Deadline]:
-        """Prevent that links, channels or shells are opened during the body, at most for `seconds`.
+        """Allow no thread to open a link, channel or shell during the body, at most for `seconds`.
 
         Several steps may measure at the same time; the latest end applies.
         """
         until = Deadline.after(seconds)
         with self._lock:
-            self._silences.append(until)
+            self._silent_periods.append(until)
         try:
             yield until
         finally:
             with self._lock:
-                self._silences = [silence for silence in self._silences if silence is not until]
+                self._silent_periods = [silence for silence in self._silent_periods if silence is not until]
 
     def _extend_timeout(self, link: Link | None, seconds: float) -> None:
         if link is not None:
@@ -242,15 +247,15 @@ class Connection:
                 link.extend_timeout(seconds)
 
     def _silence_s(self) -> float:
-        """Return the time for which no link, channel or shell may be opened; 0 if they may."""
-        return max((silence.remaining_s for silence in self._silences), default=0.0)
+        """Return the remaining time in which no link, channel or shell may be opened; 0 if they may be opened."""
+        return max((silence.remaining_s for silence in self._silent_periods), default=0.0)
 
     def close(self) -> None:
         """Close the link, and end all waits for it in other threads."""
         with self._lock:
-            self._ended.set()
-            self._ended = threading.Event()
+            self._close_event.set()
+            self._close_event = threading.Event()
             link, self._link = self._link, None
-            self._was_up, self._lost_at_s, self._silences = False, None, []
+            self._was_up, self._lost_at_s, self._silent_periods = False, None, []
         if link is not None:
             link.close()

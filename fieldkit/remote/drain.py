@@ -8,12 +8,12 @@ from fieldkit.core.deadline import Deadline, ExpiredError
 from fieldkit.core.errors import RobotError
 from fieldkit.remote.command import printable
 from fieldkit.remote.link import Channel
-from fieldkit.remote.standing import Execution
+from fieldkit.remote.persistent_shells import Execution
 
 _CHUNK: Final = 1 << 16
 _LINK_ERROR_S: Final = 0.5
 _MAX_WAIT_S: Final = 1.0
-"""Maximum time of one wait: Python handles a Ctrl-C that arrived just before the wait only after it."""
+"""Maximum time of one wait. If Ctrl-C arrives just before a wait, Python handles it only after the wait."""
 
 
 def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, robot: str) -> bool:
@@ -27,15 +27,15 @@ def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, 
         start_s, wait_s = time.monotonic(), min(deadline.remaining_s, _MAX_WAIT_S)
         channel.settimeout(wait_s)
         try:
-            piece = channel.recv(remaining)  # `select` would also report standard error, which only `drain` reads
+            chunk = channel.recv(remaining)  # `select` would also report standard error, which only `drain` reads
         except TimeoutError:
             deadline = deadline.extended_by_suspension(start_s, wait_s)
             continue
-        remaining -= len(piece)
-        if not piece:
+        remaining -= len(chunk)
+        if not chunk:
             if not channel.status_event.wait(deadline.remaining_s):
                 break
-            _exit_code(channel, b"", robot)  # raises if the link ended, and not the command
+            _exit_code(channel, b"", robot)  # raises if the link has ended, not the command
             return False
     if remaining:
         raise ExpiredError("report")

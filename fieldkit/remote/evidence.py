@@ -55,9 +55,9 @@ def begin(
         RobotError: Its disk has less free space than needed, or cannot be written.
     """
     command = begin_command(folder, role, interface, old=old, token=token, need_kib=need_kib)
-    done = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
-    require_success(shell, done)
-    return printable(done.stdout)
+    completed = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
+    require_success(shell, completed)
+    return printable(completed.stdout)
 
 
 def boot_id(shell: Shell) -> str:
@@ -67,12 +67,12 @@ def boot_id(shell: Shell) -> str:
         LinkError: The robot did not answer.
         RobotError: The boot ID cannot be read.
     """
-    done = shell.run(("cat", "/proc/sys/kernel/random/boot_id"), deadline=Deadline.after(REPLY_S))
-    return printable(done.stdout)
+    completed = shell.run(("cat", "/proc/sys/kernel/random/boot_id"), deadline=Deadline.after(REPLY_S))
+    return printable(completed.stdout)
 
 
 def end_jobs(shell: Shell, folder: str) -> None:
-    """Stop all running jobs of the attempt, and prevent that others start; raises as `begin`."""
+    """Stop all running jobs of the attempt, and block the start of others; raises as `begin`."""
     call(shell, "end", folder, deadline=Deadline.after(2 * REPLY_S))
 
 
@@ -86,10 +86,10 @@ def discard_attempt(shell: Shell, folder: str) -> None:
     call(shell, "drop", folder, deadline=Deadline.after(REPLY_S))
 
 
-def discard(shell: Shell, trial: str, *, but: Collection[str] = ()) -> None:
-    """Delete all files of `trial` on the robot, except the folders of the attempts in `but`; raises as `begin`."""
-    if but:
-        kept = (folder.rpartition("/")[2] for folder in but)
-        call(shell, "tidy", f"{HOME}/{trial}", *kept, deadline=Deadline.after(REPLY_S))
+def discard(shell: Shell, trial: str, *, kept_folders: Collection[str] = ()) -> None:
+    """Delete all files of `trial` on the robot, except `kept_folders` of attempts; raises as `begin`."""
+    if kept_folders:
+        names = (folder.rpartition("/")[2] for folder in kept_folders)
+        call(shell, "tidy", f"{HOME}/{trial}", *names, deadline=Deadline.after(REPLY_S))
     else:
         call(shell, "drop", f"{HOME}/{trial}", deadline=Deadline.after(REPLY_S))

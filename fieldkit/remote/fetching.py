@@ -20,18 +20,19 @@ from fieldkit.remote.shell import Shell
 PIECE_BYTES: Final = 1 << 22
 """Size of the pieces in which large files are fetched, and maximum total size of the small files in the archive."""
 
-ALWAYS_BYTES: Final = 1 << 30
+ALWAYS_ALLOWED_BYTES: Final = 1 << 30
 EXPECTED_TIMES: Final = 4
 UNEXPECTED_SHARE: Final = 0.1
-"""The total size of large files is limited to the largest of `ALWAYS_BYTES`, `EXPECTED_TIMES` the expected size, and
-`UNEXPECTED_SHARE` of the free disk: a camera may send more than its profile says, but must not fill this disk."""
+"""The total size of large files is limited to the largest of three values: `ALWAYS_ALLOWED_BYTES`, `EXPECTED_TIMES`
+the expected size, and `UNEXPECTED_SHARE` of the free disk. A camera may send more than its profile says, but must not
+fill this disk."""
 
 RESERVE_BYTES: Final = 100 << 20
 """Disk space of this machine that evidence must leave free."""
 
 _PIECE_S: Final = 300.0
-"""Timeout of a piece, which a link with 14 kB/s needs."""
-_SUMMED_BYTES_PER_S: Final = 2e6
+"""Timeout of a piece: the time that a link with 14 kB/s needs."""
+_MIN_HASH_BYTES_PER_S: Final = 2e6
 """Minimum rate of sha256sum on a robot: a tenth of that on a Raspberry Pi Zero."""
 
 _PACKED_BYTES: Final = 2 * PIECE_BYTES
@@ -41,8 +42,8 @@ _LIST_CHUNKS: Final = 2
 _REPORT_S: Final = 5.0
 
 _NO_FOLDER: Final = "no folder "
-_LATE: Final = "job "
-_SUMS: Final = re.compile(r"\.sums-[0-9]{1,10}\Z", re.ASCII)
+_LATE_JOB: Final = "job "
+_HASH_LIST: Final = re.compile(r"\.sums-[0-9]{1,10}\Z", re.ASCII)
 _LARGE: Final = re.compile(r"\.large-[0-9]{1,10}\Z", re.ASCII)
 _SIZE: Final = re.compile(r"[0-9]{1,15}\Z", re.ASCII)
 # At most 97 characters in total, which every tar writes without an extension.
@@ -55,15 +56,15 @@ class NoFolderError(RobotError):
     """The robot has no folder of the attempt: it was never created, or it was deleted."""
 
 
-class LateError(RobotError):
-    """All evidence was fetched, but a job for whose end `jobs.stop` did not wait has failed."""
+class LateJobError(RobotError):
+    """All evidence was fetched, but a job failed after `jobs.stop`, which did not wait for its end, had returned."""
 
 
 class FetchProgress:
     """Progress of the fetch of large files.
 
     Args:
-        report: Called at times with a text, and the estimated remaining time in seconds.
+        report: Called every few seconds with a text, and the estimated remaining time in seconds.
         is_over: Returns True if the fetch was cancelled.
     """
 
@@ -80,12 +81,12 @@ class FetchProgress:
         self._total, self._done, self._received = total_bytes, 0, 0
         self._start_s = self._reported_s = time.monotonic()
 
-    def add(self, size_bytes: int, *, had: bool = False) -> None:
+    def add(self, size_bytes: int, *, fetched_before: bool = False) -> None:
         """Add a number of fetched bytes.
 
         Args:
             size_bytes: The number.
-            had: Whether an earlier call of `fetch` has fetched them.
+            fetched_before: Whether an earlier call of `fetch` has fetched them.
 
         Raises:
             LinkError: The fetch was cancelled. Without this error the next piece would open the connection again.
@@ -93,7 +94,7 @@ class FetchProgress:
         if self._is_over():
             raise LinkError("the fetch was cancelled")
         self._done += size_bytes
-        if had:
+        if fetched_before:
             return
         self._received += size_bytes
         now_s = time.monotonic()
@@ -119,7 +120,7 @@ def fetch(
     progress: FetchProgress | None = None,
     foreign: Callable[[str], str | None] = lambda _: None,
 ) -> None:
-    """Let the robot record its state again, fetch its files of a repeat, and check the hash of each file.
+    """Make the robot record its state again, fetch its files of a repeat, and check the hash of each file.
 
     Small files are sent in one archive, large files piece by piece. Each transfer has a timeout, the total time
     increases with the size, and an interrupted fetch continues from the last piece, also in a later call.
@@ -140,13 +141,13 @@ def fetch(
 
     Raises:
         LinkError: The robot did not answer.
-        LateError: All files were fetched, but a job for whose end `jobs.stop` did not wait has failed.
+        LateJobError: All files were fetched, but a job failed after `jobs.stop` had returned.
         RobotError: It has no such folder, or could not pack its files; files that arrived are kept.
         EvidenceError: The files are incomplete, unsafe, fail their hash, or are too large.
     """
     packed = into / f".{role}.tar"
     try:
-        large, late = _fetch_small(shell, pack_command(folder, role, interface), packed, folder, foreign)
+        large, job_error = _fetch_small(shell, pack_command(folder, role, interface), packed, folder, foreign)
     finally:
         packed.unlink(missing_ok=True)
     if large:
@@ -155,8 +156,8 @@ def fetch(
         progress.begin(sum(large.values()))
         for name, size_bytes in large.items():
             _LargeFile(shell, folder, name, size_bytes).fetch(into, role, progress)
-    if late is not None:
-        raise late
+    if job_error is not None:
+        raise job_error
 
 
 def _fetch_small(
@@ -167,17 +168,18 @@ def _fetch_small(
     Returns:
         The sizes of the large files by name, and the error of the robot if all files arrived nevertheless.
     """
-    late: RobotError | None = None
+    job_error: RobotError | None = None
     try:
         shell.fetch(command, packed, deadline=Deadline.after(_PIECE_S), limit_bytes=_PACKED_BYTES)
     except RobotError as error:
-        late = _pack_error(error, folder)
+        job_error = _pack_error(error, folder)
     try:
-        return _unpack(packed, packed.parent, shell.robot, foreign), late
+        return _unpack(packed, packed.parent, shell.robot, foreign), job_error
     except (EvidenceError, FileNotFoundError) as error:
-        if isinstance(late, LateError):
-            late = RobotError(late.what, where=late.where, remedy=late.remedy)  # the archive is incomplete
-        raise late or error from None
+        if isinstance(job_error, LateJobError):
+            # The archive is incomplete, so the error must not report that all files arrived.
+            job_error = RobotError(job_error.what, where=job_error.where, remedy=job_error.remedy)
+        raise job_error or error from None
 
 
 def _pack_error(error: RobotError, folder: str) -> RobotError:
@@ -185,16 +187,16 @@ def _pack_error(error: RobotError, folder: str) -> RobotError:
     reported = error_message(error.what.encode())
     if reported.startswith(_NO_FOLDER):
         return NoFolderError(f"it no longer has {reported.removeprefix('no ')}", where=error.where)
-    if reported.startswith(_LATE):
-        return LateError(reported, where=error.where, remedy=f"look into {folder} on the robot")
-    return RobotError(reported, where=error.where, remedy=f"look into {folder} on the robot") if reported else error
+    if reported.startswith(_LATE_JOB):
+        return LateJobError(reported, where=error.where, remedy=f"inspect {folder} on the robot")
+    return RobotError(reported, where=error.where, remedy=f"inspect {folder} on the robot") if reported else error
 
 
 def _require_space(shell: Shell, large: Mapping[str, int], into: Path, expected_bytes: int) -> None:
     """Raise `EvidenceError` if large files do not fit on this disk, or are much larger than expected."""
     total = sum(large.values())
     free = files.free_bytes(into)
-    limit = max(ALWAYS_BYTES, EXPECTED_TIMES * expected_bytes, UNEXPECTED_SHARE * free)
+    limit = max(ALWAYS_ALLOWED_BYTES, EXPECTED_TIMES * expected_bytes, UNEXPECTED_SHARE * free)
     space = free - RESERVE_BYTES + sum(part.stat().st_size for part in into.glob(".*.part"))
     if total > limit:
         reason = f"at most {format_bytes(limit)} are fetched if {format_bytes(expected_bytes)} are expected"
@@ -203,7 +205,7 @@ def _require_space(shell: Shell, large: Mapping[str, int], into: Path, expected_
     else:
         return
     raise EvidenceError(
-        f"{format_bytes(total)} are to be fetched ({', '.join(large)}), but {reason}: they stay on the robot",
+        f"{format_bytes(total)} must be fetched ({', '.join(large)}), but {reason}: they stay on the robot",
         where=shell.robot,
     )
 
@@ -227,7 +229,7 @@ class _LargeFile:
             file.seek(0)
             while chunk := file.read(_CHUNK_BYTES):
                 digest.update(chunk)
-            progress.add(fetched_bytes, had=True)
+            progress.add(fetched_bytes, fetched_before=True)
             try:
                 for start in range(fetched_bytes, self.size_bytes, PIECE_BYTES):
                     content = self._piece(start, piece)
@@ -236,7 +238,7 @@ class _LargeFile:
                     progress.add(len(content))
             finally:
                 piece.unlink(missing_ok=True)
-        if self._sum() != digest.hexdigest():
+        if self._remote_hash() != digest.hexdigest():
             part.unlink()  # the pieces of an earlier call may be wrong
             raise EvidenceError(f"hash differs: {self.name}", where=self.shell.robot)
         path = _target_path(into, self.name, self.shell.robot)
@@ -257,20 +259,20 @@ class _LargeFile:
             raise EvidenceError(what, where=self.shell.robot)
         return content[:expected]
 
-    def _sum(self) -> str | None:
-        deadline = Deadline.after(_PIECE_S + self.size_bytes / _SUMMED_BYTES_PER_S)
-        return _parse_sums(call(self.shell, "sum", self.folder, self.name, deadline=deadline)).get(self.name)
+    def _remote_hash(self) -> str | None:
+        deadline = Deadline.after(_PIECE_S + self.size_bytes / _MIN_HASH_BYTES_PER_S)
+        return _parse_hashes(call(self.shell, "sum", self.folder, self.name, deadline=deadline)).get(self.name)
 
 
 def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str | None]) -> Mapping[str, int]:
     """Unpack an archive of small files, check them, and return the sizes of the large files by name."""
-    sums: dict[str, str] = {}
+    hashes: dict[str, str] = {}
     large: dict[str, int] = {}
     received: dict[str, str] = {}
     with packed.open("rb") as file:
         for member in archive.members(file, robot):
-            if _SUMS.match(member.name) and not sums:
-                sums = _parse_sums(b"".join(islice(member.chunks, _LIST_CHUNKS)))
+            if _HASH_LIST.match(member.name) and not hashes:
+                hashes = _parse_hashes(b"".join(islice(member.chunks, _LIST_CHUNKS)))
             elif _LARGE.match(member.name) and not large:
                 large = _parse_sizes(b"".join(islice(member.chunks, _LIST_CHUNKS)), robot)
                 for name in large:
@@ -280,7 +282,7 @@ def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str |
             else:
                 _require_own(member.name, robot, foreign)
                 received[member.name] = _write(member, into, robot)
-    wrong = sorted(name for name in sums.keys() | received.keys() if sums.get(name) != received.get(name))
+    wrong = sorted(name for name in hashes.keys() | received.keys() if hashes.get(name) != received.get(name))
     if wrong or not received:
         raise EvidenceError(f"hash differs or file missing: {', '.join(wrong) or 'all files'}", where=robot)
     return large
@@ -327,7 +329,7 @@ def _duplicate_error(name: str, robot: str) -> EvidenceError:
     return EvidenceError(f"sent {name}, which it or another robot sent before", where=robot)
 
 
-def _parse_sums(content: bytes) -> dict[str, str]:
+def _parse_hashes(content: bytes) -> dict[str, str]:
     matches = map(_SUM_LINE.match, content.decode("ascii", "replace").splitlines())
     return {match[2]: match[1] for match in matches if match}
 

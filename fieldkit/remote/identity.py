@@ -25,7 +25,7 @@ class Address:
     user: str = ""
 
     @property
-    def by_hand(self) -> str:
+    def ssh_arguments(self) -> str:
         """The arguments for `ssh` or `ssh-copy-id` to this robot."""
         port = f"-p {self.port} " if self.port != 22 else ""
         return f"{port}{self.user}@{self.host}" if self.user else f"{port}{self.host}"
@@ -50,7 +50,7 @@ class HostKey:
 
     @property
     def fingerprint_command(self) -> str:
-        """The command that shows the fingerprint on the robot; dropbear has its own key format."""
+        """The command that shows the fingerprint on the robot; dropbear has a different key format."""
         name = "ecdsa" if self.kind.startswith("ecdsa-") else self.kind.removeprefix("ssh-")
         if "dropbear" in self.server:
             return f"dropbearkey -y -f /etc/dropbear/dropbear_{name}_host_key"

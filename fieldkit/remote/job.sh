@@ -239,7 +239,7 @@ strays() { # list processes in deleted folders of jobs, and send them signal $1 
     done
 }
 
-stand() { # run the commands from standard input in sequence, each a line `NONCE [held] VERB WORD...`, quoted for a shell
+command_loop() { # run the commands from standard input in sequence, each a line `NONCE [held] VERB WORD...`, quoted for a shell
     echo ready
     while read -r nonce line; do
         echo "$nonce" >&2
@@ -262,7 +262,7 @@ main() {
         end) [ ! -d "$1" ] || end "$1" ;;
         halt) end "$1"/* ;;
         drop) remove "$1"; rmdir "${1%/*}" 2>/dev/null || : ;;
-        stop | halt_motion | motion_states | life_signs | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs | stand) "$verb" "$@" ;;
+        stop | halt_motion | motion_states | life_signs | begin | pack | piece | sum | tidy | left | lock | renew | unlock | holder | abort | needs | command_loop) "$verb" "$@" ;;
         *) fail "unknown verb '$verb'" ;;
     esac
 }

@@ -88,9 +88,9 @@ class Job:
         argv: The command.
         limit_s: The robot stops the job when it has been ready for this time.
         log: File in `folder` for its standard error, and for its standard output if `stdout` is None.
-        stdin: File in `folder` for its standard input; None for none.
+        stdin: File in `folder` for its standard input; None for no input.
         stdout: File in `folder` for its standard output; None for the log.
-        ready: Condition for a started job to be ready: `log:TEXT`, or from `ready_when_bound`; None for immediately.
+        ready: Condition for a started job to be ready: `log:TEXT`, or from `ready_when_bound`; None for no condition.
         as_root: Whether `sudo -n` runs it.
         ready_s: Time in which it must be ready, in whole seconds.
         output_limit_bytes: Maximum kept size of standard output, and of standard error; 0 for no limit.
@@ -123,7 +123,7 @@ def landing_marker_file(name: str) -> str:
     """Return the path of the file that protects a job from SIGKILL, relative to the folder of its attempt.
 
     A job creates it while it must not be killed, for example while it lands a drone. When all jobs are stopped, it
-    receives SIGINT as the others, but no SIGKILL while the file exists.
+    receives SIGINT as the others do, but no SIGKILL while the file exists.
     """
     return f".jobs/{name}/unhurried"
 
@@ -160,8 +160,8 @@ def start(shell: Shell, job: Job) -> None:
         RobotError: The job ended before it was ready, or was not ready in time; the message has the end of its log.
     """
     within_s = REPLY_S - READY_S + job.ready_s
-    done = shell.run(command("start", job), deadline=Deadline.after(within_s), check=False)
-    require_success(shell, done, remedy=f"look into {job.folder} on the robot")
+    completed = shell.run(command("start", job), deadline=Deadline.after(within_s), check=False)
+    require_success(shell, completed, remedy=f"inspect {job.folder} on the robot")
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,8 @@ class Pending:
             LinkError: The robot did not answer in `within_s`.
             RobotError: The robot could not start the job, has no such job, or rebooted while it ran.
         """
-        done = self.session.end(deadline=Deadline.after(within_s), check=False)
-        return _exit_code(self.shell, self.job, done)
+        completed = self.session.end(deadline=Deadline.after(within_s), check=False)
+        return _exit_code(self.shell, self.job, completed)
 
 
 def begin(shell: Shell, job: Job) -> Pending:
@@ -225,8 +225,8 @@ def serve(shell: Shell, job: Job) -> Pending:
     """
     session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_READY_OUTPUT)
     if not session.is_ready:
-        done = session.end(deadline=Deadline.after(REPLY_S), check=False)
-        require_success(shell, done, remedy=f"look into {job.folder} on the robot")
+        completed = session.end(deadline=Deadline.after(REPLY_S), check=False)
+        require_success(shell, completed, remedy=f"inspect {job.folder} on the robot")
     return Pending(shell, job, session)
 
 
@@ -277,8 +277,8 @@ def stop(
         settle or "-",
         *([job.log, end_text] if end_text else []),
     )
-    done = shell.run(argv, deadline=Deadline.after(grace_s + REPLY_S), check=False)
-    return _exit_code(shell, job, done)
+    completed = shell.run(argv, deadline=Deadline.after(grace_s + REPLY_S), check=False)
+    return _exit_code(shell, job, completed)
 
 
 def list_running(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
@@ -304,19 +304,19 @@ class Aborted:
     error: FieldkitError | None = None
 
 
-def abort(shell: Shell, who: str, deadline: Deadline) -> Aborted:
-    """Break the robot's lock in the name of `who`, and stop all jobs of all trials.
+def abort(shell: Shell, user: str, deadline: Deadline) -> Aborted:
+    """Break the robot's lock in the name of `user`, and stop all jobs of all trials.
 
     The script is not installed for it, because a full or read-only disk may be the reason for the abort.
 
     Raises:
         LinkError: The robot did not answer.
     """
-    argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "abort", who)
-    done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
-    output, error = done.stdout, None
+    argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "abort", user)
+    completed = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
+    output, error = completed.stdout, None
     try:
-        require_success(shell, done)
+        require_success(shell, completed)
     except RobotError as script_error:
         error = script_error
     landing = tuple((match["program"].decode(), match["state"].decode()) for match in _LANDING_LINE.finditer(output))
@@ -332,7 +332,7 @@ def _script(job: Job) -> Sequence[str]:
     return ("sudo", "-n", *CALL) if job.as_root else CALL
 
 
-def _exit_code(shell: Shell, job: Job, done: Completed) -> int:
-    if error_message(done.stderr):
-        require_success(shell, done, remedy=f"look into {job.folder} on the robot")
-    return done.exit_code
+def _exit_code(shell: Shell, job: Job, completed: Completed) -> int:
+    if error_message(completed.stderr):
+        require_success(shell, completed, remedy=f"inspect {job.folder} on the robot")
+    return completed.exit_code

@@ -25,7 +25,8 @@ Channel = paramiko.Channel
 Transport = paramiko.Transport
 
 SPARES: Final = 2
-"""Number of channels that are opened in advance: one for the next command, one while its successor is opened."""
+"""Number of channels that are opened in advance: one for the next command, and one for the time in which a further
+channel is opened."""
 
 BROKEN: Final = (paramiko.SSHException, OSError, EOFError)
 """Exceptions of a broken connection."""
@@ -154,13 +155,13 @@ class Link:
         timing: Timeouts of the connection.
 
     Attributes:
-        doing: The next action of the server, for messages: `FIRST`, or for example `send its SSH banner`.
+        awaited_action: The next action of the server, for messages: `FIRST_ACTION`, or `send its SSH banner`.
     """
 
-    FIRST: Final = "accept the connection"
+    FIRST_ACTION: Final = "accept the connection"
 
     def __init__(self, connect: Connect, timing: Timing) -> None:
-        self.doing = self.FIRST
+        self.awaited_action = self.FIRST_ACTION
         self._connect = connect
         self._timing = timing
         self._lock = threading.Lock()
@@ -192,16 +193,16 @@ class Link:
                 stream.close()
         # The caller has a deadline; these timeouts must only be longer.
         transport.banner_timeout = transport.auth_timeout = 2 * self._timing.connect_s
-        kinds = sorted(_SIGNATURES, key=lambda key_type: key_type != kind)
+        key_types = sorted(_SIGNATURES, key=lambda key_type: key_type != kind)
         options = transport.get_security_options()
-        options.key_types = [name for key_type in kinds for name in _SIGNATURES[key_type]]
+        options.key_types = [name for key_type in key_types for name in _SIGNATURES[key_type]]
         options.ciphers, options.digests = _without_weak(options.ciphers), _without_weak(options.digests)
-        self.doing = "send its SSH banner"
+        self.awaited_action = "send its SSH banner"
         key_exchanged = threading.Event()
         transport.start_client(event=key_exchanged)
         while not key_exchanged.wait(0.02):
             if transport.remote_version:
-                self.doing = "agree on keys"
+                self.awaited_action = "agree on keys"
         if not transport.is_active():
             error = transport.get_exception() or EOFError("it closed the connection")
             if isinstance(error, paramiko.ssh_exception.IncompatiblePeer):
@@ -227,10 +228,10 @@ class Link:
                 where=address.robot,
                 remedy=f"continue only if it was reinstalled: fieldkit enroll {address.robot} --replace",
             )
-        self.doing = "answer the login"
-        _, transport = self._connected()
+        self.awaited_action = "answer the login"
+        _, transport = self._connection()
         count = 0
-        for attempt in _attempts(transport, address, credentials):
+        for attempt in _login_attempts(transport, address, credentials):
             with contextlib.suppress(paramiko.AuthenticationException):
                 attempt()
             if transport.is_authenticated():
@@ -241,18 +242,18 @@ class Link:
             count += 1
         if not count:
             raise EOFError("it closed the connection")
-        raise _refused(address, credentials, count)
+        raise _refused_error(address, credentials, count)
 
-    def begin(self, command: str, deadline: Deadline, ended: threading.Event) -> Channel:
+    def begin(self, command: str, deadline: Deadline, close_event: threading.Event) -> Channel:
         """Start a command, and return its channel when the server has accepted it.
 
         Raises:
-            ExpiredError: The deadline passed, or `ended` was set.
+            ExpiredError: The deadline passed, or `close_event` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
-        _, transport = self._connected()
-        channel = call_with_deadline(lambda: self._channel(transport), deadline, ended, what="get a channel")
-        call_with_deadline(lambda: channel.exec_command(command), deadline, ended, what="start")
+        _, transport = self._connection()
+        channel = call_with_deadline(lambda: self._channel(transport), deadline, close_event, what="get a channel")
+        call_with_deadline(lambda: channel.exec_command(command), deadline, close_event, what="start")
         self.acknowledge()
         assert isinstance(transport.packetizer, _Packetizer)
         # From now on only necessary packets are sent, because the radio under test may be measured.
@@ -261,20 +262,20 @@ class Link:
 
     def acknowledge(self) -> None:
         """Send the TCP acknowledgement now, so that no delayed one collides with packets of the robot's command."""
-        stream, _ = self._connected()
+        stream, _ = self._connection()
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def extend_timeout(self, seconds: float) -> None:
         """Extend `Timing.dead_s`, the time that the peer may be silent, by some seconds."""
-        stream, _ = self._connected()
+        stream, _ = self._connection()
         _set_timeout(stream, self._timing.dead_s + seconds)
 
     def open_spares(self) -> None:
-        """Start to open channels for later commands, which then need not wait for one.
+        """Start to open channels in advance, so that later commands need not wait for a channel.
 
         Must be called after a command has ended. At its start the answers would collide with its packets.
         """
-        _, transport = self._connected()
+        _, transport = self._connection()
         if _closes_spares(transport):
             return
         with self._lock:
@@ -293,7 +294,7 @@ class Link:
         Raises:
             OSError, SSHException, EOFError: The connection broke, or the server refuses more.
         """
-        _, transport = self._connected()
+        _, transport = self._connection()
         if _closes_spares(transport):
             return None
         with self._lock:
@@ -351,7 +352,7 @@ class Link:
             transport.close()
             stream.close()
 
-    def _connected(self) -> tuple[socket.socket, paramiko.Transport]:
+    def _connection(self) -> tuple[socket.socket, paramiko.Transport]:
         if self._stream is None or self._transport is None:
             raise EOFError("not connected")
         return self._stream, self._transport
@@ -370,7 +371,7 @@ def _without_weak(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def _enable_keepalive(stream: socket.socket, timing: Timing) -> None:
-    """Let the kernel close the connection if the peer does not answer, also while no data is sent."""
+    """Make the kernel close the connection if the peer does not answer, also while no data is sent."""
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     _set_timeout(stream, timing.dead_s)
     stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -383,7 +384,7 @@ def _set_timeout(stream: socket.socket, seconds: float) -> None:
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(seconds * 1000))
 
 
-def _attempts(
+def _login_attempts(
     transport: paramiko.Transport, address: Address, credentials: Credentials
 ) -> Iterator[Callable[[], object]]:
     """Yield a function for each login method."""
@@ -395,11 +396,11 @@ def _attempts(
         yield lambda key=key: transport.auth_publickey(user, key)  # type: ignore[misc]
 
 
-def _refused(address: Address, credentials: Credentials, count: int) -> LoginRefusedError:
+def _refused_error(address: Address, credentials: Credentials, count: int) -> LoginRefusedError:
     if credentials.password is not None:
-        method, remedy = "the password", f"ssh {address.by_hand}, and log in with that password"
+        method, remedy = "the password", f"ssh {address.ssh_arguments}, and log in with that password"
     else:
-        method, remedy = format_count(count, "key"), f"ssh-copy-id {address.by_hand}"
+        method, remedy = format_count(count, "key"), f"ssh-copy-id {address.ssh_arguments}"
     return LoginRefusedError(
         f"refused the login of {address.user!r} with {method}",
         where=address.robot,

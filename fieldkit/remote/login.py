@@ -22,20 +22,20 @@ def log_in(
     *,
     timing: Timing,
     deadline: Deadline,
-    ended: threading.Event,
+    close_event: threading.Event,
 ) -> Link:
-    """Return a connection that is logged in.
+    """Return a connection that is logged in; the caller can set `close_event` to cancel the login.
 
     Raises:
         LinkLostError: The robot was not reached, or did not answer before the deadline.
-        LinkError: `ended` was set.
+        LinkError: `close_event` was set.
         RobotError: Its host key is not the pinned one.
         LoginRefusedError: It refused the login.
         ConfigurationError: There is no key for the login.
     """
     link = Link(connect, timing)
-    with _converting_errors(link, address, ended):
-        call_with_deadline(lambda: link.log_in(address, credentials), deadline, ended)
+    with _converting_errors(link, address, close_event):
+        call_with_deadline(lambda: link.log_in(address, credentials), deadline, close_event)
     return link
 
 
@@ -51,7 +51,7 @@ def offered_key(address: Address, connect: Connect, *, deadline: Deadline, kind:
 
 
 @contextlib.contextmanager
-def _converting_errors(link: Link, address: Address, ended: threading.Event) -> Iterator[None]:
+def _converting_errors(link: Link, address: Address, close_event: threading.Event) -> Iterator[None]:
     """Close a link that could not be opened, and convert its exception to an error with a remedy."""
     try:
         yield
@@ -59,15 +59,15 @@ def _converting_errors(link: Link, address: Address, ended: threading.Event) -> 
         link.close()
         if isinstance(error, FieldkitError) or not isinstance(error, BROKEN):
             raise
-        if ended.is_set():
+        if close_event.is_set():
             raise closed_error(address) from error
         if isinstance(error, UnfitServerError):
             raise RobotError(
-                f"its SSH server cannot be trusted with a login: {error}",
+                f"its SSH server is not secure enough for a login: {error}",
                 where=address.robot,
-                remedy=f"update it; `ssh -vv {address.by_hand} true` shows what it offers",
+                remedy=f"update it; `ssh -vv {address.ssh_arguments} true` shows what it offers",
             ) from error
-        what, remedy = _explanation(error, link.doing, address)
+        what, remedy = _explanation(error, link.awaited_action, address)
         raise LinkLostError(what, where=address.robot, remedy=remedy) from error
 
 
@@ -76,23 +76,32 @@ def closed_error(address: Address) -> LinkError:
     return LinkError("fieldkit closed the connection", where=address.robot)
 
 
-def _explanation(error: BaseException, doing: str, address: Address) -> tuple[str, str]:
+def _explanation(error: BaseException, awaited_action: str, address: Address) -> tuple[str, str]:
     """Return the message of an error, and its remedy."""
     host = address.host
-    cannot = f"{host} cannot be reached for SSH"
+    unreachable = f"{host} cannot be reached for SSH"
     if isinstance(error, socket.gaierror):
-        return f"{cannot}: its name cannot be resolved", f"getent hosts {host}; is `host` right in the site file?"
+        return (
+            f"{unreachable}: its name cannot be resolved",
+            f"getent hosts {host}; is `host` right in the site file?",
+        )
     if isinstance(error, ConnectionRefusedError):
         remedy = "start its SSH server (Debian: sudo systemctl start ssh); is `port` right in the site file?"
-        return f"{cannot}: nothing listens on port {address.port}", remedy
+        return f"{unreachable}: nothing listens on port {address.port}", remedy
     if isinstance(error, OSError) and error.errno in _NO_ROUTE:
-        return f"{cannot}: there is no route to it", f"ip route get {host}; is this computer in the robots' network?"
+        return (
+            f"{unreachable}: there is no route to it",
+            f"ip route get {host}; is this computer in the robots' network?",
+        )
     if isinstance(error, TimeoutError):
-        command = f"ping -c 3 {host}" if doing == Link.FIRST else f"ssh -v {address.by_hand}"
-        return f"{host} did not {doing} in time", f"{command}; is the robot up and in range?"
-    if doing == Link.FIRST:
-        return f"{cannot}: {error}", f"ping -c 3 {host}; is the robot up and in range?"
-    return f"{host} broke the connection before it could {doing}: {_text(error)}", f"ssh -v {address.by_hand}"
+        command = f"ping -c 3 {host}" if awaited_action == Link.FIRST_ACTION else f"ssh -v {address.ssh_arguments}"
+        return f"{host} did not {awaited_action} in time", f"{command}; is the robot up and in range?"
+    if awaited_action == Link.FIRST_ACTION:
+        return f"{unreachable}: {error}", f"ping -c 3 {host}; is the robot up and in range?"
+    return (
+        f"{host} broke the connection before it could {awaited_action}: {_text(error)}",
+        f"ssh -v {address.ssh_arguments}",
+    )
 
 
 def _text(error: BaseException) -> str:

@@ -33,8 +33,8 @@ BY_SEVERITY: Final = tuple(MotionState)
 DESCENDING_STATES: Final = frozenset({MotionState.LAND, MotionState.RETURN})
 
 STATE_TEXTS: Final[Mapping[MotionState, str]] = {
-    MotionState.NOTHING: "nothing of fieldkit moves it; nothing was sent to it",
-    MotionState.STATIONARY: "stopped (standing)",
+    MotionState.NOTHING: "no program of fieldkit moves it; nothing was sent to it",
+    MotionState.STATIONARY: "stopped (stationary)",
     MotionState.LANDED: "stopped (on the ground)",
     MotionState.ENDED: "stopped (its program had not started to move it, or has ended)",
     MotionState.LAND: "coming down (land)",

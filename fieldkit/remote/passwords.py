@@ -22,7 +22,7 @@ def at_terminal(user: str, host: str, robot: str) -> str:
     """
     if not sys.stdin.isatty():
         raise ConfigurationError(
-            f"the password of {user}@{host} must be typed, and there is no terminal to ask at",
+            f"the password of {user}@{host} must be typed, but standard input is not a terminal",
             where=robot,
             remedy=f"{_store_command(user, host)}, and write `password: keyring`; or use a key",
         )

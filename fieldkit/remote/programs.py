@@ -12,8 +12,8 @@ _MIN_BYTES_PER_S: Final = 14_000.0
 # $1 folder of the program, $2 its name, $3 its mode, $4 its SHA-256. Folders whose name begins with a dot are not
 # evidence, so that the program is not fetched.
 _COPY_SCRIPT: Final = (
-    'umask 077 && mkdir -p "$1" && cat >"$1/$2.$$" && said=$(sha256sum <"$1/$2.$$") && '
-    '{ [ "${said%% *}" = "$4" ] || { echo "the copy is not whole: $1/$2" >&2; exit 1; }; } && '
+    'umask 077 && mkdir -p "$1" && cat >"$1/$2.$$" && actual=$(sha256sum <"$1/$2.$$") && '
+    '{ [ "${actual%% *}" = "$4" ] || { echo "the copy is incomplete: $1/$2" >&2; exit 1; }; } && '
     'chmod "$3" "$1/$2.$$" && mv -f "$1/$2.$$" "$1/$2"'
 )
 
@@ -28,13 +28,13 @@ def path(job: str, name: str) -> str:
     return f".put/{job}/{name}"
 
 
-def copy(shell: Shell, folder: str, at: str, content: bytes, sha256: str, *, executable: bool) -> None:
+def copy(shell: Shell, folder: str, program_path: str, content: bytes, sha256: str, *, executable: bool) -> None:
     """Copy a program into the folder of an attempt; idempotent.
 
     Args:
         shell: The robot.
         folder: The attempt's folder on the robot.
-        at: The path of the program, from `path`.
+        program_path: The path of the program, from `path`.
         content: The program.
         sha256: Its SHA-256, which the robot checks.
         executable: Whether the copy may be executed.
@@ -43,7 +43,7 @@ def copy(shell: Shell, folder: str, at: str, content: bytes, sha256: str, *, exe
         LinkError: The robot did not answer.
         RobotError: It cannot be written there.
     """
-    program_folder, _, name = at.rpartition("/")
+    program_folder, _, name = program_path.rpartition("/")
     argv = (
         "sh",
         "-c",

@@ -31,7 +31,7 @@ CALL: Final = ("sh", SCRIPT_PATH)
 # that has another owner or other content is replaced.
 _CHECK_SCRIPT: Final = (
     'umask 077 && mkdir -p "$1" && chmod go-rwx "$1" && [ -O "$2" ] && [ ! -L "$2" ] && '
-    'said=$(sha256sum <"$2") && [ "${said%% *}" = "$3" ] && exec sh "$2" needs'
+    'actual=$(sha256sum <"$2") && [ "${actual%% *}" = "$3" ] && exec sh "$2" needs'
 )
 _COPY_SCRIPT: Final = (
     'umask 077 && mkdir -p "$1" && chmod go-rwx "$1" && cat >"$2.$$" && mv "$2.$$" "$2" && exec sh "$2" needs'
@@ -43,7 +43,7 @@ _GREETING_BYTES: Final = 60
 _READ_ONLY_REMEDY: Final = "on the robot: dmesg | tail; a failing SD card becomes read-only, so save its data"
 
 HELD_REMEDY: Final = "wait, resume that trial if it is yours, or end it: fieldkit abort"
-"""Remedy for a locked robot. The holder may be the operator's own trial, if its laptop failed."""
+"""Remedy for a locked robot. The holder may be another trial of the operator whose laptop failed."""
 
 _MESSAGE_PREFIX: Final = b"job.sh: "
 _HELD: Final = re.compile(
@@ -55,8 +55,8 @@ _LOST: Final = re.compile(
 _LOSS_MESSAGES: Final = {
     "aborted": "the trial was aborted by {who} at {at}",
     "stopped": "{who} stopped the robots at {at} (fieldkit stop)",
-    "held": "{who} took the robot at {at} for {what}, after this trial's lock had expired",
-    "gone": "the lock of this trial is gone; the last to hold the robot was {who} at {at} for {what}",
+    "held": "{who} locked the robot at {at} for {what}, after this trial's lock had expired",
+    "gone": "the lock of this trial is missing; the last lock was that of {who} at {at} for {what}",
 }
 
 
@@ -72,7 +72,7 @@ def install(shell: Shell, deadline: Deadline) -> None:
         raise RobotError(
             f"its login shell answers every command with {printable(checked.stdout[:_GREETING_BYTES])!r}",
             where=shell.robot,
-            remedy="first line of ~/.bashrc (or its like) on the robot: case $- in *i*) ;; *) return ;; esac",
+            remedy="first line of its start-up file (~/.bashrc) on the robot: case $- in *i*) ;; *) return ;; esac",
         )
     if checked.exit_code == 0:
         return
@@ -94,33 +94,35 @@ def call(shell: Shell, verb: str, *words: str, deadline: Deadline) -> bytes:
         LockLostError: This trial has lost its lock.
         RobotError: The script failed.
     """
-    done = shell.run((*CALL, verb, *words), deadline=deadline, check=False)
-    require_success(shell, done)
-    return done.stdout
+    completed = shell.run((*CALL, verb, *words), deadline=deadline, check=False)
+    require_success(shell, completed)
+    return completed.stdout
 
 
-def require_success(shell: Shell, done: Completed, *, remedy: str = "") -> None:
+def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> None:
     """Check that a call of the script succeeded; raises as `call` otherwise."""
-    if done.exit_code == 0:
+    if completed.exit_code == 0:
         return
     # A login shell that refuses the login (nologin) prints its message to either stream.
-    output = printable(done.stderr or done.stdout) or "no message"
-    what = error_message(done.stderr) or f"`{done.argv[0]}` ended with exit code {done.exit_code}: {output}"
-    match done.exit_code:
+    output = printable(completed.stderr or completed.stdout) or "no message"
+    what = (
+        error_message(completed.stderr)
+        or f"`{completed.argv[0]}` ended with exit code {completed.exit_code}: {output}"
+    )
+    match completed.exit_code:
         case 75 if held := _HELD.match(what):  # exit codes of the script, see common.sh
             age, remaining = (format_duration(float(held[name])) for name in ("age", "rest"))
-            what = (
-                f"{held['who']} holds it since {_since(held)}, {age} ago, for {held['what']}; expires in {remaining}"
-            )
+            holder = f"{held['who']} holds it since {_start_time(held)}, {age} ago, for {held['what']}"
+            what = f"{holder}; expires in {remaining}"
             remedy = HELD_REMEDY
         case 76 if lost := _LOST.match(what):
             raise LockLostError(
-                _LOSS_MESSAGES[lost["kind"]].format(at=_since(lost), **lost.groupdict()), where=shell.robot
+                _LOSS_MESSAGES[lost["kind"]].format(at=_start_time(lost), **lost.groupdict()), where=shell.robot
             )
         case 77:
             remedy = "check its battery and power supply; on the robot: uptime -s"
         case 28:
-            remedy = f"see what fills its disk: df -h; du -sh ~/{HOME}/*; then remove old trials and bags"
+            remedy = f"find what fills its disk: df -h; du -sh ~/{HOME}/*; then remove old trials and bags"
     default_remedy = _READ_ONLY_REMEDY if "Read-only file system" in what else "run the command on the robot by hand"
     raise RobotError(what, where=shell.robot, remedy=remedy or default_remedy)
 
@@ -136,5 +138,5 @@ def error_message(stderr: bytes) -> str:
     return ": ".join(text for text in (printable(reason), printable(log)) if text)
 
 
-def _since(record: re.Match[str]) -> str:
+def _start_time(record: re.Match[str]) -> str:
     return f"{datetime.fromtimestamp(int(record['since']), UTC):%H:%M:%S UTC}"

@@ -14,9 +14,9 @@ from fieldkit.remote.connection import Connection
 from fieldkit.remote.drain import drain, wait_for_output
 from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.link import BROKEN, Connect, FloodError, Link, NoSessionError, Timing
+from fieldkit.remote.persistent_shells import Execution, RunningCommand
 from fieldkit.remote.script import CALL
 from fieldkit.remote.shell import Completed
-from fieldkit.remote.standing import Execution, RunningCommand
 
 CONNECT_S: Final = Timing.connect_s
 PATIENCE_S: Final = 60.0
@@ -80,7 +80,7 @@ class SshShell:
     @property
     def ssh_destination(self) -> str:
         """The arguments for `ssh` to this robot."""
-        return self._connection.address.by_hand
+        return self._connection.address.ssh_arguments
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> "SshSession":
         """Start a command and return when the robot has accepted it, or has written `until`; as `Shell.begin`."""
@@ -198,12 +198,12 @@ class SshSession:
                     pending_input = None
                     if self._ends_on_request:
                         channel.request_end()
-                done = drain(
+                completed = drain(
                     channel, output, stdin=pending_input, deadline=within, limit_bytes=limit_bytes, robot=self._robot
                 )
-                shell_command = f"exec {quote((*CALL, 'stand'))}" if _is_call(self._argv) else None
+                shell_command = f"exec {quote((*CALL, 'command_loop'))}" if _is_call(self._argv) else None
                 self._connection.open_spares(link, shell_command)
-                return done
+                return completed
 
         exit_code, stderr = self._connection.run_with_retries(attempt, deadline)
         if check and exit_code != 0:
@@ -231,16 +231,16 @@ def _start(
     """
     # Without `exec`, the login shell would wait for the command and delay the report of its end.
     command_line = quote(argv) if ends_on_request or has_input else f"exec {quote(argv)} </dev/null"
-    ended = connection.ended
+    close_event = connection.close_event
     link = connection.link(deadline)
     try:
         with _converting_errors(connection.address, link, argv):
             running = None
             if _is_call(argv) and not has_input:
                 running = connection.shells.begin(
-                    link, quote(argv[len(CALL) :]), deadline, ended, held=ends_on_request
+                    link, quote(argv[len(CALL) :]), deadline, close_event, held=ends_on_request
                 )
-            return link, running or link.begin(command_line, deadline, ended)
+            return link, running or link.begin(command_line, deadline, close_event)
     except LinkError:
         link.close()  # a server that does not answer this command will not answer the next one
         raise
@@ -259,14 +259,16 @@ def _converting_errors(address: Address, link: Link, argv: Sequence[str]) -> Ite
         yield
     except ExpiredError as error:
         raise LinkError(
-            f"`{command}` did not {error} in time", where=robot, remedy=f"ssh {address.by_hand}; does the robot hang?"
+            f"`{command}` did not {error} in time",
+            where=robot,
+            remedy=f"ssh {address.ssh_arguments}; does the robot hang?",
         ) from error
     except FloodError as error:
         link.close()
         raise RobotError(
             f"its SSH server violated the SSH protocol during `{command}`: {error}",
             where=robot,
-            remedy=f"ssh -v {address.by_hand} true; does the robot answer, and is its SSH server up to date?",
+            remedy=f"ssh -v {address.ssh_arguments} true; does the robot answer, and is its SSH server up to date?",
         ) from error
     except BROKEN as error:
         link.close()
@@ -276,7 +278,7 @@ def _converting_errors(address: Address, link: Link, argv: Sequence[str]) -> Ite
             raise LinkLostError(
                 f"its SSH server opens no session: {error}",
                 where=robot,
-                remedy=f"ssh {address.by_hand} true; on the robot: grep -i MaxSessions /etc/ssh/sshd_config",
+                remedy=f"ssh {address.ssh_arguments} true; on the robot: grep -i MaxSessions /etc/ssh/sshd_config",
             ) from error
         raise LinkLostError(
             f"the connection broke during `{command}`: {error or type(error).__name__}",

@@ -70,12 +70,12 @@ def trial_columns(additional: Iterable[Column] = ()) -> tuple[Column, ...]:
     Args:
         additional: Columns that not every trial has, as in the trial's plan.
     """
-    everywhere = _everywhere()
+    everywhere = _common_columns()
     return (*everywhere.values(), *(column for column in additional if column.name not in everywhere))
 
 
 @cache
-def _everywhere() -> Mapping[str, Column]:
+def _common_columns() -> Mapping[str, Column]:
     return {column.name: column for column in (*IDENTITY, *measures())}
 
 
@@ -89,7 +89,7 @@ def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
 
     These are the columns of named steps, additional columns that a step declares, and those of other packages' kinds.
     """
-    return tuple(column for step in steps for column in of_step(step) if column.name not in _everywhere())
+    return tuple(column for step in steps for column in of_step(step) if column.name not in _common_columns())
 
 
 def filled_by(steps: Iterable[Step]) -> tuple[Column, ...]:
@@ -99,7 +99,7 @@ def filled_by(steps: Iterable[Step]) -> tuple[Column, ...]:
     return tuple(column for column in trial_columns(step_columns) if column.name in names)
 
 
-def clash(column: Column, filled: Collection[str]) -> str | None:
+def column_conflict(column: Column, filled: Collection[str]) -> str | None:
     """Return the reason why a step cannot fill a column, or None if it can.
 
     Args:
@@ -108,7 +108,7 @@ def clash(column: Column, filled: Collection[str]) -> str | None:
     """
     if declaration_error := column.declaration_error():
         return f"a column {column.name!r}: {declaration_error}"
-    if _everywhere().get(column.name, column) != column:
+    if _common_columns().get(column.name, column) != column:
         return f"a column {column.name!r} is one of fieldkit's; give the step a name, or rename the column"
     if column.name in filled:
         return f"a column {column.name!r} is filled by two steps; give the step a name"
@@ -122,7 +122,7 @@ def installed() -> tuple[Column, ...]:
     Raises:
         ConfigurationError: As for `step_types`, or a kind declares an invalid column, or one that exists already.
     """
-    by_name = dict(_everywhere())
+    by_name = dict(_common_columns())
     for kind, step in step_types().items():
         for column in step.columns:
             declaration_error = column.declaration_error()

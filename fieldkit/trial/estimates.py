@@ -40,17 +40,17 @@ def dead_link_s(procedure: Procedure, protocol: Protocol) -> float:
 
 def finished_repeats(plan: Plan, entries: Iterable[JournalEntry]) -> list[FinishedRepeat]:
     """Return the finished repeats of a journal with their durations; interrupted attempts do not count."""
-    began_ns: dict[RepeatId, int] = {}
+    start_ns: dict[RepeatId, int] = {}
     took_s: dict[RepeatId, float] = {}
-    over: dict[RepeatId, None] = {}
+    finished: dict[RepeatId, None] = {}
     for entry in entries:
         if entry.status is Status.RUNNING:
-            began_ns[entry.repeat] = entry.utc_ns
-        elif entry.status in ENDED and entry.repeat in began_ns and not entry.excused:
-            lasted_s = max(entry.utc_ns - began_ns[entry.repeat], 0) / 1e9
-            took_s[entry.repeat] = took_s.get(entry.repeat, 0.0) + lasted_s
-            over |= {entry.repeat: None} if entry.status is not Status.VOID else {}
-    return [FinishedRepeat(plan, repeat.protocol, took_s[repeat]) for repeat in over]
+            start_ns[entry.repeat] = entry.utc_ns
+        elif entry.status in ENDED and entry.repeat in start_ns and not entry.excused:
+            attempt_s = max(entry.utc_ns - start_ns[entry.repeat], 0) / 1e9
+            took_s[entry.repeat] = took_s.get(entry.repeat, 0.0) + attempt_s
+            finished |= {entry.repeat: None} if entry.status is not Status.VOID else {}
+    return [FinishedRepeat(plan, repeat.protocol, took_s[repeat]) for repeat in finished]
 
 
 def of_trial(plan: Plan, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
@@ -63,7 +63,7 @@ def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[Fi
 
     Finished repeats at the same distance are the best basis. Otherwise those at the nearest shorter and longer
     distances are used, of the same topology if there are any. If no finished repeat was at a longer distance, the
-    link may be dead here.
+    link may be dead at this distance.
 
     Args:
         plan: The trial.
@@ -71,22 +71,22 @@ def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[Fi
         count: Number of repeats.
         finished: Finished repeats of this and of other trials.
     """
-    alike = [
+    similar = [
         repeat
         for repeat in finished
         if repeat.plan.procedure.name == plan.procedure.name and repeat.protocol is protocol
     ]
-    alike = [repeat for repeat in alike if repeat.plan.topology is plan.topology] or alike
-    here = [repeat.took_s for repeat in alike if repeat.plan.distance_m == plan.distance_m]
-    if here:
-        return TimeEstimate(count * fmean(here), count * max(here))
+    similar = [repeat for repeat in similar if repeat.plan.topology is plan.topology] or similar
+    same_distance_s = [repeat.took_s for repeat in similar if repeat.plan.distance_m == plan.distance_m]
+    if same_distance_s:
+        return TimeEstimate(count * fmean(same_distance_s), count * max(same_distance_s))
     dead_s = dead_link_s(plan.procedure, protocol)
-    if not alike:
+    if not similar:
         return TimeEstimate(count * plan.procedure.expected_s(protocol), count * dead_s)
-    shorter = [repeat for repeat in alike if repeat.plan.distance_m < plan.distance_m]
-    longer = [repeat for repeat in alike if repeat.plan.distance_m > plan.distance_m]
-    edges_m = {max(repeat.plan.distance_m for repeat in shorter)} if shorter else set()
-    edges_m |= {min(repeat.plan.distance_m for repeat in longer)} if longer else set()
-    nearest_s = [repeat.took_s for repeat in alike if repeat.plan.distance_m in edges_m]
-    longest_s = max(repeat.took_s for repeat in alike)
+    shorter = [repeat for repeat in similar if repeat.plan.distance_m < plan.distance_m]
+    longer = [repeat for repeat in similar if repeat.plan.distance_m > plan.distance_m]
+    nearest_distances_m = {max(repeat.plan.distance_m for repeat in shorter)} if shorter else set()
+    nearest_distances_m |= {min(repeat.plan.distance_m for repeat in longer)} if longer else set()
+    nearest_s = [repeat.took_s for repeat in similar if repeat.plan.distance_m in nearest_distances_m]
+    longest_s = max(repeat.took_s for repeat in similar)
     return TimeEstimate(count * fmean(nearest_s), count * (longest_s if longer else max(longest_s, dead_s)))

@@ -14,7 +14,7 @@ from fieldkit.core.columns import Column, Figure, Kind
 
 MAX_COLUMNS: Final = 2000
 """Limit per trial, not counting the columns of every trial."""
-_MOST: Final = sys.float_info.max  # YAML is read without infinity, and no column has such a value
+_MAX_FLOAT: Final = sys.float_info.max  # YAML is read without infinity, and no column has such a value
 
 
 class FrozenFigure(Strict):
@@ -51,14 +51,14 @@ class FrozenColumn(Strict):
         return Column(self.name, self.unit, self.meaning, bounds=self.bounds, figure=figure)
 
 
-def _demand_unique_names(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColumn, ...]:
+def _require_unique_names(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColumn, ...]:
     for name, count in Counter(column.name for column in columns).items():
         if count > 1:
             raise schema.validation_error(f"the column {name} occurs twice")
     return columns
 
 
-Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MAX_COLUMNS), AfterValidator(_demand_unique_names)]
+Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MAX_COLUMNS), AfterValidator(_require_unique_names)]
 
 
 class _PlanColumns(Strict):
@@ -106,7 +106,7 @@ def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:
             name=column.name,
             unit=column.unit,
             meaning=column.meaning,
-            bounds=column.bounds and (max(column.bounds[0], -_MOST), min(column.bounds[1], _MOST)),
+            bounds=column.bounds and (max(column.bounds[0], -_MAX_FLOAT), min(column.bounds[1], _MAX_FLOAT)),
             figure=None if column.figure is None else FrozenFigure(**vars(column.figure)),
         )
         for column in columns

@@ -58,10 +58,10 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         view = View(scene, evidence, placed.within)
         try:
             result = placed.step.measure(view)
-            impossible = dict(_impossible(placed, result))
+            impossible = dict(_impossible_values(placed, result))
             if not placed.disturbed:
-                problems += (_step_problem(placed, why) for why in placed.step.check(view))
-                problems += _unexplained(placed, result)
+                problems += (_step_problem(placed, reason) for reason in placed.step.check(view))
+                problems += _unexplained_columns(placed, result)
                 problems += impossible.values()
             result = result.without(impossible)
             if placement_problem:
@@ -70,27 +70,27 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see the docstring)
-            why = f"the evidence of {placed.called} cannot be measured: {describe_exception(error)}"
+            reason = f"the evidence of {placed.label} cannot be measured: {describe_exception(error)}"
             step_errors.append("".join(format_exception(error)))
-            problems.append(why)
-            result = Measured.all_missing(placed.step.output_columns(), why)
+            problems.append(reason)
+            result = Measured.all_missing(placed.step.output_columns(), reason)
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors))
 
 
-def _step_problem(placed: PlacedStep, why: str) -> str:
+def _step_problem(placed: PlacedStep, reason: str) -> str:
     """Return a problem of a step's evidence, preceded by the step's name if it has one."""
-    return f"{placed.step.prefix}: {why}" if placed.step.prefix else why
+    return f"{placed.step.prefix}: {reason}" if placed.step.prefix else reason
 
 
-def _unexplained(placed: PlacedStep, measured: Measured) -> Iterator[str]:
+def _unexplained_columns(placed: PlacedStep, measured: Measured) -> Iterator[str]:
     for column in placed.step.output_columns():
         if column.name not in measured.values and column.name not in measured.missing:
-            yield f"{placed.called} gives neither a value nor a reason for {column.name}"
+            yield f"{placed.label} gives neither a value nor a reason for {column.name}"
 
 
-def _impossible(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, str]]:
+def _impossible_values(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, str]]:
     """Yield each column whose measured value is outside its declared range, and the reason.
 
     Such values are removed, because a table that contains one could not be read again.
@@ -119,5 +119,5 @@ def _testbed_problems(evidence: AttemptEvidence) -> Iterator[str]:
         except EvidenceError as error:
             yield f"{name}: {error.what}"
             continue
-        if isinstance(content, Lateness) and (why := oracle_delays.lateness_problem(content)):
-            yield f"{name}: {why}"
+        if isinstance(content, Lateness) and (reason := oracle_delays.lateness_problem(content)):
+            yield f"{name}: {reason}"

@@ -18,10 +18,10 @@ REBOOTED: Final = "the robot rebooted during the repeat"
 
 
 def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
-    """Yield the problems of the robots that make an attempt void, and the sections that are missing in their notes.
+    """Yield the robots' problems that make an attempt void, and the sections that are missing in their state files.
 
     A section that a robot cannot provide is missing before and after; if it is missing in one of them only, it was
-    lost. Of a robot that a step restarts only the jobs are judged, because its clock starts again.
+    lost. If a step restarts a robot, only its jobs are judged, because its clock starts again.
     """
     restarted_roles = restarted(procedure)
     for role in sorted(procedure.roles()):
@@ -38,9 +38,9 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> I
             if rebooted(before.boot, after.boot):
                 yield f"{name}: {REBOOTED}"
                 continue  # a reboot also ends its jobs and restarts its clock
-            yield from (f"{name}: {why}" for why in _clock_problems(before, after))
+            yield from (f"{name}: {reason}" for reason in _clock_problems(before, after))
         if after is not None and after.endings is not None:
-            yield from (f"{name}: {why}" for why in _job_problems(procedure, scene, role, after, evidence))
+            yield from (f"{name}: {reason}" for reason in _job_problems(procedure, scene, role, after, evidence))
 
 
 def restarted(procedure: Procedure) -> frozenset[Role]:
@@ -67,9 +67,9 @@ def _clock_problems(before: HostState, after: HostState) -> Iterator[str]:
     if (
         before.clock is not None
         and after.clock is not None
-        and (why := clock.step_description(before.clock, after.clock))
+        and (reason := clock.step_description(before.clock, after.clock))
     ):
-        yield why
+        yield reason
 
 
 def _job_problems(
@@ -80,7 +80,7 @@ def _job_problems(
         try:
             planned_jobs = () if placed.disturbed else tuple(own_jobs(placed.step, scene))
         except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
-            yield f"the commands of {placed.called} cannot be derived: {describe_exception(error)}"
+            yield f"the commands of {placed.label} cannot be derived: {describe_exception(error)}"
             continue
         for planned in planned_jobs:
             if planned.role is not role:
@@ -92,5 +92,5 @@ def _job_problems(
                 and any(evidence.has(file) for file in (planned.job.log, planned.job.stdout) if file)
             ):
                 yield f"its job {planned.job.name} ran, but its exit was not recorded"
-            if ending and (why := endings.termination_error(ending, planned.permitted_causes, planned.least_s)):
-                yield f"its job {planned.job.name} {why}"
+            if ending and (reason := endings.termination_error(ending, planned.permitted_causes, planned.least_s)):
+                yield f"its job {planned.job.name} {reason}"

@@ -88,7 +88,7 @@ class Attempt:
         return tuple(self.repeat.folder(status, self.number) for status in ENDED)
 
 
-def claimed(folder: Path) -> AbstractContextManager[None]:
+def locked(folder: Path) -> AbstractContextManager[None]:
     """Return a context that locks a trial against other processes of fieldkit; raises as `jsonl.locked`."""
     return jsonl.locked(folder / JOURNAL_FILE, "trial")
 
@@ -99,7 +99,7 @@ def append(folder: Path, *entries: JournalEntry) -> None:
 
 
 def reopen_failed(folder: Path, plan: Plan) -> int:
-    """Plan every failed repeat of a claimed trial again, and return the number of these repeats.
+    """Plan every failed repeat of a locked trial again, and return the number of these repeats.
 
     `ended` reports the failed attempts as void from then on.
 
@@ -131,36 +131,36 @@ def history(folder: Path, plan: Plan) -> list[JournalEntry]:
         EvidenceError: As for `read`; or an entry cannot follow those before it, or its repeat is not in the plan.
     """
     entries = read(folder)
-    for line, why in _impossible(entries, plan):
+    for line, reason in _impossible_entries(entries, plan):
         raise EvidenceError(
-            f"impossible entry: {why}",
+            f"impossible entry: {reason}",
             where=f"{folder / JOURNAL_FILE}:{line}",
             remedy="restore the file from a copy",
         )
     return entries
 
 
-def _impossible(entries: list[JournalEntry], plan: Plan) -> Iterator[tuple[int, str]]:
+def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tuple[int, str]]:
     """Yield line and reason of each entry that contradicts the plan or an entry before it."""
     started: set[tuple[RepeatId, int]] = set()
     ended: set[tuple[RepeatId, int]] = set()
-    over: dict[RepeatId, Status] = {}
+    final_status: dict[RepeatId, Status] = {}
     for line, entry in enumerate(entries, start=1):
         repeat, attempt = entry.repeat, (entry.repeat, entry.attempt)
         if repeat.protocol not in plan.protocols or repeat.number > plan.repeats:
             yield line, f"the plan has no repeat {repeat}"
         elif entry.status is Status.PLANNED:
-            if over.pop(repeat, Status.FAILED) is not Status.FAILED:
+            if final_status.pop(repeat, Status.FAILED) is not Status.FAILED:
                 yield line, f"{repeat} is planned again, although it was valid"
         elif entry.status is Status.RUNNING:
-            if attempt in started or repeat in over or not entry.attempt:
+            if attempt in started or repeat in final_status or not entry.attempt:
                 yield line, f"attempt {entry.attempt} at {repeat} starts, although it or its repeat has ended"
             started.add(attempt)
         elif attempt not in started or attempt in ended:
             yield line, f"attempt {entry.attempt} at {repeat} is {entry.status}, although it is not running"
         elif entry.status in ENDED:
             ended.add(attempt)
-            over |= {repeat: entry.status} if entry.status is not Status.VOID else {}
+            final_status |= {repeat: entry.status} if entry.status is not Status.VOID else {}
 
 
 def ended(entries: list[JournalEntry]) -> list[Attempt]:
@@ -189,11 +189,11 @@ def ended(entries: list[JournalEntry]) -> list[Attempt]:
 
 def interrupted(entries: list[JournalEntry]) -> list[Attempt]:
     """Return the attempts that started and did not end, `running` or `measured`, because fieldkit was killed."""
-    over = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
+    ended_attempts = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
     started = {
         (entry.repeat, entry.attempt): entry.utc_ns
         for entry in entries
-        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in over
+        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in ended_attempts
     }
     measured = {(entry.repeat, entry.attempt) for entry in entries if entry.status is Status.MEASURED}
     return [

@@ -81,7 +81,7 @@ class Manifest:
         self._save()
 
     def renew(self, names: Iterable[str]) -> None:
-        """Compute the checksums of some top-level files again, which are derived from others; the rest is kept."""
+        """Compute the checksums of the top-level files `names` again; all other checksums are kept."""
         self._top_level |= {name: _sha256(self._folder / name) for name in names}
         self._save()
 
@@ -113,9 +113,9 @@ def read(folder: Path) -> Sums:
             "no readable manifest", where=str(path), remedy="name the folder of a trial that ran at least one repeat"
         ) from error
     except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else f"not a line of a manifest: {str(error)[:60]}"
+        reason = error.strerror if isinstance(error, OSError) else f"not a line of a manifest: {str(error)[:60]}"
         raise EvidenceError(
-            f"no readable manifest: {why}", where=str(path), remedy="restore the file from a copy"
+            f"no readable manifest: {reason}", where=str(path), remedy="restore the file from a copy"
         ) from error
 
 
@@ -178,7 +178,7 @@ def is_positions(name: str) -> bool:
 
 
 def _unchanged_lines(path: Path, digest: str) -> int | None:
-    """Return the number of lines after which a file has this checksum, or None if it never has."""
+    """Return the number of leading lines of a file that have this checksum, or None if no number of lines has it."""
     hasher, count = hashlib.sha256(), 0
     try:
         lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)
@@ -199,10 +199,10 @@ def summarize(problems: Mapping[str, str]) -> str:
 
 
 def _file_differences(names: Iterable[str], listed: Sums, present: Mapping[str, Path]) -> dict[str, str]:
-    wanted = set(names)
-    problems = dict.fromkeys(wanted - present.keys(), "missing")
+    listed_names = set(names)
+    problems = dict.fromkeys(listed_names - present.keys(), "missing")
     problems |= dict.fromkeys(present.keys() - listed.keys(), "not in the manifest")
-    problems |= {name: "changed" for name in wanted & present.keys() if _sha256(present[name]) != listed[name]}
+    problems |= {name: "changed" for name in listed_names & present.keys() if _sha256(present[name]) != listed[name]}
     return problems
 
 

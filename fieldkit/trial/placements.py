@@ -39,8 +39,8 @@ odometry."""
 def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
     """Return the reason why the recorded positions contradict the planned placement, or None.
 
-    Robots are at their places when an attempt starts, even if they move later. So the recorded distance of two robots
-    must equal the planned one at some time of the attempt.
+    Robots are at their places when an attempt starts, even if they move later. Therefore the recorded distance of two
+    robots must equal the planned one at some time of the attempt.
     """
     return next(_contradictions(scene, evidence), None)
 
@@ -60,8 +60,8 @@ def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
         times_ns = _times_ns(evidence, ends[0], source, destination)
         recorded_m = np.linalg.norm(destination.at_m(times_ns) - source.at_m(times_ns), axis=1)
         planned_m = float(np.linalg.norm(np.subtract(places_m[ends[1]], places_m[ends[0]])))
-        off_m = float(np.abs(recorded_m - planned_m).min())
-        if off_m > (SATELLITE_M if satellites else TRACKER_M) + SHARE * planned_m:
+        deviation_m = float(np.abs(recorded_m - planned_m).min())
+        if deviation_m > (SATELLITE_M if satellites else TRACKER_M) + SHARE * planned_m:
             closest_m = float(recorded_m[np.abs(recorded_m - planned_m).argmin()])
             planned = f"the {ends[0]} and the {ends[1]} were placed {planned_m:.1f} m apart"
             yield f"{planned}, but by their recorded positions they were {closest_m:.1f} m apart"

@@ -119,7 +119,7 @@ class Plan(Strict):
                     remedy="report it to the author of the step",
                 ) from error
 
-    def puts(self) -> tuple[PutProgram, ...]:
+    def program_copies(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""
         planned = (job for scene in self.scenes() for job in self.jobs(scene))
         return tuple(dict.fromkeys(job.put for job in planned if job.put is not None))
@@ -141,7 +141,7 @@ class Plan(Strict):
         return sample_size.unmet_requirements(self.procedure.expectations, self.procedure.figures, self.repeats)
 
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
-        """Return descriptions of what the testbed does in one repeat besides running the commands."""
+        """Return the actions of the testbed in one repeat in addition to the commands, one sentence each."""
         section_notes = (line for section in self._sections() for line in section.dry_run_notes(self))
         steps = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, DescribesActions))
         return (*section_notes, *(line for step in steps for line in step.dry_run_notes(scene)))

@@ -60,9 +60,9 @@ def set_positions(
     """
     plan = store.read_plan(folder)
     for role, source in sources.items():
-        _demand_role(plan, role)
+        _require_role(plan, role)
         if isinstance(source, Path):
-            _demand_file(source)
+            _require_file(source)
             position_files.read_file(source)
     # Position files that were added before are replaced, so their changes do not matter.
     changes = {
@@ -71,8 +71,10 @@ def set_positions(
     if changes:
         problem = f"the evidence is not what was measured: {manifest.summarize(changes)}"
         raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
-    with journal.claimed(folder):
-        sources_by_role = {role: _stored(folder, role, source, offset_s, gap_s) for role, source in sources.items()}
+    with journal.locked(folder):
+        sources_by_role = {
+            role: _store_source(folder, role, source, offset_s, gap_s) for role, source in sources.items()
+        }
         if sources_by_role:
             text = position_sources.text(PositionSources(sources_by_role, heights=heights))
             files.write(folder / position_sources.FILE, text.encode())
@@ -84,13 +86,13 @@ def set_positions(
     return rebuild(folder)
 
 
-def _demand_role(plan: Plan, role: Role) -> None:
+def _require_role(plan: Plan, role: Role) -> None:
     if role not in plan.cast:
         remedy = did_you_mean(role, plan.cast, f"roles of the trial: {', '.join(plan.cast)}")
         raise ConfigurationError(f"the trial has no role {role}", remedy=remedy)
 
 
-def _demand_file(path: Path) -> None:
+def _require_file(path: Path) -> None:
     if not path.is_file():
         raise ConfigurationError(
             "there is no such file", where=str(path), remedy="name GPX, CSV, or a place: 48.1,11.5"
@@ -100,7 +102,9 @@ def _demand_file(path: Path) -> None:
         raise ConfigurationError(problem, where=str(path), remedy="cut it to the time of the trial")
 
 
-def _stored(folder: Path, role: Role, source: Path | PositionSource, offset_s: float, gap_s: float) -> PositionSource:
+def _store_source(
+    folder: Path, role: Role, source: Path | PositionSource, offset_s: float, gap_s: float
+) -> PositionSource:
     """Copy the position file of a robot into the trial's folder and return it as a position source."""
     if isinstance(source, PositionSource):
         return source
@@ -181,11 +185,13 @@ _SMALLEST: Final = "_distance_min_m"
 
 
 def _distances_m(measured: Measured) -> Iterator[tuple[str, tuple[float, float]]]:
-    for name, least in measured.values.items():
+    for name, minimum_m in measured.values.items():
         if name.endswith(_SMALLEST):
             measurement = name.removesuffix(_SMALLEST)
-            yield measurement, (float(least), float(measured.values[f"{measurement}_distance_max_m"]))
+            yield measurement, (float(minimum_m), float(measured.values[f"{measurement}_distance_max_m"]))
 
 
 def _missing(measured: Measured) -> Mapping[str, str]:
-    return {name.removesuffix(_SMALLEST): why for name, why in measured.missing.items() if name.endswith(_SMALLEST)}
+    return {
+        name.removesuffix(_SMALLEST): reason for name, reason in measured.missing.items() if name.endswith(_SMALLEST)
+    }

@@ -139,26 +139,26 @@ class Procedure(catalog.Named, Sectioned):
         robot_files = (
             name(role) for role in self.roles() for name in (host.before_file, host.after_file, link_samples.file)
         )
-        claimed, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
+        used_resources, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
         filled = set[str]()
         for placed in self.walk():
             step = placed.step
             before = [other.step for other in earlier if not placed.runs_beside(other)]
-            if isinstance(step, ChecksPlacement) and (why := step.placement_error(before, placed.within)):
-                raise schema.validation_error(why, *placed.at)
-            for claim in step.exclusive_resources():
-                if (step.prefix, claim) in claimed:
-                    raise schema.validation_error(_claimed_twice(step, claim), *placed.at)
-                claimed.add((step.prefix, claim))
+            if isinstance(step, ChecksPlacement) and (reason := step.placement_error(before, placed.within)):
+                raise schema.validation_error(reason, *placed.at)
+            for resource in step.exclusive_resources():
+                if (step.prefix, resource) in used_resources:
+                    raise schema.validation_error(_duplicate_resource_message(step, resource), *placed.at)
+                used_resources.add((step.prefix, resource))
             for name in step.files():
-                if why := _file_conflict(step, name, files):
-                    raise schema.validation_error(why, *placed.at)
+                if reason := _file_conflict(step, name, files):
+                    raise schema.validation_error(reason, *placed.at)
                 files.add(name)
-            if why := next(filter(None, map(placed.port_conflict, earlier)), None):
-                raise schema.validation_error(why, *placed.at, "port")
+            if reason := next(filter(None, map(placed.port_conflict, earlier)), None):
+                raise schema.validation_error(reason, *placed.at, "port")
             for column in columns.of_step(step):
-                if why := columns.clash(column, filled):
-                    raise schema.validation_error(why, *placed.at)
+                if reason := columns.column_conflict(column, filled):
+                    raise schema.validation_error(reason, *placed.at)
                 filled.add(column.name)
             earlier.append(placed)
         return self
@@ -272,7 +272,7 @@ class PlacedStep:
         return any(nest.disturbs for nest in self.within)
 
     @property
-    def called(self) -> str:
+    def label(self) -> str:
         """Description of the step: `the step transfer up`."""
         return " ".join(filter(None, ("the step", self.kind, self.step.prefix)))
 
@@ -286,19 +286,26 @@ class PlacedStep:
         is_captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)
         if not (isinstance(self.step, Listens) and isinstance(other.step, Listens)):
             return None
-        for mine, theirs in product(self.step.listens(), other.step.listens()):
-            is_exclusive = not (mine.shared and theirs.shared)
-            if is_simultaneous and is_exclusive and (mine.role, mine.port) == (theirs.role, theirs.port):
-                return f"port {mine.port} is used twice at the same time on {mine.role}; give one another {mine.by}"
-            if is_captured and mine.looks_like(theirs):
-                conflict = f"port {mine.port} is used twice in one capture, from {mine.peer} to {mine.role}"
-                return f"{conflict}; give one another {mine.by}, or a separate capture each"
+        for listener, other_listener in product(self.step.listens(), other.step.listens()):
+            is_exclusive = not (listener.shared and other_listener.shared)
+            if (
+                is_simultaneous
+                and is_exclusive
+                and (listener.role, listener.port) == (other_listener.role, other_listener.port)
+            ):
+                conflict = f"port {listener.port} is used twice at the same time on {listener.role}"
+                return f"{conflict}; give one another {listener.by}"
+            if is_captured and listener.looks_like(other_listener):
+                conflict = (
+                    f"port {listener.port} is used twice in one capture, from {listener.peer} to {listener.role}"
+                )
+                return f"{conflict}; give one another {listener.by}, or a separate capture each"
         return None
 
     def runs_beside(self, other: "PlacedStep") -> bool:
         """Return True if an earlier step runs at the same time and neither contains the other."""
         paths = zip((*self.within, self.step), (*other.within, other.step), strict=False)
-        fork = next((index for index, (mine, theirs) in enumerate(paths) if mine is not theirs), 0)
+        fork = next((index for index, (step, other_step) in enumerate(paths) if step is not other_step), 0)
         return fork > 0 and self.within[fork - 1].parallel
 
 
@@ -310,19 +317,21 @@ def _file_conflict(step: Step, name: str, files: Set[str]) -> str | None:
     return f"there is already a file {name}; give it, or its step, another name" if name in files else None
 
 
-def _claimed_twice(step: Step, claim: str) -> str:
-    """Return the message for two steps that claim the same exclusive resource under one name."""
+def _duplicate_resource_message(step: Step, resource: str) -> str:
+    """Return the message for two steps that use the same exclusive resource under one name."""
     if step.prefix:
-        return f"{claim} named {step.prefix} is defined twice; give one another name, inside for: with its variable"
-    return f"{claim} is defined twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
+        return (
+            f"{resource} named {step.prefix} is defined twice; give one another name, inside for: with its variable"
+        )
+    return f"{resource} is defined twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
 
 
 def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[PlacedStep]:
     for index, entry in enumerate(entries):
-        here = (*at, index, entry.kind)
-        yield PlacedStep(entry.step, entry.kind, within, here)
+        location = (*at, index, entry.kind)
+        yield PlacedStep(entry.step, entry.kind, within, location)
         if isinstance(entry.step, Nest):
-            yield from _walk(entry.step.during, (*here, "during"), (*within, entry.step))
+            yield from _walk(entry.step.during, (*location, "during"), (*within, entry.step))
 
 
 def load_procedure(name: str) -> Procedure:
@@ -344,7 +353,7 @@ def read_procedure(path: Path) -> Procedure:
 
 
 def with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
-    """Return the procedures; those that measure the figure have the expectation in addition to their own.
+    """Return the procedures, with the expectation added to those that measure its figure.
 
     Args:
         procedures: The procedures.

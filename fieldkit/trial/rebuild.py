@@ -21,13 +21,13 @@ class Rebuilt:
         cells: The summary.
         changed: Files whose bytes differ from before, or that were missing.
         expected: Names of the quantities that have an expectation.
-        is_summed: Whether there is a manifest, so that the evidence was verified to be unchanged.
+        has_manifest: Whether there is a manifest, so that the evidence was verified to be unchanged.
     """
 
     cells: tuple[Cell, ...]
     changed: tuple[str, ...]
     expected: frozenset[str]
-    is_summed: bool
+    has_manifest: bool
 
 
 def rebuild(folder: Path) -> Rebuilt:
@@ -49,16 +49,16 @@ def rebuild(folder: Path) -> Rebuilt:
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
     before = {name: _content(folder / name) for name in names}
     entries = journal.history(folder, plan)
-    with journal.claimed(folder):  # rows that a running trial adds meanwhile would be lost
-        table = rows.to_csv(_measured(folder, plan, entries), plan.table)
+    with journal.locked(folder):  # rows that a running trial adds meanwhile would be lost
+        table = rows.to_csv(_rows(folder, plan, entries), plan.table)
         rows.summary(folder, plan, table)  # if this fails, nothing has been written yet
         rows.write_table(folder, table)
         cells = rows.write_summary(folder, plan, table)
-        if is_summed := (folder / store.MANIFEST_FILE).exists():
+        if has_manifest := (folder / store.MANIFEST_FILE).exists():
             manifest.Manifest(folder).renew(names)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
     expected = frozenset(expectation.quantity for expectation in plan.procedure.expectations)
-    return Rebuilt(cells=cells, changed=changed, expected=expected, is_summed=is_summed)
+    return Rebuilt(cells=cells, changed=changed, expected=expected, has_manifest=has_manifest)
 
 
 def measured(folder: Path, plan: Plan) -> list[Row]:
@@ -67,10 +67,10 @@ def measured(folder: Path, plan: Plan) -> list[Row]:
     Raises:
         EvidenceError: As for `journal.history`.
     """
-    return _measured(folder, plan, journal.history(folder, plan))
+    return _rows(folder, plan, journal.history(folder, plan))
 
 
-def _measured(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row]:
+def _rows(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row]:
     attempts = journal.ended(entries)
     return [row(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder))) for attempt in attempts]
 

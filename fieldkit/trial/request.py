@@ -72,8 +72,8 @@ def make_plan(
             common ROS master and each robot has its own.
     """
     procedure, topology = request.procedure, request.chosen_topology
-    _demand_roles(procedure, topology, cast)
-    _demand_ros_master(procedure, topology, cast)
+    _require_roles(procedure, topology, cast)
+    _require_ros_master(procedure, topology, cast)
     if request.record_s is not None:
         procedure = procedure.with_record(request.record_s)
     procedure = procedure.resolved(cast)
@@ -111,7 +111,7 @@ def make_plan(
         step_packages=step_packages.of_kinds(placed.kind for placed in procedure.walk()),
         columns=freeze((*others, *of_steps(placed.step for placed in procedure.walk()))) or None,
     )
-    plan.puts()  # raises before robots are started if a step of another package cannot give its commands
+    plan.program_copies()  # raises before robots are started if a step of another package cannot give its commands
     return plan
 
 
@@ -126,7 +126,7 @@ def _robot_data(cast: Cast) -> dict[str, object]:
     return data
 
 
-def _demand_ros_master(procedure: Procedure, topology: Topology, cast: Cast) -> None:
+def _require_ros_master(procedure: Procedure, topology: Topology, cast: Cast) -> None:
     if procedure.needs_ros_master and not any(robot.ros_master for robot in cast.values()):
         raise ConfigurationError(
             f"procedure {procedure.name} needs one ROS master for all robots; in {topology} each robot has its own",
@@ -134,7 +134,7 @@ def _demand_ros_master(procedure: Procedure, topology: Topology, cast: Cast) -> 
         )
 
 
-def _demand_roles(procedure: Procedure, topology: Topology, cast: Cast) -> None:
+def _require_roles(procedure: Procedure, topology: Topology, cast: Cast) -> None:
     """Raise an error if the cast lacks a role of the procedure or of the topology."""
     placed = {Role.SENDER, Role.RECEIVER} | ({Role.RELAY} if topology is Topology.MASTER else set())
     if missing := (procedure.roles() | placed) - cast.keys():

@@ -7,7 +7,7 @@ from fieldkit.steps.capabilities import ReservesSpace, UsesSpace
 from fieldkit.trial.plan import Plan
 
 SPARE: Final = 2.0
-"""Factor by which evidence may exceed the estimate: repeats are redone, and segments are retransmitted."""
+"""Factor by which evidence may exceed the estimate, because repeats are repeated and segments are retransmitted."""
 
 RESERVE_BYTES: Final = 100 << 20
 """Bytes that a trial leaves free on every disk for other data."""

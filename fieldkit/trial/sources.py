@@ -133,7 +133,7 @@ class Sources:
             self.note(f"kept as text, because no installed kind of step declares it: {', '.join(others)}")
         if columns is None:
             columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
-        content = partial(_measured, note=self.note) if self.rebuild else Path.read_bytes
+        content = partial(_remeasured_table, note=self.note) if self.rebuild else Path.read_bytes
         attempts, notes = deduplicated(repeats.read(self.tables, self.columns, columns, content))
         for note in notes:
             self.note(note)
@@ -168,7 +168,7 @@ def find_each(runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = Fal
     all_tables = [table for run_tables in tables_by_run for table in run_tables]
     columns = tables.planned(all_tables) if rebuild else tables.declared_in(all_tables)
     return [
-        Sources(_where(paths), run_tables, columns, rebuild, note)
+        Sources(_paths_text(paths), run_tables, columns, rebuild, note)
         for paths, run_tables in zip(runs, tables_by_run, strict=True)
     ]
 
@@ -177,11 +177,11 @@ def _find_tables(paths: Sequence[Path], note: Note, *, rebuild: bool) -> list[Pa
     by_identity = {_identity(table): table for path in paths for table in _tables(path, note, rebuild=rebuild)}
     if not by_identity:
         remedy = "add --rebuild, or make each as the notes above say"
-        raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=_where(paths), remedy=remedy)
+        raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=_paths_text(paths), remedy=remedy)
     return list(by_identity.values())
 
 
-def _where(paths: Sequence[Path]) -> str:
+def _paths_text(paths: Sequence[Path]) -> str:
     return " ".join(map(str, paths))
 
 
@@ -233,7 +233,7 @@ def _identity(table: Path) -> object:
     return status.st_dev, status.st_ino
 
 
-def _measured(table: Path, note: Note) -> bytes:
+def _remeasured_table(table: Path, note: Note) -> bytes:
     """Return a trial's table, measured again from its raw evidence."""
     from fieldkit.trial import rebuild  # noqa: PLC0415 (loads all measuring code, which existing tables do not need)
 

@@ -66,11 +66,11 @@ def missing(document: object) -> str | None:
     if not absent:
         return None
     sources = (packages[kind] if isinstance(packages[kind], dict) else {} for kind in absent)
-    named = (
+    descriptions = (
         f"step kind `{kind}` from {source.get('package', 'an unknown package')} {source.get('version', '')}".strip()
         for kind, source in zip(absent, sources, strict=True)
     )
-    return f"{', '.join(named)} {'is' if len(absent) == 1 else 'are'} not installed"
+    return f"{', '.join(descriptions)} {'is' if len(absent) == 1 else 'are'} not installed"
 
 
 def _code_hash(module: str) -> str:

@@ -81,9 +81,9 @@ def read_plan(folder: Path) -> Plan:
 
     Raises:
         ConfigurationError: The folder has no plan, or the plan was edited.
-        EvidenceError: As for `demand_plain`.
+        EvidenceError: As for `require_plain`.
     """
-    demand_plain(folder)
+    require_plain(folder)
     if not (folder / PLAN_FILE).is_file():
         raise ConfigurationError(
             f"there is no {PLAN_FILE}", where=str(folder), remedy="name the folder of a trial, trials/<stamp>_..."
@@ -98,7 +98,7 @@ def read_plan(folder: Path) -> Plan:
     return schema.validate(document, Plan)
 
 
-def demand_plain(folder: Path) -> None:
+def require_plain(folder: Path) -> None:
     """Raise an error if a file of the trial is not a plain file or folder.
 
     A trial may come from another person. Links could lead out of its folder, and reading a pipe could block.
@@ -194,7 +194,7 @@ def unjournalled_attempt(folder: Path, names: Iterable[str]) -> Path | None:
     return next((path for name in names if (path := attempt_folder(folder, name)).is_dir()), None)
 
 
-def demand_space(folder: Path, needed_bytes: int) -> None:
+def require_space(folder: Path, needed_bytes: int) -> None:
     """Raise an error if this machine has too little space for the evidence of an attempt.
 
     Raises:

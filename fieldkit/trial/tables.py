@@ -27,8 +27,8 @@ def declared_in(tables: Sequence[Path]) -> tuple[Column, ...]:
         ConfigurationError: A table or a plan cannot be read, or plans contradict each other.
     """
     everywhere = {column.name for column in trial_columns()} | {"", SOURCE}
-    others = {table: names for table in tables if (names := _others(table, everywhere))}
-    planned_columns = merge_columns((table.parent / PLAN_FILE, _frozen(table)) for table in others)
+    others = {table: names for table in tables if (names := _other_column_names(table, everywhere))}
+    planned_columns = merge_columns((table.parent / PLAN_FILE, _frozen_columns(table)) for table in others)
     installed_columns = {column.name: column for column in installed()}
     other_names = dict.fromkeys(name for names in others.values() for name in names)
     return trial_columns(planned_columns.get(name) or _by_name(name, installed_columns) for name in other_names)
@@ -65,16 +65,16 @@ def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str
                     remedy="combine only trials in which it is the same",
                 )
             if kept.bounds != column.bounds:
-                (low, high), (least, most) = kept.possible, column.possible
-                merged[column.name] = first, replace(kept, bounds=(min(low, least), max(high, most)))
+                (low, high), (other_low, other_high) = kept.possible, column.possible
+                merged[column.name] = first, replace(kept, bounds=(min(low, other_low), max(high, other_high)))
     return {name: column for name, (_, column) in merged.items()}
 
 
-def _others(table: Path, everywhere: Iterable[str]) -> list[str]:
+def _other_column_names(table: Path, everywhere: Iterable[str]) -> list[str]:
     return [name for name in repeats.names(table) if name not in everywhere]
 
 
-def _frozen(table: Path) -> tuple[Column, ...]:
+def _frozen_columns(table: Path) -> tuple[Column, ...]:
     """Return the columns in the plan in the folder of a table."""
     plan = table.parent / PLAN_FILE
     return frozen.read(plan) if plan.exists() and not files.unexpected_type(plan) else ()

@@ -91,13 +91,13 @@ def test_other_systems_and_damaged_frames_are_ignored() -> None:
     assert state.position_m == (1.0, 2.0, 3.0)
 
 
-@given(st.lists(st.tuples(st.sampled_from([*mavlink_frames.EXTRA]), st.binary(max_size=60)), max_size=5))
+@given(st.lists(st.tuples(st.sampled_from([*mavlink_frames.CRC_EXTRA]), st.binary(max_size=60)), max_size=5))
 def test_any_payload_is_tolerated(payloads: list[tuple[int, bytes]]) -> None:
     state, link = state_from()
     check = ArmingCheck(state, FlightNeeds(3.0, 5.0, 30.0, 0.2, returns=True))
     for kind, payload in payloads:
         body = bytes((len(payload), 0, 0, 0, 7, 1)) + kind.to_bytes(3, "little") + payload
-        total = mavlink_frames.checksum(body + bytes((mavlink_frames.EXTRA[kind],)))
+        total = mavlink_frames.checksum(body + bytes((mavlink_frames.CRC_EXTRA[kind],)))
         link.coming.append(b"\xfd" + body + total.to_bytes(2, "little"))
     state.receive()
     numbers = (*(state.position_m or ()), state.yaw_rad or 0.0, *state.parameters.values())

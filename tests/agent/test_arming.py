@@ -88,10 +88,13 @@ def test_no_faults_for_a_ready_autopilot() -> None:
         ({"status": status(healthy=0)}, "ArduCopter refuses to be armed: GPS"),
         ({"text": d.MAVLink_statustext_message(2, b"PreArm: Gyros inconsistent")}, "be armed: Gyros inconsistent"),
         ({"home": None}, "it has no home position"),
-        ({"top": parameter("FENCE_ALT_MAX", 2.5)}, "its own fence ends 2.5 m high, but the flight needs 3 m"),
+        (
+            {"top": parameter("FENCE_ALT_MAX", 2.5)},
+            "the fence of its autopilot ends 2.5 m high, but the flight needs 3 m",
+        ),
         (
             {"radius": parameter("FENCE_RADIUS", 15)},
-            "its own fence ends 15 m far from home, but the flight needs 20 m",
+            "the fence of its autopilot ends 15 m far from home, but the flight needs 20 m",
         ),
         ({"back": parameter("RTL_ALT", 1500)}, "it returns at a height of 15 m, but only 10 m are allowed"),
     ],

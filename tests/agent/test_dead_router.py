@@ -14,7 +14,7 @@ from typing import Final
 
 from fieldkit.agent import landing
 from fieldkit.agent.flight_plan import CLIMB, FlightPlan
-from fieldkit.agent.links import places
+from fieldkit.agent.links import link_files
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from tests.helpers import drones
@@ -86,6 +86,6 @@ def test_all_programs_stop_in_time_after_a_signal(tmp_path: Path) -> None:
 
 def server_pid(connection: str) -> int:
     """Return the process id of the link server."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client, places.address(connection) as address:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client, link_files.address(connection) as address:
         client.connect(address)
-        return places.peer_credentials(client)[0]
+        return link_files.peer_credentials(client)[0]

@@ -14,7 +14,7 @@ ACM = {name: number for number, name in mavutil.mode_mapping_acm.items()}
 
 
 def test_crc_extra_is_that_of_the_definitions() -> None:
-    assert {kind: d.mavlink_map[kind].crc_extra for kind in mavlink_frames.EXTRA} == mavlink_frames.EXTRA
+    assert {kind: d.mavlink_map[kind].crc_extra for kind in mavlink_frames.CRC_EXTRA} == mavlink_frames.CRC_EXTRA
 
 
 @pytest.mark.parametrize(

@@ -169,7 +169,7 @@ def test_drives_out_and_back_and_ends_with_zero_velocity(monkeypatch: pytest.Mon
 def test_lost_laptop_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders", leaves_s=100.9)
     ended, log, status = run(world, monkeypatch, tmp_path)
-    assert ended == status["ended"] == "the laptop was silent for 2 s"
+    assert ended == status["ended"] == "no order from the laptop for 2 s"
     assert log[-1]["utc_ns"] / 1e9 < 100.9 + 2.0 + 0.7
     assert world.sent[-8:] == [DriveVelocity()] * 8
 

@@ -14,7 +14,7 @@ import pytest
 from fieldkit.agent import flight, landing
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
 from fieldkit.agent.flying import loop
-from fieldkit.agent.mavlink_frames import LOCAL_POSITION_NED, head
+from fieldkit.agent.mavlink_frames import LOCAL_POSITION_NED, parse_frame
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot
@@ -94,12 +94,12 @@ def test_autopilot_without_reports_is_commanded_to_land(
     lost: int | None, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """It may receive commands although its answers are lost."""
-    monkeypatch.setattr(loop, "_BLIND_S" if lost else "_SILENT_S", 2.0)
+    monkeypatch.setattr(loop, "_POSITION_TIMEOUT_S" if lost else "_FLIGHT_HEARTBEAT_TIMEOUT_S", 2.0)
     silent, codes = threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
 
     def damage(frame: bytes) -> list[bytes]:
-        return [] if silent.is_set() and lost in {None, head(frame).kind} else [frame]
+        return [] if silent.is_set() and lost in {None, parse_frame(frame).kind} else [frame]
 
     with drones.autopilot_at_udp(damage) as (port, autopilot):
         flight_plan, over = plan(tmp_path, port), threading.Event()
@@ -122,7 +122,7 @@ def test_silent_autopilot_ends_the_flight_with_an_alarm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """As behind a stopped router: the alarm is logged first, and the program exits some time later."""
-    monkeypatch.setattr(loop, "_SILENT_S", 5.0)
+    monkeypatch.setattr(loop, "_FLIGHT_HEARTBEAT_TIMEOUT_S", 5.0)
     monkeypatch.setattr(landing, "NO_HEARTBEAT_S", 1.0)
     silent, over, codes = threading.Event(), threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent.flying.talk import AutopilotSession
-from fieldkit.agent.links import places, survey
+from fieldkit.agent.flying.session import AutopilotSession
+from fieldkit.agent.links import link_files, survey
 from fieldkit.agent.links.client import SharedLink
 from fieldkit.agent.mavlink_frames import ATTITUDE, LOCAL_POSITION_NED
 from fieldkit.remote import agent
@@ -94,7 +94,7 @@ def servers(connection: str) -> list[int]:
 def assert_nothing_remains(connection: str) -> None:
     """Wait until a connection has no server, and its files are deleted."""
     end_s = time.monotonic() + PATIENCE_S
-    while servers(connection) or any(Path(places.folder()).glob(f"{places.name(connection)}.*")):
+    while servers(connection) or any(Path(link_files.folder()).glob(f"{link_files.name(connection)}.*")):
         assert time.monotonic() < end_s, servers(connection)
         threading.Event().wait(0.05)
 

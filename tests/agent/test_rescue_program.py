@@ -60,7 +60,7 @@ def programs(folder: Path) -> Iterator[list["subprocess.Popen[bytes]"]]:
 def have_started(path: Path) -> bool:
     """Return True if both programs are in the file."""
     life_entries = entries(path) if path.exists() else ()
-    return bool(life_entries) and all(entry.turns for entry in life_entries)
+    return bool(life_entries) and all(entry.iterations for entry in life_entries)
 
 
 def entries(path: Path) -> tuple[liveness.LifeEntry, ...]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fieldkit.agent.standstill import WITHIN_S, Standstill
+from fieldkit.agent.standstill import WINDOW_S, Standstill
 from fieldkit.agent.steering import OdometryPose
 
 
@@ -24,8 +24,8 @@ def test_motion_above_the_limits_is_detected(speed_m_s: float, turn_rad_s: float
 
 def test_short_observation_confirms_nothing() -> None:
     assert not Standstill().stationary
-    assert not after(0.0, 0.0, WITHIN_S - 0.05).stationary
-    assert after(0.0, 0.0, WITHIN_S).stationary
+    assert not after(0.0, 0.0, WINDOW_S - 0.05).stationary
+    assert after(0.0, 0.0, WINDOW_S).stationary
 
 
 def test_stopped_robot_is_stationary_after_the_window() -> None:

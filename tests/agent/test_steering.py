@@ -88,13 +88,13 @@ def test_drives_out_and_back_to_its_pose(
     task = replace(TASK, legs=legs, fence_m=50.0, limit_s=500.0)
     driver, robot = Driver(task, 0.0), Robot(start, noise_m, seed)
     out = list(run(driver, robot))
-    assert (driver.phase, driver.stopped) == ("there", "")
+    assert (driver.phase, driver.stop_reason) == ("there", "")
     cos, sin = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
     ahead, left = map(sum, zip(*legs, strict=True))
     goal = start.x_m + cos * ahead - sin * left, start.y_m + sin * ahead + cos * left
     assert math.dist(robot.pose[:2], goal) < 0.05 + 5 * noise_m + 3 * noise_m * len(legs)
     back = list(run(driver, robot, now_s=len(out) * TICK_S, order=BACK))
-    assert (driver.phase, driver.stopped) == ("home", "")
+    assert (driver.phase, driver.stop_reason) == ("home", "")
     assert math.dist(robot.pose[:2], start[:2]) < 0.05 + 10 * noise_m
     assert abs(math.remainder(robot.pose.yaw_rad - start.yaw_rad, math.tau)) < 0.1 + 5 * noise_m
     assert out[-1] == back[-1] == ZERO_VELOCITY
@@ -126,8 +126,8 @@ def test_any_odometry_and_order_keep_the_limits(
         assert 0 <= velocity.forward_m_s <= TASK.speed_m_s
         assert abs(velocity.turn_rad_s) <= TASK.turn_rad_s
         assert velocity.forward_m_s - last.forward_m_s <= TASK.acceleration_m_s2 * for_s + 1e-9
-        assert not stopped or (velocity == ZERO_VELOCITY and driver.stopped == stopped), "the stop is final"
-        last, stopped = velocity, driver.stopped
+        assert not stopped or (velocity == ZERO_VELOCITY and driver.stop_reason == stopped), "the stop is final"
+        last, stopped = velocity, driver.stop_reason
 
 
 def moving(task: DriveTask = TASK) -> tuple[Driver, Robot, float]:
@@ -140,7 +140,7 @@ def moving(task: DriveTask = TASK) -> tuple[Driver, Robot, float]:
 
 def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: bool, hears: bool) -> float:
     now_s = since_s
-    while not driver.stopped:
+    while not driver.stop_reason:
         now_s += TICK_S
         if hears:
             driver.on_odometry(now_s, robot.odometry())
@@ -158,23 +158,23 @@ def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: boo
 def test_lost_laptop_stops_it_within_its_lease() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)]))
     assert stopped_after_s(driver, since_s, robot, renews=False, hears=True) <= TASK.lease_s + TICK_S
-    assert driver.stopped == "the laptop was silent for 2 s"
+    assert driver.stop_reason == "no order from the laptop for 2 s"
 
 
 def test_silent_odometry_stops_it() -> None:
     driver, robot, since_s = moving()
     assert stopped_after_s(driver, since_s, robot, renews=True, hears=False) <= TASK.odometry_s + TICK_S
-    assert driver.stopped == "odometry was silent for 0.5 s"
+    assert driver.stop_reason == "no odometry for 0.5 s"
 
 
 def test_stops_at_its_fence_and_after_its_time_limit() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], fence_m=2.0))
     stopped_after_s(driver, since_s, robot, renews=True, hears=True)
-    assert driver.stopped == "beyond the fence, 2 m from its place"
+    assert driver.stop_reason == "beyond the fence, 2 m from its place"
     assert math.dist(robot.pose[:2], (7.0, 8.0)) < 2.0 + 2 * TASK.speed_m_s * TICK_S
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], limit_s=3.0))
     assert stopped_after_s(driver, since_s, robot, renews=True, hears=True) <= 3.0
-    assert driver.stopped == "not there after 3 s"
+    assert driver.stop_reason == "the path was not finished in 3 s"
 
 
 def test_jumping_odometry_and_an_order_stop_it() -> None:
@@ -182,10 +182,10 @@ def test_jumping_odometry_and_an_order_stop_it() -> None:
     robot.pose = robot.pose._replace(x_m=robot.pose.x_m + 1.0)
     driver.on_odometry(since_s + TICK_S, robot.odometry())
     assert driver.tick(since_s + TICK_S) == ZERO_VELOCITY
-    assert driver.stopped.startswith("odometry jumped by 1")
+    assert driver.stop_reason.startswith("odometry jumped by 1")
     driver, _, since_s = moving()
     driver.on_order(since_s, END)
-    assert (driver.tick(since_s), driver.stopped) == (ZERO_VELOCITY, "ordered to stop")
+    assert (driver.tick(since_s), driver.stop_reason) == (ZERO_VELOCITY, "ordered to stop")
 
 
 def test_waits_for_its_laptop_and_turns_back_at_its_position() -> None:
@@ -229,9 +229,9 @@ def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
         driver.on_odometry(at_s, pose if driver.phase != "waits" else OdometryPose(0.0, 0.0, 0.0))
         driver.on_order(at_s, OUT)
         way_m += driver.tick(at_s).forward_m_s * TICK_S
-        if driver.stopped:
+        if driver.stop_reason:
             break
-    assert driver.stopped.startswith("1.3 m were commanded, but by its odometry the robot drove 0.0 m")
+    assert driver.stop_reason.startswith("1.3 m were commanded, but by its odometry the robot drove 0.0 m")
     assert way_m < 1.5, "of 5 m to its fence"
 
 
@@ -249,7 +249,7 @@ def test_robot_that_is_not_at_its_place_does_not_start(
 ) -> None:
     driver = Driver(replace(TASK, origin=(0.0, 0.0, 0.0), last=last), 0.0)
     assert set(run(driver, Robot(OdometryPose(*start)))) == {ZERO_VELOCITY}
-    assert (driver.stopped, driver.refused) == (why, True)
+    assert (driver.stop_reason, driver.refused) == (why, True)
 
 
 def test_later_repeats_use_the_heading_of_the_origin() -> None:
@@ -264,7 +264,7 @@ def test_gap_between_two_iterations_stops_it() -> None:
     driver.on_order(since_s + 6.0, OUT)
     driver.on_odometry(since_s + 6.0, robot.odometry())
     assert driver.tick(since_s + 6.0) == ZERO_VELOCITY
-    assert driver.stopped == "its program was suspended for 6.0 s"
+    assert driver.stop_reason == "its program was suspended for 6.0 s"
 
 
 def test_first_returns_along_its_path_if_allowed() -> None:
@@ -274,9 +274,9 @@ def test_first_returns_along_its_path_if_allowed() -> None:
     for _ in run(driver, robot):
         x_m, y_m, _ = robot.pose
         off_m = max(off_m, min(abs(y_m), abs(x_m - 2.0)))
-    assert (driver.phase, driver.stopped) == ("there", "")
+    assert (driver.phase, driver.stop_reason) == ("there", "")
     assert off_m < 0.2, "around the corner"
     assert driver.driven_m == pytest.approx(3.5, abs=0.3), "without the path of the return"
     driver = Driver(task, 0.0)
     assert set(run(driver, Robot(OdometryPose(0.5, 2.0, 0.0)))) == {ZERO_VELOCITY}
-    assert driver.stopped.endswith("more than 1 m off its path")
+    assert driver.stop_reason.endswith("more than 1 m off its path")

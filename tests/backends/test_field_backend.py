@@ -123,8 +123,8 @@ def test_robots_drive_automatically_only_if_allowed(tmp_path: Path, access: str)
     operator = RecordingOperator()
     with field.open(cast, seed=1, sink=lambda event: None, operator=operator) as lab:
         lab.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("5m")))
-        lab.bring_back(Role.SENDER, by_itself=True)
-        lab.bring_back(Role.SENDER, by_itself=False)
+        lab.bring_back(Role.SENDER, has_returned=True)
+        lab.bring_back(Role.SENDER, has_returned=False)
     assert operator.asked == [
         (
             "move turtlebot-1 to 5 m from duckiedrone-1, nothing between them; let turtlebot-1 face away from "

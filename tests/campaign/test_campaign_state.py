@@ -53,10 +53,10 @@ def begin(lawn: Path) -> tuple[CampaignPlan, CampaignJournal]:
 
 def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) -> None:
     asked, journal = begin(lawn)
-    with journal.claimed(asked):
+    with journal.locked(asked):
         lawn.write_text(f"# dry grass\n{LAWN}", encoding="utf-8")
     again, document = plan.make_plan(lawn, "field")
-    frozen = plan.begun(journal.folder, again, document)
+    frozen = plan.started_plan(journal.folder, again, document)
     assert frozen is not None
     assert frozen.order == asked.order
     assert frozen.trials() == asked.trials()
@@ -74,11 +74,11 @@ def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) 
 )
 def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str, line: int, named: str) -> None:
     asked, journal = begin(lawn)
-    with journal.claimed(asked):
+    with journal.locked(asked):
         lawn.write_text(LAWN.replace(old, new), encoding="utf-8")
     again, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
     with pytest.raises(ConfigurationError) as caught:
-        plan.begun(journal.folder, again, document)
+        plan.started_plan(journal.folder, again, document)
     assert caught.value.what == f"changed since the campaign started: {named}"
     assert caught.value.where == f"{lawn}:{line}"
     assert "campaign.yaml" in caught.value.remedy
@@ -87,13 +87,13 @@ def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str,
 def test_a_changed_procedure_is_rejected(lawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(lawn.parent)
     asked, journal = begin(lawn)
-    with journal.claimed(asked):
+    with journal.locked(asked):
         Path("procedures").mkdir()
     shipped = ROOT / "procedures" / "los.yaml"
     changed = shipped.read_text(encoding="utf-8").replace("count: 10", "count: 11")
     Path("procedures/los.yaml").write_text(changed, encoding="utf-8")
     with pytest.raises(ConfigurationError, match="a file of its procedures"):
-        plan.begun(journal.folder, *plan.make_plan(lawn, "field"))
+        plan.started_plan(journal.folder, *plan.make_plan(lawn, "field"))
 
 
 def test_an_impossible_walk_is_rejected_with_the_minimum(lawn: Path) -> None:
@@ -110,19 +110,19 @@ def test_an_impossible_walk_is_rejected_with_the_minimum(lawn: Path) -> None:
 def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
     asked, journal = begin(lawn)
     first, second, third, *_ = asked.trials()
-    with journal.claimed(asked):
+    with journal.locked(asked):
         for trial in (first, second, third):
             journal.add(trial, TrialProgress.STARTED, trial=f"trial of {trial}")
         journal.add(first, TrialProgress.PLACED, took_s=30.0, note="windy")
         journal.add(first, TrialProgress.ENDED, trial=f"trial of {first}", valid=3)
         journal.add(second, TrialProgress.SKIPPED)
-        begun = journal.folder / f"trial of {third}"
-        begun.mkdir()
-        (begun / "trial.yaml").touch()
+        started_plan = journal.folder / f"trial of {third}"
+        started_plan.mkdir()
+        (started_plan / "trial.yaml").touch()
     for seen in (journal, CampaignJournal(journal.folder)):
         assert list(seen.ended()) == [str(first)]
         assert seen.interrupted(second) is None, "it has no folder"
-        assert seen.interrupted(third) == begun
+        assert seen.interrupted(third) == started_plan
         assert seen.placing_s(99.0) == 30.0
     assert CampaignJournal(journal.folder / "none").placing_s(99.0) == 99.0
 
@@ -135,7 +135,7 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
     lawn.write_text(LAWN, encoding="utf-8")
     asked, journal = begin(lawn)
     trials = asked.trials()
-    with journal.claimed(asked):
+    with journal.locked(asked):
         for trial in trials[:-1]:
             journal.add(trial, TrialProgress.ENDED, valid=1)
     path = journal.folder / JOURNAL_FILE
@@ -144,7 +144,7 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
     kept = CampaignJournal(journal.folder)
     complete = len(kept.ended())
     assert complete >= path.read_bytes().count(b"\n")
-    with kept.claimed(asked):
+    with kept.locked(asked):
         kept.add(trials[-1], TrialProgress.ENDED, valid=1)
     assert list(CampaignJournal(journal.folder).ended()) == [*map(str, trials[:complete]), str(trials[-1])]
 
@@ -152,9 +152,9 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
 def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None:
     asked, journal = begin(lawn)
     with (
-        journal.claimed(asked),
+        journal.locked(asked),
         pytest.raises(ConfigurationError, match="another fieldkit runs this campaign"),
-        CampaignJournal(journal.folder).claimed(asked),
+        CampaignJournal(journal.folder).locked(asked),
     ):
         raise AssertionError("two at once")
     (journal.folder / JOURNAL_FILE).write_text('{"what": "lost"}\n{}\n', encoding="utf-8")
@@ -174,12 +174,12 @@ def test_the_estimate_uses_measured_placing_times(lawn: Path) -> None:
     asked, journal = begin(lawn)
     (lawn.parent / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     by_hand = load_backend("field", *load_site(lawn.parent / "fieldkit.yaml"))
-    by_itself = load_backend("emulated", *load_site(lawn.parent / "fieldkit.yaml"))
-    work_s = planned(asked, journal, by_itself).left_s
+    emulated_backend = load_backend("emulated", *load_site(lawn.parent / "fieldkit.yaml"))
+    work_s = planned(asked, journal, emulated_backend).left_s
     assert work_s > 8 * 3 * 2 * 66, "8 trials, 3 repeats of 2 protocols, recordings of 66 s"
     assert planned(asked, journal, by_hand).left_s == pytest.approx(work_s + 8 * PLACING_S)
     first, second, *_ = asked.trials()
-    with journal.claimed(asked):
+    with journal.locked(asked):
         journal.add(first, TrialProgress.PLACED, took_s=10.0)
         journal.add(second, TrialProgress.PLACED, took_s=30.0)
         journal.add(first, TrialProgress.ENDED, valid=6)
@@ -204,7 +204,7 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
     asked, journal = begin(lawn)
     backend = load_backend("emulated", None, None)
     whole, failed, *_ = asked.trials()
-    with journal.claimed(asked):
+    with journal.locked(asked):
         for trial, count in ((whole, 0), (failed, 2)):
             journal.add(trial, TrialProgress.STARTED, trial=str(count))
             journal.add(trial, TrialProgress.ENDED, trial=str(count), failed=count)
@@ -216,8 +216,8 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
     assert isinstance(event, CampaignPlanned)
     assert str(failed) in event.trials
     assert str(whole) not in event.trials
-    with journal.claimed(asked):
-        campaign._reopen()
+    with journal.locked(asked):
+        campaign._restart_failed()
     (journal.folder / "2").mkdir()
     (journal.folder / "2" / "trial.yaml").touch()
     for kept in (journal, CampaignJournal(journal.folder)):

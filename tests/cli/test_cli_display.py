@@ -13,7 +13,7 @@ import pytest
 
 from fieldkit.cli import main
 from fieldkit.cli.commands import listings
-from fieldkit.cli.display import table, words_of
+from fieldkit.cli.display import event_words, table
 from fieldkit.core.events import CampaignPlanned, CampaignWent, RepeatEnded
 from fieldkit.core.model import Status
 from tests.helpers.paths import ROOT
@@ -77,12 +77,12 @@ def test_a_title_longer_than_its_table_stays_one_line(capsys: pytest.CaptureFixt
 
 def test_reason_of_a_void_repeat_precedes_its_measurements() -> None:
     ended = RepeatEnded("udp-07", 1, Status.VOID, "no message", "RTT 1.3 ms", done=0, total=2, left_s=0.0)
-    assert "".join(text for text, _ in words_of(ended)) == "  0/2  udp-07  void   no message; measured: RTT 1.3 ms"
+    assert "".join(text for text, _ in event_words(ended)) == "  0/2  udp-07  void   no message; measured: RTT 1.3 ms"
 
 
 def test_remedy_for_a_failed_step_is_below_its_repeat() -> None:
     ended = RepeatEnded("udp-07", 1, Status.VOID, "too late", "", done=0, total=2, left_s=0, remedy="a larger idle")
-    _, below = "".join(text for text, _ in words_of(ended)).splitlines()
+    _, below = "".join(text for text, _ in event_words(ended)).splitlines()
     assert below.split() == ["remedy:", "a", "larger", "idle"]
 
 
@@ -90,7 +90,7 @@ def test_finished_campaign_shows_no_time_and_no_disk_space() -> None:
     went = CampaignWent("los 10ft master", done=2, total=2, left_s=0.0)
     planned = CampaignPlanned("small", (), 2, 2, walk_m=0.0, left_s=0.0, needed_bytes=0, free_bytes=1 << 30)
     for event in (went, planned):
-        assert "".join(text for text, _ in words_of(event)) == "campaign: 2 of 2 trials are done"
+        assert "".join(text for text, _ in event_words(event)) == "campaign: 2 of 2 trials are done"
 
 
 def test_paths_in_the_list_of_robots_are_not_wrapped(capsys: pytest.CaptureFixture[str]) -> None:
@@ -115,9 +115,9 @@ def test_table_has_a_header_a_rule_and_aligned_columns(capsys: pytest.CaptureFix
 
 REPORT_EVENTS = """
 from threading import Thread
-from fieldkit.cli.display import watching
+from fieldkit.cli.display import showing_events
 from fieldkit.core.events import PhaseStarted
-with watching(as_json=True) as sink:
+with showing_events(as_json=True) as sink:
     threads = [Thread(target=lambda: [sink(PhaseStarted("ping")) for _ in range(200)]) for _ in range(4)]
     for thread in threads:
         thread.start()

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from fieldkit.cli import hints, main, parser
-from fieldkit.cli.display import show_error, show_findings, watching, words_of
+from fieldkit.cli.display import event_words, show_error, show_findings, showing_events
 from fieldkit.core.errors import shell_command
 from fieldkit.core.events import Finding, TrialStopped
 from fieldkit.core.model import Verdict
@@ -47,7 +47,7 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
             assert inner is not top or not to_type, f"{path}: {text}"
             seen += inner is not top
             options = [] if inner is top else re.findall(r" (--[a-z-]+)", match["rest"])
-            assert all(inner.takes(option, "x") for option in options), f"{path}: {text}"
+            assert all(inner.accepts(option, "x") for option in options), f"{path}: {text}"
     assert seen > 30
 
 
@@ -96,7 +96,7 @@ def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture
         show_error("held\n  remedy: fieldkit abort")
         show_findings([finding])
         for as_json in (False, True):
-            with watching(as_json=as_json) as sink:
+            with showing_events(as_json=as_json) as sink:
                 sink(TrialStopped("my trials/a", 1, 2))
                 sink(finding)
     shown = capsys.readouterr()
@@ -107,7 +107,7 @@ def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture
 
 
 def test_without_options_hints_are_unchanged() -> None:
-    ((text, _),) = words_of(TrialStopped("trials/a", 1, 2))
+    ((text, _),) = event_words(TrialStopped("trials/a", 1, 2))
     assert hints.completed(text).endswith("to continue: fieldkit resume trials/a")
 
 

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from fieldkit.cli.display import words_of
+from fieldkit.cli.display import event_words
 from fieldkit.cli.progress import ProgressBar
 from fieldkit.core.events import (
     Answered,
@@ -82,7 +82,7 @@ def test_no_line_during_a_question_and_after_the_end() -> None:
 
 def test_line_of_a_valid_repeat_is_complete_and_wraps_in_narrow_terminals() -> None:
     def repeat(width: int | None) -> str:
-        return "".join(text for text, _ in words_of(VALID, width))
+        return "".join(text for text, _ in event_words(VALID, width))
 
     assert repeat(None) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms  (3 min 20 s left)"
     assert repeat(80) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms"
@@ -92,7 +92,7 @@ def test_line_of_a_valid_repeat_is_complete_and_wraps_in_narrow_terminals() -> N
 def test_reason_of_a_void_repeat_wraps_below_it_and_is_not_cut() -> None:
     reason = "turtlebot-1: the link is lost; the sender's capture dropped 12 packets, its interface none"
     void = RepeatEnded("udp-07", 1, Status.VOID, reason, "RTT 1.3 ms", 6, 40, 200.0)
-    first, *below = "".join(text for text, _ in words_of(void, 60)).splitlines()
+    first, *below = "".join(text for text, _ in event_words(void, 60)).splitlines()
     assert first == "  6/40  udp-07  void   "
     assert all(text.startswith(" " * 8) and len(text) <= 60 for text in below)
     assert " ".join(text.strip() for text in below) == f"{reason}; measured: RTT 1.3 ms"

@@ -23,7 +23,7 @@ ASK = """
 import sys
 from threading import Thread
 from fieldkit.cli import INTERRUPTED
-from fieldkit.cli.display import watching
+from fieldkit.cli.display import showing_events
 from fieldkit.cli.terminal import Terminal
 from fieldkit.core.events import Event, Note, PhaseStarted, Request
 def forward(event: Event) -> None:
@@ -31,7 +31,7 @@ def forward(event: Event) -> None:
     if isinstance(event, Request):
         Thread(target=sink, args=[Note("link lost")]).start()
 try:
-    with watching(as_json=False) as sink:
+    with showing_events(as_json=False) as sink:
         sink(PhaseStarted("connect"))
         sink(PhaseStarted("work", repeat="tcp-01"))
         answer = Terminal(forward).ask("move a", may_skip=True)

@@ -102,7 +102,7 @@ def campaign(*changes: str, started: bool = False) -> Setup:
         path.write_text(text, encoding="utf-8")
         if started:
             asked, _ = plan.make_plan(path, "emulated")
-            with CampaignJournal(lab / "trials" / "campaign_lawn").claimed(asked):
+            with CampaignJournal(lab / "trials" / "campaign_lawn").locked(asked):
                 pass
         for old, new in zip(changes[::2], changes[1::2], strict=True):
             assert old in text

@@ -228,7 +228,7 @@ def test_killing_fieldkit_stops_the_robot(outside: Outside) -> None:
         lambda: json.loads(shell.run(text, deadline=Deadline.after(30)).stdout)["ended"] != "", Deadline.after(30)
     )
     status = json.loads(shell.run(text, deadline=Deadline.after(30)).stdout)
-    assert status["ended"] == f"the laptop was silent for {LEASE_S:g} s"
+    assert status["ended"] == f"no order from the laptop for {LEASE_S:g} s"
     assert status["x_m"] < 19.0, "long before its end"
 
 
@@ -264,7 +264,7 @@ def test_the_first_signal_stops_the_robot_immediately(outside: Outside, number: 
         run = finish(process)
     assert took_s < LEASE_S, "by the order, not by its lease"
     assert "stopping: rover-1 stops where it is" in run.err
-    assert "rover-1: stopped (standing)" in run.err
+    assert "rover-1: stopped (stationary)" in run.err
     assert run.code == 130
     assert run.err.index("stopping: rover-1") < run.err.index("rover-1: stopped")
     assert_held(outside, "stopped by the operator")
@@ -312,7 +312,7 @@ def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(outside: Outside) -> N
         os.close(master)
     assert took_s < LEASE_S, "by the order, not by its lease"
     text = b"".join(shown).decode()
-    assert text.index("stopping: rover-1") < text.index("rover-1: stopped (standing)")
+    assert text.index("stopping: rover-1") < text.index("rover-1: stopped (stationary)")
 
 
 def test_ctrl_c_while_the_robot_drives_back_stops_it(outside: Outside) -> None:
@@ -371,9 +371,9 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(outside: O
         took_s = standstill_s(outside, sent_ns)
         assert run.code == 0, run.err + run.out
         assert sorted(run.out.splitlines()) == [
-            "rover-1: stopped (standing)",
-            "rover-2: nothing of fieldkit moves it; nothing was sent to it",
-            "rover-3: nothing of fieldkit moves it; nothing was sent to it",
+            "rover-1: stopped (stationary)",
+            "rover-2: no program of fieldkit moves it; nothing was sent to it",
+            "rover-3: no program of fieldkit moves it; nothing was sent to it",
         ]
         process.send_signal(signal.SIGCONT)
         ended = finish(process)
@@ -381,12 +381,12 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(outside: O
     assert "stopped the robots at" in ended.err
     assert standstill_s(outside, sent_ns + int(1e9 * took_s) + 1) == 0.0, "nothing moved again"
     again = fieldkit(outside.folder, "stop", "rover-1")
-    assert (again.code, again.out) == (0, "rover-1: nothing of fieldkit moves it; nothing was sent to it\n")
+    assert (again.code, again.out) == (0, "rover-1: no program of fieldkit moves it; nothing was sent to it\n")
     outside.links.cut(Role.SENDER)
     partly = fieldkit(outside.folder, "stop", "--all")
     assert partly.code == 3
     assert "rover-2: NOT REACHED: stop it by hand" in partly.out
-    assert "rover-1: nothing of fieldkit moves it" in partly.out
+    assert "rover-1: no program of fieldkit moves it" in partly.out
 
 
 def test_ctrl_c_while_the_program_starts_prevents_motion(outside: Outside) -> None:
@@ -422,7 +422,7 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(outside: Outside)
         wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
         stands_ns = time.time_ns()
         stopped = fieldkit(outside.folder, "stop", "rover-1")
-        assert (stopped.code, stopped.out) == (0, "rover-1: stopped (standing)\n")
+        assert (stopped.code, stopped.out) == (0, "rover-1: stopped (stationary)\n")
         wait_for_end({agent}, within_s=60.0)
         assert standstill_s(outside, stands_ns) == 0.0
         assert finish(process).code == 3
@@ -487,7 +487,7 @@ def test_after_a_fault_nothing_moves_before_it_is_confirmed(outside: Outside) ->
     # --yes is no confirmation, in any run.
     again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
-    assert "the laptop was silent for 2 s" in again.err
+    assert "no order from the laptop for 2 s" in again.err
     assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
     # Pressing Enter does not confirm either: the default is to stop.
     answers = outside.folder / "answers"

@@ -172,7 +172,7 @@ def test_stop_stops_a_robot_after_fieldkit_was_killed(lab: RoverLab) -> None:
     stopped = fieldkit(lab.folder, "stop", "--all", "--site", "broken.yaml")
     assert stopped.code == 0, stopped.out + stopped.err
     assert sorted(stopped.out.splitlines()) == [
-        "box-1: nothing of fieldkit moves it; nothing was sent to it",
-        "rover-1: stopped (standing)",
+        "box-1: no program of fieldkit moves it; nothing was sent to it",
+        "rover-1: stopped (stationary)",
     ]
     assert lab.stationary

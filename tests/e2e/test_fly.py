@@ -182,7 +182,7 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(out
     )
     assert stops < comes < ground
     assert height_m(outside, Role.SENDER) < 1e-3, "confirmed when it is there"
-    assert_landed(outside, Role.SENDER, "return: the job was ended")
+    assert_landed(outside, Role.SENDER, "return: the job was cancelled")
     assert far_m(outside, Role.SENDER) < NEAR_M
     wait_until(lambda: not agents(), Deadline.after(60))
 
@@ -198,7 +198,7 @@ def test_a_drone_flies_on_without_its_laptop_until_abort(outside: Outside) -> No
     aborted = fieldkit(outside.folder, "abort", "--yes")
     assert aborted.code == 0
     assert "/fly " in aborted.out, aborted.err
-    assert_landed(outside, Role.RECEIVER, "land: the job was ended")
+    assert_landed(outside, Role.RECEIVER, "land: the job was cancelled")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
@@ -211,7 +211,7 @@ def test_a_second_ctrl_c_does_not_wait_for_the_landing(outside: Outside) -> None
     stopped = finish(process)
     assert stopped.code == 130
     assert "the order to stop was sent" in stopped.err
-    assert_landed(outside, Role.RECEIVER, "land: the job was ended")
+    assert_landed(outside, Role.RECEIVER, "land: the job was cancelled")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
@@ -222,10 +222,10 @@ def test_stop_lands_a_drone_after_fieldkit_was_killed(outside: Outside) -> None:
     stopped = fieldkit(outside.folder, "stop", "--all")
     assert stopped.code == 0, stopped.err
     assert sorted(stopped.out.splitlines()) == [
-        "copter-1: nothing of fieldkit moves it; nothing was sent to it",
+        "copter-1: no program of fieldkit moves it; nothing was sent to it",
         "duckiedrone-1: coming down (land)",
     ]
-    assert_landed(outside, Role.RECEIVER, "land: the job was ended")
+    assert_landed(outside, Role.RECEIVER, "land: the job was cancelled")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 

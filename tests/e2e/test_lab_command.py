@@ -121,11 +121,11 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
         stopped = fieldkit(lab, "stop", "--all", "--backend", "emulated")
         assert (stopped.code, sorted(stopped.out.splitlines())) == (
             0,
-            ["air-1: nothing of fieldkit moves it; nothing was sent to it", "ground-1: stopped (standing)"],
+            ["air-1: no program of fieldkit moves it; nothing was sent to it", "ground-1: stopped (stationary)"],
         )
         assert not jobs.list_running(shells["ground-1"], Deadline.after(WITHIN_S))
     again = fieldkit(lab, "stop", "ground-1", "--backend", "emulated")
-    assert (again.code, again.out) == (0, "ground-1: nothing of fieldkit moves it; nothing was sent to it\n")
+    assert (again.code, again.out) == (0, "ground-1: no program of fieldkit moves it; nothing was sent to it\n")
     unknown = fieldkit(lab, "stop", "ground-2", "--backend", "emulated")
     assert (unknown.code, "did you mean 'ground-1'?" in unknown.err) == (2, True)
 

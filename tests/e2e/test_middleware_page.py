@@ -14,7 +14,7 @@ PAGE = ROOT / "docs" / "studies" / "middleware.md"
 
 def test_every_point_of_the_loss_figure_has_its_interval_and_its_number_of_samples() -> None:
     cells = middleware_page.cells(PAGE)
-    chart = middleware.by_distance(MiddlewareFindings(cells, "", 0.0, 0.0), "middleware-loss", middleware.LOST)
+    chart = middleware.by_distance(MiddlewareFindings(cells, "", 0.0, 0.0), "middleware-loss", middleware.LOSS_FIGURE)
     points = [
         point
         for panel in chart.panels

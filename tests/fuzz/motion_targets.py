@@ -42,7 +42,7 @@ from tests.ros.bags.test_recorded_topics import ROS2, log, write
 
 _ENDS: Final = (Role.SENDER, Role.RECEIVER)
 _JOB: Final = Job(folder="f", name="drive", argv=(), limit_s=1.0, log="drive.log")
-_STATUS: Final = b'{"phase": "back", "x_m": 0.1, "left_m": 1.5, "ended": "odometry was silent for 0.5 s"}'
+_STATUS: Final = b'{"phase": "back", "x_m": 0.1, "left_m": 1.5, "ended": "no odometry for 0.5 s"}'
 _ARMING: Final = (
     b'{"what": "its battery has 10%", "remedy": "charge it", "grave": true}\n{"autopilot": "PX4", "charge": 0.1}\n',
     b"rmw_cyclonedds_cpp\n",

@@ -31,5 +31,5 @@ class IdleTestbed:
     def moving(self, move: Move) -> AbstractContextManager[None]:
         raise AssertionError(move)
 
-    def bring_back(self, role: Role, *, by_itself: bool) -> None:
+    def bring_back(self, role: Role, *, has_returned: bool) -> None:
         raise AssertionError(role)

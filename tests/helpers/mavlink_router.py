@@ -11,7 +11,7 @@ import time
 from contextlib import suppress
 from typing import Final, Self
 
-from fieldkit.agent.mavlink_frames import COMMAND_ACK, frames, head
+from fieldkit.agent.mavlink_frames import COMMAND_ACK, frames, parse_frame
 
 _POLL_S: Final = 0.05
 _CLOSE_LIMIT_S: Final = 60.0
@@ -127,12 +127,12 @@ class MavlinkRouter:
 
     def _to_autopilot(self, endpoint: object, buffer: bytearray) -> None:
         for frame in frames(buffer):
-            sender = head(frame)
+            sender = parse_frame(frame)
             self._addresses.setdefault(endpoint, set()).add((sender.system, sender.component))
             self._autopilot_socket.sendto(frame, self._autopilot)
 
     def _to_clients(self, frame: bytes) -> None:
-        message = head(frame)
+        message = parse_frame(frame)
         target = tuple(message.payload.ljust(10, b"\0")[8:10]) if message.kind == COMMAND_ACK else (0, 0)
         for endpoint in ("udp", *self._streams):
             if target != (0, 0) and target not in self._addresses.get(endpoint, set()):

@@ -239,7 +239,7 @@ class MotionLab:
             problems = [f"left running: {' '.join(argv)[:80]}" for argv in remaining.values()]
             send(signal.SIGKILL, remaining)
         self.stop_router(craft)
-        self.outside.testbed.bring_back(_ROLES[craft], by_itself=False)
+        self.outside.testbed.bring_back(_ROLES[craft], has_returned=False)
         return problems
 
     def close(self) -> None:

@@ -108,7 +108,7 @@ def _few_losses(module: ModuleType, folder: Path) -> None:
     """Reduce `tcp_vs_ns3` to one loss pattern and one loss probability."""
     _without_ns3(module, folder)
     replace(module, "PATTERNS", {"1 packet": module.PATTERNS["1 packet"]})
-    replace(module, "CHANCES", {"2 % of data": (0.02, 0.0, 1.0)})
+    replace(module, "RANDOM_LOSSES", {"2 % of data": (0.02, 0.0, 1.0)})
 
 
 def _stand_in_iw(module: ModuleType, folder: Path) -> None:
@@ -127,7 +127,7 @@ def _two_commands(module: ModuleType, folder: Path) -> None:
 
 def _two_bridge_paths(module: ModuleType, folder: Path) -> None:
     del folder
-    replace(module, "WAYS", tuple(way for way in module.WAYS if way.name in {"ros1 plain", "ros1 bridged to dds"}))
+    replace(module, "PATHS", tuple(way for way in module.PATHS if way.name in {"ros1 plain", "ros1 bridged to dds"}))
 
 
 def _slow_iperf(module: ModuleType, folder: Path) -> None:
@@ -280,7 +280,7 @@ def _short_detour(module: ModuleType, folder: Path) -> None:
 CASES: Final[Mapping[str, Smallest]] = {
     "aggregate": Smallest("--rounds 1 --tables 1 --rows 80"),
     "bridge": Smallest(
-        "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLES_S": 0.5}, shrink=_two_bridge_paths, emulated=True
+        "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLING_S": 0.5}, shrink=_two_bridge_paths, emulated=True
     ),
     "cosim_discovery": Smallest("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
     "cosim_exchange": Smallest("", {"COUNTS": (3,), "ROUNDS": 1, "EXCHANGES": 5}),
@@ -303,7 +303,7 @@ CASES: Final[Mapping[str, Smallest]] = {
     "tcp_vs_kernel": Smallest("--runs 2 --seconds 1 --together 1 --loss 1% --delay 5ms", emulated=True),
     "tcp_vs_ns3": Smallest("", {"SECONDS": 1.0, "SEEDS": 2}, shrink=_few_losses),
     "telemetry": Smallest("--seconds 0.5", {"SLOWER": (1,)}, shrink=_stand_in_iw),
-    "topics": Smallest("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "LASTS_S": 1.0, "BURST_S": 0.1}),
+    "topics": Smallest("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "STREAM_S": 1.0, "BURST_S": 0.1}),
     "trial_overhead": Smallest("--rounds 1 --record 1s --round-trips 0s", emulated=True),
     "studies.zenoh_images": Smallest(
         "--rounds 1", {"SAMPLES": 2, "BYTES": 10_000}, shrink=_one_setting, emulated=True

@@ -12,7 +12,7 @@ from fieldkit.pytest.plugin_options import Keep
 
 def test_a_folder_is_created_on_first_use(tmp_path: Path) -> None:
     folder = EvidenceFolder(tmp_path / "run" / "test_a")
-    assert (folder.is_there, list(tmp_path.iterdir())) == (False, [])
+    assert (folder.exists, list(tmp_path.iterdir())) == (False, [])
     folder.add("heard")
     assert folder.path == tmp_path / "run" / "test_a"
     assert (folder.path / LOG).read_text(encoding="utf-8").endswith(" heard\n")
@@ -31,8 +31,8 @@ def test_a_folder_remains_if_it_must_be_kept(tmp_path: Path, *, keep: Keep, fail
     folder = EvidenceFolder(tmp_path / "run" / "test_a")
     folder.add("heard")
     folder.has_failed = failed
-    folder.settle(keep)
-    assert (folder.is_there, (tmp_path / "run").exists()) == (stays, stays)
+    folder.remove_unless_kept(keep)
+    assert (folder.exists, (tmp_path / "run").exists()) == (stays, stays)
 
 
 def test_a_rerun_of_a_test_has_a_separate_folder(tmp_path: Path) -> None:

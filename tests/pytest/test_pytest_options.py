@@ -67,7 +67,7 @@ from fieldkit.pytest.plugin_options import LabOptions
 
 def test_operator(pytestconfig):
     person = operator_of(pytestconfig, LabOptions(), print)
-    with pytest.raises(ConfigurationError, match="a person must carry it, but there is no terminal") as caught:
+    with pytest.raises(ConfigurationError, match="a person must carry it, but standard input") as caught:
         person.ask("carry it")
     assert "--fieldkit-yes" in caught.value.remedy
     assert operator_of(pytestconfig, LabOptions(yes=True), print) is UNATTENDED

@@ -266,7 +266,7 @@ def test_events_write_only_printable_characters_to_the_terminal(text: str) -> No
         RepeatEnded("udp-01", 1, Status.VOID, reason=text, summary=text, done=1, total=2, left_s=1),
     ]
     for event in events:
-        shown = display.shown(event)
+        shown = display.event_text(event)
         assert shown is not None
         assert shown.plain.replace("\n", "").replace("\N{NO-BREAK SPACE}", "").isprintable()
 

@@ -156,11 +156,11 @@ def test_wrong_piece_of_an_earlier_fetch_is_detected_and_fetched_again(robot: Fl
 def test_more_than_expected_stays_on_the_robot_and_is_reported(
     robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fetching, "ALWAYS_BYTES", 1000)
+    monkeypatch.setattr(fetching, "ALWAYS_ALLOWED_BYTES", 1000)
     monkeypatch.setattr(fetching, "UNEXPECTED_SHARE", 0.0)
     with pytest.raises(
         EvidenceError,
-        match=r"17 MB are to be fetched \(camera\.bag, scan/scan_0\.db3\), but at most 4\.0 MB are fetched",
+        match=r"17 MB must be fetched \(camera\.bag, scan/scan_0\.db3\), but at most 4\.0 MB are fetched",
     ):
         fetch(robot, into, expected_bytes=1_000_000)
     assert robot.pieces == []
@@ -175,7 +175,7 @@ def test_more_than_the_free_space_stays_on_the_robot_and_is_reported(
     robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(files, "free_bytes", lambda _: fetching.RESERVE_BYTES + 5_000_000)
-    with pytest.raises(EvidenceError, match=r"17 MB are to be fetched .* but 5\.0 MB are free here"):
+    with pytest.raises(EvidenceError, match=r"17 MB must be fetched .* but 5\.0 MB are free here"):
         fetch(robot, into)
 
 
@@ -199,7 +199,7 @@ def test_missing_folder_is_reported(robot: Flaky, into: Path) -> None:
 def test_unfetched_folders_are_not_deleted(robot: Flaky) -> None:
     for number in (2, 3):
         evidence.begin(robot, jobs.work_folder("trial", f"udp-0{number}-1"), "sender", "lo", need_kib=0)
-    evidence.discard(robot, "trial", but=[FOLDER, jobs.work_folder("trial", "udp-03-1")])
+    evidence.discard(robot, "trial", kept_folders=[FOLDER, jobs.work_folder("trial", "udp-03-1")])
     assert sorted(path.name for path in (robot.home / ".fieldkit/trial").iterdir()) == ["udp-01-1", "udp-03-1"]
     evidence.discard(robot, "trial")
     assert not (robot.home / ".fieldkit/trial").exists()
@@ -238,7 +238,7 @@ class HostileShell(LocalShell):
         ("100 -rf\n", "not a regular file"),
         ("-1 a.bag\n", "not a regular file"),
         ("a.bag\n", "not a regular file"),
-        (f"{10**14} a.bag\n", "are to be fetched"),
+        (f"{10**14} a.bag\n", "must be fetched"),
         ("".join(f"1 f{number}\n" for number in range(501)), "more than 500 files"),
         ("100 x\n", "sent before"),
         ("100 a.bag\n", "hash differs"),

@@ -264,7 +264,7 @@ def test_server_with_weak_ciphers_only_gets_no_login(
         return transport
 
     shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
-    with pytest.raises(RobotError, match=f"cannot be trusted with a login: {output_text}") as caught:
+    with pytest.raises(RobotError, match=f"is not secure enough for a login: {output_text}") as caught:
         shell.run(("true",), deadline=soon())
     assert caught.value.remedy.startswith("update it")
 
@@ -474,7 +474,7 @@ def test_command_whose_link_breaks_is_sent_again(
     assert done.result(SOON).stdout == b"part\nwhole\n"
     assert len(notices) == 2
     assert notices[0].startswith("robot: the link is lost; trying again for ")
-    assert notices[1].startswith("robot: the link is back after ")
+    assert notices[1].startswith("robot: the link is open again after ")
 
 
 def test_link_that_breaks_before_the_expected_output_is_not_an_end(
@@ -607,7 +607,7 @@ def test_link_over_the_radio_is_not_reopened_during_a_measurement(
     waiting.wait_for_starts(2)
     waiting.go.touch()
     assert done.result(SOON).stdout == b"part\nwhole\n"
-    assert notices[1].startswith("robot: the link is back after ")
+    assert notices[1].startswith("robot: the link is open again after ")
     shell.close()
 
 

@@ -148,7 +148,7 @@ def test_missing_keyring_is_reported() -> None:
 
 
 def test_missing_terminal_is_reported() -> None:
-    with pytest.raises(ConfigurationError, match="there is no terminal to ask at") as caught:
+    with pytest.raises(ConfigurationError, match="standard input is not a terminal") as caught:
         passwords.at_terminal("duckie", "192.168.4.1", "duckiedrone-1")
     assert "keyring set fieldkit duckie@192.168.4.1" in caught.value.remedy
 

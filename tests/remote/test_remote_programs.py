@@ -29,7 +29,7 @@ def test_copy_is_complete_private_and_idempotent(tmp_path: Path, userland: str) 
 
 def test_incomplete_copy_is_rejected(tmp_path: Path) -> None:
     at = programs.path("run", "probe")
-    with pytest.raises(RobotError, match="the copy is not whole"):
+    with pytest.raises(RobotError, match="the copy is incomplete"):
         programs.copy(LocalShell(tmp_path), "folder", at, CONTENT[:-1], SHA256, executable=True)
     assert not (tmp_path / "folder" / at).exists()
 

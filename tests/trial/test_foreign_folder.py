@@ -126,7 +126,7 @@ def test_a_journal_with_a_second_name_is_not_written(trial: Path, ours: Path) ->
     (trial / "journal.jsonl").hardlink_to(ours)
     with (
         pytest.raises(ConfigurationError, match="hard link, and writing would change that file too"),
-        journal.claimed(trial),
+        journal.locked(trial),
     ):
         raise AssertionError("claimed")
     with pytest.raises(OSError, match="hard link"):
@@ -224,7 +224,7 @@ def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Pat
     """Names of files that are not UTF-8 contain such halves, and errors contain names of files."""
     plan = los_plan(repeats=1, protocols=(Protocol.UDP,))
     folder = store.create(tmp_path, plan)
-    with journal.claimed(folder):
+    with journal.locked(folder):
         ledger = Ledger(plan, folder, Stop())
         repeat = RepeatId(Protocol.UDP, 1)
         begun = ledger.begin(repeat)

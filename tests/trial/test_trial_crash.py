@@ -72,7 +72,7 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
     for verb in (
         "begin",
         "measure",
-        "demand_held",
+        "require_locks",
         "end_jobs",
         "stop_leftover_jobs",
         "close_connections",

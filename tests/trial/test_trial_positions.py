@@ -111,7 +111,7 @@ def test_invalid_positions_are_rejected_and_change_nothing(
 @pytest.mark.motion
 def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
     walk(trial)
-    with journal.claimed(trial):
+    with journal.locked(trial):
         assert output_text(capsys, "receiver=walk.csv")[0] == 2
     file = next(trial.glob("repeats/*/ping.txt"))
     file.write_bytes(file.read_bytes() + b"\n")

@@ -16,7 +16,7 @@ from fieldkit.agent.flight_plan import LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING, LivenessFile
 from fieldkit.agent.flying.loop import GAP_S, HEARTBEAT_S, RATE_HZ
-from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.landing import (
     CANCELLED,
     LEASE_EXPIRED,
@@ -65,9 +65,9 @@ class FlightGuard:
             log_line(f"waiting for the heartbeat of an autopilot at {self._plan.connection}")
             self._wait_for_autopilot()
             log_line("ready")
-            self._watch()
+            self._supervise()
         except FlightError as error:
-            self._give_up(error)
+            self._abort_flight(error)
             raise
         finally:
             self._state = ENDED
@@ -78,10 +78,10 @@ class FlightGuard:
         start_s = time.monotonic()
         while not self._drone.alive:
             if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was ended")
+                raise FlightError(CANCELLED, "the job was cancelled")
             if time.monotonic() > start_s + HEARTBEAT_S:
-                where = self._plan.connection
-                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {where} in {HEARTBEAT_S:g} s")
+                connection = self._plan.connection
+                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
             self._exchange()
         self._first_mode = self._drone.mode if self._drone.armed else None
         for kind in (HEARTBEAT, LOCAL_POSITION_NED):
@@ -89,14 +89,14 @@ class FlightGuard:
         self._orders = Orders(self._plan.orders, (STAY, LEAVE), self._plan.lease_s)
         self._iteration_s = None
 
-    def _watch(self) -> None:
+    def _supervise(self) -> None:
         """Return after the order `leave`; raise `FlightError` if the drone must land."""
         while self._orders.order != LEAVE:
             previous_s, self._iteration_s = self._iteration_s, time.monotonic()
             if previous_s is not None and (gap_s := self._iteration_s - previous_s) > GAP_S:
                 raise FlightError(LEASE_EXPIRED, f"the guard did not run for {gap_s:.1f} s")
             if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was ended")
+                raise FlightError(CANCELLED, "the job was cancelled")
             self._orders.poll()
             if self._orders.expired:
                 raise FlightError(
@@ -129,7 +129,7 @@ class FlightGuard:
         is_program = drone.dialect is not None and drone.dialect.is_program_controlled(drone.mode)
         return is_program or drone.mode == self._first_mode
 
-    def _give_up(self, error: FlightError) -> None:
+    def _abort_flight(self, error: FlightError) -> None:
         """Land the drone if the guard may control it; raises as `bring_down`, with an alarm in the log."""
         drone = self._drone
         if not drone.armed or not (self._pilot_flies if self._liveness is not None else self._may_command()):

@@ -19,10 +19,10 @@ PILOT, GUARD = 0, 1
 IDLE, FLYING, LANDING, ENDED = 0, 1, 2, 3
 """State of a program: it waits, flies the drone, lands it, or has ended."""
 
-SILENT_S = 0.8
+SILENCE_TIMEOUT_S = 0.8
 """A program whose counter does not change for this time has stopped."""
 _MAX_POLL_S = 0.2
-"""Maximum time that one poll adds to the silence: delays of the polling program must not count."""
+"""Maximum time that one poll adds to the silence, because delays of the polling program must not count."""
 _ENTRY = struct.Struct("<QQQQ")
 SIZE = 2 * _ENTRY.size
 """Size of the file in bytes."""
@@ -37,13 +37,13 @@ class LifeEntry(NamedTuple):
     Attributes:
         pid: Its process id.
         started: Start time of the process, in clock ticks since boot.
-        turns: Counter of its iterations.
+        iterations: Counter of its iterations.
         state: Its state: `IDLE`, `FLYING`, `LANDING` or `ENDED`.
     """
 
     pid: int
     started: int
-    turns: int
+    iterations: int
     state: int
 
 
@@ -84,13 +84,13 @@ class LivenessFile:
     def update(self, state: int) -> None:
         """Increment the counter of this program, and write its state."""
         self._count += 1
-        entry = os.getpid(), _process(os.getpid())[1], self._count, state
+        entry = os.getpid(), _process_state(os.getpid())[1], self._count, state
         _ENTRY.pack_into(self._map, self._own * _ENTRY.size, *entry)
 
     @property
     def other_state(self) -> int:
         """The last state that the other program has written."""
-        return self._other().state
+        return self._other_entry().state
 
     def poll(self) -> str:
         """Check the other program; must be called in each iteration.
@@ -98,30 +98,30 @@ class LivenessFile:
         Returns:
             The reason why it does not run, for example `has ended`; empty while it runs.
         """
-        pid, started, count, _ = self._other()
+        pid, started, count, _ = self._other_entry()
         now_s = time.monotonic()
         passed_s, self._polled_s = min(now_s - self._polled_s, _MAX_POLL_S), now_s
         self._silent_s = self._silent_s + passed_s if count == self._other_count else 0.0
         self._other_count = count
-        state, other_started = _process(pid)
+        state, other_started = _process_state(pid)
         if not pid or other_started != started or state in _ENDED_STATES:
             return "has ended"
         if state in _SUSPENDED_STATES:
             return "is suspended"
-        return f"has not run for {self._silent_s:.1f} s" if self._silent_s > SILENT_S else ""
+        return f"has not run for {self._silent_s:.1f} s" if self._silent_s > SILENCE_TIMEOUT_S else ""
 
     def kill_other(self) -> None:
         """Kill the other program, so that it cannot continue later; never another process that reuses its pid."""
-        pid, started, *_ = self._other()
-        if pid and _process(pid)[1] == started:
+        pid, started, *_ = self._other_entry()
+        if pid and _process_state(pid)[1] == started:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 
-    def _other(self) -> LifeEntry:
+    def _other_entry(self) -> LifeEntry:
         return entries(self._map[:])[1 - self._own]
 
 
-def _process(pid: int) -> tuple[str, int]:
+def _process_state(pid: int) -> tuple[str, int]:
     """Return the state of a process and its start time in clock ticks since boot; `X` and 0 if it does not exist."""
     try:
         with open(f"/proc/{pid}/stat", encoding="utf-8", errors="replace") as file:  # noqa: PTH123 (Python 3.8)

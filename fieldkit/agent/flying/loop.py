@@ -10,7 +10,7 @@ from fieldkit.agent.autopilot import AutopilotState
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying.liveness import FLYING, IDLE, LANDING, PILOT, LivenessFile
 from fieldkit.agent.flying.origin import FlightFence, FlightOrigin, Position
-from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.landing import (
     CANCELLED,
     COMMAND_TIMEOUT_S,
@@ -33,9 +33,9 @@ GAP_S = 1.0
 HEARTBEAT_S = 6.0
 """Timeout for the first heartbeat of the autopilot."""
 
-_SILENT_S = 10.0
-"""Timeout for heartbeats in flight: a lost connection may be restored."""
-_BLIND_S = 5.0
+_FLIGHT_HEARTBEAT_TIMEOUT_S = 10.0
+"""Timeout for heartbeats in flight. It is long, because a lost connection may be restored."""
+_POSITION_TIMEOUT_S = 5.0
 """Timeout for position reports in flight, which are requested repeatedly during this time."""
 _STREAMS = (HEARTBEAT, LOCAL_POSITION_NED, ATTITUDE)
 
@@ -89,10 +89,10 @@ class FlightLoop:
         start_s = time.monotonic()
         while not self.drone.alive:
             if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was ended")
+                raise FlightError(CANCELLED, "the job was cancelled")
             if time.monotonic() > start_s + HEARTBEAT_S:
-                where = self._plan.connection
-                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {where} in {HEARTBEAT_S:g} s")
+                connection = self._plan.connection
+                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
             self.update()
             self.session.exchange(1 / RATE_HZ)
         for kind in _STREAMS:
@@ -123,7 +123,7 @@ class FlightLoop:
         while True:
             self._require_no_gap()
             if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was ended")
+                raise FlightError(CANCELLED, "the job was cancelled")
             self.orders.poll()
             if self.orders.expired:
                 raise FlightError(
@@ -188,19 +188,21 @@ class FlightLoop:
         drone = self.drone
         if self.state != FLYING:
             return
-        if drone.heartbeat_age_s > _SILENT_S:
-            lost = ", its connection is closed" if self.session.link.lost_since_s is not None else ""
-            raise FlightError(REFUSED, f"no heartbeat of the autopilot for {_SILENT_S:g} s{lost}")
+        if drone.heartbeat_age_s > _FLIGHT_HEARTBEAT_TIMEOUT_S:
+            connection_note = ", its connection is closed" if self.session.link.lost_since_s is not None else ""
+            raise FlightError(
+                REFUSED, f"no heartbeat of the autopilot for {_FLIGHT_HEARTBEAT_TIMEOUT_S:g} s{connection_note}"
+            )
         if not drone.guided:
             if self._liveness is not None and self._liveness.other_state == LANDING:
-                raise FlightError(PEER_STOPPED, "the guard brings it down")
+                raise FlightError(PEER_STOPPED, "the guard lands it")
             raise FlightError(TAKEN_OVER, f"another party flies it ({drone.status_text})")
         if not self.has_armed:
             return
         if not drone.armed:
             raise FlightError(TAKEN_OVER, f"its motors have stopped ({drone.status_text})")
-        if drone.position_age_s > _BLIND_S:
-            raise FlightError(REFUSED, f"it has not reported its position for {_BLIND_S:g} s")
+        if drone.position_age_s > _POSITION_TIMEOUT_S:
+            raise FlightError(REFUSED, f"it has not reported its position for {_POSITION_TIMEOUT_S:g} s")
         if (
             self.fence is not None
             and drone.position_m is not None

@@ -20,7 +20,7 @@ START_M = 2.0
 """Maximum horizontal distance between the start of a flight and its origin."""
 FENCE_MARGIN_M = 2.0
 """Tolerance of the fence for overshoot and errors of the position estimate."""
-_DEGREE_M = 111_318.84502145034
+_METRES_PER_DEGREE = 111_318.84502145034
 """Metres per degree of latitude (ArduPilot, AP_Common/Location.h, LOCATION_SCALING_FACTOR)."""
 _SAME_BOOT_S = 10.0
 """Maximum difference between two estimates of one boot time: the autopilot's clock drifts against the computer's."""
@@ -115,13 +115,13 @@ def resolve_origin(recorded: FlightOrigin | None, start: FlightOrigin) -> Flight
     coordinates = recorded.latitude_deg, recorded.longitude_deg, start.latitude_deg, start.longitude_deg
     if None not in coordinates:
         latitude, longitude, start_latitude, start_longitude = (float(value or 0.0) for value in coordinates)
-        north_m = (start_latitude - latitude) * _DEGREE_M
+        north_m = (start_latitude - latitude) * _METRES_PER_DEGREE
         longitude_difference = math.remainder(start_longitude - longitude, 360.0)
-        east_m = longitude_difference * _DEGREE_M * math.cos(math.radians(latitude))
+        east_m = longitude_difference * _METRES_PER_DEGREE * math.cos(math.radians(latitude))
     elif not is_same_frame(recorded.frame_id, start.frame_id):
         raise OriginError(
             "its autopilot has rebooted since the first flight of this trial, and latitude and longitude of its "
-            "origin are not known: wait for GPS, or start a new trial with the drone at its place"
+            "origin are not known: wait for GPS, or put the drone at its start position and start a new trial"
         )
     if (distance_m := math.hypot(north_m, east_m)) > START_M:
         bearing_deg = math.degrees(math.atan2(east_m, north_m)) % 360

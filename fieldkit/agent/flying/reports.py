@@ -19,16 +19,16 @@ class AutopilotTexts:
         self._number = self._count = self._read_count = 0
 
     def add_message(self, payload: bytes) -> None:
-        """Add a message; the pieces of a long text have the same number (STATUSTEXT, id and chunk_seq)."""
+        """Add a message; the chunks of a long text have the same number (STATUSTEXT, id and chunk_seq)."""
         text = printable(payload[1:51].split(b"\0")[0].decode("utf-8", "replace"))
-        number, piece = _CHUNK.unpack_from(payload, 51)
+        number, chunk_index = _CHUNK.unpack_from(payload, 51)
         severity = payload[0]
         if severity > NOTICE:
             return
-        if piece and number == self._number and self._texts:
+        if chunk_index and number == self._number and self._texts:
             severity, previous = self._texts[-1]
             self._texts[-1] = severity, (previous + text)[:_MAX_CHARACTERS]
-        elif not piece:
+        elif not chunk_index:
             self._texts = [*self._texts[1 - _MAX_TEXTS :], (severity, text)]
             self._count += 1
         self._number = number

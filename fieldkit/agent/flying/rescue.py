@@ -9,7 +9,7 @@ from fieldkit.agent.autopilot import GUARD, AutopilotState
 from fieldkit.agent.flight_plan import FlightPlan
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.liveness import LivenessFile
-from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.landing import (
     MANUAL_ACTION,
     NO_HEARTBEAT_S,
@@ -22,7 +22,7 @@ from fieldkit.agent.landing import (
 )
 
 _POLL_S = 0.1
-_WARNS_S = 4.0
+_ALARM_DELAY_S = 4.0
 """An alarm is logged after this time without a heartbeat."""
 
 
@@ -82,7 +82,7 @@ def _open_session(connection: str, deadline_s: float) -> AutopilotSession:
 
 
 def _wait_for_autopilot(session: AutopilotSession, deadline_s: float) -> None:
-    warning_s = time.monotonic() + _WARNS_S
+    warning_s = time.monotonic() + _ALARM_DELAY_S
     while not session.drone.alive:
         if time.monotonic() > deadline_s:
             raise FlightError(REFUSED, f"no heartbeat of the autopilot in {NO_HEARTBEAT_S:g} s")

@@ -15,11 +15,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Iterator, Mapping
 
-from fieldkit.agent.links import devices, places
+from fieldkit.agent.links import devices, link_files
 from fieldkit.agent.links.server import ALIVE, FRAMES, STATE
-from fieldkit.agent.mavlink_frames import COMMAND_LONG, SET_MESSAGE_INTERVAL, frames, head
+from fieldkit.agent.mavlink_frames import COMMAND_LONG, SET_MESSAGE_INTERVAL, frames, parse_frame
 
-OPENS_S = 3.0
+OPEN_TIMEOUT_S = 3.0
 """Timeout for opening a connection when a client starts; a router restarts in 2 s."""
 
 _ROOT = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", "..", ".."))  # noqa: PTH100, PTH118, PTH120
@@ -59,7 +59,7 @@ class SharedLink:
 
     Attributes:
         lost_since_s: Monotonic time since which the connection is closed; None while it is open.
-        left_out: Number of frames from the autopilot that were dropped because this program was too slow.
+        dropped_frames: Number of frames from the autopilot that were dropped because this program was too slow.
         restarts: Number of replaced servers.
         messages: State of this program's requests for messages, by message id.
     """
@@ -75,7 +75,7 @@ class SharedLink:
         self._requests: dict[tuple[bytes, bytes], bytes] = {}
         self._stop_event = threading.Event()
         self._answered_s = 0.0
-        self._refused = self._dropped = self._server_left_out = self._earlier_left_out = 0
+        self._refused = self._dropped_by_client = self._dropped_by_server = self._dropped_by_earlier_servers = 0
         self.lost_since_s: float | None = time.monotonic()
         self.error = (0, "")
         self.failure: OSError | None = None
@@ -89,19 +89,19 @@ class SharedLink:
         return self.lost_since_s is None
 
     @property
-    def left_out(self) -> int:
+    def dropped_frames(self) -> int:
         """Number of frames from the autopilot that were dropped because this program was too slow."""
-        return self._dropped + self._earlier_left_out + self._server_left_out
+        return self._dropped_by_client + self._dropped_by_earlier_servers + self._dropped_by_server
 
     def open(self) -> None:
         """Wait until the connection is open.
 
         Raises:
-            OSError: It cannot be opened within `OPENS_S`.
+            OSError: It cannot be opened within `OPEN_TIMEOUT_S`.
         """
         self._connect()
         self._thread.start()
-        deadline_s = time.monotonic() + OPENS_S
+        deadline_s = time.monotonic() + OPEN_TIMEOUT_S
         while not self.connected:
             if time.monotonic() > deadline_s:
                 self.close()
@@ -121,7 +121,7 @@ class SharedLink:
 
     def send(self, frame: bytes) -> None:
         """Send a frame; a request for an interval is stored and repeated to a new server."""
-        message = head(frame)
+        message = parse_frame(frame)
         if message.kind == COMMAND_LONG:
             payload = message.payload.ljust(33, b"\0")
             if int.from_bytes(payload[_COMMAND_OFFSET : _COMMAND_OFFSET + 2], "little") == SET_MESSAGE_INTERVAL:
@@ -183,11 +183,11 @@ class SharedLink:
             try:
                 self._frames_in.send(packet[1:])
             except OSError:
-                self._dropped += sum(1 for _ in frames(bytearray(packet[1:])))
+                self._dropped_by_client += sum(1 for _ in frames(bytearray(packet[1:])))
         elif packet[:1] == STATE:
             state = json.loads(packet[1:].decode())
             self.error = state["error"][0], state["error"][1]
-            self._server_left_out = state["left_out"]
+            self._dropped_by_server = state["left_out"]
             self.messages = {int(kind): MessageRate(**rate) for kind, rate in state["messages"].items()}
             self.lost_since_s = state["lost_since_s"]
 
@@ -199,7 +199,7 @@ class SharedLink:
     def _is_suspended(self) -> bool:
         assert self._server is not None
         try:
-            with open(f"/proc/{places.peer_credentials(self._server)[0]}/stat", encoding="utf-8") as file:  # noqa: PTH123
+            with open(f"/proc/{link_files.peer_credentials(self._server)[0]}/stat", encoding="utf-8") as file:  # noqa: PTH123
                 return file.read().rpartition(")")[2].split()[0] in ("T", "t")
         except (OSError, IndexError):
             return True
@@ -207,7 +207,7 @@ class SharedLink:
     def _kill_server(self) -> None:
         """Kill the server. Its socket is open, so no other process can have its pid."""
         assert self._server is not None
-        pid, uid = places.peer_credentials(self._server)
+        pid, uid = link_files.peer_credentials(self._server)
         if pid > 1 and uid == os.geteuid():
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -219,8 +219,8 @@ class SharedLink:
                 self._server.close()
             self._server = None
         self.lost_since_s = self.lost_since_s or time.monotonic()
-        self._earlier_left_out += self._server_left_out
-        self._server_left_out = 0
+        self._dropped_by_earlier_servers += self._dropped_by_server
+        self._dropped_by_server = 0
         self.restarts += 1
 
     def _connect(self) -> None:
@@ -247,12 +247,12 @@ class SharedLink:
         """Return a socket that is connected to the server, or None if no server runs."""
         server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            with places.address(self._connection) as address:
+            with link_files.address(self._connection) as address:
                 server.connect(address)
         except (FileNotFoundError, ConnectionRefusedError, ConnectionResetError):
             server.close()
             return None
-        if places.peer_credentials(server)[1] != os.geteuid():
+        if link_files.peer_credentials(server)[1] != os.geteuid():
             server.close()
             raise PermissionError(f"another user serves {self._connection}")
         server.setblocking(False)

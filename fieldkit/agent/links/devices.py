@@ -17,7 +17,7 @@ from typing import Protocol
 MAX_BYTES = 65_536
 _CONNECT_TIMEOUT_S = 2.0
 _PEER_TIMEOUT_S = 3.0
-"""After this time without a datagram from the peer the next sender replaces it: a restarted peer has a new port."""
+"""If the peer sends no datagram for this time, the next sender replaces it: a restarted peer has a new port."""
 _MAX_QUEUED_BYTES = 4096
 """Maximum number of queued bytes for a slow line: 0.7 s at 57600 baud. Older data would be useless."""
 
@@ -25,7 +25,7 @@ _MAX_QUEUED_BYTES = 4096
 class FlightDevice(Protocol):
     """An open connection to an autopilot."""
 
-    whole: bool
+    has_whole_frames: bool
     """Whether each read returns complete frames."""
 
     def fileno(self) -> int:
@@ -61,7 +61,7 @@ def check(connection: str) -> None:
     kind, _, rest = connection.partition(":")
     if kind.startswith("/"):
         if not rest.isdigit() or not hasattr(termios, f"B{int(rest)}"):
-            raise ValueError(f"{kind} has no rate of {rest} baud")
+            raise ValueError(f"{kind} does not support {rest} baud")
         return
     host, _, port = rest.rpartition(":")
     if kind not in ("tcp", "udpout", "udpin"):
@@ -98,7 +98,7 @@ class UdpDevice:
         listens: Whether to wait for the first datagram, whose sender becomes the peer.
     """
 
-    whole = True
+    has_whole_frames = True
 
     def __init__(self, address: tuple[str, int], *, listens: bool) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -148,7 +148,7 @@ class StreamDevice:
         descriptor: The file descriptor of the stream; it is closed with the device.
     """
 
-    whole = False
+    has_whole_frames = False
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor

@@ -15,13 +15,14 @@ from fieldkit.agent.mavlink_frames import ACCEPTED
 DEFAULT = 0
 """Interval that selects the default rate of the autopilot; it also ends a request."""
 _OFF = -1
-LATER = (1, 5)
-"""MAV_RESULT_TEMPORARILY_REJECTED and MAV_RESULT_IN_PROGRESS: it may be accepted later."""
+RETRY_RESULTS = (1, 5)
+"""MAV_RESULT_TEMPORARILY_REJECTED and MAV_RESULT_IN_PROGRESS: the request may be accepted later."""
 _ANSWER_TIMEOUT_S = 0.4
 _MIN_PAUSE_S, _MAX_PAUSE_S = 0.5, 8.0
 """Bounds of the time between two requests for the same message."""
 _MIN_FRACTION = 0.7
-"""A rate below this fraction of the requested one is requested again: 4 Hz of 5 is jitter or loss, 4 Hz of 10 not."""
+"""A message with less than this fraction of the requested rate is requested again: 4 Hz instead of 5 Hz may be jitter
+or loss, but 4 Hz instead of 10 Hz is not."""
 _SILENT_INTERVALS = 3
 _WINDOW_INTERVALS = 10
 _WINDOW_S = 1.0
@@ -65,7 +66,7 @@ class MessageInterval:
     @property
     def is_refused(self) -> bool:
         """Whether the autopilot refuses the request."""
-        return self.result not in (None, ACCEPTED, *LATER)
+        return self.result not in (None, ACCEPTED, *RETRY_RESULTS)
 
     def on_message(self, now_s: float) -> None:
         """Register an arrival of the message."""
@@ -97,7 +98,7 @@ class MessageInterval:
             return self.tries == 0 or now_s >= self.due_s
         if self.is_refused or self.interval_us <= 0:
             return False
-        if self.result in LATER:
+        if self.result in RETRY_RESULTS:
             return now_s >= self.due_s
         if not self._is_slow(now_s):
             if now_s > self._answered_s + self._window_s:

@@ -20,23 +20,23 @@ import traceback
 from contextlib import suppress
 from typing import Any, Mapping
 
-from fieldkit.agent.links import devices, places
+from fieldkit.agent.links import devices, link_files
 from fieldkit.agent.links.devices import FlightDevice
 from fieldkit.agent.links.intervals import MessageIntervals, Target
 from fieldkit.agent.mavlink_frames import (
     COMMAND_ACK,
     COMMAND_LONG,
     SET_MESSAGE_INTERVAL,
-    FrameHead,
     FrameWriter,
+    ParsedFrame,
     frames,
-    head,
     is_intact,
+    parse_frame,
 )
 
 FRAMES, ALIVE, STATE = b"F", b"P", b"S"
 
-_ADDRESS = 245, 194
+_SERVER_ADDRESS = 245, 194
 """System and component id of the server: MAV_COMP_ID_ONBOARD_COMPUTER4, which no client uses."""
 _COMMAND = struct.Struct("<7fHBB")
 _COMMAND_ACK = struct.Struct("<HB5xBB")
@@ -118,7 +118,7 @@ class SharedDevice:
             return []
         if data:
             self._received_s = time.monotonic()
-        if self._device.whole:
+        if self._device.has_whole_frames:
             return list(frames(bytearray(data)))
         self._buffer += data
         return list(frames(self._buffer))
@@ -159,12 +159,12 @@ class LinkClient:
         stream: The socket that is connected to the client.
 
     Attributes:
-        left_out: Number of frames that were dropped because the client was too slow.
+        dropped_frames: Number of frames that were dropped because the client was too slow.
     """
 
     def __init__(self, stream: socket.socket) -> None:
         self.stream = stream
-        self.left_out = 0
+        self.dropped_frames = 0
         stream.setblocking(False)
         stream.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
 
@@ -173,7 +173,7 @@ class LinkClient:
         try:
             self.stream.send(packet)
         except OSError:
-            self.left_out += count
+            self.dropped_frames += count
 
 
 class LinkServer:
@@ -188,7 +188,7 @@ class LinkServer:
         self._device = SharedDevice(connection)
         self._listener = listener
         self._clients: dict[int, LinkClient] = {}
-        self._writer = FrameWriter(*_ADDRESS)
+        self._writer = FrameWriter(*_SERVER_ADDRESS)
         self._intervals = MessageIntervals(self._request)
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
@@ -238,7 +238,7 @@ class LinkServer:
     def _accept(self) -> None:
         with suppress(OSError):  # the client has disconnected already
             stream, _ = self._listener.accept()
-            if places.peer_credentials(stream)[1] != os.geteuid() or len(self._clients) >= _MAX_CLIENTS:
+            if link_files.peer_credentials(stream)[1] != os.geteuid() or len(self._clients) >= _MAX_CLIENTS:
                 stream.close()
                 return
             self._clients[stream.fileno()] = LinkClient(stream)
@@ -247,7 +247,7 @@ class LinkServer:
     def _distribute(self, received: list[bytes]) -> None:
         now_s = time.monotonic()
         for frame in received:
-            message = head(frame)
+            message = parse_frame(frame)
             source = message.system, message.component
             self._intervals.on_message(source, message.kind, now_s)
             if message.kind == COMMAND_ACK and is_intact(frame):
@@ -257,11 +257,11 @@ class LinkServer:
             for client in self._clients.values():
                 client.send(packet, len(received))
 
-    def _on_command_ack(self, source: Target, message: FrameHead, now_s: float) -> None:
+    def _on_command_ack(self, source: Target, message: ParsedFrame, now_s: float) -> None:
         command, result, *target = _COMMAND_ACK.unpack(
             message.payload[: _COMMAND_ACK.size].ljust(_COMMAND_ACK.size, b"\0")
         )
-        if command == SET_MESSAGE_INTERVAL and tuple(target) in (_ADDRESS, (0, 0)):
+        if command == SET_MESSAGE_INTERVAL and tuple(target) in (_SERVER_ADDRESS, (0, 0)):
             self._intervals.on_answer(source, result, now_s)
 
     def _receive_packet(self, descriptor: int, client: LinkClient) -> None:
@@ -286,7 +286,7 @@ class LinkServer:
 
     def _intercept_request(self, client: int, frame: bytes) -> bool:
         """Process a frame that requests an interval, which is not forwarded; return True if the frame is one."""
-        message = head(frame)
+        message = parse_frame(frame)
         if message.kind != COMMAND_LONG or not is_intact(frame):
             return False
         payload = message.payload[: _COMMAND.size].ljust(_COMMAND.size, b"\0")
@@ -304,7 +304,7 @@ class LinkServer:
         return {
             "lost_since_s": self._device.lost_since_s,
             "error": self._device.error,
-            "left_out": self._clients[client].left_out,
+            "left_out": self._clients[client].dropped_frames,
             "messages": self._intervals.report(client, time.monotonic()),
         }
 
@@ -317,7 +317,7 @@ def serve(connection: str, stop_event: threading.Event) -> None:
         ValueError: The name of the connection is invalid.
     """
     devices.check(connection)
-    lock = places.lock(connection)
+    lock = link_files.lock(connection)
     if lock is None:
         return
     ready, notify = os.pipe()
@@ -328,8 +328,10 @@ def serve(connection: str, stop_event: threading.Event) -> None:
     code = 1
     try:
         os.close(ready)
-        _detach(f"{places.folder()}/{places.name(connection)}.log")
-        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener, places.address(connection) as address:
+        _detach(f"{link_files.folder()}/{link_files.name(connection)}.log")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener, link_files.address(
+            connection
+        ) as address:
             with suppress(FileNotFoundError):
                 os.unlink(address)  # noqa: PTH108 (of a server that was killed)
             listener.bind(address)
@@ -338,7 +340,7 @@ def serve(connection: str, stop_event: threading.Event) -> None:
             listener.setblocking(False)
             os.close(notify)
             LinkServer(connection, listener).run(stop_event)
-            places.remove(connection)  # while the lock is held
+            link_files.remove(connection)  # while the lock is held
         code = 0
     except Exception:  # noqa: BLE001 (the log has it, and clients start another server)
         traceback.print_exc()

@@ -11,20 +11,20 @@ from contextlib import closing
 from typing import Iterator
 
 from fieldkit.agent.autopilot import PREFLIGHT
-from fieldkit.agent.flying.talk import AutopilotSession
+from fieldkit.agent.flying.session import AutopilotSession
 
 _HEARTBEAT_S = 5.0
 _POLL_S = 0.1
-_LINES = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/ttyAMA*", "/dev/ttyTHS*")
+_SERIAL_PATTERNS = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/ttyAMA*", "/dev/ttyTHS*")
 _TCP_PORTS, _UDP_PORTS = range(5760, 5764), range(14540, 14561)
 """Ports of mavlink-router and of simulated autopilots, by their documentation."""
-_LISTENS = "0A"
+_LISTENING = "0A"
 """State of a listening socket (Linux, include/net/tcp_states.h)."""
 
 
 def candidates() -> Iterator[str]:
     """Yield the serial lines and open ports of this computer to which autopilots are usually connected."""
-    for pattern in _LINES:
+    for pattern in _SERIAL_PATTERNS:
         yield from sorted(glob.glob(pattern))  # noqa: PTH207 (Python 3.8)
     yield from (f"TCP port {port}" for port in sorted(_open_ports("tcp") & set(_TCP_PORTS)))
     yield from (f"UDP port {port}" for port in sorted(_open_ports("udp") & set(_UDP_PORTS)))
@@ -34,7 +34,7 @@ def _open_ports(protocol: str) -> set[int]:
     """Return the ports on which programs of this computer listen (proc(5), /proc/net/tcp)."""
     with open(f"/proc/net/{protocol}", encoding="ascii") as file:  # noqa: PTH123
         rows = [line.split() for line in file.readlines()[1:]]
-    return {int(row[1].rpartition(":")[2], 16) for row in rows if protocol == "udp" or row[3] == _LISTENS}
+    return {int(row[1].rpartition(":")[2], 16) for row in rows if protocol == "udp" or row[3] == _LISTENING}
 
 
 def survey(connection: str, stop_event: threading.Event) -> int:

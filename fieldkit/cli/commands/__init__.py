@@ -41,7 +41,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "completion": "print a shell script for Tab completion",
     }
 )
-"""In the order in which the help lists them."""
+"""The order is that of the help."""
 LISTINGS: Final = ("robots", "procedures", "columns")
 """Commands in the module `listings`."""
 

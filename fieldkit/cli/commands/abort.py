@@ -4,7 +4,7 @@ import argparse
 from typing import Final
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import show_error, watching
+from fieldkit.cli.display import show_error, showing_events
 from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import confirmed
 from fieldkit.core import runtime
@@ -29,9 +29,9 @@ def add(parser: Parser) -> None:
     parser.set_defaults(run=run)
 
 
-_NONE: Final = "the robots of this backend run only while their lab runs, so there is nothing to abort"
+_NO_ROBOTS: Final = "the robots of this backend run only while their lab runs, so there is nothing to abort"
 
-_ENDS: Final = (
+_LANDING_END: Final = (
     "It terminates when the drone has landed, 60 s after the last heartbeat of its autopilot, or after 10 min"
 )
 
@@ -42,11 +42,11 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.remote.motion_states import STATE_TEXTS, MotionState
     from fieldkit.trial.running import locks
 
-    with watching(as_json=False) as sink:
+    with showing_events(as_json=False) as sink:
         _, backend = cli_options.backend(arguments, sink)
         with backend.persistent_shells(sink=sink) as robots:
             if not robots:
-                sink(Note(_NONE))
+                sink(Note(_NO_ROBOTS))
                 return 0
             question = f"terminate every job of fieldkit on {', '.join(robots)}"
             if not arguments.yes and not confirmed(question, remedy="fieldkit abort --yes"):
@@ -61,7 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
             print_text(f"{robot}: {count}")
         print_text("".join(f"  {job}\n" for job in result.jobs), end="")
         for program, state in result.landing:
-            print_text(f"  {program.rpartition('/')[2]} still runs: {STATE_TEXTS[MotionState(state)]}. {_ENDS}")
+            print_text(
+                f"  {program.rpartition('/')[2]} still runs: {STATE_TEXTS[MotionState(state)]}. {_LANDING_END}"
+            )
         if result.error is not None:
             show_error(str(result.error))
     return RobotError.exit_code if any(result.error for result in results.values()) else 0

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import show_error, watching
+from fieldkit.cli.display import show_error, showing_events
 from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import interruptible
 from fieldkit.core.errors import EvidenceError, FieldkitError, shell_command
@@ -41,11 +41,11 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.campaign.runner import CampaignRun
     from fieldkit.cli import cli_options, results
 
-    with watching(as_json=arguments.json) as sink, interruptible() as stop:
+    with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         planned, document = plan.make_plan(arguments.file, name)
         folder = arguments.out / f"campaign_{planned.campaign.name}"
-        started = plan.begun(folder, planned, document)
+        started = plan.started_plan(folder, planned, document)
         campaign = CampaignRun(started or planned, CampaignJournal(folder), backend, sink, failed=arguments.failed)
         campaign.announce()
         if arguments.dry_run:
@@ -53,17 +53,18 @@ def run(arguments: argparse.Namespace) -> int:
         with cli_options.operator(arguments, sink) as operator:
             outcome = campaign.run(operator, stop)
     results.write_junit(arguments, outcome.folders)
-    return _exit_code(outcome, arguments.file, folder)
+    return _report_outcome(outcome, arguments.file, folder)
 
 
-def _exit_code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
+def _report_outcome(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
+    """Print failed repeats, skipped trials and unmet expectations with remedies; return the exit code."""
     if outcome.failed:
         failed = format_count(outcome.failed, "repeat")
         command = shell_command("fieldkit", "campaign", file, "--failed")
         remedy = f"correct what the reasons name, then add --failed: {command}"
         show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}\n  remedy: {remedy}")
-    if outcome.left:
-        names = ", ".join(map(str, outcome.left))
+    if outcome.remaining:
+        names = ", ".join(map(str, outcome.remaining))
         show_error(f"skipped: {names}\n  remedy: run the same command again for the skipped trials")
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
@@ -72,4 +73,4 @@ def _exit_code(outcome: "CampaignOutcome", file: Path, folder: Path) -> int:
         )
     if outcome.failed:
         return EvidenceError.exit_code
-    return FieldkitError.exit_code if outcome.left or outcome.unmet else 0
+    return FieldkitError.exit_code if outcome.remaining or outcome.unmet else 0

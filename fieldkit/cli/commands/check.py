@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import show_findings, watching
+from fieldkit.cli.display import show_findings, showing_events
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import RobotError
 from fieldkit.core.events import PhaseStarted
@@ -26,7 +26,7 @@ def add(parser: Parser) -> None:
         "procedure", metavar="PROCEDURE", nargs="?", default="los", help="name of a procedure (default: los)"
     )
     shared.add_site(parser)
-    shared.add_changes(parser)
+    shared.add_overrides(parser)
     shared.add_json(parser)
     parser.set_defaults(run=run)
 
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.trial.running import preflight
 
     request = cli_options.request(arguments, _CLOSE)
-    with watching(as_json=arguments.json) as sink:
+    with showing_events(as_json=arguments.json) as sink:
         name, backend = cli_options.backend(arguments, sink)
         cast = backend.cast(request.chosen_topology)
         plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC), lab_bytes=backend.lab_bytes)

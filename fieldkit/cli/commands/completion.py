@@ -1,4 +1,4 @@
-"""Complete command lines in bash, zsh and fish. The only user of argcomplete.
+"""Complete command lines in bash, zsh and fish. Only this module imports argcomplete.
 
 Argcomplete runs fieldkit at each press of the Tab key, so nothing here imports the strict readers of files.
 """
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def answer(parser: Parser) -> None:
+def write_completions(parser: Parser) -> None:
     """Write the completions of the shell's command line, and exit."""
     _declare_command(parser)
     argcomplete.autocomplete(parser, always_complete_options=False, default_completer=_Values())

@@ -19,9 +19,11 @@ def add(parser: Parser) -> None:
     parser.add_argument(
         "topic", metavar="TOPIC", nargs="?", default="index", help="a page or a command (default: index)"
     )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--path", action="store_true", help="print the path of the page in place of opening it")
-    where.add_argument("--list", action="store_true", help="list all topics with their pages")
+    output_options = parser.add_mutually_exclusive_group()
+    output_options.add_argument(
+        "--path", action="store_true", help="print the path of the page in place of opening it"
+    )
+    output_options.add_argument("--list", action="store_true", help="list all topics with their pages")
     parser.set_defaults(run=run)
 
 

@@ -21,8 +21,8 @@ def add(parser: Parser) -> None:
     parser.description = (
         "Read the SSH host key of a robot (ed25519 if it has one) without logging in, show type and fingerprint, ask "
         "for confirmation, and write the key into the site file as host_key; nothing else in the file changes. A key "
-        "that is already pinned is not changed. If the robot offers another key, enroll ends with both fingerprints "
-        "and exit code 3. After the answer no the exit code is 1."
+        "that is already pinned is not changed. If the robot offers another key, enroll prints both fingerprints "
+        "and exits with code 3. After the answer no the exit code is 1."
     )
     parser.add_argument("robot", metavar="ROBOT", help="name of a robot in the site file")
     parser.add_argument(
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     name, path = arguments.robot, arguments.site
     robot, where = _robot(name, path)
     address = Address(name, robot.host or "", robot.port)
-    pinned = _pinned(name, robot, or_none=arguments.replace)
+    pinned = _pinned_key(name, robot, ignore_invalid=arguments.replace)
     offered = offered_key(
         address,
         over_tcp(address.host, address.port),
@@ -90,13 +90,13 @@ def _robot(name: str, path: Path) -> "tuple[SiteRobot, str]":
     return site.robots[name], where
 
 
-def _pinned(name: str, robot: "SiteRobot", *, or_none: bool) -> HostKey | None:
+def _pinned_key(name: str, robot: "SiteRobot", *, ignore_invalid: bool) -> HostKey | None:
     if robot.host_key is None:
         return None
     try:
         return HostKey.parse(robot.host_key, name)
     except ConfigurationError:
-        if or_none:
+        if ignore_invalid:
             return None
         raise
 
@@ -105,6 +105,4 @@ def _show(address: Address, offered: HostKey, pinned: HostKey | None) -> None:
     if pinned is not None:
         print_text(f"pinned before: {pinned.kind} {pinned.fingerprint}")
     print_text(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
-    print_text(
-        f"compare it with the output of this command on the robot's own console:\n  {offered.fingerprint_command}"
-    )
+    print_text(f"compare it with the output of this command on the robot's console:\n  {offered.fingerprint_command}")

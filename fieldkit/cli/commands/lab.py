@@ -68,9 +68,9 @@ def add(parser: Parser) -> None:
     action = actions.add_parser(
         "plot",
         help="draw the robots of the lab from above, with the SNR of their links",
-        description="Draw the lab from above, with the mean SNR of each link without shadowing, and the obstacles on "
-        "it; frames do not arrive over a dotted link. If no lab is up, or with --robots, --site or --backend, draw "
-        "what `up` would bring up.",
+        description="Draw the lab from above, with the mean SNR of each link without shadowing, and the obstacles "
+        "that it crosses; frames do not arrive over a dotted link. If no lab is up, or with --robots, --site or "
+        "--backend, draw the robots that `up` would start.",
     )
     shared.add_robots(action)
     action.add_argument(
@@ -117,22 +117,22 @@ def up(arguments: argparse.Namespace) -> int:
     """Start the robots, and return when they are up, or with --foreground when they are down."""
     from fieldkit.lab import daemon
 
-    here, backend = folder.of_directory(Path.cwd()), _backend(arguments)
+    lab_folder, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
     def announce(robots: "Lab") -> None:
         print_text(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
-        daemon.run(here, backend, seed=arguments.seed, sink=_show_note, ready=announce)
+        daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, ready=announce)
         return 0
 
-    def serve(leave: daemon.OnReady) -> int:
+    def serve(detach: daemon.OnReady) -> int:
         def ready(robots: "Lab") -> None:
             print_text(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
-            leave(here.log)
+            detach(lab_folder.log)
 
         try:
-            daemon.run(here, backend, seed=arguments.seed, sink=_show_note, ready=ready)
+            daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, ready=ready)
         except FieldkitError as error:
             show_error(str(error))
             return error.exit_code
@@ -145,7 +145,7 @@ def list_robots(arguments: argparse.Namespace) -> int:
     """List the robots."""
     from fieldkit.lab import requests
 
-    state = requests.state(_here())
+    state = requests.state(_lab_folder())
     if arguments.json:
         print_text(json_text(asdict(state)))
         return 0
@@ -176,7 +176,7 @@ def move(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(f"{option} takes EAST NORTH [UP], not {' '.join(words)!r}", remedy=_EXAMPLE)
     east_m, north_m, *up_m = map(parse_offset_m, words)
     to = Destination(east_m, north_m, up_m[0] if up_m else None, relative)
-    place_m = requests.move(_here(), arguments.robot, to)
+    place_m = requests.move(_lab_folder(), arguments.robot, to)
     print_text(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
     return 0
 
@@ -185,15 +185,15 @@ def shell(arguments: argparse.Namespace) -> int:
     """Replace this process by ssh to the robot."""
     from fieldkit.lab import protocol, requests
 
-    here = _here()
-    names = [robot.name for robot in requests.state(here).robots]
+    lab_folder = _lab_folder()
+    names = [robot.name for robot in requests.state(lab_folder).robots]
     if arguments.robot not in names:
         raise protocol.unknown_robot(arguments.robot, names)
     program = shutil.which("ssh")
     if program is None:
         raise ConfigurationError("there is no ssh", remedy="sudo apt-get install openssh-client")
     terminal = ["-t"] if arguments.command and sys.stdin.isatty() and sys.stdout.isatty() else []
-    argv = [program, "-F", str(here.ssh_config), *terminal, arguments.robot, *arguments.command]
+    argv = [program, "-F", str(lab_folder.ssh_config), *terminal, arguments.robot, *arguments.command]
     os.execv(program, argv)  # noqa: S606 (an argument list, no shell)
 
 
@@ -201,9 +201,9 @@ def print_ssh_config(_: argparse.Namespace) -> int:
     """Print the configuration."""
     from fieldkit.lab import requests
 
-    here = _here()
-    requests.state(here)
-    print_text(here.ssh_config.read_text(encoding="utf-8"), end="")
+    lab_folder = _lab_folder()
+    requests.state(lab_folder)
+    print_text(lab_folder.ssh_config.read_text(encoding="utf-8"), end="")
     return 0
 
 
@@ -211,7 +211,7 @@ def down(_: argparse.Namespace) -> int:
     """Stop the robots."""
     from fieldkit.lab import requests
 
-    requests.end(_here())
+    requests.end(_lab_folder())
     print_text("the robots are down")
     return 0
 
@@ -239,11 +239,11 @@ def _overview(arguments: argparse.Namespace) -> "Overview":
 
     if arguments.robots is None and arguments.site is None and arguments.backend is None:
         with suppress(requests.NoLabError):
-            return requests.overview(_here())
+            return requests.overview(_lab_folder())
     return _backend(arguments).overview()
 
 
-def _here() -> LabFolder:
+def _lab_folder() -> LabFolder:
     return folder.of_directory(Path.cwd())
 
 

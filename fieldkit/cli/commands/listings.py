@@ -113,19 +113,20 @@ def _columns(name: str | None) -> int:
         "summary.csv": (*(column for column in trial if column.name in DEFAULT_BY), *declared(EstimateRow)),
         "compare": declared(DifferenceRow),
     }
-    known = {column.name for columns in files.values() for column in columns}
-    wanted = (
-        name if name is None or name in known else plain_name(name)
+    column_names = {column.name for columns in files.values() for column in columns}
+    selected_name = (
+        name if name is None or name in column_names else plain_name(name)
     )  # a named step adds its name to the column's name
     rows = [
         (file, column.name, column.unit, column.meaning)
         for file, columns in files.items()
         for column in columns
-        if wanted in {None, column.name}
+        if selected_name in {None, column.name}
     ]
     if not rows:
         raise ConfigurationError(
-            f"there is no column {name!r}", remedy=did_you_mean(name or "", known, "fieldkit columns lists them")
+            f"there is no column {name!r}",
+            remedy=did_you_mean(name or "", column_names, "fieldkit columns lists them"),
         )
     table(("file", "column", "unit", "meaning"), rows)
     return 0

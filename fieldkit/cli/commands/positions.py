@@ -47,7 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
     if files or arguments.clear:
         if files and arguments.clear:
             raise ConfigurationError(
-                "--clear removes stored files and takes no new ones", remedy="omit it to replace the stored files"
+                "--clear removes the stored files and cannot be combined with new ones",
+                remedy="omit it to replace the stored files",
             )
         rebuilt = positions.set_positions(
             arguments.trial,
@@ -69,11 +70,14 @@ def _offset_s(text: str) -> float:
     return -offset_s if text.startswith("-") else offset_s
 
 
-def _lines(spotted: "AttemptPositions") -> list[str]:
+def _lines(attempt_positions: "AttemptPositions") -> list[str]:
     """Return the lines about an attempt, one per distance."""
-    source = spotted.source or "positions from the backend"
+    source = attempt_positions.source or "positions from the backend"
     lines = [
-        f"{spotted.attempt}  {pair}: {least:.1f} to {most:.1f} m, {source}"
-        for pair, (least, most) in spotted.distances_m.items()
+        f"{attempt_positions.attempt}  {pair}: {minimum_m:.1f} to {maximum_m:.1f} m, {source}"
+        for pair, (minimum_m, maximum_m) in attempt_positions.distances_m.items()
     ]
-    return lines + [f"{spotted.attempt}  {pair}: no distance, {reason}" for pair, reason in spotted.missing.items()]
+    return lines + [
+        f"{attempt_positions.attempt}  {pair}: no distance, {reason}"
+        for pair, reason in attempt_positions.missing.items()
+    ]

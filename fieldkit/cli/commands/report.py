@@ -67,14 +67,14 @@ def run(arguments: argparse.Namespace) -> int:
     out, folder = arguments.out, arguments.figures
     _require_writable(out)
     data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
-    chosen = [data.quantity(name).name for name in arguments.quantity]
+    selected_names = [data.quantity(name).name for name in arguments.quantity]
     repeats = data.read()
     report_contents = contents.build_contents(
         repeats,
         title=arguments.title,
         repeat=arguments.repeat,
         command=_command(arguments),
-        quantities=chosen,
+        quantities=selected_names,
         unmeasured=list(unmeasured(arguments.paths, set(repeats.texts["source"].tolist()), show_note)),
     )
     with _explain_os_errors(out, "-o"):

@@ -3,7 +3,7 @@
 import argparse
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import watching
+from fieldkit.cli.display import showing_events
 from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import interruptible
 
@@ -13,8 +13,8 @@ def add(parser: Parser) -> None:
     parser.description = (
         "Continue a trial that stopped: by Ctrl-C, a kill, a lost robot or testbed, a full disk. Finished repeats "
         "are not repeated. Files that differ from their checksums are reported; if trial.csv would have to be made "
-        "again from them, the trial does not continue (exit code 4). Backend and cast must be those that the trial "
-        "began with."
+        "again from them, the trial does not continue (exit code 4). Backend and cast must be those with which "
+        "the trial started."
     )
     shared.add_trial(parser, "folder of the trial")
     parser.add_argument(
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.trial.running.resumption import resumable
 
     resumable(arguments.trial)  # raise errors of the trial before those of site files and backends
-    with watching(as_json=arguments.json) as sink, interruptible() as stop:
+    with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         with cli_options.operator(arguments, sink) as operator:
             outcome = opening.resume(

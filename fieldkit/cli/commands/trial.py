@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import watching
+from fieldkit.cli.display import showing_events
 from fieldkit.cli.parser import Parser
 from fieldkit.cli.terminal import interruptible
 from fieldkit.core.events import Note
@@ -24,7 +24,7 @@ def add(parser: Parser) -> None:
     parser.add_argument("procedure", metavar="PROCEDURE", help="name of a procedure, see `fieldkit procedures`")
     parser.add_argument("distances", metavar="DISTANCE", nargs="+", help="with a unit, for example 30ft or 9.1m")
     shared.add_site(parser)
-    shared.add_changes(parser)
+    shared.add_overrides(parser)
     parser.add_argument(
         "--seed", type=shared.natural, metavar="N", default=1, help="seed of everything random (default: 1)"
     )
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         for text in arguments.distances
     ]
     topology = requests[0].chosen_topology
-    with watching(as_json=arguments.json) as sink, interruptible() as stop:
+    with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         cast = backend.cast(topology)
         run_id = secrets.token_hex(8)
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
         from fieldkit.cli import results
         from fieldkit.trial.running import opening
 
-        sink(Note(_announce(plans)))
+        sink(Note(_announcement(plans)))
         with cli_options.operator(arguments, sink) as operator:
             outcomes = opening.run(
                 plans, backend, plans[0].cast, arguments.out, sink=sink, operator=operator, stop=stop
@@ -89,7 +89,8 @@ def run(arguments: argparse.Namespace) -> int:
     return results.report(outcomes, arguments)
 
 
-def _announce(plans: "list[Plan]") -> str:
+def _announcement(plans: "list[Plan]") -> str:
+    """Return the number of repeats and the expected duration, as text."""
     from fieldkit.trial import estimates
 
     protocols = " and ".join(protocol.upper() for protocol in plans[0].protocols)

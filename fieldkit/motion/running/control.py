@@ -2,14 +2,14 @@
 
 from typing import Final
 
-from fieldkit.motion.running.permission import MotionPermission, demand_one_place
+from fieldkit.motion.running.permission import MotionPermission, require_one_place
 from fieldkit.trial.running.motion_control import MotionSupport
 
 
 class MotionControl:
     """Implementation of `fieldkit.trial.running.motion_control.MotionSupport`."""
 
-    demand_one_place = staticmethod(demand_one_place)
+    require_one_place = staticmethod(require_one_place)
     permission = MotionPermission
 
 

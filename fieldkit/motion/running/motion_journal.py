@@ -232,7 +232,7 @@ class KeptOrigins:
         """Record that a motion did not start, so that the robot is held."""
         self._journal.add(MotionEvent.HELD, self._robots[role], reason=f"it did not start: {why}")
 
-    def demand(self) -> None:
+    def require(self) -> None:
         """Check that robots may move; robots in motion are exempt.
 
         Raises:
@@ -244,7 +244,7 @@ class KeptOrigins:
     @contextmanager
     def moving(self, role: Role) -> Iterator[RobotMotion]:
         """Record start and end of a motion; a motion that is not over when the body ends leaves the robot held."""
-        self.demand()
+        self.require()
         name, motion, why = self._robots[role], RobotMotion(), "it stopped on its way"
         self._journal.add(MotionEvent.BEGUN, name)
         self._in_motion.add(name)

@@ -23,7 +23,7 @@ CONFIRM: Final = "confirm"
 _STOP: Final = "stop"
 
 
-def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
+def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
     """Check that self-moving robots stay at one place in all trials, or that a person moves them.
 
     Raises:
@@ -74,7 +74,7 @@ class MotionPermission:
         robots = {role: robot.name for role, robot in plan.cast.items()}
         self.origins = self._kept = KeptOrigins(self._journal, folder, robots, plan.placement, may_return=allowed)
 
-    def demand(self) -> None:
+    def require(self) -> None:
         """Check that robots may move in the next attempt. After a fault, a person must type `confirm`.
 
         Raises:
@@ -84,9 +84,9 @@ class MotionPermission:
         """
         if self._kept is None or not self._moving:
             return
-        self._demand_placed(self._kept)
+        self._require_placed(self._kept)
         if self._journal.holds:
-            self._demand_confirmed(self._kept)
+            self._require_confirmed(self._kept)
 
     @contextmanager
     def noting(self, sink: Sink) -> Iterator[None]:
@@ -99,7 +99,7 @@ class MotionPermission:
                 sink(Note(f"{hold.reason}: {place}"))
             raise
 
-    def _demand_placed(self, kept: KeptOrigins) -> None:
+    def _require_placed(self, kept: KeptOrigins) -> None:
         """Raise an error if a robot must be at a new place but no person was asked: its origin would be wrong."""
         testbed = self._testbed
         if isinstance(testbed, Attended) and not isinstance(testbed.operator, Unattended):
@@ -111,7 +111,7 @@ class MotionPermission:
                     remedy="put it at its place for this trial, clear its path, then repeat this without --yes",
                 )
 
-    def _demand_confirmed(self, kept: KeptOrigins) -> None:
+    def _require_confirmed(self, kept: KeptOrigins) -> None:
         testbed = self._testbed
         if isinstance(testbed, Attended):
             if permissions.MOVE_AFTER_FAULT in testbed.permissions:
@@ -126,4 +126,4 @@ class MotionPermission:
             if testbed.operator.enter(Question(text, choices=(CONFIRM, _STOP), usual=_STOP)) == CONFIRM:
                 self._journal.confirm("a person confirmed", at_place=True)
                 return
-        kept.demand()
+        kept.require()

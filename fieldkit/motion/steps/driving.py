@@ -404,7 +404,7 @@ def _bring_back(
     end_state = drive_lease.end_state
     _end(shell, job)
     if by_hand or end_state == drive_log.HOME:
-        testbed.bring_back(move.role, by_itself=end_state == drive_log.HOME)
+        testbed.bring_back(move.role, has_returned=end_state == drive_log.HOME)
     return end_state
 
 

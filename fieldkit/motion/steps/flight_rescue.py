@@ -19,7 +19,7 @@ from fieldkit.remote.shell import Shell
 
 MANUAL_ACTION: Final = "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION"
 
-SILENT_S: Final = 0.6
+SILENCE_TIMEOUT_S: Final = 0.6
 """Programs whose counters do not change for this time of the robot's clock do not run; they count ten a second."""
 _POLL_S: Final = 0.15
 _MAX_STEP_S: Final = 0.4
@@ -44,12 +44,12 @@ class LifeSigns:
             now_s = float(sample[SIZE:].split()[0])
         except (ValueError, IndexError):
             return False
-        turns = programs[PILOT].turns, programs[GUARD].turns
+        turns = programs[PILOT].iterations, programs[GUARD].iterations
         elapsed_s, self._polled_s = min(now_s - self._polled_s, _MAX_STEP_S), now_s
         self._silent_s = self._silent_s + elapsed_s if turns == self._turns else 0.0
         self._turns = turns
         flies = programs[PILOT].state in {FLYING, LANDING} or programs[GUARD].state == LANDING
-        return flies and self._silent_s >= SILENT_S
+        return flies and self._silent_s >= SILENCE_TIMEOUT_S
 
 
 class FlightRescue:

@@ -30,7 +30,7 @@ from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 from fieldkit.ros.middlewares.ports import MAX_DOMAIN
 
 MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
-"""The keys of `agent.middleware.ADAPTERS`, which a test compares, without `ros2`.
+"""The keys of `agent.middleware.ADAPTERS` without `ros2`; a test compares them.
 
 That adapter needs the Python of a robot's ROS 2.
 """
@@ -50,8 +50,8 @@ def add(parser: Parser) -> None:
     )
     parser.add_choice("--from", MIDDLEWARES, dest="near", required=True, help=f"one of: {', '.join(MIDDLEWARES)}")
     parser.add_choice("--to", MIDDLEWARES, dest="far", required=True, help="another of them")
-    parser.add_argument("topics", metavar="TOPIC", nargs="*", help="goes from the first to the second")
-    for option, text in (("--back", "goes in the other direction"), ("--both", "goes in both directions")):
+    parser.add_argument("topics", metavar="TOPIC", nargs="*", help="topic from the first middleware to the second")
+    for option, text in (("--back", "topic in the other direction"), ("--both", "topic in both directions")):
         parser.add_argument(
             option, metavar="TOPIC", action="append", default=[], help=f"{text}; may be given more than once"
         )
@@ -175,23 +175,23 @@ def _address(text: str) -> str:
         raise ConfigurationError(f"{text!r} is not an IPv4 address", remedy="for example 10.42.0.1") from None
 
 
-def _host(text: str, usual_port: int) -> tuple[str, int]:
+def _host(text: str, default_port: int) -> tuple[str, int]:
     try:
         parts = urlsplit(f"//{text}")
         if parts.hostname and parts.netloc == text:
-            return parts.hostname, parts.port or usual_port
+            return parts.hostname, parts.port or default_port
     except ValueError:
         pass
-    raise ConfigurationError(f"{text!r} is not a host and port", remedy=f"write it as 10.42.0.1:{usual_port}")
+    raise ConfigurationError(f"{text!r} is not a host and port", remedy=f"write it as 10.42.0.1:{default_port}")
 
 
-def _domain(given: int | None) -> int:
+def _domain(option_value: int | None) -> int:
     text = os.environ.get("ROS_DOMAIN_ID") or "0"
-    number = given if given is not None else int(text) if text.isascii() and text.isdigit() else -1
+    number = option_value if option_value is not None else int(text) if text.isascii() and text.isdigit() else -1
     if 0 <= number <= MAX_DOMAIN:
         return number
     raise ConfigurationError(
-        f"{text if given is None else given} is not a domain of ROS 2", remedy=f"use 0 to {MAX_DOMAIN}"
+        f"{text if option_value is None else option_value} is not a domain of ROS 2", remedy=f"use 0 to {MAX_DOMAIN}"
     )
 
 
@@ -208,7 +208,7 @@ def _until_signal() -> Iterator[threading.Event]:
 
 
 def _watch(carriers: Sequence[Carrier], stopped: threading.Event) -> None:
-    """Wait for `stopped`. Report once per topic that other nodes use it with another type."""
+    """Wait for `stopped`. If other nodes use a topic with another type, report this once."""
     reported: set[str] = set()
     while not stopped.wait(_POLL_S):
         for sentence in chain.from_iterable(carrier.other_types() for carrier in carriers):

@@ -95,7 +95,7 @@ def assess(attempts: Repeats, criterion: LinkCriterion) -> list[Assessment]:
         criterion: The criterion.
     """
     tables: dict[tuple[Candidate, str, float], list[Repeats]] = {}
-    for rows, stream, prefix, rmw in _measured(attempts):
+    for rows, stream, prefix, rmw in _attempts_by_step(attempts):
         if criterion.size_bytes is not None and round(stream.bytes) != round(criterion.size_bytes):
             continue
         for (topology, distance), index in rows.groups(("topology", "distance")).items():
@@ -111,7 +111,7 @@ def assess(attempts: Repeats, criterion: LinkCriterion) -> list[Assessment]:
     ]
 
 
-def _measured(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, str]]:
+def _attempts_by_step(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, str]]:
     """Yield the attempts of each trial with each of its `topics` steps, its column prefix, and its RMW."""
     for folder in dict.fromkeys(attempts.texts[SOURCE]):
         if not folder or not Path(folder).is_dir():
@@ -169,13 +169,12 @@ def assess_candidate(
 
 def _reason(judgement: Judgement) -> str:
     """Return the reason why a judgement does not hold, with the measured values."""
-    unknown, demand = judgement.why or "not shown", judgement.expectation.text
+    unknown, expectation_text = judgement.why or "not shown", judgement.expectation.text
     if judgement.estimate is None or judgement.met is None:
-        return f"{demand}: {unknown}"
+        return f"{expectation_text}: {unknown}"
     why = f"; {judgement.why}" if judgement.why else ""
-    return (
-        f"{demand} in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}{why}"
-    )
+    figures = f"in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}"
+    return f"{expectation_text} {figures}{why}"
 
 
 def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:

@@ -56,7 +56,7 @@ def add(parser: Parser) -> None:
     action.set_defaults(run=f"{__name__}:recommend")
 
 
-NOTHING: int = 1
+NOTHING_WRITTEN: int = 1
 
 
 def recommend(arguments: argparse.Namespace) -> int:
@@ -80,30 +80,30 @@ def recommend(arguments: argparse.Namespace) -> int:
     assessments = candidates.assess(data.read(undeclared=True), criterion)
     if not assessments:
         print_text("no trial has a step topics with samples of this size; to run one, see: fieldkit docs topics")
-        return NOTHING
+        return NOTHING_WRITTEN
     best: dict[str, Assessment] = {}
     for assessment in assessments:
-        word = "passed" if assessment.passed else "failed" if assessment.failed else "undecided"
-        print_text(sanitized(f"{word}: {assessment.candidate}"))
+        result = "passed" if assessment.passed else "failed" if assessment.failed else "undecided"
+        print_text(sanitized(f"{result}: {assessment.candidate}"))
         for reason in (*assessment.failed, *assessment.lacking):
             print_text(sanitized(f"  {reason}"))
         current = best.get(assessment.candidate.over)
         if assessment.passed and (current is None or assessment.rank < current.rank):
             best[assessment.candidate.over] = assessment
-    wrote = [_write(arguments, assessment, criterion) for assessment in best.values()]
-    if any(wrote):
+    written_files = [_write(arguments, assessment, criterion) for assessment in best.values()]
+    if any(written_files):
         return 0
     print_text(
         "nothing was written: no settings passed. Measure the undecided ones with more repeats, or other settings"
     )
-    return NOTHING
+    return NOTHING_WRITTEN
 
 
 def _parse_share(text: str, option: str, maximum: float = 1.0) -> float:
     """Return the share in an option's value.
 
     Raises:
-        ConfigurationError: It is not a share, or above `maximum`; or it is 0 and `most` is below 1.
+        ConfigurationError: It is not a share, or above `maximum`; or it is 0 and `maximum` is below 1.
     """
     share = parse_amount(text, "share", option)
     if share > maximum or (maximum < 1 and not share):

@@ -49,21 +49,21 @@ def check_topics(plan: Plan, role: Role, shell: Shell, probed: Probed, report: R
         RobotError: The recorder did not start.
     """
     robot = plan.cast[role]
-    wanted, battery = recorded(plan, role), "" if has_shared_battery(plan, role) else battery_of(robot)
-    topics = tuple(dict.fromkeys((*wanted, *((battery,) if battery else ()))))
+    required_topics, battery = recorded(plan, role), "" if has_shared_battery(plan, role) else battery_of(robot)
+    topics = tuple(dict.fromkeys((*required_topics, *((battery,) if battery else ()))))
     if not topics or not can_record(plan, role, probed):
         return
     step = recording(role, robot, topics)
     scene = plan.scene(RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: probed.variants})
     with tempfile.TemporaryDirectory() as into:
         try:
-            path, recorded_bag = _record(scene, step, shell, Path(into), waits_full_time=bool(wanted))
+            path, recorded_bag = _record(scene, step, shell, Path(into), waits_full_time=bool(required_topics))
         except EvidenceError as error:
-            judge(robot, wanted, None, report, why=error.what)
+            judge(robot, required_topics, None, report, why=error.what)
             return
         finally:
             evidence.discard(shell, plan.trial)
-        judge(robot, wanted, recorded_bag, report)
+        judge(robot, required_topics, recorded_bag, report)
         _check_battery(path, battery, report)
 
 
@@ -133,12 +133,12 @@ def _record(
         EvidenceError: There is no bag, or no message in it; the error includes the end of the recorder's log.
     """
     robot = scene.robot(step.robot)
-    where = (scene.folder, step.robot, robot.profile.radio.interface)
+    location = (scene.folder, step.robot, robot.profile.radio.interface)
     (planned,) = step.jobs(scene)
     job = planned.job if waits_full_time else replace(planned.job, limit_s=min(planned.job.limit_s, _SHORT_LIMIT_S))
-    evidence.begin(shell, *where)
+    evidence.begin(shell, *location)
     jobs.run(shell, job)
-    fetching.fetch(shell, *where, into)
+    fetching.fetch(shell, *location, into)
     path, log = into / step.bag(robot), into / job.log
     try:
         return path, bag.read(path)

@@ -10,8 +10,9 @@ from fieldkit.trial.check.report import Report
 
 CONTACT_S: Final = 15.0
 WARN_S: Final = 1.0
-HOUR_S: Final = 1800.0
-"""From half an hour on, a clock is wrong rather than late: wrong time zone, or a board without a battery."""
+WRONG_CLOCK_S: Final = 1800.0
+"""A clock that differs by half an hour or more does not drift but is wrong, for example by its time zone, or because
+the board has no battery."""
 
 
 def log_in(shell: Shell) -> None:
@@ -32,12 +33,12 @@ def judge(shell: Shell, report: Report) -> Offset | None:
     return offset(exchanges) if exchanges else None
 
 
-def judge_clock(clock_offset: Offset | None, by_hand: str, report: Report) -> None:
+def judge_clock(clock_offset: Offset | None, ssh_destination: str, report: Report) -> None:
     """Add the offset of a robot's clock.
 
     Args:
         clock_offset: The offset; None if the robot reported no time.
-        by_hand: Login command for a person (`Shell.by_hand`).
+        ssh_destination: Login command for a person (`Shell.ssh_destination`).
         report: Receives the finding.
     """
     if clock_offset is None:
@@ -48,10 +49,10 @@ def judge_clock(clock_offset: Offset | None, by_hand: str, report: Report) -> No
     if magnitude_s - clock_offset.error_s <= WARN_S:
         report.ok("clock", detail)
         return
-    if magnitude_s >= HOUR_S:
+    if magnitude_s >= WRONG_CLOCK_S:
         ahead = "ahead" if clock_offset.offset_s > 0 else "behind"
         detail = f"{magnitude_s / 3600:.1f} hours {ahead}: {detail}"
     command = "date -u -s @$(date +%s)"
     has_sudo = report.user_tools is None or report.user_tools.root or "sudo" in report.user_tools.programs
     on_robot = f"sudo {command}" if has_sudo else f"\"su -c '{command}'\""
-    report.warn("clock", detail, f"ssh -t {by_hand} {on_robot}   # on the laptop")
+    report.warn("clock", detail, f"ssh -t {ssh_destination} {on_robot}   # on the laptop")

@@ -19,7 +19,7 @@ _HEAD: Final = re.compile(r"^==> (.+): ([0-9]{1,3}) <==$", re.MULTILINE)
 
 Sections = Mapping[str, CommandResult]
 
-NOTHING: Final = CommandResult(text="", code=CommandResult.MISSING)
+MISSING_SECTION: Final = CommandResult(text="", code=CommandResult.MISSING)
 """Result of a section that the robot did not send."""
 
 
@@ -35,13 +35,13 @@ def run_probe(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]
         LinkError: The robot did not answer, or not in `PROBE_S`.
         RobotError: Its output exceeds the limit of a probe.
     """
-    done = shell.run(
+    completed = shell.run(
         ("sh", "-s", interface),
         stdin=script(commands).encode(),
         deadline=Deadline.after(PROBE_S),
         check=False,
     )
-    return parse(done.stdout.decode(errors="replace"))
+    return parse(completed.stdout.decode(errors="replace"))
 
 
 def script(commands: Mapping[str, Sequence[str]]) -> str:

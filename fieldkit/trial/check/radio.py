@@ -8,7 +8,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config import locations
 from fieldkit.core.model import Control
 from fieldkit.steps.scene import CommandResult
-from fieldkit.trial.check.probe import NOTHING, Sections
+from fieldkit.trial.check.probe import MISSING_SECTION, Sections
 from fieldkit.trial.check.report import Report
 
 MARGIN_DB: Final = 10
@@ -26,7 +26,7 @@ _OFFLOADS: Final = {
 _FACTS: Final = {
     "type": r"^[ \t]*type (.{1,30})$",
     "channel": r"^[ \t]*channel ([0-9]{1,3}) \(",
-    "joined": r"^(?:Connected to|Joined IBSS) (\S{1,20}) \(on ",
+    "associated": r"^(?:Connected to|Joined IBSS) (\S{1,20}) \(on ",
     "ssid": r"^[ \t]*(?:SSID:|ssid) (.{1,128})$",
     "rate": r"^[ \t]*tx bitrate:[ \t]*([0-9.]{1,10} MBit/s)",
 }
@@ -40,10 +40,13 @@ def judge(robot: Robot, sections: Sections, report: Report) -> None:
     _judge_interface(robot, sections, report)
     _judge_control(robot, sections, report)
     _judge_offloads(sections, report)
-    if sections.get("wifi-info", NOTHING).ok:
+    if sections.get("wifi-info", MISSING_SECTION).ok:
         _judge_wifi(robot, sections, report)
-    elif sections.get("wireless", NOTHING).ok and "link/ether" in sections.get("interface", NOTHING).text:
-        section = sections.get("wifi-info", NOTHING)
+    elif (
+        sections.get("wireless", MISSING_SECTION).ok
+        and "link/ether" in sections.get("interface", MISSING_SECTION).text
+    ):
+        section = sections.get("wifi-info", MISSING_SECTION)
         if section.code == CommandResult.MISSING:
             report.warn("Wi-Fi", "signal and power save cannot be read without iw", "sudo apt-get install iw")
         else:
@@ -52,7 +55,7 @@ def judge(robot: Robot, sections: Sections, report: Report) -> None:
 
 def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     name = robot.profile.radio.interface
-    check, section = f"interface {name}", sections.get("interface", NOTHING)
+    check, section = f"interface {name}", sections.get("interface", MISSING_SECTION)
     flags = _FLAGS.search(section.text)
     addresses = _ADDRESS.findall(section.text)
     if section.code == CommandResult.MISSING:
@@ -66,7 +69,11 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     elif "UP" not in flags["flags"].split(","):
         report.fail(check, "down", f"sudo ip link set {name} up")
     elif "NO-CARRIER" in flags["flags"]:
-        report.fail(check, "up, but joined to nothing: no carrier", f"iw dev {name} link   # then join the network")
+        report.fail(
+            check,
+            "up, but not associated with a network: no carrier",
+            f"iw dev {name} link   # then join the network",
+        )
     elif robot.address not in {address.partition("/")[0] for address in addresses}:
         actual = f"has {', '.join(addresses)}" if addresses else "has no IPv4 address"
         remedy = f"ip addr   # then correct address of {robot.name} in the site file, or join its network"
@@ -77,13 +84,13 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
 
 def is_missing(sections: Sections) -> bool:
     """Return True if the robot has no interface of the profile's name."""
-    section = sections.get("interface", NOTHING)
+    section = sections.get("interface", MISSING_SECTION)
     return section.code != CommandResult.MISSING and _FLAGS.search(section.text) is None
 
 
 def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
-    # The client's address and port, then the robot's address and port, as the SSH server sees the connection.
-    words = sections.get("control", NOTHING).text.split()
+    # The client's address and port, then the robot's address and port, as the SSH server reports the connection.
+    words = sections.get("control", MISSING_SECTION).text.split()
     if len(words) != 4:
         report.ok("control", "the SSH server does not report the addresses of the connection")
     elif words[2] != robot.address:
@@ -99,7 +106,7 @@ def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
 
 
 def _judge_offloads(sections: Sections, report: Report) -> None:
-    section = sections.get("offloads", NOTHING)
+    section = sections.get("offloads", MISSING_SECTION)
     states = {name: re.search(rf"^{long}: (on|off)", section.text, re.MULTILINE) for name, long in _OFFLOADS.items()}
     offloads = [f"{name} {state[1]}" for name, state in states.items() if state]
     report.ok("offloads", ", ".join(offloads) or "not known: ethtool is not installed")
@@ -107,7 +114,7 @@ def _judge_offloads(sections: Sections, report: Report) -> None:
 
 def facts(sections: Sections) -> Mapping[str, str]:
     """Return the values printed by `iw info` and `iw link`, by the names in `_FACTS`; others are missing."""
-    text = "\n".join(sections.get(name, NOTHING).text for name in ("wifi-info", "wifi-link"))
+    text = "\n".join(sections.get(name, MISSING_SECTION).text for name in ("wifi-info", "wifi-link"))
     matches = {name: re.search(pattern, text, re.MULTILINE) for name, pattern in _FACTS.items()}
     return {name: match[1] for name, match in matches.items() if match}
 
@@ -116,14 +123,14 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
     wifi_facts = facts(sections)
     interface = robot.profile.radio.interface
     is_access_point = wifi_facts.get("type") == "AP"
-    if "joined" not in wifi_facts and wifi_facts.get("type") == "managed":
-        report.fail("Wi-Fi", "joined to no network", f"sudo wpa_cli -i {interface} reconnect")
+    if "associated" not in wifi_facts and wifi_facts.get("type") == "managed":
+        report.fail("Wi-Fi", "not associated with a network", f"sudo wpa_cli -i {interface} reconnect")
         return
-    stations = "wifi-stations" if is_access_point or "joined" not in wifi_facts else "wifi-link"
-    signals = [int(signal) for signal in _SIGNAL.findall(sections.get(stations, NOTHING).text)]
+    stations = "wifi-stations" if is_access_point or "associated" not in wifi_facts else "wifi-link"
+    signals = [int(signal) for signal in _SIGNAL.findall(sections.get(stations, MISSING_SECTION).text)]
     words = [
         f"{wifi_facts.get('type', 'unknown mode')} {wifi_facts.get('ssid', '')!r}",
-        *([f"at {wifi_facts['joined']}"] if "joined" in wifi_facts else []),
+        *([f"at {wifi_facts['associated']}"] if "associated" in wifi_facts else []),
         *([f"channel {wifi_facts['channel']}"] if "channel" in wifi_facts else []),
         *([f"{len(signals)} stations"] if is_access_point else []),
         *([f"{min(signals)} dBm"] if signals else []),
@@ -132,7 +139,9 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
     weak_dbm = robot.profile.radio.sensitivity_dbm + MARGIN_DB
     if signals and min(signals) < weak_dbm:
         report.warn(
-            "Wi-Fi", f"{', '.join(words)}: weaker than {weak_dbm:g} dBm", f"iw dev {interface} link   # closer?"
+            "Wi-Fi",
+            f"{', '.join(words)}: weaker than {weak_dbm:g} dBm",
+            f"iw dev {interface} link   # is the robot too far away?",
         )
     else:
         report.ok("Wi-Fi", ", ".join(words))
@@ -141,7 +150,7 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
 
 
 def _judge_power_save(interface: str, sections: Sections, report: Report) -> None:
-    section = sections.get("wifi-power-save", NOTHING)
+    section = sections.get("wifi-power-save", MISSING_SECTION)
     state = _POWER_SAVE.search(section.text)
     if state is None:
         report.ok("power save", f"not known: {section.text}")

@@ -49,15 +49,15 @@ class Report:
         self.add(check, Verdict.WARN, detail, remedy)
 
     def fail(self, check: str, detail: str, remedy: str) -> None:
-        """Add a problem with which no trial can start."""
+        """Add a problem that prevents a trial."""
         self.add(check, Verdict.FAIL, detail, remedy)
 
     def add(self, check: str, status: Verdict, detail: str, remedy: str) -> None:
         """Add a check with its verdict; the remedy is empty if it passed."""
-        check, detail, remedy = (printable(text.encode()) for text in (check, detail, self._typable(remedy)))
+        check, detail, remedy = (printable(text.encode()) for text in (check, detail, self._adapted_remedy(remedy)))
         self.findings.append(Finding(self.robot, check, status, detail or "no answer", remedy))
 
-    def _typable(self, remedy: str) -> str:
+    def _adapted_remedy(self, remedy: str) -> str:
         """Adapt a remedy to this robot's user; steps write remedies for Debian and a user with sudo."""
         if self.user_tools is None:
             return remedy

@@ -19,7 +19,7 @@ from fieldkit.steps.scene import CommandResult, Need, Planned
 from fieldkit.steps.variants import Tool, Variants
 from fieldkit.trial import session_jobs
 from fieldkit.trial.check import radio, tools
-from fieldkit.trial.check.probe import NOTHING, Sections
+from fieldkit.trial.check.probe import MISSING_SECTION, Sections
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
 
@@ -67,7 +67,7 @@ class Probed:
             needs: The needs of steps on the robot.
         """
         names = (_section(program), *(need.name for need in needs if need.missing_program == program))
-        return all(self.sections.get(name, NOTHING).ok for name in names)
+        return all(self.sections.get(name, MISSING_SECTION).ok for name in names)
 
 
 def commands(plan: Plan, role: Role) -> dict[str, Sequence[str]]:
@@ -91,26 +91,26 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
     profile = plan.cast[role].profile
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
     remedies = {planned.program: planned.remedy for planned in _planned(plan, role)}
-    present = [program for program in programs if sections.get(_section(program), NOTHING).ok]
+    present = [program for program in programs if sections.get(_section(program), MISSING_SECTION).ok]
     report.ok("programs", ", ".join(present) or "none found")
     needs = needs_of(plan, role)
-    # A recorder that its setup file hides is explained by the finding on that file.
-    explained = {need.missing_program for need in needs if not sections.get(need.name, NOTHING).ok}
+    # If a ROS setup file is missing, its recorder is not found either. Only the setup file is then reported.
+    explained = {need.missing_program for need in needs if not sections.get(need.name, MISSING_SECTION).ok}
     for program in programs:
         if program not in present and program not in explained:
             package = _PACKAGES.get(Path(program).name)
-            correct = remedies.get(program) or (
+            profile_remedy = remedies.get(program) or (
                 f"correct its name in profile {profile.name}: {locations.copy_profile_command(profile.name)}"
             )
-            report.fail(program, "not found", f"sudo apt-get install {package}" if package else correct)
+            report.fail(program, "not found", f"sudo apt-get install {package}" if package else profile_remedy)
     interface = profile.radio.interface if radio.is_missing(sections) else None
     for need in needs:
         # A need that uses a missing interface is skipped: the missing interface is reported separately.
         if (not need.required_program or need.required_program in present) and interface not in need.argv:
-            report.add(need.name, *need.judge(sections.get(need.name, NOTHING)))
+            report.add(need.name, *need.judge(sections.get(need.name, MISSING_SECTION)))
     if len(present) < len(programs):
         return variants.expected(profile)
-    return _judge_tools(profile, sections.get(_TOOLS, NOTHING), report)
+    return _judge_tools(profile, sections.get(_TOOLS, MISSING_SECTION), report)
 
 
 def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
@@ -121,11 +121,11 @@ def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report
         RobotError: The agent cannot be installed.
     """
     for need in needs_of(plan, role, by_agent=True):
-        if sections.get(_section(need.required_program), NOTHING).ok:
+        if sections.get(_section(need.required_program), MISSING_SECTION).ok:
             agent.install(shell)
-            done = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
-            text = (done.stdout + done.stderr).decode("utf-8", "replace")
-            report.add(need.name, *need.judge(CommandResult(text, done.exit_code)))
+            completed = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
+            text = (completed.stdout + completed.stderr).decode("utf-8", "replace")
+            report.add(need.name, *need.judge(CommandResult(text, completed.exit_code)))
 
 
 def _section(program: str) -> str:
@@ -152,7 +152,7 @@ def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -
 
 
 def _programs(plan: Plan, role: Role) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield each program that a step or fieldkit starts, with the files to source before looking for it."""
+    """Yield each program that a step or fieldkit starts, with the setup files that must be sourced first."""
     yield from ((program, ()) for program in BASE_PROGRAMS)
     yield from dict.fromkeys((planned.program, planned.setup) for planned in _planned(plan, role))
 

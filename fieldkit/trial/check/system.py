@@ -10,7 +10,7 @@ from fieldkit.core.units import format_bytes, format_duration
 from fieldkit.remote.command import quote
 from fieldkit.steps.capabilities import SendsTraffic
 from fieldkit.trial import size
-from fieldkit.trial.check.probe import NOTHING, Sections
+from fieldkit.trial.check.probe import MISSING_SECTION, Sections
 from fieldkit.trial.check.report import Report, UserTools
 from fieldkit.trial.plan import Plan
 
@@ -24,26 +24,26 @@ _BATTERY: Final = re.compile(r"^(?P<name>\S{1,60}) (?P<percent>[0-9]{1,3})$", re
 
 def user_tools(sections: Sections) -> UserTools:
     """Return the permissions and programs of a robot's user."""
-    programs = sections.get("means", NOTHING).text.split()
-    return UserTools(sections.get("user", NOTHING).text.strip() == "0", frozenset(programs))
+    programs = sections.get("means", MISSING_SECTION).text.split()
+    return UserTools(sections.get("user", MISSING_SECTION).text.strip() == "0", frozenset(programs))
 
 
 def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
     """Report the findings on kernel, disk, ports and battery."""
-    report.ok("system", sections.get("system", NOTHING).text)
+    report.ok("system", sections.get("system", MISSING_SECTION).text)
     _judge_disk(plan, role, sections, report)
     scene = plan.scenes()[0]
     steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, SendsTraffic))
     flows = (flow for step in steps for flow in step.flows(scene) if not flow.served)
     for port in dict.fromkeys(flow.port for flow in flows if flow.destination is role and flow.port is not None):
         _judge_port(port, sections, report)
-    for battery in _BATTERY.finditer(sections.get("batteries", NOTHING).text):
+    for battery in _BATTERY.finditer(sections.get("batteries", MISSING_SECTION).text):
         judge_battery(battery["name"], int(battery["percent"]), report)
 
 
 def judge_laptop(plan: Plan, out: Path, report: Report) -> None:
     """Report whether the disk of `out` has space for the trial, and whether fetching its evidence takes long."""
-    judge_room(plan, files.free_bytes(out), files.nearest_existing(out), report)
+    judge_disk_space(plan, files.free_bytes(out), files.nearest_existing(out), report)
     if (fetch_s := size.fetch_s(plan)) > LONG_FETCH_S:
         rate = size.FETCHED_BYTES_PER_S
         evidence, duration = format_bytes(rate * fetch_s), format_duration(fetch_s)
@@ -54,7 +54,7 @@ def judge_laptop(plan: Plan, out: Path, report: Report) -> None:
         )
 
 
-def judge_room(plan: Plan, free: int, folder: Path, report: Report) -> None:
+def judge_disk_space(plan: Plan, free: int, folder: Path, report: Report) -> None:
     """Report whether the laptop has space: a failure without space for one attempt, a warning for the whole trial.
 
     Args:
@@ -63,21 +63,21 @@ def judge_room(plan: Plan, free: int, folder: Path, report: Report) -> None:
         folder: Folder of the trial.
         report: Receives the finding.
     """
-    attempt, whole = size.attempt_bytes(plan), size.trial_bytes(plan)
-    detail = f"{format_bytes(free)} free, the trial needs {format_bytes(whole)} at most"
+    attempt, whole_trial = size.attempt_bytes(plan), size.trial_bytes(plan)
+    detail = f"{format_bytes(free)} free, the trial needs {format_bytes(whole_trial)} at most"
     remedy = f"du -sh {quote((str(folder),))}/*   # delete what is not needed, or choose another --out"
     if free < attempt + size.RESERVE_BYTES:
         report.fail("disk", detail, remedy)
-    elif free < whole + size.RESERVE_BYTES:
+    elif free < whole_trial + size.RESERVE_BYTES:
         report.warn("disk", detail, remedy)
     else:
         report.ok("disk", detail)
 
 
 def _judge_disk(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
-    lines = list(_DF.finditer(sections.get("disk", NOTHING).text))
+    lines = list(_DF.finditer(sections.get("disk", MISSING_SECTION).text))
     if not lines:
-        report.fail("disk", sections.get("disk", NOTHING).text, "df -Pk .")
+        report.fail("disk", sections.get("disk", MISSING_SECTION).text, "df -Pk .")
         return
     free = int(lines[-1]["free_kib"]) << 10
     needed = size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)
@@ -92,7 +92,7 @@ def _judge_disk(plan: Plan, role: Role, sections: Sections, report: Report) -> N
 
 def _judge_port(port: int, sections: Sections, report: Report) -> None:
     """Report whether a program listens on `port`; the second column of /proc/net/tcp is `ADDRESS:PORT` in hex."""
-    columns = map(str.split, sections.get("listeners", NOTHING).text.splitlines())
+    columns = map(str.split, sections.get("listeners", MISSING_SECTION).text.splitlines())
     if any(len(words) > 1 and words[1].endswith(f":{port:04X}") for words in columns):
         tool = "netstat" if report.user_tools and "ss" not in report.user_tools.programs else "ss"
         report.fail(

@@ -16,7 +16,7 @@ PROBE_S: Final = 40.0
 """Maximum duration of `probe`: each tool has 6 s, and Python on a small computer needs 3 s to start ros2."""
 
 # POSIX sh: dash, bash, busybox ash. Standard input is empty, and a tool that does not exit is killed.
-_PROBE_FUNCTION: Final = r"""look() {
+_PROBE_FUNCTION: Final = r"""run_tool() {
     printf '==> %s <==\n' "$1"
     shift
     "$@" </dev/null 2>&1 &
@@ -42,7 +42,7 @@ _NETCATS: Final = (
 )
 _IPUTILS: Final = re.compile(r"^ping .*iputils[ -][a-z]*(?P<date>[0-9]{8}).*", re.MULTILINE)
 _BUSYBOX: Final = re.compile(r"^BusyBox v.*", re.MULTILINE)
-# iputils 20210722 lowered the least interval of a user from 200 ms to 2 ms (its commit 0ccdbb9).
+# iputils 20210722 lowered the minimum interval of an unprivileged user from 200 ms to 2 ms (its commit 0ccdbb9).
 _NEW_IPUTILS: Final = 20210722
 _TCPDUMP: Final = re.compile(r"^tcpdump version .*", re.MULTILINE)
 _STORAGE: Final = re.compile(
@@ -55,7 +55,7 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
     """Return a read-only command that prints the output of each of `tools` for `parse`."""
     names = profile.tools
     ros = profile.ros
-    ask: dict[Tool, tuple[tuple[str, tuple[str, ...]], ...]] = {
+    commands_by_tool: dict[Tool, tuple[tuple[str, tuple[str, ...]], ...]] = {
         Tool.NETCAT: ((Tool.NETCAT, (names.netcat, "-h")),),
         Tool.PING: (
             (Tool.PING, (names.ping, "-V")),
@@ -64,11 +64,22 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
         Tool.CAPTURE: ((Tool.CAPTURE, (names.capture, "--help")),),
     }
     if ros is not None:
-        help_of = with_environment((*_verb(profile), "--help"), setup=ros.command.setup)
-        ask[Tool.RECORDER] = ((Tool.RECORDER, help_of),)
-    asked_tools = [tool for tool in ask if tool in set(tools) and (tool is not Tool.RECORDER or _verb(profile))]
-    looks = [(_USER, ("id", "-u")), *(look for tool in asked_tools for look in ask[tool])]
-    return ("sh", "-c", _PROBE_FUNCTION + "".join(f"look {name} {quote(argv)}\n" for name, argv in looks))
+        help_of = with_environment((*_record_command(profile), "--help"), setup=ros.command.setup)
+        commands_by_tool[Tool.RECORDER] = ((Tool.RECORDER, help_of),)
+    probed_tools = [
+        tool
+        for tool in commands_by_tool
+        if tool in set(tools) and (tool is not Tool.RECORDER or _record_command(profile))
+    ]
+    named_commands = [
+        (_USER, ("id", "-u")),
+        *(command for tool in probed_tools for command in commands_by_tool[tool]),
+    ]
+    return (
+        "sh",
+        "-c",
+        _PROBE_FUNCTION + "".join(f"run_tool {name} {quote(argv)}\n" for name, argv in named_commands),
+    )
 
 
 def parse(output: bytes, profile: RobotProfile) -> Variants:
@@ -92,7 +103,7 @@ def parse(output: bytes, profile: RobotProfile) -> Variants:
         ping, versions[Tool.PING] = _ping(*outputs[Tool.PING], profile.tools.ping)
         variants = replace(variants, ping=ping)
     if _ECHO in outputs:
-        _demand_ping(outputs[_ECHO][0], profile.tools.ping, variants.ping)
+        _require_ping(outputs[_ECHO][0], profile.tools.ping, variants.ping)
     if Tool.CAPTURE in outputs:
         immediate, versions[Tool.CAPTURE] = _capture(*outputs[Tool.CAPTURE], profile.tools.capture)
         variants = replace(variants, immediate_mode=immediate)
@@ -113,7 +124,7 @@ def _sections(output: bytes) -> Iterator[tuple[str, tuple[str, int]]]:
             start = None
 
 
-def _verb(profile: RobotProfile) -> tuple[str, ...]:
+def _record_command(profile: RobotProfile) -> tuple[str, ...]:
     """Return the record command without its options; empty for a program that may not support `--help`."""
     words = profile.ros.command.record if profile.ros else ("",)
     verbs = {"rosbag": ("record",), "ros2": ("bag", "record")}
@@ -137,7 +148,7 @@ def _ping(text: str, code: int, program: str) -> tuple[PingTool, str]:
     raise _unknown(text, code, program, "sudo apt-get install iputils-ping, and ping: ping in")
 
 
-def _demand_ping(text: str, program: str, kind: PingTool) -> None:
+def _require_ping(text: str, program: str, kind: PingTool) -> None:
     if "bytes from 127.0.0.1" not in text:
         raise RobotError(
             f"{program} cannot ping 127.0.0.1 (-i 0.2): {printable(text.encode()) or 'no answer'}",
@@ -159,14 +170,20 @@ def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
     is_ros1 = profile.ros.variant == "ros1"
     if ("rosbag record" if is_ros1 else "ros2 bag record") not in text:
         if code == _KILLED:
-            raise _silent(" ".join((*_verb(profile), "--help")))
+            raise _timeout_error(" ".join((*_record_command(profile), "--help")))
         return Recorder.NONE
     if is_ros1:
         return Recorder.ROSBAG
     words = profile.ros.command.record
-    named = [words[at + 1] for at, word in enumerate(words[:-1]) if word in {"-s", "--storage"}]
+    storage_options = [words[at + 1] for at, word in enumerate(words[:-1]) if word in {"-s", "--storage"}]
     default = _STORAGE.search(text)
-    storage = named[-1] if named else default["id"] if default else Recorder.SQLITE3.removeprefix("ros2-")
+    storage = (
+        storage_options[-1]
+        if storage_options
+        else default["id"]
+        if default
+        else Recorder.SQLITE3.removeprefix("ros2-")
+    )
     offered = _STORAGES.search(text)  # Foxy and older do not list them
     kinds = {"sqlite3": Recorder.SQLITE3, "mcap": Recorder.MCAP}
     if offered and storage not in re.split(r"[,\s]+", offered["ids"]):
@@ -174,7 +191,7 @@ def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
     return kinds.get(storage, Recorder.NONE)
 
 
-def _silent(command: str) -> RobotError:
+def _timeout_error(command: str) -> RobotError:
     return RobotError(
         f"{command} did not exit in time", remedy=f"is the robot busy? try again; on it: uptime; time {command}"
     )
@@ -182,7 +199,7 @@ def _silent(command: str) -> RobotError:
 
 def _unknown(text: str, code: int, program: str, remedy: str) -> RobotError:
     if code == _KILLED:
-        return _silent(program)
+        return _timeout_error(program)
     what = f"there is no {program}" if code in _MISSING else f"{program} is of an unknown kind"
     excerpt = printable(text.encode(), limit=100)
     return RobotError(f"{what}: {excerpt}" if excerpt else what, remedy=f"{remedy} its profile")

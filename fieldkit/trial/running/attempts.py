@@ -29,7 +29,7 @@ from fieldkit.trial.running.robots import Robots
 
 
 class Attempts:
-    """Makes the attempts of a trial, one after the other.
+    """Makes the attempts of a trial in sequence.
 
     Args:
         plan: The trial.
@@ -78,7 +78,7 @@ class Attempts:
             OSError: The disk is full or was removed.
         """
         self._robots.check_alive()
-        store.demand_space(self._folder, size.attempt_bytes(self._plan))
+        store.require_space(self._folder, size.attempt_bytes(self._plan))
         started = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
         remote = started.remote(self._plan.trial)
@@ -100,38 +100,43 @@ class Attempts:
             self._last_remote = remote
             if reasons:
                 self._robots.check_alive()
-                self._robots.demand_held()  # an attempt aborted by another user is not counted
+                self._robots.require_locks()  # an attempt aborted by another user is not counted
         invalid = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
-        why = "; ".join(hosts.without_effects(reasons))
+        reason_text = "; ".join(hosts.without_effects(reasons))
         self._ledger.commit(
-            partial, replace(started, status=invalid if reasons else Status.VALID, reason=why), verdict.measured
+            partial,
+            replace(started, status=invalid if reasons else Status.VALID, reason=reason_text),
+            verdict.measured,
         )
         return failure.remedy if failure else ""
 
-    def recover(self, cut: Attempt) -> None:
+    def recover(self, interrupted_attempt: Attempt) -> None:
         """Complete an attempt during which fieldkit was killed; errors as for `make`."""
-        self._sink(PhaseStarted("recover", str(cut.repeat)))
-        remote, was_measured = cut.remote(self._plan.trial), cut.status is Status.MEASURED
-        committed = store.unjournalled_attempt(self._folder, cut.folders)
-        evidence_folder = committed or store.reopen_attempt(self._folder, cut.repeat)
+        self._sink(PhaseStarted("recover", str(interrupted_attempt.repeat)))
+        remote, was_measured = (
+            interrupted_attempt.remote(self._plan.trial),
+            interrupted_attempt.status is Status.MEASURED,
+        )
+        committed = store.unjournalled_attempt(self._folder, interrupted_attempt.folders)
+        evidence_folder = committed or store.reopen_attempt(self._folder, interrupted_attempt.repeat)
         # Partial evidence of an interrupted attempt is stored like that of any void attempt.
         missing = [] if committed else self._robots.fetch(remote, evidence_folder, clean=was_measured)
-        verdict = self._judge(cut, evidence_folder)
+        verdict = self._judge(interrupted_attempt, evidence_folder)
         if was_measured and missing:
             reasons = ["fieldkit was killed before it had the evidence, which could not be fetched later", *missing]
         else:
             reasons = list(verdict.problems) if was_measured else ["fieldkit was killed during it"]
         status = Status.VOID if reasons else Status.VALID
-        ended = replace(cut, status=status, reason="; ".join(reasons), excused=bool(reasons))
+        ended = replace(interrupted_attempt, status=status, reason="; ".join(reasons), excused=bool(reasons))
         self._ledger.commit(evidence_folder, ended, verdict.measured)
         self._last_remote = remote
 
-    def _measure(self, started: Attempt, remote: str, here: Path) -> FieldkitError | None:
+    def _measure(self, started: Attempt, remote: str, laptop_folder: Path) -> FieldkitError | None:
         """Run the steps of an attempt; return the error that makes it void, or None."""
         repeat = started.repeat
         self._reached = Status.RUNNING
         planned = self._plan.scene(repeat, remote, self._variants)
-        scene = replace(planned, laptop_folder=here, motions=self._motions, origins=self._origins)
+        scene = replace(planned, laptop_folder=laptop_folder, motions=self._motions, origins=self._origins)
 
         def announce(name: str, expected_s: float | None) -> None:
             self._sink(PhaseStarted(name, str(repeat), expected_s))
@@ -163,7 +168,7 @@ class Attempts:
             is_fetched_later = self._reached is Status.MEASURED and not self._robots.transient
             if is_fetched_later and isinstance(error, KeyboardInterrupt):
                 raise  # the attempt is intact: resume fetches the rest of it
-            reason = STOPPED if self._motions.is_ordered else _why_cut(error)
+            reason = STOPPED if self._motions.is_ordered else _interruption_reason(error)
             if self._reached:
                 self._robots.mark_unfetched(started.remote(self._plan.trial), partial, reason)
             ended = replace(started, status=Status.VOID, reason=reason, excused=True)
@@ -180,7 +185,7 @@ class Attempts:
             return EvidenceVerdict(("this machine has too little memory to measure it",), Measured({}, {}))
 
 
-def _why_cut(error: BaseException) -> str:
+def _interruption_reason(error: BaseException) -> str:
     """Return the reason why an attempt was interrupted."""
     match error:
         case FieldkitError():

@@ -23,7 +23,7 @@ from fieldkit.trial.running.stop import Stop
 
 TABLE_SHARE: Final = 0.01
 """Table and manifest are rewritten when this share of the attempts is missing in them: after each one in a trial of
-up to 100 attempts. So the total amount written grows linearly with the trial, not with its square."""
+up to 100 attempts. Therefore the total amount written grows linearly with the trial, not with its square."""
 
 
 class Ledger:
@@ -48,37 +48,37 @@ class Ledger:
         self._in_table = 0
         self._last: tuple[Attempt, Row] | None = None
         self._numbers: dict[RepeatId, int] = {}
-        self._spent: Counter[RepeatId] = Counter()
-        self._over: set[RepeatId] = set()
+        self._counted_attempts: Counter[RepeatId] = Counter()
+        self._finished: set[RepeatId] = set()
         self._counts: Counter[Status] = Counter()
         journal.remove_torn_line(folder)
-        past = journal.history(folder, plan)
+        entries = journal.history(folder, plan)
         self._manifest = Manifest(folder)
-        if not past:
+        if not entries:
             now = time.time_ns()
             planned = (
                 JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in plan.order()
             )
             journal.append(folder, *planned)
-        ended = journal.ended(past)
+        ended = journal.ended(entries)
         for attempt in ended:
             self._rename(attempt)
-        self.differences = dict(self._differing(ended))
+        self.differences = dict(self._manifest_differences(ended))
         """Differences from the manifest, by file."""
         unchanged = self._unchanged_lines(len(ended))
-        remade = [attempt for index, attempt in enumerate(ended) if index >= len(unchanged) or attempt.reopened]
-        if remade and self.differences:
-            self._demand_evidence(remade)
+        remeasured = [attempt for index, attempt in enumerate(ended) if index >= len(unchanged) or attempt.reopened]
+        if remeasured and self.differences:
+            self._require_evidence(remeasured)
         for number, attempt in enumerate(ended):
             evidence = store.attempt_folder(folder, attempt.folder)
             is_known = number < len(unchanged) and not attempt.reopened  # a reopened attempt changes its row
             row = {} if is_known else rebuild.row(plan, attempt, AttemptEvidence(evidence))
-            self._enter(attempt, unchanged[number] if is_known else rows.line(row, self._plan.table))
+            self._add_line(attempt, unchanged[number] if is_known else rows.line(row, self._plan.table))
             if attempt.folder not in self._manifest:
                 self._manifest.add(evidence)
         self.ended = tuple(ended)
         """The attempts that ended in earlier runs, in order."""
-        self.interrupted = tuple(journal.interrupted(past))
+        self.interrupted = tuple(journal.interrupted(entries))
         """Attempts during which fieldkit was killed; they must be completed first."""
 
     @property
@@ -91,18 +91,18 @@ class Ledger:
         """Return the number of attempts with a final status."""
         return self._counts[status]
 
-    def is_over(self, repeat: RepeatId) -> bool:
+    def is_finished(self, repeat: RepeatId) -> bool:
         """Return True if a repeat is valid, or failed after its last attempt."""
-        return repeat in self._over
+        return repeat in self._finished
 
     @property
     def done(self) -> int:
         """Number of repeats that are over."""
-        return len(self._over)
+        return len(self._finished)
 
     def is_last(self, repeat: RepeatId) -> bool:
         """Return True if the procedure allows only one more attempt at a repeat."""
-        return self._spent[repeat] + 1 >= self._plan.procedure.attempts
+        return self._counted_attempts[repeat] + 1 >= self._plan.procedure.attempts
 
     def begin(self, repeat: RepeatId) -> Attempt:
         """Record the start of a new attempt; returns when it is on disk.
@@ -136,7 +136,7 @@ class Ledger:
             ended = replace(attempt, reason=encodable(attempt.reason))
             row = rows.build(self._plan, ended, measured)
             self._append(ended, time.time_ns())
-            self._enter(ended, rows.line(row, self._plan.table))
+            self._add_line(ended, rows.line(row, self._plan.table))
             self._last = ended, row
             self._manifest.add(final)
             if self._is_due(self._in_table):
@@ -171,7 +171,7 @@ class Ledger:
     def _table(self) -> str:
         return rows.head(self._plan.table) + "".join(self._lines)
 
-    def _differing(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
+    def _manifest_differences(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
         if ended and not (self._folder / store.MANIFEST_FILE).exists():
             yield store.MANIFEST_FILE, "missing, so changes of the evidence cannot be detected"
         if self._manifest.unchanged_lines(store.TRIAL_CSV) is None:
@@ -187,7 +187,7 @@ class Ledger:
         head, *lines = text.splitlines(keepends=True)[:line_count]
         return lines if head == rows.head(self._plan.table) and len(lines) <= ended else []
 
-    def _demand_evidence(self, attempts: list[Attempt]) -> None:
+    def _require_evidence(self, attempts: list[Attempt]) -> None:
         """Raise an error if evidence that must be measured again has changed."""
         if differing := manifest.differences(self._folder, [attempt.folder for attempt in attempts]):
             raise EvidenceError(
@@ -209,9 +209,9 @@ class Ledger:
         )
         journal.append(self._folder, entry)
 
-    def _enter(self, attempt: Attempt, line: str) -> None:
+    def _add_line(self, attempt: Attempt, line: str) -> None:
         self._lines.append(line)
         self._numbers[attempt.repeat] = max(attempt.number, self._numbers.get(attempt.repeat, 0))
-        self._spent[attempt.repeat] += not attempt.excused
-        self._over |= {attempt.repeat} if attempt.status in {Status.VALID, Status.FAILED} else set()
+        self._counted_attempts[attempt.repeat] += not attempt.excused
+        self._finished |= {attempt.repeat} if attempt.status in {Status.VALID, Status.FAILED} else set()
         self._counts[attempt.status] += 1

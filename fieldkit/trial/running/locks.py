@@ -19,7 +19,8 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
-"""Lifetime of a lock that is not renewed; `evidence.begin` renews it after half. Longer than any attempt or walk."""
+"""Lifetime of a lock that is not renewed; `evidence.begin` renews it after half of this time.
+It is longer than any attempt or walk."""
 
 _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
 
@@ -122,11 +123,11 @@ def holder(shell: Shell) -> LockState | None:
     match = _HELD.match(call(shell, "holder", deadline=Deadline.after(REPLY_S)))
     if match is None:
         return None
-    token, who, what = (word(match[name].decode(errors="replace")) for name in ("token", "who", "what"))
-    return LockState(Holder(token, who, what), float(match["left"]))
+    token, user, purpose = (word(match[name].decode(errors="replace")) for name in ("token", "who", "what"))
+    return LockState(Holder(token, user, purpose), float(match["left"]))
 
 
-def demand(shell: Shell, token: str) -> None:
+def require_lock(shell: Shell, token: str) -> None:
     """Check that a robot with the job script is still locked by this trial.
 
     Raises:
@@ -149,20 +150,20 @@ def _unlock(shell: Shell, holder: Holder, sink: Sink) -> None:
         sink(Note(f"{shell.robot} stays locked until its lock expires: {error.what}"))
 
 
-def abort(robots: Mapping[str, Shell | FieldkitError], who: str) -> Mapping[str, Aborted]:
+def abort(robots: Mapping[str, Shell | FieldkitError], user: str) -> Mapping[str, Aborted]:
     """Break the lock of every robot and end all of its jobs, of any trial; return the result for each robot.
 
     Args:
         robots: The robots, from `Backend.persistent_shells`.
-        who: Name that is shown to the users whose trials end, see `runtime.user_at_host`.
+        user: Name that is shown to the users whose trials end, see `runtime.user_at_host`.
     """
-    return dict(zip(robots, run_parallel(lambda name: _abort(robots[name], who), robots), strict=True))
+    return dict(zip(robots, run_parallel(lambda name: _abort(robots[name], user), robots), strict=True))
 
 
-def _abort(robot: Shell | FieldkitError, who: str) -> Aborted:
+def _abort(robot: Shell | FieldkitError, user: str) -> Aborted:
     if isinstance(robot, FieldkitError):
         return Aborted(error=robot)
     try:
-        return jobs.abort(robot, word(who), Deadline.after(4 * REPLY_S))
+        return jobs.abort(robot, word(user), Deadline.after(4 * REPLY_S))
     except FieldkitError as error:
         return Aborted(error=error)

@@ -1,4 +1,4 @@
-"""What surrounds trials in which robots move by themselves: the interface of the package that moves them.
+"""Interface of the package that moves robots: permission to move, and guards of drones, during trials.
 
 The package is found by the entry point `control` of the group `fieldkit.motion`, and imported only for trials in
 which robots move.
@@ -25,7 +25,7 @@ class MotionClearance(Protocol):
         """The object that the steps get as `Scene.origins`."""
         ...
 
-    def demand(self) -> None:
+    def require(self) -> None:
         """Check that robots may move in the next attempt.
 
         Raises:
@@ -43,7 +43,7 @@ class MotionClearance(Protocol):
 class MotionSupport(Protocol):
     """The package that moves robots."""
 
-    def demand_one_place(self, plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
+    def require_one_place(self, plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
         """Check that self-moving robots stay at one place in all trials, or that a person moves them.
 
         Raises:
@@ -60,12 +60,12 @@ class MotionSupport(Protocol):
         ...
 
 
-class _Unmoved:
+class _NoMotion:
     """Permission of a trial in which no robot moves."""
 
     origins: Final = None
 
-    def demand(self) -> None:
+    def require(self) -> None:
         """Allow the attempt."""
 
     @contextmanager
@@ -74,17 +74,17 @@ class _Unmoved:
         yield
 
 
-def demand_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
-    """Call `MotionSupport.demand_one_place` if robots move in one of the trials."""
+def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
+    """Call `MotionSupport.require_one_place` if robots move in one of the trials."""
     if any(plan.procedure.moved() for plan in plans):
-        _control().demand_one_place(plans, backend, operator)
+        _control().require_one_place(plans, backend, operator)
 
 
 def permission(plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
     """Return the permission of a trial; raises as `MotionSupport.permission`."""
     # A campaign without moves in this trial may have a robot that a fault stopped in another one.
     has_journal = any((place / laptop_files.MOTION).exists() for place in (folder, folder.parent))
-    return _control().permission(plan, testbed, folder) if plan.procedure.moved() or has_journal else _Unmoved()
+    return _control().permission(plan, testbed, folder) if plan.procedure.moved() or has_journal else _NoMotion()
 
 
 def _control() -> MotionSupport:
@@ -92,6 +92,6 @@ def _control() -> MotionSupport:
         loaded: MotionSupport = plugins.load(point)
         return loaded
     raise ConfigurationError(
-        "robots that move by themselves need a package that is not installed",
+        "robots that move automatically need a package that is not installed",
         remedy=f"install fieldkit with its entry point of the group {plugins.MOTION}",
     )

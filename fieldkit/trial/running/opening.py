@@ -15,7 +15,7 @@ from fieldkit.trial import session_jobs, step_packages, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import locks, motion_control, preflight, runner
 from fieldkit.trial.running.locks import Holder
-from fieldkit.trial.running.resumption import demand_backend, demand_cast, resumable
+from fieldkit.trial.running.resumption import require_backend, require_cast, resumable
 from fieldkit.trial.running.runner import Outcome
 from fieldkit.trial.running.stop import Stop
 
@@ -55,7 +55,7 @@ def opened(
 def run(
     plans: Sequence[Plan], backend: Backend, cast: Cast, out: Path, *, sink: Sink, operator: Operator, stop: Stop
 ) -> list[Outcome | None]:
-    """Run planned trials of one session one after the other; their robots are opened once.
+    """Run planned trials of one session in sequence; their robots are opened once.
 
     Args:
         plans: The trials, at least one.
@@ -70,10 +70,10 @@ def run(
         The outcome of each trial; None for a trial that the operator skipped.
 
     Raises:
-        ConfigurationError: As for `motion_control.demand_one_place`.
+        ConfigurationError: As for `motion_control.require_one_place`.
         FieldkitError: As for `opened` and `runner.run_trial`; a note lists the trials that were not started.
     """
-    motion_control.demand_one_place(plans, backend, operator)
+    motion_control.require_one_place(plans, backend, operator)
     store.prepare(out)
     first = plans[0]
     ended: list[Outcome | None] = []
@@ -115,8 +115,8 @@ def resume(
     plan = resumable(folder)
     for change in step_packages.changes(plan.step_packages):
         sink(Note(change))
-    demand_backend(plan, name, folder)
-    demand_cast(plan, backend.cast(plan.topology))
+    require_backend(plan, name, folder)
+    require_cast(plan, backend.cast(plan.topology))
     with opened(
         backend, plan.cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
     ) as testbed:

@@ -52,7 +52,7 @@ def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
             report.fail(_CONNECTION, error.what, error.remedy)
         return report
 
-    demand(_joined(run_parallel(log_in, cast)))
+    require_passed(_all_findings(run_parallel(log_in, cast)))
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def check(plan: Plan, shells: Shells, out: Path, *, whole: bool) -> Checked:
         reports[refusal.role].fail("tools", refusal.what, refusal.remedy)
     laptop = Report(LAPTOP)
     system.judge_laptop(plan, out, laptop)
-    return Checked(_joined([*reports.values(), laptop]), variants_by_role)
+    return Checked(_all_findings([*reports.values(), laptop]), variants_by_role)
 
 
 def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
@@ -108,11 +108,11 @@ def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[R
     for finding in findings:
         if finding.status is not Verdict.OK:
             sink(finding)
-    demand(findings)
+    require_passed(findings)
     return checked.variants
 
 
-def demand(findings: Sequence[Finding]) -> None:
+def require_passed(findings: Sequence[Finding]) -> None:
     """Raise an error if a check failed.
 
     Raises:
@@ -160,10 +160,10 @@ def _check(
         report.fail(stage, error.what, error.remedy)
 
 
-def _judge_jobs(plan: Plan, left: Sequence[str], report: Report) -> None:
+def _judge_jobs(plan: Plan, running_jobs: Sequence[str], report: Report) -> None:
     session_folders = {f"{planned.job.folder}/" for planned in session_jobs.planned(plan.cast, plan.session)}
     own_folders = (f"/{plan.trial}/", *session_folders)
-    others = [line for line in left if not any(folder in line for folder in own_folders)]
+    others = [line for line in running_jobs if not any(folder in line for folder in own_folders)]
     for line in others:
         report.fail("jobs", f"a job of an earlier trial runs: {line}", "fieldkit abort")
     if not others:
@@ -175,10 +175,10 @@ def _judge_lock(held: LockState | None, report: Report) -> bool:
     if held is None:
         report.ok("lock", "the robot is not locked")
         return True
-    holder, left = held.holder, format_duration(held.left_s)
-    report.fail("lock", f"{holder.user} holds the robot for {holder.purpose}, at most {left} more", HELD_REMEDY)
+    holder, remaining = held.holder, format_duration(held.left_s)
+    report.fail("lock", f"{holder.user} holds the robot for {holder.purpose}, at most {remaining} more", HELD_REMEDY)
     return False
 
 
-def _joined(reports: Iterable[Report]) -> tuple[Finding, ...]:
+def _all_findings(reports: Iterable[Report]) -> tuple[Finding, ...]:
     return tuple(finding for report in reports for finding in report.findings)

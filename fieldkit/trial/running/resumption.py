@@ -31,12 +31,12 @@ def resumable(folder: Path) -> Plan:
             remedy="resume it with that version, or start a new trial; the repeats that ended are complete: "
             + shell_command("fieldkit", "rebuild", folder),
         )
-    for put in plan.puts():
+    for put in plan.program_copies():
         put.program.content()
     return plan
 
 
-def demand_backend(plan: Plan, name: str, folder: Path) -> None:
+def require_backend(plan: Plan, name: str, folder: Path) -> None:
     """Raise an error if a trial would be resumed on another backend.
 
     Args:
@@ -55,7 +55,7 @@ def demand_backend(plan: Plan, name: str, folder: Path) -> None:
         )
 
 
-def demand_cast(plan: Plan, cast: Cast) -> None:
+def require_cast(plan: Plan, cast: Cast) -> None:
     """Raise an error if a trial would be resumed with other robots.
 
     Raises:

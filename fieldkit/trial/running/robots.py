@@ -25,7 +25,7 @@ from fieldkit.core.text import encodable
 from fieldkit.core.threads import run_parallel
 from fieldkit.measure.evidence import link_samples, oracle_delays, track
 from fieldkit.remote import evidence, fetching, jobs, programs
-from fieldkit.remote.fetching import FetchProgress, LateError, NoFolderError
+from fieldkit.remote.fetching import FetchProgress, LateJobError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size
 from fieldkit.trial.journal import Attempt
@@ -79,7 +79,7 @@ class Robots:
             FieldkitError: As for `evidence.begin` and `programs.copy`; or a program of the lab has changed.
         """
         plan = self._plan
-        puts = [(put, put.program.content()) for put in plan.puts()]
+        puts = [(put, put.program.content()) for put in plan.program_copies()]
 
         def make(role: Role) -> None:
             self._boots[role] = evidence.begin(
@@ -96,7 +96,7 @@ class Robots:
                     sha256, executable = put.program.sha256, put.program.executable
                     programs.copy(self.shells[role], remote, put.at, content, sha256, executable=executable)
 
-        self._everywhere(make)
+        self._run_on_all(make)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
         """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""
@@ -111,16 +111,16 @@ class Robots:
             self._run_steps(scene, announce)
         finally:
             oracle.record_air(None)
-        after, where, links = oracle.lateness(), oracle.track(since_ns), oracle.links(continue_sampling=False)
+        after, positions, links = oracle.lateness(), oracle.track(since_ns), oracle.links(continue_sampling=False)
         if scene.laptop_folder is not None:
-            (scene.laptop_folder / track.FILE).write_text(track.text(where), encoding="ascii")
+            (scene.laptop_folder / track.FILE).write_text(track.text(positions), encoding="ascii")
             (scene.laptop_folder / link_samples.FILE).write_text(link_samples.text(links), encoding="ascii")
             (scene.laptop_folder / oracle_delays.LATENESS_FILE).write_text(
                 oracle_delays.lateness_text(before, after), encoding="ascii"
             )
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
-        with self._watched(), ExitStack() as stack:
+        with self._monitored_processes(), ExitStack() as stack:
             for section in self._plan.procedure.sections.values():
                 stack.enter_context(section.around_steps(self._plan, scene, self.shells))
             for entry in self._plan.procedure.steps:
@@ -128,7 +128,7 @@ class Robots:
                     entry.step.run(scene, self._testbed, announce)
 
     @contextmanager
-    def _watched(self) -> Iterator[None]:
+    def _monitored_processes(self) -> Iterator[None]:
         """Unblock the body if a process that the robots need has exited, because no answer can arrive any more."""
         ended = Event()
 
@@ -163,7 +163,7 @@ class Robots:
             The problems, one sentence each.
         """
         self._is_fetch_cancelled = False
-        problems = self._everywhere(lambda role: self._collect(role, remote, into, clean=clean))
+        problems = self._run_on_all(lambda role: self._collect(role, remote, into, clean=clean))
         failed = [(role, *problem) for role, problem in zip(self._roles, problems, strict=True) if problem]
         for role, reason, is_there in failed:
             if is_there:
@@ -196,7 +196,7 @@ class Robots:
         except LinkError as error:
             return error.located, True
         except (RobotError, EvidenceError) as error:
-            return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateError))
+            return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateJobError))
         rebooted = None if clean else self._reboot_message(role)
         return (rebooted, False) if rebooted else None
 
@@ -239,7 +239,7 @@ class Robots:
         if isinstance(self._testbed, Transient):
             self._testbed.check_alive()
 
-    def demand_held(self) -> None:
+    def require_locks(self) -> None:
         """Raise an error if a robot reports that its lock was broken; robots that do not answer are ignored.
 
         Raises:
@@ -248,17 +248,17 @@ class Robots:
 
         def check_lock(role: Role) -> None:
             try:
-                locks.demand(self.shells[role], self._plan.session)
+                locks.require_lock(self.shells[role], self._plan.session)
             except LockLostError:
                 raise
             except FieldkitError:
                 return  # the attempt already has reasons for its failure
 
-        self._everywhere(check_lock)
+        self._run_on_all(check_lock)
 
     def end_jobs(self, remote: str) -> None:
         """End every job of an attempt; errors as `evidence.end_jobs`."""
-        self._everywhere(lambda role: evidence.end_jobs(self.shells[role], remote))
+        self._run_on_all(lambda role: evidence.end_jobs(self.shells[role], remote))
 
     def stop_leftover_jobs(self) -> None:
         """End every job of this trial that remains from a killed run; errors as for `evidence.end_all`."""
@@ -267,7 +267,7 @@ class Robots:
             jobs.install(self.shells[role], Deadline.after(jobs.REPLY_S))
             evidence.end_all(self.shells[role], self._plan.trial)
 
-        self._everywhere(end)
+        self._run_on_all(end)
 
     def close_connections(self) -> None:
         """Close every control connection and cancel fetching; the next command opens a new connection."""
@@ -285,14 +285,14 @@ class Robots:
         def remove(role: Role) -> None:
             unfetched = self._unfetched[role]
             if remote is None:
-                evidence.discard(self.shells[role], self._plan.trial, but=unfetched)
+                evidence.discard(self.shells[role], self._plan.trial, kept_folders=unfetched)
             elif remote not in unfetched:
                 evidence.discard_attempt(self.shells[role], remote)
 
-        self._everywhere(remove)
+        self._run_on_all(remove)
 
     def _interface(self, role: Role) -> str:
         return self._plan.cast[role].profile.radio.interface
 
-    def _everywhere(self, call: Callable[[Role], T]) -> list[T]:
+    def _run_on_all(self, call: Callable[[Role], T]) -> list[T]:
         return run_parallel(call, self._roles, on_interrupt=self.close_connections)

@@ -118,7 +118,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
     """
     folder = store.create(out, plan)
     sink(Note(f"trial {folder}"))
-    with journal.claimed(folder), _writing(folder):
+    with journal.locked(folder), _converting_write_errors(folder):
         return _run(plan, testbed, folder, sink, stop, report_resume=report_resume)
 
 
@@ -144,7 +144,7 @@ def continue_trial(
         FieldkitError: As for `begin`.
     """
     plan = resumable(folder)
-    with journal.claimed(folder), _writing(folder):
+    with journal.locked(folder), _converting_write_errors(folder):
         if failed and not journal.reopen_failed(folder, plan) and report_resume:
             sink(Note("no repeat of this trial failed"))
         return _run(plan, testbed, folder, sink, stop, report_resume=report_resume)
@@ -157,7 +157,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
     for ended in ledger.ended:
         robots.restore_unfetched(ended, store.attempt_folder(folder, ended.folder))
     repeats = list(plan.order())
-    past = estimates.finished_repeats(plan, journal.read(folder))
+    finished = estimates.finished_repeats(plan, journal.read(folder))
     if ledger.differences:
         sink(Note(f"the evidence has changed since it was stored: {manifest.summarize(ledger.differences)}"))
     try:
@@ -180,17 +180,19 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
             attempts.recover(interrupted)
         for repeat in repeats:
             started_s = time.monotonic()
-            while not ledger.is_over(repeat):
-                permission.demand()
-                lasts_s = plan.procedure.expected_s(repeat.protocol)
+            while not ledger.is_finished(repeat):
+                permission.require()
+                expected_s = plan.procedure.expected_s(repeat.protocol)
                 notes = plan.abort_notes(plan.scene(repeat, ""))
-                with permission.noting(sink), stop.finishing(lasts_s, notes):
+                with permission.noting(sink), stop.finishing(expected_s, notes):
                     remedy = attempts.make(repeat)
-                    if ledger.is_over(repeat):
-                        past.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))
-                    remaining = [other for other in repeats if not ledger.is_over(other)]
+                    if ledger.is_finished(repeat):
+                        finished.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))
+                    remaining = [other for other in repeats if not ledger.is_finished(other)]
                     # Inside the context, so that a repeat that a stop request let finish is reported too.
-                    sink(_repeat_event(plan, ledger, len(repeats), _remaining_time(plan, remaining, past), remedy))
+                    sink(
+                        _repeat_event(plan, ledger, len(repeats), _remaining_time(plan, remaining, finished), remedy)
+                    )
     except BaseException as error:
         if report_resume:
             sink(TrialStopped(str(folder), ledger.done, len(repeats)))
@@ -233,14 +235,18 @@ def _judgement_event(judgement: Judgement) -> ExpectationJudged:
 def _report_unfetched(robots: Robots, sink: Sink) -> None:
     """Report evidence that was not fetched and is still on the robots."""
     for robot, folders in robots.unfetched().items():
-        where = ", ".join(f"~/{folder}" for folder in folders)
-        sink(Note(f"{robot}: evidence that was not fetched stays on it; delete it when it is not needed: {where}"))
+        folder_names = ", ".join(f"~/{folder}" for folder in folders)
+        sink(
+            Note(
+                f"{robot}: evidence that was not fetched stays on it; delete it when it is not needed: {folder_names}"
+            )
+        )
 
 
-def _remaining_time(plan: Plan, remaining: Sequence[RepeatId], past: Sequence[FinishedRepeat]) -> TimeEstimate:
+def _remaining_time(plan: Plan, remaining: Sequence[RepeatId], finished: Sequence[FinishedRepeat]) -> TimeEstimate:
     """Return the estimated duration of the remaining repeats."""
     counts = Counter(repeat.protocol for repeat in remaining)
-    return estimates.total(estimates.of_repeats(plan, protocol, counts[protocol], past) for protocol in counts)
+    return estimates.total(estimates.of_repeats(plan, protocol, counts[protocol], finished) for protocol in counts)
 
 
 def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: str) -> RepeatEnded:
@@ -260,7 +266,7 @@ def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, re
 
 
 @contextmanager
-def _writing(folder: Path) -> Iterator[None]:
+def _converting_write_errors(folder: Path) -> Iterator[None]:
     """Convert errors from writing to a trial's folder, for example if the disk is full or the folder was moved."""
     try:
         yield

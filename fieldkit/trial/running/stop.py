@@ -27,25 +27,25 @@ class Stop:
         self.saving = False
         self.after_saving = False
         self.motions = Motions()
-        self._ends = Deadline.after(0.0)
+        self._expected_end = Deadline.after(0.0)
 
     @property
     def left_s(self) -> float:
         """Estimated remaining time of the running repeat in seconds; 0 if it takes longer than estimated."""
-        return self._ends.remaining_s
+        return self._expected_end.remaining_s
 
     @contextmanager
-    def finishing(self, lasts_s: float, motions: tuple[str, ...]) -> Iterator[None]:
-        """Let the body finish before a request to stop takes effect, unless robots move in it without a person.
+    def finishing(self, expected_s: float, motions: tuple[str, ...]) -> Iterator[None]:
+        """Allow the body to finish before a request to stop takes effect, unless robots move in it without a person.
 
         Args:
-            lasts_s: Estimated duration of the body, in seconds.
+            expected_s: Estimated duration of the body, in seconds.
             motions: See `Motions.stop_notes`: until the body clears it, a request to stop takes effect immediately.
 
         Raises:
             KeyboardInterrupt: The body has finished, and a stop was requested meanwhile.
         """
-        self._ends, self.motions.stop_notes = Deadline.after(lasts_s), motions
+        self._expected_end, self.motions.stop_notes = Deadline.after(expected_s), motions
         self.can_finish = True
         try:
             yield
@@ -56,7 +56,7 @@ class Stop:
 
     @contextmanager
     def saving_files(self) -> Iterator[None]:
-        """Let the body, which is short, finish before a stop.
+        """Allow the body, which is short, to finish before a stop.
 
         Raises:
             KeyboardInterrupt: The body has finished, and a stop was due meanwhile.

@@ -6,7 +6,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.cli.display import show_note, working
+from fieldkit.cli.display import show_note, showing_progress
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, [scenario.policy.window], len(seeds))
-    with working() as sink:
+    with showing_progress() as sink:
         runs = len({*policies, EventDriven.name}) * len(seeds)
         all_outcomes = outcomes(
             partial(_build, scenario), policies, seeds, progress=partial(progress_reporter(sink), "bias", runs)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-from fieldkit.cli.display import working
+from fieldkit.cli.display import showing_progress
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     seeds = settings.seeds(arguments, scenario)
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     tasks = [Task(ErrorBounded.name, seed) for seed in seeds]
-    with working() as sink:
+    with showing_progress() as sink:
         report = partial(progress_reporter(sink, "seeds"), "bound", len(seeds))
         report(0)
         costs = run_many(partial(_bound_cost, scenario), tasks, progress=report)

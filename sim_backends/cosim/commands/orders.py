@@ -7,7 +7,7 @@ from functools import partial
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.cli.display import show_note, working
+from fieldkit.cli.display import show_note, showing_progress
 from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
-    with working() as sink:
+    with showing_progress() as sink:
         by_policy, failures = _measure(scenario, policies, seeds, windows_s, sink)
     title = f"{scenario.name}, {scenario.topology}, {format_count(len(seeds), 'seed')}"
     _error_sheet(title, by_policy).show(arguments.format)

@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Sequence
 from typing import Final
 
-from fieldkit.cli.display import show_note, working
+from fieldkit.cli.display import show_note, showing_progress
 from fieldkit.core.text import print_text
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate_all
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     )  # raises before the folder is created if the scenario is invalid
     folder = None if arguments.out is None else RunFolder(arguments.out, scenario, text, seeds)
     settings.note_commensurate_events(scenario, [policy], [scenario.policy.window], len(seeds))
-    with working() as sink:
+    with showing_progress() as sink:
         results, interrupted = simulate_all(
             scenario, policy, seeds, folder, sink=sink, deadline_s=settings.deadline_s(arguments.deadline)
         )

@@ -4,7 +4,7 @@ import argparse
 from functools import partial
 from typing import Final
 
-from fieldkit.cli.display import show_note, working
+from fieldkit.cli.display import show_note, showing_progress
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count, parse_quantity
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     seed = scenario.seeds[0] if arguments.seed is None else arguments.seed
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, [arguments.policy], [scenario.policy.window], 1)
-    with working() as sink:
+    with showing_progress() as sink:
         report = partial(progress_reporter(sink), "satisfy", arguments.rounds + 1)
         satisfaction = satisfy(
             _CountedRuns(scenario, seed, report),

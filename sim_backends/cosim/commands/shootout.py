@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-from fieldkit.cli.display import show_note, working
+from fieldkit.cli.display import show_note, showing_progress
 from fieldkit.core.events import Sink
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import bias, bound, orders, settings
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, windows_s, len(seeds))
-    with working() as sink:
+    with showing_progress() as sink:
         all_rows = _all_rows(scenario, policies, seeds, windows_s, sink)
     _sheet(scenario, all_rows, seeds).show(arguments.format)
     for window_s, row in all_rows:

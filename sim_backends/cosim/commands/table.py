@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
-from fieldkit.cli.display import working
+from fieldkit.cli.display import showing_progress
 from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     seeds = range(1, arguments.seeds + 1) if arguments.seed is None else (arguments.seed,)
     table = None if which == "claims" else paper_table(which, changes)
     setups = claim_setups(changes) if table is None else table.setups
-    with working() as sink:
+    with showing_progress() as sink:
         progress = partial(progress_reporter(sink), f"table {which}", len(setups) * len(seeds))
         progress(0)
         samples = flow_samples(setups, seeds, progress=progress)

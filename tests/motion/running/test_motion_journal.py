@@ -79,7 +79,7 @@ def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_p
     journal = MotionJournal(tmp_path / MOTION_FILE)
     journal.confirm("how", at_place=at_place)
     again = kept(tmp_path)
-    again.demand()
+    again.require()
     assert again.get(Role.RECEIVER) == (None if at_place else ORIGIN)
 
 
@@ -87,19 +87,19 @@ def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -
     (tmp_path / laptop_files.CAMPAIGN).write_text("{}", encoding="utf-8")
     trials = tmp_path / "first", tmp_path / "second"
     first = KeptOrigins(MotionJournal(journal_of(trials[0])), trials[0], ROBOTS, NEAR)
-    first.demand()
+    first.require()
     with pytest.raises(KeyboardInterrupt), first.moving(Role.RECEIVER):
         raise KeyboardInterrupt
     later = KeptOrigins(MotionJournal(journal_of(trials[1])), trials[1], ROBOTS, NEAR)
     with pytest.raises(MotionHeldError, match="rover-1: stopped by the operator") as held:
-        later.demand()
+        later.require()
     assert "fieldkit campaign, as before" in held.value.remedy
 
 
 def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.BEGUN, "rover-1")
     with pytest.raises(MotionHeldError, match="fieldkit stopped while it moved"):
-        kept(tmp_path).demand()
+        kept(tmp_path).require()
 
 
 def test_two_robots_move_at_the_same_time(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_two_robots_move_at_the_same_time(tmp_path: Path) -> None:
     with origins.moving(Role.SENDER) as outer, origins.moving(Role.RECEIVER) as inner:
         inner.mark_ended()
         outer.mark_ended()
-    origins.demand()
+    origins.require()
 
 
 def test_the_trials_of_a_campaign_have_one_journal(tmp_path: Path) -> None:

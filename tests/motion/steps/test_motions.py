@@ -59,7 +59,7 @@ def test_each_robot_is_stopped_once_and_leaving_waits_for_landing() -> None:
         "drone: coming down (land)",
         "drone: stopped (on the ground)",
     ]
-    assert any(line.startswith("rover: stopped (standing)") for line in reports)
+    assert any(line.startswith("rover: stopped (stationary)") for line in reports)
 
 
 def test_no_robot_starts_to_move_after_the_order() -> None:

@@ -238,9 +238,9 @@ class Field(IdleTestbed):
         super().__init__({Role.RECEIVER: cast("Shell", link)})
         self.returns: list[bool] = []
 
-    def bring_back(self, role: Role, *, by_itself: bool) -> None:
+    def bring_back(self, role: Role, *, has_returned: bool) -> None:
         assert role is Role.RECEIVER
-        self.returns.append(by_itself)
+        self.returns.append(has_returned)
 
 
 @pytest.fixture
@@ -282,8 +282,8 @@ def test_robot_that_returns_is_not_brought_back(stopped: list[str]) -> None:
 
 
 def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "odometry was silent for 0.5 s"}']))
-    with pytest.raises(RobotError, match="it stopped on its path: odometry was silent"):
+    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "no odometry for 0.5 s"}']))
+    with pytest.raises(RobotError, match="it stopped on its path: no odometry"):
         driven(field, lambda: None)
     assert field.returns == [False]
     assert stopped == ["out.drive"]

@@ -311,5 +311,5 @@ def test_stop_of_all_jobs_lets_the_pilot_land(shell: Shell) -> None:
         with suppress(RobotError):
             fly(shell, port, "60min", lambda: evidence.end_jobs(shell, FOLDER))
         wait_until(lambda: "landed" in log(shell), Deadline.after(60))
-        assert "land: the job was ended" in log(shell)
+        assert "land: the job was cancelled" in log(shell)
         assert not autopilot.vehicle.armed

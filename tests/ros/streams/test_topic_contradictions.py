@@ -321,7 +321,7 @@ def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int,
 
 
 def test_constants_equal_those_of_the_agent() -> None:
-    assert int(stream.SETTLES_S * 1e9) == topic_checks.SETTLES_NS
+    assert int(stream.SETTLING_S * 1e9) == topic_checks.SETTLES_NS
     assert (stream.MAGIC, stream.MIN_BYTES) == (
         topic_samples.MAGIC,
         topic_samples.HEAD_BYTES,

@@ -141,7 +141,7 @@ def test_outputs_of_the_kernels_wifi_stack_are_read_in_every_mode() -> None:
     )
     assert only(ibss, "Wi-Fi").detail == "IBSS 'lawn', at 26:9f:2e:55:bf:8b, channel 6"
     down = heard(SENDER, wifi_info=output_text("iw/info-hwsim-down-5.txt"), wifi_link=output_text("iw/link-none.txt"))
-    assert only(down, "Wi-Fi").detail == "joined to no network"
+    assert only(down, "Wi-Fi").detail == "not associated with a network"
 
 
 def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:
@@ -198,7 +198,7 @@ def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
     whole = size.trial_bytes(PLAN)
     for free, status in ((size.RESERVE_BYTES + whole, OK), (size.RESERVE_BYTES + whole - 1, WARN), (0, FAIL)):
         report = Report("laptop")
-        system.judge_room(PLAN, free, Path("/trials"), report)
+        system.judge_disk_space(PLAN, free, Path("/trials"), report)
         assert only(report.findings, "disk").status is status
 
 

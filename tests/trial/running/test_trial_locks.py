@@ -125,7 +125,7 @@ def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShel
     with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         alter(robot, (4, "1"))
         with locked({Role.SENDER: robot}, BERT, sink=quiet):
-            with pytest.raises(LockLostError, match=r"bert@two took the robot at .* for trial-b") as caught:
+            with pytest.raises(LockLostError, match=r"bert@two locked the robot at .* for trial-b") as caught:
                 begin(robot, ANNA)
             assert caught.value.exit_code == 3
             begin(robot, BERT)
@@ -270,7 +270,7 @@ def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -
         with locked({Role.SENDER: robot}, BERT, sink=quiet):
             for call in (jobs.start, jobs.run):
                 one = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
-                with pytest.raises(LockLostError, match=r"bert@two took the robot at .* for trial-b"):
+                with pytest.raises(LockLostError, match=r"bert@two locked the robot at .* for trial-b"):
                     call(robot, one)
     assert not (robot.home / FOLDER / "started").exists()
 
@@ -309,10 +309,10 @@ def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Pat
     shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
     with locked({Role.SENDER: robot}, anna, sink=quiet):
         robots = Robots(plan, IdleTestbed(shells))
-        robots.demand_held()
+        robots.require_locks()
         locks.abort({"turtlebot-1": robot}, "bert@two")
         with pytest.raises(LockLostError, match=r"turtlebot-1: the trial was aborted by bert@two at"):
-            robots.demand_held()
+            robots.require_locks()
 
 
 def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> None:

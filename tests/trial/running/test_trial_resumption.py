@@ -27,21 +27,21 @@ def test_rows_of_different_code_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_robots_of_another_backend_are_rejected() -> None:
-    resumption.demand_backend(PLAN, PLAN.backend, TRIAL)
+    resumption.require_backend(PLAN, PLAN.backend, TRIAL)
     with pytest.raises(ConfigurationError, match=f"it was started on backend {PLAN.backend}, not imagined") as caught:
-        resumption.demand_backend(PLAN, "imagined", TRIAL)
+        resumption.require_backend(PLAN, "imagined", TRIAL)
     assert caught.value.remedy == shell_command("fieldkit", "resume", TRIAL, "--backend", PLAN.backend)
 
 
 @pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])
 def test_other_robots_are_rejected(change: dict[str, str] | None) -> None:
-    resumption.demand_cast(PLAN, PLAN.cast)
+    resumption.require_cast(PLAN, PLAN.cast)
     changed = dict(PLAN.cast)
     sender = changed.pop(Role.SENDER)
     if change is not None:
         changed[Role.SENDER] = sender.model_copy(update=change)
     with pytest.raises(ConfigurationError, match=f"sender was {sender.name} ") as caught:
-        resumption.demand_cast(PLAN, changed)
+        resumption.require_cast(PLAN, changed)
     assert caught.value.where == PLAN.trial
 
 
@@ -53,13 +53,13 @@ def test_a_self_moving_robot_needs_permission_again() -> None:
     }
     by_hand = {role: robot.model_copy(update={"abilities": frozenset()}) for role, robot in PLAN.cast.items()}
     plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
-    resumption.demand_cast(plan, driving)
+    resumption.require_cast(plan, driving)
     with pytest.raises(ConfigurationError, match="moved without a person in this trial, and may not now") as caught:
-        resumption.demand_cast(plan, by_hand)
+        resumption.require_cast(plan, by_hand)
     assert "--allow-motion" in caught.value.remedy
     # Permission to move does not matter if nothing moves the robot, or if a person does.
-    resumption.demand_cast(PLAN.model_copy(update={"cast": driving}), by_hand)
-    resumption.demand_cast(plan.model_copy(update={"cast": by_hand}), driving)
+    resumption.require_cast(PLAN.model_copy(update={"cast": driving}), by_hand)
+    resumption.require_cast(plan.model_copy(update={"cast": by_hand}), driving)
 
 
 def test_a_trial_with_a_changed_program_is_not_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,7 +74,7 @@ def test_a_trial_with_a_changed_program_is_not_resumed(tmp_path: Path, monkeypat
     plan = PLAN.model_copy(update={"procedure": procedure})
     (folder / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
     monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
-    assert [put.at for put in resumption.resumable(folder).puts()] == [".put/run/probe"]
+    assert [put.at for put in resumption.resumable(folder).program_copies()] == [".put/run/probe"]
     program.write_bytes(b"2")
     with pytest.raises(ConfigurationError, match="probe: the program has changed since the procedure was read"):
         resumption.resumable(folder)

@@ -111,7 +111,7 @@ def test_an_aborted_attempt_does_not_count(tmp_path: Path, monkeypatch: pytest.M
         raise LockLostError("the trial was aborted by anna@one at 12:00:00 UTC", where="turtlebot-1")
 
     monkeypatch.setattr(Robots, "measure", measure)
-    monkeypatch.setattr(Robots, "demand_held", aborted)
+    monkeypatch.setattr(Robots, "require_locks", aborted)
     monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
@@ -341,7 +341,7 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
 def test_a_running_trial_is_not_rebuilt(tmp_path: Path) -> None:
     run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     with (
-        journal.claimed(only(tmp_path)),
+        journal.locked(only(tmp_path)),
         pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
     ):
         rebuild(only(tmp_path))

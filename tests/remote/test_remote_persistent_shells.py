@@ -22,10 +22,10 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.remote.drain import drain, wait_for_output
 from fieldkit.remote.link import SPARES, Channel, Link, UnfitServerError
+from fieldkit.remote.persistent_shells import PersistentShell, RunningCommand
 from fieldkit.remote.script import CALL, SCRIPT, SCRIPT_PATH
 from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshSession, SshShell
-from fieldkit.remote.standing import PersistentShell, RunningCommand
 from tests.helpers.sshd import Server, sshd, wait_until
 from tests.helpers.userlands import USERLANDS, userland_path
 

@@ -4,7 +4,7 @@ A command is a line `NONCE VERB WORD...`, quoted as all remote commands. On both
 the output of the command, and the nonce again with the exit code. If `held` precedes the verb, it writes the end only
 after it has received another line. The nonce is random for each command, and programs on the robot do not receive it.
 Therefore no output, with or without a newline at its end, can be mistaken for the end of an answer, and output of
-processes that were left behind is dropped between two commands.
+processes that a command left running is dropped between two commands.
 """
 
 import re
@@ -39,14 +39,14 @@ class ShellPool:
         self._opener: threading.Thread | None = None
 
     def begin(
-        self, link: Link, command_line: str, deadline: Deadline, ended: threading.Event, *, held: bool = False
+        self, link: Link, command_line: str, deadline: Deadline, close_event: threading.Event, *, held: bool = False
     ) -> "RunningCommand | None":
         """Start a command in a shell on `link`; return None if no shell is free, or if the shell has ended.
 
         With `held`, the shell reports the end of the command only after `RunningCommand.request_end`.
 
         Raises:
-            ExpiredError: The deadline passed, or `ended` was set.
+            ExpiredError: The deadline passed, or `close_event` was set.
             OSError, SSHException, EOFError: The connection broke.
         """
         with self._lock:
@@ -55,7 +55,7 @@ class ShellPool:
         if shell is None:
             return None
         full_line = f"held {command_line}" if held else command_line
-        command = call_with_deadline(lambda: shell.start(full_line), deadline, ended, what="start")
+        command = call_with_deadline(lambda: shell.start(full_line), deadline, close_event, what="start")
         link.acknowledge()
         return command
 
@@ -108,8 +108,8 @@ class PersistentShell:
         """
         channel.exec_command(command)
         output = b""
-        while len(output) < len(_READY) and (piece := channel.recv(len(_READY) - len(output))):
-            output += piece
+        while len(output) < len(_READY) and (chunk := channel.recv(len(_READY) - len(output))):
+            output += chunk
         if output != _READY:
             channel.close()
             raise EOFError("the persistent shell did not start")
@@ -117,7 +117,7 @@ class PersistentShell:
 
     @property
     def alive(self) -> bool:
-        """Whether the shell is open, as far as is known."""
+        """Whether no end of the shell was received."""
         return not (self._channel.closed or self._channel.eof_received)
 
     def reserve(self) -> bool:
@@ -159,8 +159,8 @@ class RunningCommand:
 
     def wait_for_start(self) -> bool:
         """Wait until the shell has started the command; return False if the shell has ended."""
-        while not self._out.has_started and (piece := self._channel.recv(_CHUNK)):
-            self._out.feed(piece)
+        while not self._out.has_started and (chunk := self._channel.recv(_CHUNK)):
+            self._out.feed(chunk)
         return self._out.has_started
 
     def request_end(self) -> None:
@@ -216,10 +216,10 @@ class RunningCommand:
         Raises:
             TimeoutError: Nothing arrived in time.
         """
-        while self._out.is_waiting and (piece := self._channel.recv(_CHUNK)):
-            self._out.feed(piece)
-        while not self._out.output and self._err.code is None and (piece := self._channel.recv_stderr(_CHUNK)):
-            self._err.feed(piece)
+        while self._out.is_waiting and (chunk := self._channel.recv(_CHUNK)):
+            self._out.feed(chunk)
+        while not self._out.output and self._err.code is None and (chunk := self._channel.recv_stderr(_CHUNK)):
+            self._err.feed(chunk)
         return self._out.read(size_bytes)
 
     def recv_stderr(self, size_bytes: int) -> bytes:
@@ -292,7 +292,7 @@ class _Stream:
         chunk, self.output = self.output[:size_bytes], self.output[size_bytes:]
         return chunk
 
-    def feed(self, piece: bytes) -> None:
+    def feed(self, chunk: bytes) -> None:
         """Process received data; data before the start mark and after the end mark are dropped.
 
         Raises:
@@ -300,7 +300,7 @@ class _Stream:
         """
         if self.code is not None:
             return
-        data, self._incomplete = self._incomplete + piece, b""
+        data, self._incomplete = self._incomplete + chunk, b""
         if not self.has_started:
             before_start, start_mark, data = data.partition(self._nonce + b"\n")
             self.has_started = bool(start_mark)
@@ -315,7 +315,7 @@ class _Stream:
             elif len(rest) >= _MIN_END_BYTES:
                 raise UnfitServerError("the answer to a command has no valid exit code")
         else:
-            # Only a possible start of the nonce is held back, because a caller may wait for the other output.
+            # Only a possible start of the nonce is kept, because a caller may wait for the output before it.
             held = next((n for n in range(len(self._nonce) - 1, 0, -1) if output.endswith(self._nonce[:n])), 0)
             output, self._incomplete = output[: len(output) - held], output[len(output) - held :]
         self.output += output

@@ -9,7 +9,7 @@ from typing import Callable
 from fieldkit.agent.autopilot import PILOT, AutopilotState
 from fieldkit.agent.mavlink_links import open_link
 
-_BEAT_S = 1.0
+_HEARTBEAT_INTERVAL_S = 1.0
 
 
 class AutopilotSession:
@@ -35,22 +35,22 @@ class AutopilotSession:
         self._on_state = on_state
         self.link = open_link(connection)
         self.drone = AutopilotState(self.link, component)
-        self._waiting = selectors.DefaultSelector()
-        self._waiting.register(self.link.fileno(), selectors.EVENT_READ)
-        self._next_beat_s = 0.0
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self.link.fileno(), selectors.EVENT_READ)
+        self._next_heartbeat_s = 0.0
 
     def exchange(self, duration_s: float) -> None:
         """Receive and send messages for this time in seconds."""
         end_s = time.monotonic() + duration_s
-        if time.monotonic() > self._next_beat_s:
-            self._next_beat_s = time.monotonic() + _BEAT_S
+        if time.monotonic() > self._next_heartbeat_s:
+            self._next_heartbeat_s = time.monotonic() + _HEARTBEAT_INTERVAL_S
             self.drone.send_heartbeat()
-        while (left_s := end_s - time.monotonic()) > 0:
-            if self._waiting.select(left_s):
+        while (remaining_s := end_s - time.monotonic()) > 0:
+            if self._selector.select(remaining_s):
                 self.drone.receive()
         self._on_state(self.drone)
 
     def close(self) -> None:
         """Close the connection, which ends this program's requests for messages."""
-        self._waiting.close()
+        self._selector.close()
         self.link.close()

@@ -1,4 +1,4 @@
-"""Paths of a link server: a Unix-domain socket and a lock file in a private folder.
+"""Files of a link server: a Unix-domain socket and a lock file in a private folder.
 
 Their name is a hash of the connection, the network namespace and the boot ID, so that connections of different robots
 with a shared home folder, or of containers, are not confused.
