@@ -1,13 +1,13 @@
-"""Compare middlewares on a lossy radio: `python -m benchmarks.studies.middleware [--figures FOLDER] [--page PAGE]`.
+"""Compare middlewares on a lossy radio: `python -m benchmarks.studies.middleware [--figures FOLDER] [--table FILE]`.
 
 It needs root. Six campaigns of benchmarks/studies/middleware/ run in parallel, because a repeat mostly waits;
 `--only` selects some of them, `--full` those that last hours. It can be stopped at any time: the same command
-continues the campaigns. At the end it prints the tables of docs/studies/middleware.md, or writes them into PAGE, and
-draws its figures.
+continues the campaigns. At the end it prints the conditions of the runs for docs/studies/middleware.md, writes the
+table docs/studies/middleware.csv, and draws the figures.
 
 Two repeats, as in the campaigns, show only large differences. On a quiet machine `--repeats 12` measures each place
 twelve times, in about two and a half hours. Then the intervals treat the repeat as the independent unit.
-`--from-page docs/studies/middleware.md --figures docs/studies` draws the figures only from the tables of the page.
+`--from-table docs/studies/middleware.csv --figures docs/studies` only draws the figures, from the table.
 """
 
 import argparse
@@ -17,12 +17,12 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from benchmarks.studies import middleware_page
+from benchmarks.studies import middleware_table
 from benchmarks.studies.middleware_cells import BYTES, CAMPAIGNS, MiddlewareCell, MiddlewareFindings, read
 from fieldkit.core import files
 from fieldkit.report import figures
@@ -33,8 +33,6 @@ LAB: Final = Path(__file__).with_name("middleware")
 ROOT: Final = LAB.parents[2]
 ROS2: Final = ROOT / ".ros2" / "bin" / "python"
 """A real ROS 2, as installed by `.ci/install --dev`."""
-BEGIN: Final = "<!-- written by benchmarks.studies.middleware: from here -->"
-END: Final = "<!-- written by benchmarks.studies.middleware: to here -->"
 
 STYLES: Final[dict[str, Style]] = {
     "CycloneDDS": Style("blue", "o"),
@@ -114,7 +112,7 @@ def run(folder: Path, names: Sequence[str]) -> None:
             print(f"{name}: exit code {process.returncode}, see {folder / name}.log", file=sys.stderr)
 
 
-def by_distance(findings: MiddlewareFindings, name: str, drawn_figure: "DrawnFigure") -> Chart:
+def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:
     """Return a chart of two robots: a row of panels per size, best effort on the left and reliable on the right."""
     pairs = [cell for cell in findings.cells if cell.robots == 2]
     distances_m = [cell.distance_m for cell in pairs] or [0.0]
@@ -127,12 +125,8 @@ def by_distance(findings: MiddlewareFindings, name: str, drawn_figure: "DrawnFig
                     cell for cell in pairs if (cell.kind, cell.middleware, cell.size_bytes) == (kind, label, size)
                 ]
                 shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
-                series.append(
-                    _series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], drawn_figure)
-                )
-            panel = drawn_figure.panel(
-                f"{SIZES[size]}, {quality}{_sample_count_text(pairs, size)}", "distance (m)", series
-            )
+                series.append(_series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], drawn))
+            panel = drawn.panel(f"{SIZES[size]}, {quality}{_sample_count_text(pairs, size)}", "distance (m)", series)
             panels.append(replace(panel, left=min(distances_m) - MARGIN_M, right=max(distances_m) + MARGIN_M))
     return Chart(name=name, title=name, caption="", panels=panels)
 
@@ -140,7 +134,7 @@ def by_distance(findings: MiddlewareFindings, name: str, drawn_figure: "DrawnFig
 def by_robots(findings: MiddlewareFindings) -> Chart:
     """Return a chart of loss and delay by the number of robots that publish to one."""
     panels = []
-    for drawn_figure in (LOSS_FIGURE, DELAY_FIGURE):
+    for drawn in (LOST, LATE):
         for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
             for size in sorted({cell.size_bytes for cell in _comparable(findings, metres)}):
                 size_cells = [cell for cell in _comparable(findings, metres) if cell.size_bytes == size]
@@ -153,26 +147,24 @@ def by_robots(findings: MiddlewareFindings) -> Chart:
                             for cell in size_cells
                             if cell.middleware == label
                         ],
-                        drawn_figure,
+                        drawn,
                     )
                     for rank, label in enumerate(STYLES)
                 ]
-                panel = drawn_figure.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
+                panel = drawn.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
                 panels.append(replace(panel, x_ticks=[(number, str(number)) for number in numbers]))
     return Chart(name="middleware-robots", title="", caption="", panels=panels)
 
 
-def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn_figure: "DrawnFigure") -> Series:
+def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "DrawnFigure") -> Series:
     """Return the points of a middleware with their intervals; no line joins them, as intervals are too wide."""
-    measured = sorted(
-        ((x, cell) for x, cell in points if drawn_figure.value(cell) is not None), key=lambda pair: pair[0]
-    )
-    ends = [drawn_figure.interval(cell) for _, cell in measured]
+    measured = sorted(((x, cell) for x, cell in points if drawn.value(cell) is not None), key=lambda pair: pair[0])
+    ends = [drawn.interval(cell) for _, cell in measured]
     return Series(
         label,
         STYLES[label],
         [x for x, _ in measured],
-        [drawn_figure.value(cell) or 0.0 for _, cell in measured],
+        [drawn.value(cell) or 0.0 for _, cell in measured],
         low=[low for low, _ in ends],
         high=[high for _, high in ends],
         join="none",
@@ -238,81 +230,16 @@ class DrawnFigure:
         return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
 
 
-LOSS_FIGURE: Final = DrawnFigure("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
-DELAY_FIGURE: Final = DrawnFigure("delay, 95 % (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
-
-
-BIMODAL: Final = " *"
-BIMODAL_NOTE: Final = (
-    "`*`: not a rate. The loss is bimodal: a repeat loses few or nearly all "
-    "([every repeat](middleware-link.md#images-over-zenoh-every-repeat))."
-)
-
-
-def tables(findings: MiddlewareFindings, conditions: str) -> Iterator[str]:
-    """Yield the lines for docs/studies/middleware.md."""
-    yield conditions
-    yield ""
-    yield "Two robots: samples lost, and the delay of the others (95 %); - if clocks are not comparable."
-    yield BIMODAL_NOTE
-    yield ""
-    pairs = [cell for cell in findings.cells if cell.robots == 2]
-    yield from _table(pairs, "distance_m", lambda metres: f"{metres:g} m", _loss_and_delay)
-    for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
-        yield ""
-        yield f"Robots that publish to one at {metres:g} m, all streams together; delay of the first:"
-        yield ""
-        yield from _table(_comparable(findings, metres), "robots", lambda number: f"{number} robots", _loss_and_delay)
-
-
-def _table(
-    cells: Sequence[MiddlewareCell],
-    column_attribute: str,
-    head: Callable[[float], str],
-    text: Callable[[MiddlewareCell], str],
-) -> Iterator[str]:
-    columns = sorted({getattr(cell, column_attribute) for cell in cells})
-    yield "| " + " | ".join(["data", "kind", "middleware", *map(head, columns)]) + " |"
-    yield "| " + " | ".join(["---"] * (3 + len(columns))) + " |"
-    rows = {(cell.size_bytes, cell.kind, cell.middleware) for cell in cells}
-    for size, kind, name in sorted(rows, key=lambda row: (row[0], row[1], list(STYLES).index(row[2]))):
-        by_column = {
-            getattr(cell, column_attribute): cell
-            for cell in cells
-            if (cell.size_bytes, cell.kind, cell.middleware) == (size, kind, name)
-        }
-        texts = [text(by_column[column]) if column in by_column else "" for column in columns]
-        yield "| " + " | ".join([SIZES[size], kind, name, *texts]) + " |"
-
-
-def _loss_and_delay(cell: MiddlewareCell) -> str:
-    loss_percent, delay_ms = _loss_percent(cell), _delay_p95_ms(cell)
-    if loss_percent is None:
-        return "not found"
-    is_bimodal = (cell.middleware, cell.kind) == (
-        "Zenoh",
-        "reliable",
-    ) and cell.size_bytes >= middleware_page.IMAGE_BYTES
-    return f"{loss_percent:.1f} %, " + ("-" if delay_ms is None else f"{delay_ms:.0f} ms") + BIMODAL * is_bimodal
-
-
-def write_tables(page: Path, lines: Sequence[str]) -> None:
-    """Write tables into a page, between its two markers.
-
-    Raises:
-        ValueError: It has no such markers.
-    """
-    text = page.read_text(encoding="utf-8")
-    before, after = text.index(BEGIN) + len(BEGIN), text.index(END)
-    files.write(page, "\n".join((text[:before], "", *lines, "", text[after:])).encode())
+LOST: Final = DrawnFigure("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
+LATE: Final = DrawnFigure("delay, 95 % (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
 
 
 def main() -> None:
-    """Run or continue the campaigns, print the tables or write them into the page, draw the figures."""
+    """Run or continue the campaigns, write the table, draw the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("middleware"), help="folder of the lab and its trials")
     parser.add_argument("--figures", type=Path, help="write middleware-loss, -delay and -robots.svg there")
-    parser.add_argument("--page", type=Path, help="write the tables into this page")
+    parser.add_argument("--table", type=Path, help="write loss and delay of each cell into this CSV file")
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--full", action="store_true", help="the campaigns that take hours")
     size.add_argument("--repeats", type=int, help="repeats at each place, in separate campaigns")
@@ -320,10 +247,10 @@ def main() -> None:
         "--only", nargs="+", choices=CAMPAIGNS, default=CAMPAIGNS, help="run only these; all are read"
     )
     parser.add_argument("--no-run", action="store_true", help="read the existing results")
-    parser.add_argument("--from-page", type=Path, help="draw the figures from the tables of this page, run nothing")
+    parser.add_argument("--from-table", type=Path, help="draw the figures from this CSV file, run nothing")
     options = parser.parse_args()
-    if options.from_page:
-        draw(MiddlewareFindings(middleware_page.cells(options.from_page), "", 0.0, 0.0), options.figures)
+    if options.from_table:
+        draw(MiddlewareFindings(middleware_table.cells(options.from_table), "", 0.0, 0.0), options.figures)
         return
     prefix = "full-" if options.full else ""
     names = [f"{prefix}{campaign_name(name, options.repeats)}" for name in CAMPAIGNS]
@@ -331,15 +258,12 @@ def main() -> None:
         copy_lab(options.out, options.repeats)
         run(options.out, [f"{prefix}{campaign_name(name, options.repeats)}" for name in options.only])
     findings = read(options.out, names)
-    conditions = (
+    print(
         f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.ended}; packets were up to "
         f"{1e3 * findings.late_s:.1f} ms late; load average {os.getloadavg()[2]:.1f} when this was written."
     )
-    lines = list(tables(findings, conditions))
-    if options.page:
-        write_tables(options.page, lines)
-    else:
-        print("\n".join(lines))
+    if options.table:
+        files.write(options.table, middleware_table.text(findings.cells, list(STYLES)).encode())
     if options.figures:
         draw(findings, options.figures)
 
@@ -347,8 +271,8 @@ def main() -> None:
 def draw(findings: MiddlewareFindings, folder: Path) -> None:
     """Write the figures of docs/studies/middleware.md into a folder."""
     for chart in (
-        by_distance(findings, "middleware-loss", LOSS_FIGURE),
-        by_distance(findings, "middleware-delay", DELAY_FIGURE),
+        by_distance(findings, "middleware-loss", LOST),
+        by_distance(findings, "middleware-delay", LATE),
         by_robots(findings),
     ):
         files.write(folder / f"{chart.name}.svg", figures.paper(chart, "svg"))

@@ -16,7 +16,7 @@ NOT_RUN = {
 
 PARTS = {"bash_peer", "footprint", "lifetimes", "namespaces", "own_time", "pandas_peer", "slow_links"} | {
     "studies.middleware_cells",
-    "studies.middleware_page",
+    "studies.middleware_table",
     "studies.zenoh_plain",
 }
 """Modules that other benchmarks import or start."""

@@ -1,19 +1,20 @@
-"""The figures of docs/studies/middleware.md equal its tables, including the numbers of samples and intervals."""
+"""The figures of docs/studies/middleware.md equal its table, including the numbers of samples and intervals."""
 
 import re
 
 import pytest
 from scipy import stats
 
-from benchmarks.studies import middleware, middleware_page
+from benchmarks.studies import middleware, middleware_table
 from benchmarks.studies.middleware_cells import MiddlewareFindings
 from tests.helpers.paths import ROOT
 
 PAGE = ROOT / "docs" / "studies" / "middleware.md"
+TABLE = PAGE.with_suffix(".csv")
 
 
 def test_every_point_of_the_loss_figure_has_its_interval_and_its_number_of_samples() -> None:
-    cells = middleware_page.cells(PAGE)
+    cells = middleware_table.cells(TABLE)
     chart = middleware.by_distance(MiddlewareFindings(cells, "", 0.0, 0.0), "middleware-loss", middleware.LOSS_FIGURE)
     points = [
         point
@@ -33,22 +34,23 @@ def test_every_point_of_the_loss_figure_has_its_interval_and_its_number_of_sampl
     assert {series.join for panel in chart.panels for series in panel.series} == {"none"}
 
 
-def test_a_bimodal_loss_is_marked_wherever_it_is_in_the_tables() -> None:
-    page = PAGE.read_text(encoding="utf-8")
-    marked = [line for line in page.splitlines() if line.startswith("|") and "*" in line]
-    assert [line.split("|")[1:4] for line in marked] == [[" 1 MB ", " reliable ", " Zenoh "]]
-    assert marked[0].count(" * |") == 4
-    # The tables are written again, with the marks and the note that explains them.
-    written = list(middleware.tables(MiddlewareFindings(middleware_page.cells(PAGE), "", 0.0, 0.0), ""))
-    assert marked[0] in written
-    assert middleware.BIMODAL_NOTE in written
-    assert middleware.BIMODAL_NOTE in page
+def test_a_bimodal_loss_is_marked_in_the_table() -> None:
+    table = TABLE.read_text(encoding="utf-8")
+    marked = [line.split(",") for line in table.splitlines() if line.endswith(f",{middleware_table.BIMODAL}")]
+    assert [row[:5] for row in marked] == [
+        ["1000000", "reliable", "Zenoh", "2", str(metres)] for metres in (20, 40, 60, 80)
+    ]
+
+
+def test_the_table_is_written_again_from_its_cells() -> None:
+    written = middleware_table.text(middleware_table.cells(TABLE), list(middleware.STYLES))
+    assert written == TABLE.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("size_bytes", "samples", "lost"), [(1_000, 80, 0), (1_000, 80, 20), (1_000_000, 20, 15)])
 def test_the_interval_counts_samples_within_half_a_second_as_one(size_bytes: int, samples: int, lost: int) -> None:
     trials = samples / (5 if size_bytes < 1_000_000 else 1)
-    low, high = middleware_page.interval(lost / samples, size_bytes, samples)
+    low, high = middleware_table.interval(lost / samples, size_bytes, samples)
     z = stats.norm.ppf(0.975)
     p = lost / samples
     centre = (p + z**2 / (2 * trials)) / (1 + z**2 / trials)
@@ -59,7 +61,7 @@ def test_the_interval_counts_samples_within_half_a_second_as_one(size_bytes: int
 def test_the_intervals_quoted_on_the_page_are_those_of_its_table() -> None:
     by_cell = {
         (cell.middleware, cell.kind, cell.size_bytes, cell.robots, cell.distance_m): cell
-        for cell in middleware_page.cells(PAGE)
+        for cell in middleware_table.cells(TABLE)
     }
     text = PAGE.read_text(encoding="utf-8")
     for key, quoted in (

@@ -293,7 +293,9 @@ CASES: Final[Mapping[str, Smallest]] = {
     "medium": Smallest("--rounds 1 --seconds 1 --probes 20", shrink=_slow_iperf, emulated=True),
     "studies.mesh": Smallest("--out FOLDER/lab --repeats 1", shrink=_short_row, emulated=True),
     "studies.mesh_losses": Smallest("--losses 1", shrink=_short_detour, emulated=True),
-    "studies.middleware": Smallest("--out FOLDER/lab --only dds --repeats 1", shrink=_one_stream, emulated=True),
+    "studies.middleware": Smallest(
+        "--out FOLDER/lab --only dds --repeats 1 --table FOLDER/table.csv", shrink=_one_stream, emulated=True
+    ),
     "moves": Smallest("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
     "pcap": Smallest("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 400}),
     "radio_vs_ns3": Smallest("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}, shrink=_without_ns3),
