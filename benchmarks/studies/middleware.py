@@ -134,7 +134,7 @@ def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -
 def by_robots(findings: MiddlewareFindings) -> Chart:
     """Return a chart of loss and delay by the number of robots that publish to one."""
     panels = []
-    for drawn in (LOST, LATE):
+    for drawn in (LOSS_FIGURE, DELAY_FIGURE):
         for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
             for size in sorted({cell.size_bytes for cell in _comparable(findings, metres)}):
                 size_cells = [cell for cell in _comparable(findings, metres) if cell.size_bytes == size]
@@ -230,8 +230,8 @@ class DrawnFigure:
         return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
 
 
-LOST: Final = DrawnFigure("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
-LATE: Final = DrawnFigure("delay, 95 % (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
+LOSS_FIGURE: Final = DrawnFigure("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
+DELAY_FIGURE: Final = DrawnFigure("delay, 95 % (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
 
 
 def main() -> None:
@@ -271,8 +271,8 @@ def main() -> None:
 def draw(findings: MiddlewareFindings, folder: Path) -> None:
     """Write the figures of docs/studies/middleware.md into a folder."""
     for chart in (
-        by_distance(findings, "middleware-loss", LOST),
-        by_distance(findings, "middleware-delay", LATE),
+        by_distance(findings, "middleware-loss", LOSS_FIGURE),
+        by_distance(findings, "middleware-delay", DELAY_FIGURE),
         by_robots(findings),
     ):
         files.write(folder / f"{chart.name}.svg", figures.paper(chart, "svg"))

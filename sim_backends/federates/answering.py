@@ -34,7 +34,7 @@ from sim_backends.federates.frames import (
     encode,
     text_bytes,
 )
-from sim_backends.federates.handshake import NO_EVENT, Capability, Hello, Welcome
+from sim_backends.federates.handshake import NO_EVENT, FederateCapability, Hello, Welcome
 from sim_backends.federates.records import COMMAND_TYPES, command_type
 from sim_backends.world.motion import DeadReckoned
 
@@ -79,12 +79,12 @@ class FederateService:
         if role != hello.role:
             raise ValueError(f"it is a {ROLES[role]}, and a {ROLES[hello.role]} was requested")
         flags = {
-            Capability.DETERMINISTIC: self.is_deterministic,
-            Capability.FORK: self.forks,
-            Capability.NEXT_EVENT: hasattr(federate, "next_event_ns"),
-            Capability.EXTRAPOLATES: getattr(federate, "extrapolates", False),
-            Capability.AGENTS_APPEAR: self.agents_appear,
-            Capability.AGENTS_DISAPPEAR: self.agents_disappear,
+            FederateCapability.DETERMINISTIC: self.is_deterministic,
+            FederateCapability.FORK: self.forks,
+            FederateCapability.NEXT_EVENT: hasattr(federate, "next_event_ns"),
+            FederateCapability.EXTRAPOLATES: getattr(federate, "extrapolates", False),
+            FederateCapability.AGENTS_APPEAR: self.agents_appear,
+            FederateCapability.AGENTS_DISAPPEAR: self.agents_disappear,
         }
         indices = AgentTable(agent.name for agent in hello.agents).indices
         return Welcome(
@@ -92,7 +92,7 @@ class FederateService:
             self.name or type(federate).__name__,
             hello.configuration_hash,
             self.software,
-            Capability(sum(flag for flag, has in flags.items() if has)),
+            FederateCapability(sum(flag for flag, has in flags.items() if has)),
             federate.step_ns if role == PHYSICS else 0,
             _next_event_ns(federate),
             self.commands if role == PHYSICS else (),

@@ -37,7 +37,7 @@ _POSITION: Final = struct.Struct("<3d")
 _AGENT_BYTES: Final = 4 + _AGENT.size + STATE.size
 
 
-class Capability(IntFlag):
+class FederateCapability(IntFlag):
     """Optional properties of a federate."""
 
     DETERMINISTIC = 1
@@ -48,7 +48,7 @@ class Capability(IntFlag):
     AGENTS_DISAPPEAR = 32
 
 
-NO_CAPABILITY: Final = Capability(0)
+NO_CAPABILITY: Final = FederateCapability(0)
 
 
 def _read_prefix(reader: FrameReader) -> None:
@@ -216,7 +216,7 @@ class Welcome:
     name: str
     configuration_hash: bytes
     software: str = ""
-    capabilities: Capability = NO_CAPABILITY
+    capabilities: FederateCapability = NO_CAPABILITY
     step_ns: int = 0
     next_event_ns: int = NO_EVENT
     commands: Sequence[int] = ()
@@ -256,7 +256,7 @@ class Welcome:
         reader.end()
         if not all(math.isfinite(sum(position)) for position in emitters_m):
             raise MalformedFrameError(reader.position, "the position of an emitter is not finite")
-        known = Capability(bits & int(~Capability(0)))
+        known = FederateCapability(bits & int(~FederateCapability(0)))
         return Welcome(
             role,
             name,

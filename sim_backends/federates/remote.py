@@ -15,7 +15,7 @@ from sim_backends.federates.exchanges import (
     encode_fork,
 )
 from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
-from sim_backends.federates.handshake import NO_EVENT, Capability, Hello, Welcome
+from sim_backends.federates.handshake import NO_EVENT, FederateCapability, Hello, Welcome
 from sim_backends.federates.protocols import FederateError, seconds_text
 from sim_backends.federates.records import command_type
 from sim_backends.federates.session import FederateSession, open_session
@@ -47,7 +47,7 @@ class _RemoteFederate:
         Raises:
             FederateError: The federate does not support this, or failed.
         """
-        if not self.welcome.capabilities & Capability.FORK:
+        if not self.welcome.capabilities & FederateCapability.FORK:
             raise FederateError(
                 f"{self.session.name} cannot be copied, as it does not support fork",
                 remedy="use another command, or a federate that supports it",
@@ -138,7 +138,7 @@ class RemoteNetwork(_RemoteFederate):
 
     def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
         super().__init__(session, hello, welcome)
-        self.extrapolates = bool(welcome.capabilities & Capability.EXTRAPOLATES)
+        self.extrapolates = bool(welcome.capabilities & FederateCapability.EXTRAPOLATES)
         if any(index >= len(hello.agents) for index in welcome.transmitters):
             session.fail(f"{session.name} names a transmitter that is not an agent")
         self.transmitters = frozenset(hello.agents[index].name for index in welcome.transmitters)
@@ -180,7 +180,7 @@ class RemoteNetwork(_RemoteFederate):
 
     def next_event_ns(self) -> int | None:
         """Implement `NetworkFederate.next_event_ns`."""
-        if not self.welcome.capabilities & Capability.NEXT_EVENT:
+        if not self.welcome.capabilities & FederateCapability.NEXT_EVENT:
             raise FederateError(
                 f"{self.session.name} does not report the time of its next event, which this sync policy needs",
                 remedy="use another policy, for example sliding_window",

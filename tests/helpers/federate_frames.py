@@ -4,7 +4,7 @@ from sim_backends.federates import exchanges
 from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import PHYSICS, MessageKind, encode, text_bytes
-from sim_backends.federates.handshake import AgentStart, Capability, Hello, Welcome, encode_join
+from sim_backends.federates.handshake import AgentStart, FederateCapability, Hello, Welcome, encode_join
 from sim_backends.federates.records import COMMAND_TYPES
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.body import Twist, Velocity
@@ -27,7 +27,7 @@ WELCOME = Welcome(
     "carts",
     HELLO.configuration_hash,
     "carts 1.0",
-    Capability.DETERMINISTIC | Capability.AGENTS_APPEAR,
+    FederateCapability.DETERMINISTIC | FederateCapability.AGENTS_APPEAR,
     step_ns=1_000_000,
     commands=COMMAND_TYPES,
 )

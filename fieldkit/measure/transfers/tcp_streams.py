@@ -95,8 +95,8 @@ _CONNECTION_BITS: Final = 33
 
 
 @dataclass(frozen=True, eq=False)
-class Intervals:
-    """Intervals of positions from `starts` up to and excluding `stops`; they may overlap."""
+class ByteIntervals:
+    """ByteIntervals of positions from `starts` up to and excluding `stops`; they may overlap."""
 
     starts: Ints
     stops: Ints
@@ -111,9 +111,9 @@ class Intervals:
         uncovered_from = np.maximum(starts[1:], reached[:-1])
         return int(reached[0] - starts[0] + np.maximum(reached[1:] - uncovered_from, 0).sum())
 
-    def bytes_not_in(self, other: "Intervals") -> int:
+    def bytes_not_in(self, other: "ByteIntervals") -> int:
         """Return the number of bytes that these intervals cover and `other` does not."""
-        both = Intervals(np.concatenate((self.starts, other.starts)), np.concatenate((self.stops, other.stops)))
+        both = ByteIntervals(np.concatenate((self.starts, other.starts)), np.concatenate((self.stops, other.stops)))
         return both.size_bytes - other.size_bytes
 
 
@@ -140,25 +140,25 @@ class Connections:
         """Return a mask of the ports that belong to one of these connections."""
         return np.isin(ports, self.ports)
 
-    def payload(self, frames: Packets) -> Intervals:
+    def payload(self, frames: Packets) -> ByteIntervals:
         """Return the payload bytes in frames from sender to receiver."""
         selected = frames.where(self.includes(frames.sport) & (frames.tcp_payload_bytes > 0))
         # SYN consumes a sequence number before the data that TCP Fast Open lets it carry (RFC 7413).
         starts = self._positions(selected.sport, selected.tcp_seq + (selected.tcp_flags & SYN != 0))
-        return Intervals(starts, starts + selected.tcp_payload_bytes)
+        return ByteIntervals(starts, starts + selected.tcp_payload_bytes)
 
-    def numbers(self, frames: Packets) -> Intervals:
+    def numbers(self, frames: Packets) -> ByteIntervals:
         """Return the sequence numbers of bytes and of FINs; a FIN is acknowledged like one byte."""
         ends = frames.where(self.includes(frames.sport) & (frames.tcp_flags & FIN != 0))
         stops = self._positions(ends.sport, ends.tcp_seq) + ends.tcp_payload_bytes
         carried = self.payload(frames)
-        return Intervals(np.concatenate((carried.starts, stops)), np.concatenate((carried.stops, stops + 1)))
+        return ByteIntervals(np.concatenate((carried.starts, stops)), np.concatenate((carried.stops, stops + 1)))
 
-    def acknowledged(self, answers: Packets) -> Intervals:
+    def acknowledged(self, answers: Packets) -> ByteIntervals:
         """Return the sequence numbers that frames from receiver to sender acknowledge."""
         selected = answers.where(self.includes(answers.dport) & (answers.tcp_flags & ACK != 0))
         starts = self._positions(selected.dport, self.first_seq[np.searchsorted(self.ports, selected.dport)])
-        return Intervals(starts, np.maximum(starts, self._positions(selected.dport, selected.tcp_ack)))
+        return ByteIntervals(starts, np.maximum(starts, self._positions(selected.dport, selected.tcp_ack)))
 
     def _positions(self, ports: Ints, numbers: Ints) -> Ints:
         index = np.searchsorted(self.ports, ports)

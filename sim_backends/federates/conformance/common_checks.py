@@ -3,7 +3,7 @@
 from sim_backends.federates.conformance.probe import CheckError, NotDeclaredError, Target
 from sim_backends.federates.exchanges import encode_fork
 from sim_backends.federates.frames import MessageKind
-from sim_backends.federates.handshake import Capability
+from sim_backends.federates.handshake import FederateCapability
 from sim_backends.federates.records import COMMAND_TYPES
 
 
@@ -50,7 +50,7 @@ def check_counts(target: Target) -> None:
 def check_fork_absence(target: Target) -> None:
     """A federate that does not declare fork refuses it."""
     probe = target.open()
-    if probe.has(Capability.FORK):
+    if probe.has(FederateCapability.FORK):
         raise NotDeclaredError("it declares FORK")
     probe.expect_error(MessageKind.FORK, encode_fork(1), MessageKind.DONE, "fork, which it does not declare")
 

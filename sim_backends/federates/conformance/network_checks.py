@@ -6,7 +6,7 @@ from typing import Final
 from sim_backends.federates.conformance.probe import CheckError, FederateProbe, NotDeclaredError, Target
 from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import MessageKind
-from sim_backends.federates.handshake import NO_EVENT, Capability
+from sim_backends.federates.handshake import NO_EVENT, FederateCapability
 from sim_backends.network.packets import Arrival, Packet
 from sim_backends.world.motion import State
 
@@ -63,7 +63,7 @@ class _Account:
         self._packets |= {packet.packet_id: packet for packet in packets}
         if outcomes.at_ns != to_ns:
             raise CheckError(f"asked to advance to {to_ns} ns, it advanced to {outcomes.at_ns} ns")
-        if self._probe.has(Capability.NEXT_EVENT):
+        if self._probe.has(FederateCapability.NEXT_EVENT):
             self._check_next_event(outcomes, to_ns, has_packets=bool(packets))
         for arrival in outcomes.arrivals:
             self._check_arrival(arrival, from_ns, to_ns)
@@ -158,7 +158,7 @@ def check_window_length(target: Target) -> None:
     arrivals = []
     for window_ns in (_WINDOW_NS, 13 * _WINDOW_NS):
         probe = target.open()
-        probe.require(Capability.DETERMINISTIC)
+        probe.require(FederateCapability.DETERMINISTIC)
         arrivals.append(sorted(_run(probe, window_ns).arrivals, key=lambda arrival: arrival.packet_id))
     for one, other in zip(*arrivals, strict=False):
         if one != other:
@@ -197,7 +197,7 @@ def check_determinism(target: Target) -> None:
     accounts = []
     for _ in range(2):
         probe = target.open()
-        probe.require(Capability.DETERMINISTIC)
+        probe.require(FederateCapability.DETERMINISTIC)
         accounts.append(_run(probe, _WINDOW_NS))
     one, other = accounts
     if one.arrivals != other.arrivals or one.reasons != other.reasons:
@@ -207,7 +207,7 @@ def check_determinism(target: Target) -> None:
 def check_new_agent(target: Target) -> None:
     """A packet to an agent that has appeared is decided, if the federate declares that agents may appear."""
     probe = target.open()
-    probe.require(Capability.AGENTS_APPEAR)
+    probe.require(FederateCapability.AGENTS_APPEAR)
     account, states = _Account(probe), _states(probe)
     account.advance(_MS, states)
     first = probe.hello.agents[0].name
@@ -225,7 +225,7 @@ def check_dead_reckoning(target: Target) -> None:
     arrivals = []
     for reckoning_ns in (0, _MS):
         probe = target.open()
-        probe.require(Capability.EXTRAPOLATES)
+        probe.require(FederateCapability.EXTRAPOLATES)
         states = _states(probe)
         outcomes = [
             probe.network(to_ns, states, packets, reckoning_ns=reckoning_ns)
@@ -239,7 +239,7 @@ def check_dead_reckoning(target: Target) -> None:
 def check_fork(target: Target) -> None:
     """A copy continues as the original, and neither changes the other."""
     probe = target.open()
-    probe.require(Capability.FORK)
+    probe.require(FederateCapability.FORK)
     states = _states(probe)
     packets = _packets(probe, [number * _MS for number in range(5)])
     probe.network(_MS, states, packets[:2])

@@ -7,7 +7,7 @@ from typing import Final
 from sim_backends.federates.conformance.probe import Advanced, CheckError, FederateProbe, NotDeclaredError, Target
 from sim_backends.federates.exchanges import encode_number
 from sim_backends.federates.frames import MessageKind
-from sim_backends.federates.handshake import AgentStart, Capability
+from sim_backends.federates.handshake import AgentStart, FederateCapability
 from sim_backends.federates.records import TWIST, VELOCITY
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State, extrapolate
@@ -91,7 +91,7 @@ def check_drift(target: Target) -> None:
         to_ns = window * window_ns
         advanced = probe.physics(to_ns, commands if window == 1 else None)
         _check_time(probe, to_ns, advanced)
-    if not probe.has(Capability.DETERMINISTIC):
+    if not probe.has(FederateCapability.DETERMINISTIC):
         raise NotDeclaredError("it does not declare DETERMINISTIC; only the times were compared")
     once = target.open()
     once.physics(0)
@@ -153,7 +153,7 @@ def check_limits(target: Target) -> None:
 def check_command_time(target: Target) -> None:
     """A command applies from `from_ns` on, even if the federate was not asked to advance to it before."""
     exact = target.open()
-    exact.require(Capability.DETERMINISTIC)
+    exact.require(FederateCapability.DETERMINISTIC)
     step_ns, commands = exact.welcome.step_ns, _commands(exact)
     middle_ns, end_ns = 100 * step_ns, 300 * step_ns
     exact.physics(0)
@@ -183,7 +183,7 @@ def check_determinism(target: Target) -> None:
     answers = []
     for _ in range(2):
         probe = target.open()
-        probe.require(Capability.DETERMINISTIC)
+        probe.require(FederateCapability.DETERMINISTIC)
         window_ns, commands = 7 * probe.welcome.step_ns, _commands(probe)
         answers.append(
             [probe.physics(number * window_ns, commands if number == 3 else None).body for number in range(100)]
@@ -196,7 +196,7 @@ def check_determinism(target: Target) -> None:
 def check_fork(target: Target) -> None:
     """A copy continues as the original, and neither changes the other."""
     probe = target.open()
-    probe.require(Capability.FORK)
+    probe.require(FederateCapability.FORK)
     step_ns, commands = probe.welcome.step_ns, _commands(probe)
     probe.physics(0)
     middle_ns, end_ns = 100 * step_ns, 400 * step_ns

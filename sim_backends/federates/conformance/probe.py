@@ -18,7 +18,7 @@ from sim_backends.federates.exchanges import (
     encode_number,
 )
 from sim_backends.federates.frames import HEADER_BYTES, PHYSICS, MessageKind, ProtocolFrame
-from sim_backends.federates.handshake import Capability, Hello, Welcome
+from sim_backends.federates.handshake import FederateCapability, Hello, Welcome
 from sim_backends.federates.protocols import FederateError
 from sim_backends.federates.session import FederateSession
 from sim_backends.network.packets import Packet
@@ -99,11 +99,11 @@ class FederateProbe:
                 f"after the header {frame_text(answer.body)}"
             )
 
-    def has(self, capability: Capability) -> bool:
+    def has(self, capability: FederateCapability) -> bool:
         """Return True if the federate declares a capability."""
         return bool(self.welcome.capabilities & capability)
 
-    def require(self, capability: Capability) -> None:
+    def require(self, capability: FederateCapability) -> None:
         """Raise `NotDeclaredError` if the federate does not declare a capability."""
         if not self.has(capability):
             raise NotDeclaredError(f"it does not declare {capability.name}")
@@ -125,10 +125,10 @@ class FederateProbe:
         decode = partial(_decode_advanced, agents=self.agents)
         advanced: Advanced = self.request(MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, decode, copy=copy)
         self.last_ns = to_ns
-        if set(self.agents.names) - known and not self.has(Capability.AGENTS_APPEAR):
+        if set(self.agents.names) - known and not self.has(FederateCapability.AGENTS_APPEAR):
             raise CheckError(f"an agent appeared, {self.agents.names[-1]}, which it does not declare")
         missing = known - advanced.states.keys()
-        if missing and not self.has(Capability.AGENTS_DISAPPEAR):
+        if missing and not self.has(FederateCapability.AGENTS_DISAPPEAR):
             raise CheckError(f"there is no state of {', '.join(sorted(missing))}, and it does not declare this")
         return advanced
 

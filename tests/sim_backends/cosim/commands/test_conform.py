@@ -15,7 +15,6 @@ import pytest
 from fieldkit.cli import main
 from tests.helpers.federate_examples import EXAMPLES
 from tests.helpers.nightly import mark_nightly
-from tests.helpers.paths import ROOT
 from tests.helpers.runs import Run
 
 
@@ -56,12 +55,6 @@ def test_the_example_in_python_conforms(carts_in_python: str) -> None:
     run = conform(carts_in_python, "--windows", "500")
     assert run.code == 0, run.out
     assert "15 checks passed, 1 not applicable, 0 failed" in run.err
-
-
-def test_the_page_has_the_example_in_python() -> None:
-    page = (ROOT / "docs" / "federates.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    assert (EXAMPLES / "carts.py").read_text(encoding="utf-8").endswith(f'"""\n\n{block}')
 
 
 def test_a_failure_has_request_and_answer_and_exit_code_1(tmp_path: Path, carts_in_c: Path) -> None:
