@@ -138,7 +138,8 @@ def test_a_profile_with_a_section_of_the_removed_package_is_refused(
 ) -> None:
     (tmp_path / "robots").mkdir()
     shutil.copy(ROOT / "robots" / f"{profile}.yaml", tmp_path / "robots")
-    done = run(copy, "fieldkit", "trial", "los", "30ft", "--dry-run", folder=tmp_path)
+    write_procedure(tmp_path, "plain", PLAIN)
+    done = run(copy, "fieldkit", "trial", "plain", "30ft", "--dry-run", folder=tmp_path)
     assert done.returncode == 2, done.stdout
     message = f"unknown key {key}; it needs the package fieldkit.motion, which is not installed"
     assert message in " ".join(done.stderr.split())

@@ -112,6 +112,7 @@ def test_abstract_class_is_refused(install: Install) -> None:
         step_types()["load"]
 
 
+@pytest.mark.ros
 def test_class_with_a_part_of_a_capability_is_refused(install: Install) -> None:
     install(load="tests.steps.test_step_capabilities:Partial")
     with pytest.raises(ConfigurationError, match="only a part of a capability: it lacks records_on, with_record"):
