@@ -128,7 +128,7 @@ class FederateSession:
             frame = self._exchange(encode(kind, self._requests, copy, body), Header(0, answer, self._requests, copy))
             if frame.header.kind is MessageKind.ERROR:
                 text = printable(decode_text(frame.body))
-                self.fail(f"{self.name} failed when it was asked to {what()}: {text}")
+                self.fail(f"{self.name} failed at the request to {what()}: {text}")
             return decode(frame.body)
         except MalformedFrameError as error:
             self.fail(
@@ -138,9 +138,7 @@ class FederateSession:
         except DeadlineError:
             self._fail_unanswered(what())
         except ClosedError as error:
-            self.fail(
-                f"{self.name} failed when it was asked to {what()}: {error}{self._progress()}{self._exit_text()}"
-            )
+            self.fail(f"{self.name} failed at the request to {what()}: {error}{self._progress()}{self._exit_text()}")
 
     def _exchange(self, request: bytes, expected: Header) -> ProtocolFrame:
         """Send a request, and return its answer or the error; the federate may report before that it computes."""

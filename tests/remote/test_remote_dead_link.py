@@ -117,7 +117,7 @@ def test_result_of_a_job_that_outlives_its_link_is_collected_once() -> None:
         assert emulated.shell.run(("cat", f"{FOLDER}/ends"), deadline=Deadline.after(30)).stdout == b"end\n"
         assert [re.split(";| after", notice)[0] for notice in emulated.notices] == [
             "turtlebot-1: the link is lost",
-            "turtlebot-1: the link is back",
+            "turtlebot-1: the link is open again",
         ]
 
 

@@ -560,7 +560,7 @@ def test_robot_that_refuses_logins_while_it_boots_is_retried(
     assert len(logins) == 4
     assert [re.split(";| after", notice)[0] for notice in notices] == [
         "robot: the link is lost",
-        "robot: the link is back",
+        "robot: the link is open again",
     ]
     shell.close()
 

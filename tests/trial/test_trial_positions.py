@@ -91,7 +91,7 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
         (["receiver=huge.gpx"], 2, "huge.gpx: it has 67 MB"),
         (["receiver=walk.csv", "--offset", "3"], 2, "has no unit"),
         (["receiver=walk.csv", "--gap", "soon"], 2, "is not a duration"),
-        (["receiver=walk.csv", "--clear"], 2, "--clear removes stored files"),
+        (["receiver=walk.csv", "--clear"], 2, "--clear removes the stored files"),
     ],
 )
 def test_invalid_positions_are_rejected_and_change_nothing(

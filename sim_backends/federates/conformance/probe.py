@@ -169,7 +169,7 @@ class FederateProbe:
         try:
             self.request(kind, body, answer, bytes)
         except FederateError as error:
-            if error.exit_code == 1 and ("failed when it was asked" in error.what):
+            if error.exit_code == 1 and ("failed at the request" in error.what):
                 return
             raise CheckError(f"it must refuse {why}: {error.what} ({time.monotonic() - started_s:.1f} s)") from error
         raise CheckError(f"it must refuse {why}, and it answered")

@@ -64,7 +64,7 @@ def from_second(alter: Callable[[bytes], bytes | None]) -> Alter:
 @pytest.mark.parametrize(
     ("alter", "error", "message"),
     [
-        (lambda frame: None, UnansweredError, "has not answered for 0.3 s: asked to advance from 0 s to 0.0011 s"),
+        (lambda frame: None, UnansweredError, "has not answered for 0.3 s: request to advance from 0 s to 0.0011 s"),
         (
             lambda frame: b"garbage" * 9,
             FederateError,
@@ -81,7 +81,7 @@ def from_second(alter: Callable[[bytes], bytes | None]) -> Alter:
         (
             lambda frame: encode(MessageKind.ERROR, 3, 0, b"\3\0a\nb"),
             FederateError,
-            "asked to advance from 0 s to 0.0011 s: a b",
+            "request to advance from 0 s to 0.0011 s: a b",
         ),
     ],
 )
@@ -152,7 +152,7 @@ def end_child(number: signal.Signals) -> Callable[[RemotePhysics], None]:
     ("fault", "message"),
     [
         (end_child(signal.SIGKILL), "the connection was closed; its last time is 0 s; it was ended by SIGKILL"),
-        (end_child(signal.SIGSTOP), "has not answered for 2 s: asked to advance from 0 s to 0.003 s"),
+        (end_child(signal.SIGSTOP), "has not answered for 2 s: request to advance from 0 s to 0.003 s"),
     ],
 )
 def test_a_child_that_is_killed_or_suspended_is_named_and_ended(

@@ -79,4 +79,4 @@ def test_a_program_that_is_not_a_federate_is_an_error() -> None:
     run = conform("--", sys.executable, "-c", "print('hello')")
     assert run.code == 1
     assert "error: network (" in run.err
-    assert "failed when it was asked to begin a run as network" in run.err or "malformed frame" in run.err
+    assert "failed at the request to begin a run as network" in run.err or "malformed frame" in run.err

@@ -118,7 +118,7 @@ serving.serve(Faulty, name="faulty")
             "os.kill(os.getpid(), signal.SIGSTOP)",
             "network",
             3,
-            "has not answered for 6 s: asked to advance from 0.2",
+            "has not answered for 6 s: request to advance from 0.2",
         ),
         (
             "channels.StreamChannel.send = lambda self, *_: os.write(self._write_fd, b'garbage' * 9)",
