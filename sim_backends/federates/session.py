@@ -180,9 +180,9 @@ class FederateSession:
         limit_s = self._deadline_s if self._busy_ns is None else PATIENCE * self._deadline_s
         busy = "" if self._busy_ns is None else f"; it last reported {seconds_text(self._busy_ns)}"
         error = UnansweredError(
-            f"{self.name} has not answered for {limit_s:g} s: asked to {what}{self._progress()}{busy}"
+            f"{self.name} has not answered for {limit_s:g} s: request to {what}{self._progress()}{busy}"
             f"{self._output_text()}",
-            remedy="check what it waits for, or give it a longer deadline",
+            remedy="find out why it waits, or set a longer deadline",
         )
         self._end()
         raise error
