@@ -12,6 +12,7 @@ Both processes share the machine's processors, so other load changes the result.
 import argparse
 import json
 import math
+import shlex
 import shutil
 import socket
 import statistics
@@ -135,7 +136,9 @@ def network(where: str, count: int) -> Iterator[Exchange]:
 
 def served(role: str, address: str = "") -> str:
     """Return the command of a federate of this benchmark."""
-    return f"{sys.executable} -m benchmarks.cosim_exchange --serve {role} {address}".strip()
+    return shlex.join(
+        word for word in (sys.executable, "-m", "benchmarks.cosim_exchange", "--serve", role, address) if word
+    )
 
 
 @contextmanager

@@ -33,7 +33,7 @@ REPEATS: Final = (1_000, 5_000, 10_000)
 LAST: Final = 100
 NEXT: Final = 10
 SPARE: Final = 100
-"""Repeats that are trial_plan in addition, to be run after reopening."""
+"""Repeats that are planned in addition, to be run after reopening."""
 
 _PROCEDURE: Final = """\
 name: small

@@ -90,4 +90,4 @@ def in_shell(job: Job) -> str:
     text = quote((("sudo", "-n") if job.as_root else ()) + job.argv)
     text += f" < {quote((job.stdin,))}" if job.stdin else ""
     text += (f" > {quote((job.stdout,))}" if job.stdout else "") + f" 2> {quote((job.log,))}"
-    return text + (f"  # at most {job.output_limit_bytes} bytes of repeats_text" if job.output_limit_bytes else "")
+    return text + (f"  # at most {job.output_limit_bytes} bytes of each" if job.output_limit_bytes else "")

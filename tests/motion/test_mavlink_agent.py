@@ -299,7 +299,7 @@ class FakeLink:
     def __init__(self) -> None:
         self.frames: list[bytes] = []
         self.messages: dict[int, MessageRate] = {}
-        self.left_out = 0
+        self.dropped_frames = 0
 
     def select(self, _: float) -> bool:
         return bool(self.frames)

@@ -34,7 +34,7 @@ roles:
 
 def site(access: str) -> str:
     """Return a site of two robots, which are one server with two names."""
-    return SITE.format(access=access, same=f"{access.replace('127.0.0.1', 'localhost')}, address: 127.0.0.1")
+    return SITE.format(access=access, same=f"{access.replace('127.0.0.1', 'localhost')}, address: 127.0.0.2")
 
 
 class Memory(KeyringBackend):

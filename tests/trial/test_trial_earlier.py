@@ -156,14 +156,15 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
 
 
 def test_rewritten_ip_ids_are_not_an_earlier_attempt(tmp_path: Path) -> None:
+    """The header checksum becomes 0, which is not judged."""
     attempt = of(Protocol.UDP, tmp_path)
     attempt.capture(
         "receiver",
         lambda packets: [
-            _changed(one, 4, bytes((one[1][HEADS + 4] ^ 0x80, one[1][HEADS + 5])))
-            if _is_icmp(one[1][HEADS:])
-            else one
-            for one in packets
+            _changed(_changed(packet, 4, bytes((packet[1][HEADS + 4] ^ 0x80, packet[1][HEADS + 5]))), 10, bytes(2))
+            if _is_icmp(packet[1][HEADS:])
+            else packet
+            for packet in packets
         ],
     )
     assert attempt.problems() == ()

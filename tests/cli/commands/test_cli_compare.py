@@ -155,7 +155,7 @@ def test_more_than_two_runs_suggest_aggregate(lab: Path, capsys: pytest.CaptureF
     assert main(["compare", "field", "sim", "field again"]) == 2
     message = capsys.readouterr().err
     assert "compare takes two runs, A and B, and 3 are given" in message
-    command = message.partition("side by side: fieldkit ")[2].strip()
+    command = message.partition("in one table: fieldkit ")[2].strip()
     assert command == "aggregate field sim 'field again' --by trial,protocol"
     assert main(shlex.split(command)) == 0
     capsys.readouterr()

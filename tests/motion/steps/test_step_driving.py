@@ -198,7 +198,7 @@ def lease_of(link: Link) -> DriveLease:
 
 
 def test_lease_repeats_the_order_until_robot_is_home() -> None:
-    link = Link(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
+    link = Link(status=["", '{"ended": ""}', "{", '{"ended": "home", "ready": true}'])
     with lease_of(link) as lease:
         assert (lease.status, lease.end_state) == ({}, "")
         lease.give_order("back")
@@ -275,14 +275,14 @@ def driven(field: Field, body: Any) -> None:  # noqa: ANN401
 
 
 def test_robot_that_returns_is_not_brought_back(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home"}']))
+    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home", "ready": true}']))
     driven(field, lambda: None)
     assert field.returns == [True]
     assert stopped == ["out.drive"]
 
 
 def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "no odometry for 0.5 s"}']))
+    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "no odometry for 0.5 s", "ready": true}']))
     with pytest.raises(RobotError, match="it stopped on its path: no odometry"):
         driven(field, lambda: None)
     assert field.returns == [False]
@@ -315,7 +315,7 @@ def test_interrupted_robot_stays_where_it_is(stopped: list[str]) -> None:
 
 
 def test_robot_returns_after_error_inside(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home"}']))
+    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home", "ready": true}']))
 
     def fail() -> None:
         raise RobotError("it broke", remedy="repair it")

@@ -303,7 +303,10 @@ def specs(robots: Cast, ros2: str, ros: str = "auto") -> Mapping[Role, Any]:
 def test_specifications_have_the_ros2_settings() -> None:
     specs_by_role = specs(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}")
     assert specs_by_role[Role.SENDER].ros2.peers == ("10.42.0.2", "10.42.0.3")
-    assert (specs_by_role[Role.SENDER].ros2.over, specs_by_role[Role.RECEIVER].ros2.over) == ("dds", "zenoh")
+    assert (specs_by_role[Role.SENDER].ros2.middleware, specs_by_role[Role.RECEIVER].ros2.middleware) == (
+        "dds",
+        "zenoh",
+    )
     assert specs_by_role[Role.RELAY].ros2 is None
     specs_by_role = specs(cast(sender="zenoh"), ROUTER)
     assert (specs_by_role[Role.SENDER].ros2.router, specs_by_role[Role.SENDER].ros2.peers) == ("10.42.0.3", ())

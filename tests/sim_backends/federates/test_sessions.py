@@ -2,6 +2,7 @@
 
 import os
 import random
+import shlex
 import signal
 import socket
 import struct
@@ -35,7 +36,7 @@ from tests.helpers.federate_pairs import HELLO, Alter, Pair, channel_of, childre
 
 MS = 1_000_000
 REQUESTS = ("advance physics", "ping", "fork", "release", "advance physics", "bye")
-CARTS = f"{sys.executable} {EXAMPLES / 'carts.py'}"
+CARTS = shlex.join((sys.executable, str(EXAMPLES / "carts.py")))
 
 
 def remote(alter: Alter) -> RemotePhysics:
@@ -195,7 +196,7 @@ def test_a_child_that_fails_shows_its_last_output(tmp_path: Path) -> None:
     program = tmp_path / "fails.py"
     program.write_text("import sys\nprint('no licence', file=sys.stderr)\nsys.exit(7)\n", encoding="utf-8")
     with pytest.raises(FederateError, match=r"it has exited with code 7; its last output: no licence"):
-        open_physics(f"{sys.executable} {program}", HELLO, 20.0)
+        open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)
     with pytest.raises(ConfigurationError, match="the federate /nowhere/at-all cannot be started"):
         open_physics("/nowhere/at-all", HELLO, 20.0)
 
@@ -215,7 +216,7 @@ def test_output_of_the_federates_code_does_not_reach_the_protocol(tmp_path: Path
         "serve(Chatty)\n",
         encoding="utf-8",
     )
-    with closing(open_physics(f"{sys.executable} {program}", HELLO, 20.0)) as physics:
+    with closing(open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)) as physics:
         for step in range(5):
             assert physics.advance(step * MS, {}).keys() == {"ann", "bob", "cy"}
         assert physics.session._child is not None

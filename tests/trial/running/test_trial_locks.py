@@ -182,7 +182,7 @@ def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell)
             begin(robot, ANNA)
     with (
         locked({Role.SENDER: robot}, BERT, sink=quiet),
-        pytest.raises(LockLostError, match="bert@two took the robot"),
+        pytest.raises(LockLostError, match="bert@two locked the robot"),
     ):
         begin(robot, ANNA)
     with locked({Role.SENDER: robot}, ANNA, sink=quiet):

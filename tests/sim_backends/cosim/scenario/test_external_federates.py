@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -24,7 +25,7 @@ from tests.helpers.federate_examples import EXAMPLES
 from tests.helpers.federate_pairs import children
 from tests.helpers.runs import Run, finish, start, wait_during
 
-SERVED = f"{sys.executable} -m sim_backends.cosim.scenario.served"
+SERVED = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served"))
 DURATION = {"duration": "400ms"}
 
 
@@ -107,7 +108,7 @@ serving.serve(Faulty, name="faulty")
 """,
         encoding="utf-8",
     )
-    return f"{sys.executable} {program}"
+    return shlex.join((sys.executable, str(program)))
 
 
 @pytest.mark.parametrize(
@@ -167,7 +168,7 @@ def test_a_network_without_next_events_suits_policies_with_windows(tmp_path: Pat
         "serve(Net)\n",
         encoding="utf-8",
     )
-    scenario = load_scenario("convoy", {"network.federate": f"{sys.executable} {program}"} | DURATION)
+    scenario = load_scenario("convoy", {"network.federate": shlex.join((sys.executable, str(program)))} | DURATION)
     assert digest(scenario, "sliding_window")
     with pytest.raises(FederateError, match="does not report the time of its next event"):
         digest(scenario, "event_driven")
