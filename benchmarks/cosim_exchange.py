@@ -146,7 +146,7 @@ def listening(role: str) -> Iterator[str]:
     """Yield the address of a federate that listens."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    process = subprocess.Popen(served(role, f"tcp-listen:127.0.0.1:{port}").split())
+    process = subprocess.Popen(shlex.split(served(role, f"tcp-listen:127.0.0.1:{port}")))
     yield f"tcp:127.0.0.1:{port}"
     process.terminate()
     process.wait()

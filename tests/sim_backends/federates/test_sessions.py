@@ -163,14 +163,14 @@ def test_a_child_that_is_killed_or_suspended_is_named_and_ended(
     physics.advance(0, {})
     physics.session._deadline_s = 2.0
     fault(physics)
-    with pytest.raises(FederateError, match=r"^physics carts \(.*carts.py\) ") as raised:
+    with pytest.raises(FederateError, match=r"^physics carts \(.*carts.py'?\) ") as raised:
         physics.advance(3 * MS, {})
     assert message in str(raised.value)
 
 
 def test_a_federate_that_fieldkit_has_not_started_is_named_and_left_alone() -> None:
     port = free_port()
-    process = subprocess.Popen([*CARTS.split(), f"tcp-listen:127.0.0.1:{port}"])
+    process = subprocess.Popen([*shlex.split(CARTS), f"tcp-listen:127.0.0.1:{port}"])
     try:
         with closing(open_physics(f"tcp:127.0.0.1:{port}", HELLO, 20.0)) as physics:
             physics.advance(0, {})

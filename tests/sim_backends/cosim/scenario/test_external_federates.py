@@ -36,7 +36,7 @@ def served() -> Iterator[dict[str, str]]:
     for role in ("physics", "network"):
         with socket.create_server(("127.0.0.1", 0)) as server:
             port = server.getsockname()[1]
-        command = [*SERVED.split(), role, f"tcp-listen:127.0.0.1:{port}"]
+        command = [*shlex.split(SERVED), role, f"tcp-listen:127.0.0.1:{port}"]
         processes.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
         addresses[role] = f"tcp:127.0.0.1:{port}"
     yield addresses
