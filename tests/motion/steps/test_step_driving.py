@@ -198,7 +198,7 @@ def lease_of(link: Link) -> DriveLease:
 
 
 def test_lease_repeats_the_order_until_robot_is_home() -> None:
-    link = Link(status=["", '{"ended": ""}', "{", '{"ended": "home", "ready": true}'])
+    link = Link(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
     with lease_of(link) as lease:
         assert (lease.status, lease.end_state) == ({}, "")
         lease.give_order("back")
