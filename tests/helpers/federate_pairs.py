@@ -3,6 +3,7 @@
 import os
 import socket
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,12 +17,22 @@ from sim_backends.federates.session import FederateSession
 from sim_backends.world.motion import State
 
 
-def children() -> set[int]:
-    """Return the process ids of this process's children."""
+def now_s() -> float:
+    """Return the time since boot, in seconds."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def children(since_s: float) -> set[int]:
+    """Return the process ids of this process's children that were started after a time since boot.
+
+    A pytest worker also adopts older processes of earlier tests.
+    """
     pids = set()
     for path in Path("/proc").glob("[0-9]*/stat"):
         with suppress(OSError):
-            if int(path.read_text(encoding="utf-8").rpartition(")")[2].split()[1]) == os.getpid():
+            fields = path.read_text(encoding="utf-8").rpartition(")")[2].split()
+            parent, started_s = int(fields[1]), (int(fields[19]) + 1) / os.sysconf("SC_CLK_TCK")
+            if parent == os.getpid() and started_s >= since_s:
                 pids.add(int(path.parent.name))
     return pids
 

@@ -32,7 +32,7 @@ from sim_backends.physics.body import Twist
 from sim_backends.world.motion import State
 from tests.helpers.federate_examples import EXAMPLES, carts
 from tests.helpers.federate_frames import example_frames
-from tests.helpers.federate_pairs import HELLO, Alter, Pair, channel_of, children
+from tests.helpers.federate_pairs import HELLO, Alter, Pair, channel_of, children, now_s
 
 MS = 1_000_000
 REQUESTS = ("advance physics", "ping", "fork", "release", "advance physics", "bye")
@@ -45,9 +45,9 @@ def remote(alter: Alter) -> RemotePhysics:
 
 @pytest.fixture(autouse=True)
 def no_process_is_left() -> Iterator[None]:
-    before = children()
+    began_s = now_s()
     yield
-    assert children() <= before
+    assert children(began_s) == set()
 
 
 def from_second(alter: Callable[[bytes], bytes | None]) -> Alter:
@@ -141,28 +141,20 @@ def test_a_federate_that_reports_that_it_computes_may_take_longer(monkeypatch: p
         impatient.advance(3 * MS, {})
 
 
-def end_child(number: signal.Signals) -> Callable[[RemotePhysics], None]:
-    def end(physics: RemotePhysics) -> None:
-        (pid,) = children()
-        os.kill(pid, number)
-
-    return end
-
-
 @pytest.mark.parametrize(
-    ("fault", "message"),
+    ("number", "message"),
     [
-        (end_child(signal.SIGKILL), "the connection was closed; its last time is 0 s; it was ended by SIGKILL"),
-        (end_child(signal.SIGSTOP), "has not answered for 2 s: request to advance from 0 s to 0.003 s"),
+        (signal.SIGKILL, "the connection was closed; its last time is 0 s; it was ended by SIGKILL"),
+        (signal.SIGSTOP, "has not answered for 2 s: request to advance from 0 s to 0.003 s"),
     ],
 )
-def test_a_child_that_is_killed_or_suspended_is_named_and_ended(
-    fault: Callable[[RemotePhysics], None], message: str
-) -> None:
+def test_a_child_that_is_killed_or_suspended_is_named_and_ended(number: signal.Signals, message: str) -> None:
+    began_s = now_s()
     physics = open_physics(CARTS, HELLO, 20.0)
     physics.advance(0, {})
     physics.session._deadline_s = 2.0
-    fault(physics)
+    (pid,) = children(began_s)
+    os.kill(pid, number)
     with pytest.raises(FederateError, match=r"^physics carts \(.*carts.py'?\) ") as raised:
         physics.advance(3 * MS, {})
     assert message in str(raised.value)

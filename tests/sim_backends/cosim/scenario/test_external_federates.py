@@ -22,7 +22,7 @@ from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.protocols import FederateError
 from tests.helpers.federate_examples import EXAMPLES
-from tests.helpers.federate_pairs import children
+from tests.helpers.federate_pairs import children, now_s
 from tests.helpers.runs import Run, finish, start, wait_during
 
 SERVED = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served"))
@@ -60,9 +60,9 @@ def test_the_built_in_federates_give_the_same_events_as_processes(policy: str, s
 def test_pipes_give_the_same_events() -> None:
     changes = {f"{role}.federate": f"{SERVED} {role}" for role in ("physics", "network")}
     external = load_scenario("convoy", changes | DURATION)
-    before = children()
+    began_s = now_s()
     assert digest(external, "sliding_window") == digest(without_federates(external), "sliding_window")
-    assert children() <= before
+    assert children(began_s) == set()
 
 
 def test_a_simulation_with_external_federates_can_be_copied(served: dict[str, str]) -> None:
@@ -133,7 +133,7 @@ serving.serve(Faulty, name="faulty")
 def test_a_fault_ends_the_run_and_its_recording_is_readable(
     fault: str, role: str, code: int, message: str, tmp_path: Path
 ) -> None:
-    before = children()
+    began_s = now_s()
     federate = (f"--{role}", faulty(tmp_path, role, fault))
     options = (
         "--duration",
@@ -149,7 +149,7 @@ def test_a_fault_ends_the_run_and_its_recording_is_readable(
     assert run.code == code, run.err
     assert f"error: {role} faulty (" in run.err
     assert message in run.err
-    assert children() <= before
+    assert children(began_s) == set()
     replayed = cosim(tmp_path, "replay", "faulty", "--format", "json")
     assert replayed.code == 0, replayed.err
     assert json.loads(replayed.out)["flows"]
