@@ -79,7 +79,9 @@ def test_a_hanging_tool_is_ended_at_its_limit(
     assert run.code in {0, 4}, run.err
     (row,) = rows(only_trial(lab))
     if tool == "netcat":  # an incomplete transfer is a measurement
-        assert (row["status"], row["received_bytes"]) == ("valid", "0"), row["reason"]
+        assert row["received_bytes"] == "0"
+        # On a busy machine the sender starts too late for the listener's limit, which makes the attempt void.
+        assert row["status"] == "valid" or "sending started up to" in row["reason"], row["reason"]
     else:
         assert row["status"] == "failed"
         assert message in row["reason"]
