@@ -71,7 +71,7 @@ def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tup
 def test_a_topic_keeps_the_values_from_its_logs(attempt: tuple[Plan, Path, journal.Attempt], role: str) -> None:
     problems, measured = with_drops(attempt, f"topic.{role}")
     assert problems == ()
-    assert measured.values.keys() >= NEEDS_NO_CAPTURE
+    assert measured.values.keys() >= NEEDS_NO_CAPTURE, measured.missing
     reason = f"the capture of {role} lacks 12 packets that its kernel dropped"
     assert {measured.missing[name] for name in NEEDS_CAPTURES} == {reason}
     assert measured.values["topic_capture_withheld"] == reason
