@@ -150,10 +150,10 @@ def _read_bag(data: bytes, place: Path) -> None:
     for stamps in ("header", "received"):
         position_source = PositionSource(topic="/where", stamps=stamps, heading_rad=1.0, began_utc_ns=BEGAN_NS + S)
         with suppress(EvidenceError):
-            found = position_files.read_topic(path, position_source)
-            _check_samples(found)
-            if found.yaws_rad is not None:
-                _check_samples(position_files.to_placement_frame(found, position_source))
+            samples = position_files.read_topic(path, position_source)
+            _check_samples(samples)
+            if samples.yaws_rad is not None:
+                _check_samples(position_files.to_placement_frame(samples, position_source))
 
 
 def _read_positions_file(ending: str, data: bytes, place: Path) -> None:

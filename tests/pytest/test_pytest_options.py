@@ -18,7 +18,7 @@ TOLD = """
 def test_told(lab_options, pytestconfig):
     from fieldkit.pytest import plugin_options
     values = lab_options, plugin_options.output(pytestconfig), plugin_options.keep(pytestconfig)
-    print(*(f"[{one}]" for one in values), sep="\\n")
+    print(*(f"[{value}]" for value in values), sep="\\n")
 """
 OTHERS = """
 import sys

@@ -199,8 +199,8 @@ def check_determinism(target: Target) -> None:
         probe = target.open()
         probe.require(FederateCapability.DETERMINISTIC)
         accounts.append(_run(probe, _WINDOW_NS))
-    one, other = accounts
-    if one.arrivals != other.arrivals or one.reasons != other.reasons:
+    first, second = accounts
+    if first.arrivals != second.arrivals or first.reasons != second.reasons:
         raise CheckError("equal requests gave different arrivals or drops")
 
 

@@ -269,17 +269,19 @@ NETWORK_CASES = [
     ),
     Broken(
         "exactly_once",
-        physics(net(lambda _, arrived, drops, to_ns: ([], [Drop(one.packet_id, "") for one in arrived]))),
+        physics(net(lambda _, arrived, drops, to_ns: ([], [Drop(arrival.packet_id, "") for arrival in arrived]))),
         "was dropped without a reason",
     ),
     Broken(
         "exactly_once",
-        physics(net(lambda _, arrived, drops, to_ns: ([replace(one, receiver="cy") for one in arrived], []))),
+        physics(net(lambda _, arrived, drops, to_ns: ([replace(arrival, receiver="cy") for arrival in arrived], []))),
         "for bob arrived at cy",
     ),
     Broken(
         "exactly_once",
-        physics(net(lambda _, arrived, drops, to_ns: ([replace(one, at_ns=to_ns + 1) for one in arrived], []))),
+        physics(
+            net(lambda _, arrived, drops, to_ns: ([replace(arrival, at_ns=to_ns + 1) for arrival in arrived], []))
+        ),
         "not between",
     ),
     Broken(
@@ -293,7 +295,7 @@ NETWORK_CASES = [
     Broken("window_borders", physics(DropsAtBorders), "at the border of a window neither arrived"),
     Broken(
         "window_length",
-        physics(net(lambda _, arrived, drops, to_ns: ([replace(one, at_ns=to_ns) for one in arrived], []))),
+        physics(net(lambda _, arrived, drops, to_ns: ([replace(arrival, at_ns=to_ns) for arrival in arrived], []))),
         "windows of another length changed an arrival",
     ),
     Broken("far_away", physics(ForgetsFarAway), "1,000 km away neither arrived nor"),

@@ -176,12 +176,12 @@ def test_a_network_without_next_events_suits_policies_with_windows(tmp_path: Pat
 
 def processes_of(program: Path) -> list[int]:
     """Return the process ids of the processes that run a program."""
-    found = []
+    pids = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with suppress(OSError):
             if os.fsencode(program) in path.read_bytes().split(b"\0")[:3]:
-                found.append(int(path.parent.name))
-    return found
+                pids.append(int(path.parent.name))
+    return pids
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
