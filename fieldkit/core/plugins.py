@@ -31,6 +31,9 @@ POSITIONS: Final = "fieldkit.positions"
 POLICIES: Final = "fieldkit.policies"
 """Entry point group of sync policies of the co-simulation: `NAME = "package.module:Class"`, a `SyncPolicy`; see
 `sim_backends.cosim.policies.registry`."""
+FEDERATES: Final = "fieldkit.federates"
+"""Entry point group of simulators that the co-simulation uses by name: `NAME = "package.module:OBJECT"`, a
+`sim_backends.federates.named.NamedFederate`."""
 COMMANDS: Final = "fieldkit.commands"
 """Entry point group of commands: `NAME = "package.module:function"`; see `fieldkit.cli.parser`."""
 PROFILE_SECTIONS: Final = "fieldkit.profile_sections"

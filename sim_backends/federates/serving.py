@@ -28,7 +28,11 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
         ConfigurationError: The address is invalid or cannot be used, or the token is missing.
         SystemExit: The last run failed.
     """
-    service = FederateService(make, **properties)
+    serve_service(FederateService(make, **properties), address=address, runs=runs)
+
+
+def serve_service(service: FederateService, *, address: str | None = None, runs: int | None = None) -> None:
+    """Serve a federate and its properties; otherwise as `serve`."""
     parsed = None if address is None else tcp.parse_address(address)
     if address is not None and parsed is None:
         raise ValueError(f"{address!r} is neither tcp:HOST:PORT nor tcp-listen:HOST:PORT")

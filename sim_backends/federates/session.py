@@ -13,6 +13,7 @@ from sim_backends.federates.children import Child
 from sim_backends.federates.exchanges import decode_number, decode_text
 from sim_backends.federates.frames import ROLES, Header, MalformedFrameError, MessageKind, ProtocolFrame, encode
 from sim_backends.federates.handshake import Hello, Welcome
+from sim_backends.federates.named import command_line
 from sim_backends.federates.protocols import FederateError, UnansweredError, seconds_text
 
 PATIENCE: Final = 20
@@ -240,13 +241,13 @@ def open_session(
 
     Args:
         role: `PHYSICS` or `NETWORK`.
-        where: A command, `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`.
+        where: A name, a command, `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`.
         hello: The hello that it receives; the token is added, and the interval of heartbeats
             suits the deadline.
         deadline_s: Longest wait for the connection and for each frame; None for no deadline.
 
     Raises:
-        ConfigurationError: The command or the address cannot be used.
+        ConfigurationError: The name, the command or the address cannot be used.
         FederateError: The federate failed, or has not connected or answered in time.
     """
     address = tcp.parse_address(where)
@@ -254,7 +255,7 @@ def open_session(
         # Several heartbeats per deadline, as the federate's machine may be busy.
         hello = replace(hello, heartbeat_ms=max(min(hello.heartbeat_ms, round(deadline_s * 250)), 1))
     if address is None:
-        child = Child(where)
+        child = Child(command_line(where, role))
         session = FederateSession(role, printable(where), child.channel, deadline_s=deadline_s, child=child)
     else:
         token = tcp.token(address)

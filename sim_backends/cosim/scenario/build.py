@@ -122,6 +122,10 @@ def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance
                 yield Jammer(float(fault.power_dbm), fault.begin_ns, fault.end_ns, place_m, fault.agent or "")
 
 
+def _nothing_to_close() -> None:
+    """End a federate that is in this process and has no method `close`."""
+
+
 @dataclass
 class Simulation:
     """A scenario that is ready to run, once; a context manager that ends its external federates.
@@ -203,12 +207,10 @@ def build(
     with ExitStack() as federates:
         scenario_bodies = bodies(scenario, world)
         details = scenario, world, scenario_bodies, seed, deadline_s
-        if physics is None and (remote_physics := open_physics(*details)) is not None:
-            federates.callback(remote_physics.close)
-            physics = remote_physics
-        if network is None and (remote_network := open_network(*details)) is not None:
-            federates.callback(remote_network.close)
-            network = remote_network
+        if physics is None and (physics := open_physics(*details)) is not None:
+            federates.callback(getattr(physics, "close", _nothing_to_close))
+        if network is None and (network := open_network(*details)) is not None:
+            federates.callback(getattr(network, "close", _nothing_to_close))
         if physics is None:
             physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
         if network is None:

@@ -1,16 +1,18 @@
-"""External federates of a scenario: the one place where the co-simulation uses the wire protocol."""
+"""External federates of a scenario: the one place where the co-simulation starts, connects or makes them."""
 
 import dataclasses
 import json
 from collections.abc import Mapping
 from typing import Any
 
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.scenario.agent_setup import antennas, limits
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates import remote
-from sim_backends.federates.frames import NETWORK, PHYSICS
+from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, Hello
-from sim_backends.federates.remote import RemoteNetwork, RemotePhysics
+from sim_backends.federates.named import PythonFederate, named
+from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Body
 from sim_backends.world.world import World
@@ -20,8 +22,8 @@ def without_federates(scenario: CosimScenario) -> CosimScenario:
     """Return the scenario with the built-in physics and network."""
     return scenario.model_copy(
         update={
-            "physics": scenario.physics.model_copy(update={"federate": None}),
-            "network": scenario.network.model_copy(update={"federate": None}),
+            "physics": scenario.physics.model_copy(update={"federate": None, "options": None}),
+            "network": scenario.network.model_copy(update={"federate": None, "options": None}),
         }
     )
 
@@ -56,11 +58,11 @@ def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[
         scenario.physics.step_ns,
         scenario.duration_ns,
         scenario.name,
-        _configuration(scenario, world),
+        _configuration(scenario, world, role),
     )
 
 
-def _configuration(scenario: CosimScenario, world: World) -> bytes:
+def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
     """Return the configuration as JSON; the order of agents is that of the scenario, as results may depend on it."""
     radios = antennas(scenario)
     configuration = {
@@ -73,30 +75,54 @@ def _configuration(scenario: CosimScenario, world: World) -> bytes:
             }
             for name, plan in scenario.agents.items()
         },
+        "options": (scenario.physics if role == PHYSICS else scenario.network).options or {},
     }
     return json.dumps(configuration).encode()
 
 
 def open_physics(
     scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
-) -> RemotePhysics | None:
-    """Start or connect the scenario's external physics, if it has one; arguments as `make_hello`.
+) -> PhysicsFederate | None:
+    """Start, connect or make the scenario's external physics, if it has one; arguments as `make_hello`.
 
     Raises:
-        ConfigurationError: The command or the address cannot be used.
+        ConfigurationError: The name, the command or the address cannot be used.
         FederateError: The federate failed, or has not connected or answered in time.
     """
     where = scenario.physics.federate
     if where is None:
         return None
-    return remote.open_physics(where, make_hello(scenario, world, bodies, seed, PHYSICS), deadline_s)
+    hello = make_hello(scenario, world, bodies, seed, PHYSICS)
+    federate = named(where, PHYSICS)
+    if isinstance(federate, PythonFederate):
+        physics: PhysicsFederate = _made(federate, where, hello)
+        return physics
+    return remote.open_physics(where, hello, deadline_s)
 
 
 def open_network(
     scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
-) -> RemoteNetwork | None:
-    """Start or connect the scenario's external network, if it has one; otherwise as `open_physics`."""
+) -> NetworkFederate | None:
+    """Start, connect or make the scenario's external network, if it has one; otherwise as `open_physics`."""
     where = scenario.network.federate
     if where is None:
         return None
-    return remote.open_network(where, make_hello(scenario, world, bodies, seed, NETWORK), deadline_s)
+    hello = make_hello(scenario, world, bodies, seed, NETWORK)
+    federate = named(where, NETWORK)
+    if isinstance(federate, PythonFederate):
+        network: NetworkFederate = _made(federate, where, hello)
+        return network
+    return remote.open_network(where, hello, deadline_s)
+
+
+def _made(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
+    """Return a federate in this process.
+
+    Raises:
+        ConfigurationError: It does not support the scenario, or something is not installed.
+    """
+    service = federate.load()
+    try:
+        return service.make(hello)
+    except ValueError as error:
+        raise ConfigurationError(f"{ROLES[hello.role]} {name}: {error}") from error

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
-from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length, Location, Strict
+from fieldkit.config.schema import AfterValidator, Duration, Field, Int, JsonValue, Length, Location, Strict
 from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
@@ -13,6 +13,7 @@ from sim_backends.cosim.policies.registry import policies, unknown_policy_remedy
 from sim_backends.cosim.programs.way_points import PERIOD_NS
 from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
+from sim_backends.federates.named import BUILT_IN
 from sim_backends.network.tcp.tcp_options import Congestion
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.obstacles import Place, Real
@@ -58,17 +59,26 @@ class PolicyChoice(Strict):
         )
 
 
+def _without_built_in(name: str | None) -> str | None:
+    return None if name == BUILT_IN else name
+
+
+Federate = Annotated[str | None, AfterValidator(_without_built_in)]
+
+
 class PhysicsOptions(Strict):
     """The physics of a scenario.
 
     Attributes:
         step: Its time step.
-        federate: An [external federate](federates.md) that replaces the built-in physics: a command,
-            `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`. A command is run when the scenario is.
+        federate: An [external federate](federates.md) that replaces the built-in physics: the name of an installed
+            simulator, a command, `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`. A command is run when the scenario is.
+        options: Options of the federate; its page lists them.
     """
 
     step: Annotated[Duration, Field(ge=1e-6, le=1)] = 0.001
-    federate: str | None = None
+    federate: Federate = None
+    options: dict[str, JsonValue] | None = None
 
     @property
     def step_ns(self) -> int:
@@ -82,9 +92,11 @@ class NetworkOptions(Strict):
     Attributes:
         federate: An [external federate](federates.md) that replaces the built-in network, as for the physics. It is
             then responsible for the radio, `tcp` and the faults of radios; there are no captures.
+        options: Options of the federate; its page lists them.
     """
 
-    federate: str | None = None
+    federate: Federate = None
+    options: dict[str, JsonValue] | None = None
 
 
 class AgentRadio(Strict):

@@ -1,0 +1,29 @@
+"""Serves a named federate that is a Python class: `python -m sim_backends.federates physics mujoco [ADDRESS]`."""
+
+import sys
+
+from sim_backends.federates.frames import ROLES
+from sim_backends.federates.named import PythonFederate, named
+from sim_backends.federates.serving import serve_service
+
+
+def main(role_name: str, name: str, address: str | None = None) -> None:
+    """Serve a federate.
+
+    Args:
+        role_name: `physics` or `network`.
+        name: Its name.
+        address: As for `serve`.
+
+    Raises:
+        SystemExit: There is no such federate.
+    """
+    (role,) = (number for number, text in ROLES.items() if text == role_name)
+    federate = named(name, role)
+    if not isinstance(federate, PythonFederate):
+        raise SystemExit(f"{name} is not a Python class")
+    serve_service(federate.load(), address=address)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,132 @@
+"""Programs in C++ that are compiled on first use, against libraries that the user has installed."""
+
+import fcntl
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.errors import ConfigurationError
+
+_LIMIT_S: Final = 900.0
+"""Longest time of a compilation, and of the wait for another process that compiles the same program."""
+_POLL_S: Final = 0.1
+_SHOWN_LINES: Final = 15
+
+
+@dataclass(frozen=True)
+class CompiledProgram:
+    """A program in one C++ file.
+
+    Attributes:
+        name: Its name in messages and file names.
+        source: The file.
+        packages: Names of its libraries for pkg-config.
+        install: Command that installs the compiler and the libraries.
+        flags: Other options of the compiler.
+        duration: Usual time of a compilation, for the message: `about 30 s`.
+    """
+
+    name: str
+    source: Path
+    packages: Sequence[str]
+    install: str
+    flags: Sequence[str] = ("-O2", "-std=c++17")
+    duration: str = "about 30 s"
+
+    def path(self) -> Path:
+        """Return the path of the program, which is compiled if it does not exist yet for this source and environment.
+
+        Raises:
+            ConfigurationError: The compiler or a library is not installed, or the compilation failed.
+        """
+        compiler, libraries = self._environment()
+        digest = hashlib.sha256(self.source.read_bytes())
+        digest.update("\0".join((*self.flags, compiler, *libraries)).encode())
+        folder = cache_folder()
+        folder.mkdir(parents=True, exist_ok=True)
+        program = folder / f"{self.name}-{digest.hexdigest()[:16]}"
+        if program.exists():
+            return program
+        with _locked(folder / f"{program.name}.lock", self.name):
+            if not program.exists():
+                self._compile(program)
+        return program
+
+    def _environment(self) -> tuple[str, list[str]]:
+        """Return the versions of the compiler and of the libraries.
+
+        Raises:
+            ConfigurationError: One of them is not installed.
+        """
+        for tool in ("g++", "pkg-config"):
+            if shutil.which(tool) is None:
+                raise ConfigurationError(f"{self.name} needs {tool}, which is not installed", remedy=self.install)
+        libraries = []
+        for package in self.packages:
+            version = _output("pkg-config", "--modversion", package)
+            if version.returncode:
+                raise ConfigurationError(
+                    f"{self.name} needs the library {package}, which is not installed", remedy=self.install
+                )
+            libraries.append(f"{package} {version.stdout.strip()}")
+        return _output("g++", "--version").stdout.partition("\n")[0], libraries
+
+    def _compile(self, program: Path) -> None:
+        sys.stderr.write(f"note: compiling {self.name}, once for these libraries: {self.duration}\n")
+        options = _output("pkg-config", "--cflags", "--libs", *self.packages).stdout.split() if self.packages else []
+        with tempfile.TemporaryDirectory(dir=program.parent, prefix=f".{self.name}-") as folder:
+            result = Path(folder) / "program"
+            words = ["g++", *self.flags, "-o", str(result), str(self.source), *options]
+            try:
+                done = _output(*words)
+            except subprocess.TimeoutExpired as error:
+                raise ConfigurationError(f"{self.name} was not compiled within {_LIMIT_S:g} s") from error
+            if done.returncode:
+                lines = done.stderr.splitlines()[:_SHOWN_LINES]
+                raise ConfigurationError(
+                    "\n".join((f"{self.name} cannot be compiled:", *lines)),
+                    where=str(self.source),
+                    remedy="report this with the versions of the compiler and of the libraries",
+                )
+            result.replace(program)
+
+
+def cache_folder() -> Path:
+    """Return the folder of compiled programs: `fieldkit/programs` in `XDG_CACHE_HOME`, by default `~/.cache`."""
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (base if base.is_absolute() else Path.home() / ".cache") / "fieldkit" / "programs"
+
+
+def _output(*words: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(words, capture_output=True, text=True, timeout=_LIMIT_S, check=False)
+
+
+@contextmanager
+def _locked(path: Path, name: str) -> Iterator[None]:
+    """Hold a lock file, so that processes that start together compile the program once.
+
+    Raises:
+        ConfigurationError: Another process holds the lock for too long.
+    """
+    deadline_s = time.monotonic() + _LIMIT_S
+    with path.open("wb") as file:
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() > deadline_s:
+                    raise ConfigurationError(
+                        f"another process has compiled {name} for {_LIMIT_S:g} s", where=str(path)
+                    ) from error
+                time.sleep(_POLL_S)
+        yield

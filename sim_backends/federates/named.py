@@ -1,0 +1,95 @@
+"""Federates that have a name, for example `mujoco`: installed simulators, found by their entry points."""
+
+import shlex
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from fieldkit.core import plugins
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.federates.answering import FederateService
+from sim_backends.federates.frames import ROLES
+
+BUILT_IN: Final = "builtin"
+"""Name of the built-in physics and of the built-in network."""
+
+
+@dataclass(frozen=True)
+class ProgramFederate:
+    """A federate that is a program.
+
+    Attributes:
+        role: `PHYSICS` or `NETWORK`.
+        command: Returns its command line, and builds it before if necessary. It raises `ConfigurationError` if
+            something is not installed; the remedy is the command that installs it.
+    """
+
+    role: int
+    command: Callable[[], str]
+
+
+@dataclass(frozen=True)
+class PythonFederate:
+    """A federate that is a Python class. A run uses it in its own process.
+
+    Attributes:
+        role: `PHYSICS` or `NETWORK`.
+        load: Imports the simulator, and returns the class with its properties. It raises `ConfigurationError` if
+            something is not installed; the remedy is the command that installs it.
+    """
+
+    role: int
+    load: Callable[[], FederateService]
+
+
+NamedFederate = ProgramFederate | PythonFederate
+"""Target of an entry point of the group `fieldkit.federates`."""
+
+
+def names(role: int) -> list[str]:
+    """Return the names of the federates of a role, in alphabetical order; only their packages are imported."""
+    return [point.name for point in plugins.entry_points(plugins.FEDERATES) if named(point.name, role) is not None]
+
+
+def named(where: str, role: int) -> NamedFederate | None:
+    """Return the federate of a name; None if it is not a name, but a command or an address.
+
+    Args:
+        where: A name, command or address.
+        role: The expected role.
+
+    Raises:
+        ConfigurationError: The package of the federate cannot be loaded, or the federate has another role.
+    """
+    for point in plugins.entry_points(plugins.FEDERATES):
+        if point.name == where:
+            federate = plugins.load(point)
+            if not isinstance(federate, NamedFederate):
+                raise ConfigurationError(
+                    "it is not a ProgramFederate or PythonFederate",
+                    where=plugins.location(point),
+                    remedy=plugins.REMEDY,
+                )
+            if federate.role != role:
+                raise ConfigurationError(
+                    f"{where} is a {ROLES[federate.role]}, not a {ROLES[role]}",
+                    remedy=f"use --{ROLES[federate.role]} {where}",
+                )
+            return federate
+    return None
+
+
+def command_line(where: str, role: int) -> str:
+    """Return the command that starts the federate of a name, or `where` itself if it is not a name.
+
+    Raises:
+        ConfigurationError: The federate cannot be used; the remedy states how to install what is missing.
+    """
+    federate = named(where, role)
+    if isinstance(federate, ProgramFederate):
+        return federate.command()
+    if isinstance(federate, PythonFederate):
+        federate.load()
+        return shlex.join((sys.executable, "-P", "-m", "sim_backends.federates", ROLES[role], where))
+    return where
