@@ -4,6 +4,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 from typing import Final
 
 from fieldkit.core import plugins
@@ -23,10 +24,12 @@ class ProgramFederate:
         role: `PHYSICS` or `NETWORK`.
         command: Returns its command line, and builds it before if necessary. It raises `ConfigurationError` if
             something is not installed; the remedy is the command that installs it.
+        summary: What it is, in one line.
     """
 
     role: int
     command: Callable[[], str]
+    summary: str = ""
 
 
 @dataclass(frozen=True)
@@ -37,19 +40,25 @@ class PythonFederate:
         role: `PHYSICS` or `NETWORK`.
         load: Imports the simulator, and returns the class with its properties. It raises `ConfigurationError` if
             something is not installed; the remedy is the command that installs it.
+        summary: What it is, in one line.
     """
 
     role: int
     load: Callable[[], FederateService]
+    summary: str = ""
 
 
 NamedFederate = ProgramFederate | PythonFederate
 """Target of an entry point of the group `fieldkit.federates`."""
 
 
-def names(role: int) -> list[str]:
-    """Return the names of the federates of a role, in alphabetical order; only their packages are imported."""
-    return [point.name for point in plugins.entry_points(plugins.FEDERATES) if named(point.name, role) is not None]
+def federates() -> dict[str, NamedFederate]:
+    """Return all federates by name; simulators are not imported.
+
+    Raises:
+        ConfigurationError: The package of a federate cannot be loaded.
+    """
+    return {point.name: _load(point) for point in plugins.entry_points(plugins.FEDERATES)}
 
 
 def named(where: str, role: int) -> NamedFederate | None:
@@ -62,22 +71,25 @@ def named(where: str, role: int) -> NamedFederate | None:
     Raises:
         ConfigurationError: The package of the federate cannot be loaded, or the federate has another role.
     """
-    for point in plugins.entry_points(plugins.FEDERATES):
-        if point.name == where:
-            federate = plugins.load(point)
-            if not isinstance(federate, NamedFederate):
-                raise ConfigurationError(
-                    "it is not a ProgramFederate or PythonFederate",
-                    where=plugins.location(point),
-                    remedy=plugins.REMEDY,
-                )
-            if federate.role != role:
-                raise ConfigurationError(
-                    f"{where} is a {ROLES[federate.role]}, not a {ROLES[role]}",
-                    remedy=f"use --{ROLES[federate.role]} {where}",
-                )
-            return federate
-    return None
+    point = next((point for point in plugins.entry_points(plugins.FEDERATES) if point.name == where), None)
+    if point is None:
+        return None
+    federate = _load(point)
+    if federate.role != role:
+        raise ConfigurationError(
+            f"{where} is a {ROLES[federate.role]}, not a {ROLES[role]}",
+            remedy=f"use --{ROLES[federate.role]} {where}",
+        )
+    return federate
+
+
+def _load(point: EntryPoint) -> NamedFederate:
+    federate = plugins.load(point)
+    if isinstance(federate, NamedFederate):
+        return federate
+    raise ConfigurationError(
+        "it is not a ProgramFederate or PythonFederate", where=plugins.location(point), remedy=plugins.REMEDY
+    )
 
 
 def command_line(where: str, role: int) -> str:

@@ -1,6 +1,7 @@
 """The arguments of `fieldkit cosim` and its commands; modules that only a running command needs are not imported."""
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,12 +42,7 @@ def _add_run(commands: Commands) -> None:
     _add_policy(parser, "sync policy (default: the scenario's)")
     _add_window(parser, "window of the sync policy")
     _add_seeds(parser)
-    for role in ("physics", "network"):
-        parser.add_argument(
-            f"--{role}",
-            metavar="FEDERATE",
-            help=f"external {role}: a command, tcp:HOST:PORT or tcp-listen:HOST:PORT (default: the scenario's)",
-        )
+    _add_federates(parser)
     parser.add_argument(
         "--out",
         type=Path,
@@ -74,6 +70,7 @@ def _add_shootout(commands: Commands) -> None:
     _add_policy(parser, "may be given more than once (default: all)", action="append", default=[])
     _add_window(parser, "windows to compare", dest="windows", metavar="TIME,...")
     _add_seeds(parser)
+    _add_federates(parser)
     modes = parser.add_mutually_exclusive_group()
     modes.add_argument("--bias", action="store_true", help="mean difference from the reference over seeds")
     modes.add_argument(
@@ -243,6 +240,17 @@ def _add_recording(parser: Parser) -> None:
     )
 
 
+def _add_federates(parser: Parser) -> None:
+    for role in ("physics", "network"):
+        action = parser.add_argument(
+            f"--{role}",
+            metavar="FEDERATE",
+            help=f"{role}: a simulator of `fieldkit cosim list`, a command, tcp:HOST:PORT or tcp-listen:HOST:PORT "
+            "(default: the scenario's)",
+        )
+        _set_completer(action, partial(_federate_names, role))
+
+
 def _add_policy(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: ANN401 (options of argparse)
     _set_completer(parser.add_argument("--policy", metavar="NAME", help=meaning, **options), _policy_names)
 
@@ -280,3 +288,10 @@ def _policy_names() -> Iterable[str]:
     from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (as above)
 
     return policies()
+
+
+def _federate_names(role: str) -> Iterable[str]:
+    from sim_backends.federates.frames import ROLES  # noqa: PLC0415 (as above)
+    from sim_backends.federates.named import BUILT_IN, federates  # noqa: PLC0415 (as above)
+
+    return [BUILT_IN, *(name for name, federate in federates().items() if ROLES[federate.role] == role)]
