@@ -282,6 +282,9 @@ CASES: Final[Mapping[str, Smallest]] = {
     "bridge": Smallest(
         "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLING_S": 0.5}, shrink=_two_bridge_paths, emulated=True
     ),
+    "studies.combinations": Smallest(
+        "run FOLDER/rows.csv --physics builtin --network builtin --policy scheduled --seeds 2 --duration 300ms"
+    ),
     "cosim_discovery": Smallest("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
     "cosim_exchange": Smallest("", {"COUNTS": (3,), "ROUNDS": 1, "EXCHANGES": 5}),
     "cosim_speed": Smallest("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy"),

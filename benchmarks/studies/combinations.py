@@ -1,0 +1,254 @@
+"""Every sync policy on every pair of simulators: `python -m benchmarks.studies.combinations run FILE.csv`.
+
+Runs one scenario with each physics, each network, each sync policy and each seed, and appends a row per run to a CSV
+file; combinations that the file has are not run again. `table FILE.csv` prints the tables of the documentation. A
+Gazebo must be running for `gazebo`.
+"""
+
+import argparse
+import csv
+import itertools
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fieldkit.core.text import print_text
+from sim_backends.cosim import build, load_scenario
+from sim_backends.cosim.comparison import errors, lost_share
+from sim_backends.cosim.policies.registry import BUILTIN
+from sim_backends.cosim.scenario.build import Simulation
+from sim_backends.cosim.studies.intervals import mean
+from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, delay_s, mean_separation_m, outcomes
+from sim_backends.federates.named import BUILT_IN
+
+REFERENCE: Final = "event_driven"
+MS: Final = 1e3
+
+
+class StudyRow(NamedTuple):
+    """The result of one run; nan is unknown.
+
+    Attributes:
+        physics: Name of the physics.
+        network: Name of the network.
+        policy: Name of the sync policy.
+        seed: Seed of all random draws.
+        loss: Share of lost packets.
+        delay_s: Mean delay of packets that arrived.
+        separation_m: Mean distance between agents over time.
+        time_error_s: Mean difference of delivery times from the exact reference of this pair of simulators.
+        path_error_m: Mean distance of agents from their positions in the reference.
+        other_fate: Share of packets with another fate than in the reference.
+        exchanges_per_s: Exchanges per simulated second.
+        wall_s: Wall time per simulated second.
+        failure: The reason why the policy could not be run; empty if it could.
+    """
+
+    physics: str
+    network: str
+    policy: str
+    seed: int
+    loss: float = math.nan
+    delay_s: float = math.nan
+    separation_m: float = math.nan
+    time_error_s: float = math.nan
+    path_error_m: float = math.nan
+    other_fate: float = math.nan
+    exchanges_per_s: float = math.nan
+    wall_s: float = math.nan
+    failure: str = ""
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Its physics and network."""
+        return self.physics, self.network
+
+
+_MEASURES: Final = StudyRow._fields[4:-1]
+
+
+def make(scenario: str, changes: Mapping[str, object], policy: str, seed: int) -> Simulation:
+    """Return a run that is ready to start."""
+    return build(load_scenario(scenario, changes), policy=policy, seed=seed)
+
+
+def study_rows(physics: str, network: str, results: Outcomes) -> Iterator[StudyRow]:
+    """Yield a row per run of a pair of simulators."""
+    for policy, runs in results.runs.items():
+        for seed in results.seeds:
+            row = StudyRow(physics, network, policy, seed)
+            if seed in runs:
+                yield _row(row, results.reference[seed], runs[seed])
+            else:
+                yield row._replace(failure=str(results.failures[policy]))
+
+
+def _row(run: StudyRow, reference: RunOutcome, outcome: RunOutcome) -> StudyRow:
+    differences = errors(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
+    return run._replace(
+        loss=lost_share(outcome.run),
+        delay_s=delay_s(outcome),
+        separation_m=mean_separation_m(outcome),
+        time_error_s=differences.delivery_error_s.mean,
+        path_error_m=differences.path_error_m.mean,
+        other_fate=differences.fate_disagreement,
+        exchanges_per_s=differences.exchanges_per_s,
+        wall_s=1 / differences.real_time_factor,
+    )
+
+
+def read_rows(path: Path) -> list[StudyRow]:
+    """Return the rows of a file; none if it does not exist."""
+    if not path.exists():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        return [
+            StudyRow(
+                record["physics"],
+                record["network"],
+                record["policy"],
+                int(record["seed"]),
+                *(float(record[name]) for name in _MEASURES),
+                record["failure"],
+            )
+            for record in csv.DictReader(file)
+        ]
+
+
+def append_rows(path: Path, rows: Sequence[StudyRow]) -> None:
+    """Append rows to a file."""
+    is_new = not path.exists()
+    with path.open("a", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        if is_new:
+            writer.writerow(StudyRow._fields)
+        writer.writerows(rows)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Run the missing combinations, append their rows to the file, and print its tables."""
+    done = {row.pair for row in read_rows(arguments.file)}
+    for pair in itertools.product(arguments.physics, arguments.network):
+        if pair in done:
+            continue
+        began_s = time.monotonic()
+        physics, network = pair
+        changes = {
+            "duration": arguments.duration,
+            "policy.window": arguments.window,
+            "physics.federate": physics,
+            "network.federate": network,
+        }
+        results = outcomes(
+            partial(make, arguments.scenario, changes), arguments.policy, range(1, arguments.seeds + 1), workers=1
+        )
+        append_rows(arguments.file, [*study_rows(physics, network, results)])
+        print_text(f"{physics} and {network}: {time.monotonic() - began_s:.0f} s", flush=True)
+    print_tables(arguments)
+
+
+def estimate_text(values: Sequence[float], scale: float, digits: int) -> str:
+    """Return the mean of seeds with its 95 % interval."""
+    finite = np.array([value for value in values if math.isfinite(value)]) * scale
+    estimate = mean(finite)
+    if math.isnan(estimate.low):
+        return "" if math.isnan(estimate.value) else f"{estimate.value:.{digits}f}"
+    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+
+
+def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
+    """Yield a table of the exact reference on each pair of simulators, beside the differences from the built-in pair.
+
+    Differences are those of runs with the same seed.
+    """
+    by_pair = by_pair_and_policy(rows)
+    built_in = by_pair[(BUILT_IN, BUILT_IN), REFERENCE]
+    yield (
+        "| physics | network | loss (%) | mean delay (ms) | difference (ms) | mean distance (m) | difference (mm) |"
+    )
+    yield "| --- | --- | --- | --- | --- | --- | --- |"
+    for (pair, policy), runs in by_pair.items():
+        if policy == REFERENCE:
+            delays_s = [run.delay_s - base.delay_s for run, base in zip(runs, built_in, strict=True)]
+            distances_m = [run.separation_m - base.separation_m for run, base in zip(runs, built_in, strict=True)]
+            cells = (
+                *pair,
+                estimate_text([run.loss for run in runs], 100, 1),
+                estimate_text([run.delay_s for run in runs], MS, 2),
+                estimate_text(delays_s, MS, 2),
+                estimate_text([run.separation_m for run in runs], 1, 3),
+                estimate_text(distances_m, MS, 1),
+            )
+            yield f"| {' | '.join(cells)} |"
+
+
+def policy_table(rows: Sequence[StudyRow]) -> Iterator[str]:
+    """Yield a table of each policy on each pair of simulators, relative to the exact reference on the same pair."""
+    yield (
+        "| physics | network | method | mean delay added (ms) | error of delivery time (ms) | "
+        "distance from the path (mm) | other fate (%) | exchanges per s | wall time per s (s) |"
+    )
+    yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+    by_pair = by_pair_and_policy(rows)
+    for (pair, policy), runs in by_pair.items():
+        if failure := next((run.failure for run in runs if run.failure), ""):
+            yield f"| {' | '.join(pair)} | `{policy}` | {failure} | | | | | |"
+            continue
+        reference = by_pair[pair, REFERENCE]
+        added_s = [run.delay_s - exact.delay_s for run, exact in zip(runs, reference, strict=True)]
+        cells = (
+            *pair,
+            f"`{policy}`",
+            estimate_text(added_s, MS, 2),
+            estimate_text([run.time_error_s for run in runs], MS, 2),
+            estimate_text([run.path_error_m for run in runs], MS, 1),
+            estimate_text([run.other_fate for run in runs], 100, 1),
+            f"{np.mean([run.exchanges_per_s for run in runs]):.0f}",
+            f"{np.median([run.wall_s for run in runs]):.2f}",
+        )
+        yield f"| {' | '.join(cells)} |"
+
+
+def by_pair_and_policy(rows: Sequence[StudyRow]) -> dict[tuple[tuple[str, str], str], list[StudyRow]]:
+    """Return the runs of each pair of simulators and policy, in order of seeds."""
+    grouped: dict[tuple[tuple[str, str], str], list[StudyRow]] = {}
+    for row in sorted(rows, key=lambda row: row.seed):
+        grouped.setdefault((row.pair, row.policy), []).append(row)
+    return dict(sorted(grouped.items(), key=lambda item: (item[0][0], list(BUILTIN).index(item[0][1]))))
+
+
+def print_tables(arguments: argparse.Namespace) -> None:
+    """Print the tables of a file."""
+    rows = read_rows(arguments.file)
+    for line in (*simulator_table(rows), "", *policy_table(rows)):
+        print_text(line)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run the study, or print its tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    runs = commands.add_parser("run")
+    runs.add_argument("file", type=Path)
+    runs.add_argument("--scenario", default="convoy")
+    runs.add_argument("--physics", nargs="+", default=[BUILT_IN, "mujoco", "gazebo"])
+    runs.add_argument("--network", nargs="+", default=[BUILT_IN, "ns3"])
+    runs.add_argument("--policy", nargs="+", default=[*BUILTIN], choices=BUILTIN)
+    runs.add_argument("--seeds", type=int, default=6)
+    runs.add_argument("--duration", default="10s")
+    runs.add_argument("--window", default="10ms")
+    runs.set_defaults(run=run)
+    tables = commands.add_parser("table")
+    tables.add_argument("file", type=Path)
+    tables.set_defaults(run=print_tables)
+    arguments = parser.parse_args(words)
+    arguments.run(arguments)
+
+
+if __name__ == "__main__":
+    main()
