@@ -69,7 +69,7 @@ class StudyRow(NamedTuple):
         return self.physics, self.network
 
 
-_MEASURES: Final = StudyRow._fields[4:-1]
+_TEXTS: Final = {"physics", "network", "policy", "failure"}
 
 
 def make(scenario: str, changes: Mapping[str, object], policy: str, seed: int) -> Simulation:
@@ -107,17 +107,11 @@ def read_rows(path: Path) -> list[StudyRow]:
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as file:
-        return [
-            StudyRow(
-                record["physics"],
-                record["network"],
-                record["policy"],
-                int(record["seed"]),
-                *(float(record[name]) for name in _MEASURES),
-                record["failure"],
-            )
-            for record in csv.DictReader(file)
-        ]
+        return [StudyRow._make(_value(name, text) for name, text in row.items()) for row in csv.DictReader(file)]
+
+
+def _value(name: str, text: str) -> str | int | float:
+    return int(text) if name == "seed" else text if name in _TEXTS else float(text)
 
 
 def append_rows(path: Path, rows: Sequence[StudyRow]) -> None:
