@@ -53,6 +53,6 @@ class AlongStep(Step, DependsOnCast, ChecksPlacement):
 
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
-        if self.along and not any(nest.leads for nest in within):
+        if self.along and not any(nest.has_path for nest in within):
             return f"along: true needs a move around it; put it into a move, or write {self.duration_key}"
         return None

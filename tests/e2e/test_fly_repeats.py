@@ -17,7 +17,7 @@ from tests.helpers.runs import fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
 
-WAY_M = 1.0
+PATH_M = 1.0
 HEIGHT_M = 0.4
 AIRBORNE_M = 0.1
 LAB = """\
@@ -42,7 +42,7 @@ steps:
   - fly:
       robot: receiver
       height: {height_m:g}m
-      path: [{{away: {way_m:g}m}}]
+      path: [{{away: {path_m:g}m}}]
       speed: 3m/s
       climb: 2m/s
       then: return
@@ -79,7 +79,7 @@ def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, mon
     profile = profile.replace("port: 14550", "port: 14550\n  autopilot: ardupilot\n  boot_s: 0")
     (tmp_path / "robots/copter.yaml").write_text(profile, encoding="utf-8")
     (tmp_path / "procedures/again.yaml").write_text(
-        PROCEDURE.format(repeats=repeats, height_m=HEIGHT_M, way_m=WAY_M), encoding="utf-8"
+        PROCEDURE.format(repeats=repeats, height_m=HEIGHT_M, path_m=PATH_M), encoding="utf-8"
     )
     (tmp_path / "lab.yaml").write_text(LAB, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
@@ -91,8 +91,10 @@ def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, mon
     flown = list(flights(places_m))
     home_m = places_m[0]
     for flight in flown:
-        away_m, aside_m = farthest_m(flight, home_m)
-        assert 0.4 * WAY_M < away_m < 1.3 * WAY_M, "it is called back on its way where the machine is busy"
+        apath_m, aside_m = farthest_m(flight, home_m)
+        assert 0.4 * PATH_M < apath_m < 1.3 * PATH_M, (
+            "it is ordered back before the end of its path if the machine is busy"
+        )
         assert abs(aside_m) < 0.3
     results = rows(only_trial(tmp_path))
     assert [row["status"] for row in results] == ["valid"] * repeats

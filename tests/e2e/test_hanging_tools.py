@@ -1,4 +1,4 @@
-"""Each tool on a robot hangs in turn, during its work or when queried for its version: the trial still ends."""
+"""One tool at a time hangs on a robot, during its work or when queried for its version: the trial still ends."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -43,7 +43,7 @@ attempts: 1
 steps:
   - move:
       robot: {role}
-      path: [{{away: {way_m:g}m}}]
+      path: [{{away: {path_m:g}m}}]
       speed: {speed_m_s:g}m/s
       during: [{{wait: {{duration: {wait_s:.1f}s}}}}]
 """
@@ -123,10 +123,10 @@ class RoverLab:
         session.end(deadline=Deadline.after(LONG_S), check=False)
         wait_until(lambda: self.stationary, Deadline.after(LONG_S))
 
-    def write_procedure(self, role: Role, way_m: float) -> None:
+    def write_procedure(self, role: Role, path_m: float) -> None:
         """Write the procedure `drive`, in which the robot of a role moves."""
-        wait_s = way_m / SPEED_M_S + 1.0  # it returns after the inner steps
-        text = _DRIVE.format(role=role, way_m=way_m, wait_s=wait_s, speed_m_s=SPEED_M_S)
+        wait_s = path_m / SPEED_M_S + 1.0  # it returns after the inner steps
+        text = _DRIVE.format(role=role, path_m=path_m, wait_s=wait_s, speed_m_s=SPEED_M_S)
         (self.folder / "procedures").mkdir(exist_ok=True)
         (self.folder / "procedures" / "drive.yaml").write_text(text, encoding="utf-8")
 

@@ -60,7 +60,7 @@ class PrintedColumn(Strict):
     name: Annotated[
         str,
         schema.pattern_field(
-            r"^[a-z][a-z0-9_]{0,40}$", "a name: small letters, digits and _, a small letter first, 41 in all"
+            r"^[a-z][a-z0-9_]{0,40}$", "a name: at most 41 lower-case letters, digits and _, a letter first"
         ),
     ]
     unit: Annotated[
@@ -152,7 +152,7 @@ class RunStep(Step, UsesSpace, Summarizes):
             variables.
         argv: The command as a list of words, in place of `command`.
         put: A program of the lab, at most 8.4 MB, which is copied to the robot before the first step: a path relative
-            to the folder of the procedure, else of the lab; links must not lead out of them. `{put}` is its path on
+            to the folder of the procedure, else of the lab; links must not point outside. `{put}` is its path on
             the robot. In `trial.yaml` it is a mapping with the keys below; in a procedure it is a path.
         takes: Approximate duration, for the estimate of the time left.
         limit: A program that runs longer is stopped, and the repeat is void.

@@ -133,7 +133,7 @@ def test_logs_of_mavlink_1_and_of_signed_frames(how: str, tmp_path: Path) -> Non
 def test_one_of_two_autopilots_must_be_named(tmp_path: Path) -> None:
     frames = [(0, Sender(system).frame(beat())) for system in (3, 4)]
     path = written(tmp_path, stamped(frames))
-    with pytest.raises(EvidenceError, match="autopilots of systems 3, 4: name one"):
+    with pytest.raises(EvidenceError, match="autopilots of systems 3, 4: choose one"):
         tlog.read(path, 0, 0)
     assert tlog.read(path, 4, 0).frames == 2
     with pytest.raises(EvidenceError, match="no heartbeat of an autopilot of system 5"):

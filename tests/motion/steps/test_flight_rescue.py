@@ -10,7 +10,7 @@ import pytest
 from fieldkit.agent.flying.liveness import ENDED, FLYING, IDLE, LANDING
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError
-from fieldkit.motion.steps.flight_rescue import MANUAL_ACTION, FlightRescue, LifeSigns
+from fieldkit.motion.steps.flight_rescue import MANUAL_ACTION, FlightRescue, LivenessMonitor
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
 from tests.helpers.sshd import wait_until
@@ -25,7 +25,7 @@ def sample(at_s: float, pilot: tuple[int, int], guard: tuple[int, int]) -> bytes
 
 def losses(samples: Sequence[bytes]) -> list[bool]:
     """Return for each sample whether the loss of both programs is detected."""
-    signs = LifeSigns()
+    signs = LivenessMonitor()
     return [signs.update(sample) for sample in samples]
 
 
@@ -79,7 +79,7 @@ class Robot:
 
 
 def rescue(robot: Robot, alarms: list[str], *, sends: bool = True) -> FlightRescue:
-    return FlightRescue(cast("Shell", robot), RESCUE, ".jobs/guard/liveness", alarms.append, sends=sends)
+    return FlightRescue(cast("Shell", robot), RESCUE, ".jobs/guard/liveness", alarms.append, may_send=sends)
 
 
 def test_rescue_starts_once_with_an_alarm() -> None:

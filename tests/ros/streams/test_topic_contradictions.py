@@ -97,7 +97,7 @@ def test_a_log_without_half_of_the_arrivals_is_noticed(kind: str, tmp_path: Path
     if kind == "reliable with samples given up":  # nothing behind a gap need ever be handed over
         assert reasons
         return
-    assert "arrived by the subscriber's capture, but are not in the subscriber's log" in reasons[0]
+    assert "arrived according to the subscriber's capture, but are not in the subscriber's log" in reasons[0]
 
 
 def other_numbers(_: int, row: Row) -> Row:
