@@ -1,4 +1,4 @@
-"""Arguments that several commands share. Nothing here imports what a command runs."""
+"""Arguments that several commands share. This module imports no code that the commands run."""
 
 import argparse
 from pathlib import Path

@@ -216,8 +216,8 @@ class ExpectationJudged:
         protocol: Protocol of the repeats; empty if there are no repeats.
         ruling: `holds`, `does not hold` or `undecided`.
         why: Reason for the ruling, if the numbers do not show it; empty otherwise.
-        measured: Measured value, formatted for people.
-        interval: Its interval or bound, formatted for people; empty if there is none.
+        measured: Measured value as text with a unit.
+        interval: Its interval or bound as text; empty if there is none.
         n: Number of valid repeats that have the figure.
         n_valid: Number of valid repeats.
         n_censored: Number of repeats among `n` with a right-censored value.

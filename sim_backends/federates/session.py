@@ -112,7 +112,7 @@ class FederateSession:
             body: Body of the request.
             answer: Kind of the answer.
             decode: Returns the answer of its body.
-            what: Returns the requested action of the federate, for errors.
+            what: Returns what the federate is asked to do, for errors.
 
         Raises:
             UnansweredError: It did not answer within its deadline.

@@ -147,7 +147,7 @@ def accept_federate(address: TcpAddress, expected_token: str, deadline_s: float)
         deadline_s: Time of `time.monotonic` until which to wait.
 
     Raises:
-        DeadlineError: No federate with this token has connected; the message has the reason for the last rejection.
+        DeadlineError: No federate with this token has connected; the message has the reason of the last rejection.
     """
     rejection = ""
     with listening(address) as server:

@@ -18,7 +18,7 @@ from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.columns import IDENTITY, filled_by, installed, measures, of_steps, trial_columns
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.procedure import Procedure
-from tests.helpers import meter, varied
+from tests.helpers import meter, vendor_trials
 from tests.helpers.casts import los_plan
 from tests.helpers.outside_packages import write_package
 
@@ -207,32 +207,40 @@ def test_columns_of_other_packages_are_only_in_trials_that_use_them() -> None:
 
 # Tables.
 
-OF_TRIAL = [column for column in varied.VENDOR if column.name.startswith("probe")]
+OF_TRIAL = [column for column in vendor_trials.VENDOR_COLUMNS if column.name.startswith("probe")]
 
 
 def written(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bool = True) -> Path:
-    plan = varied.plan(name, distance="30ft", metres=9.144, columns=columns)
-    return varied.write(folder, plan, varied.measured(plan, repeats=2), with_plan=with_plan) / "trial.csv"
+    plan = vendor_trials.plan(name, distance="30ft", metres=9.144, columns=columns)
+    return (
+        vendor_trials.write(folder, plan, vendor_trials.valid_rows(plan, repeats=2), with_plan=with_plan)
+        / "trial.csv"
+    )
 
 
 def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Path) -> None:
-    found = tables.declared_in([written(tmp_path, "one", varied.VENDOR)])
-    assert found == (*trial_columns(), *(Column(**{**vars(column), "rank": 100}) for column in varied.VENDOR))
+    found = tables.declared_in([written(tmp_path, "one", vendor_trials.VENDOR_COLUMNS)])
+    assert found == (
+        *trial_columns(),
+        *(Column(**{**vars(column), "rank": 100}) for column in vendor_trials.VENDOR_COLUMNS),
+    )
 
 
 def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
-    paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", varied.NAMED)]
+    paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", vendor_trials.NAMED_STEP_COLUMNS)]
     read = repeats.read(paths, tables.declared_in(paths))
     assert [value is None for value in read.column("probe.level")] == [False] * 4 + [True] * 4
     assert [value is None for value in read.column("up.transfer_s")] == [True] * 4 + [False] * 4
 
 
 def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path: Path) -> None:
-    alone = written(tmp_path, "one", (*varied.NAMED, *varied.VENDOR), with_plan=False)
+    alone = written(
+        tmp_path, "one", (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS), with_plan=False
+    )
     found = {column.name: column for column in tables.declared_in([alone])}
-    for column in varied.NAMED:
+    for column in vendor_trials.NAMED_STEP_COLUMNS:
         assert found[column.name] == column
-    for column in varied.VENDOR:
+    for column in vendor_trials.VENDOR_COLUMNS:
         assert found[column.name] == repeats.undeclared(column.name)
 
 

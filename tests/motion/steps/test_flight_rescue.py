@@ -100,7 +100,7 @@ def test_blocked_alarm_does_not_delay_the_rescue() -> None:
     def hang(_text: str) -> None:
         is_released.wait(60)
 
-    with FlightRescue(cast("Shell", robot), RESCUE, ".jobs/guard/liveness", hang, sends=True):
+    with FlightRescue(cast("Shell", robot), RESCUE, ".jobs/guard/liveness", hang, may_send=True):
         wait_until(lambda: "start" in robot.calls, Deadline.after(60))
         is_released.set()
 
