@@ -187,7 +187,7 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(out
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def test_a_drone_flies_on_without_its_laptop_until_abort(outside: Outside) -> None:
+def test_a_drone_continues_without_its_laptop_until_abort(outside: Outside) -> None:
     """If fieldkit is killed, the drone lands when its lease ends; `fieldkit abort` ends its job before that."""
     process = flying(outside, Role.RECEIVER, how="land", lease="60s")
     process.kill()

@@ -82,7 +82,7 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     assert [read.column(name)[0] for name in row] == kept
 
 
-def test_common_columns_come_first_whatever_their_rank() -> None:
+def test_common_columns_are_first_independently_of_their_rank() -> None:
     beyond = [Column("probe.level", "dBm", "x", rank=1), Column("status", "count", "not this one")]
     assert trial_columns(beyond) == (*trial_columns(), beyond[0])
     assert trial_columns()[: len(IDENTITY)] == IDENTITY
@@ -210,7 +210,7 @@ def test_columns_of_other_packages_are_only_in_trials_that_use_them() -> None:
 OF_TRIAL = [column for column in vendor_trials.VENDOR_COLUMNS if column.name.startswith("probe")]
 
 
-def written(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bool = True) -> Path:
+def write_trial(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bool = True) -> Path:
     plan = vendor_trials.plan(name, distance="30ft", metres=9.144, columns=columns)
     return (
         vendor_trials.write(folder, plan, vendor_trials.valid_rows(plan, repeats=2), with_plan=with_plan)
@@ -219,7 +219,7 @@ def written(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bo
 
 
 def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Path) -> None:
-    found = tables.declared_in([written(tmp_path, "one", vendor_trials.VENDOR_COLUMNS)])
+    found = tables.declared_in([write_trial(tmp_path, "one", vendor_trials.VENDOR_COLUMNS)])
     assert found == (
         *trial_columns(),
         *(Column(**{**vars(column), "rank": 100}) for column in vendor_trials.VENDOR_COLUMNS),
@@ -227,14 +227,14 @@ def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Pat
 
 
 def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
-    paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", vendor_trials.NAMED_STEP_COLUMNS)]
+    paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", vendor_trials.NAMED_STEP_COLUMNS)]
     read = repeats.read(paths, tables.declared_in(paths))
     assert [value is None for value in read.column("probe.level")] == [False] * 4 + [True] * 4
     assert [value is None for value in read.column("up.transfer_s")] == [True] * 4 + [False] * 4
 
 
 def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path: Path) -> None:
-    alone = written(
+    alone = write_trial(
         tmp_path, "one", (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS), with_plan=False
     )
     found = {column.name: column for column in tables.declared_in([alone])}
@@ -245,7 +245,10 @@ def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path:
 
 
 def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: Path) -> None:
-    paths = [written(tmp_path / "a", "one", OF_TRIAL, with_plan=False), written(tmp_path / "b", "two", OF_TRIAL)]
+    paths = [
+        write_trial(tmp_path / "a", "one", OF_TRIAL, with_plan=False),
+        write_trial(tmp_path / "b", "two", OF_TRIAL),
+    ]
     (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
     assert level.unit == "dBm"
 
@@ -260,7 +263,7 @@ def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: P
     ],
 )
 def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path, other: Column) -> None:
-    paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", [other])]
+    paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", [other])]
     with pytest.raises(ConfigurationError, match=r"probe\.level is another column here") as refused:
         tables.declared_in(paths)
     assert refused.value.where == str(paths[1].with_name("trial.yaml"))
@@ -269,7 +272,7 @@ def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path
 def test_plans_may_differ_in_meaning_and_bounds_of_a_column(tmp_path: Path) -> None:
     other = Column("probe.level", "dBm", "Level.", bounds=(-90, 0), figure=Figure("signal", Kind.MEDIAN))
     same = Column("probe.level", "dBm", "What it says.", bounds=(-120, -10), figure=Figure("level", Kind.MEDIAN))
-    paths = [written(tmp_path, "one", [other]), written(tmp_path, "two", [same])]
+    paths = [write_trial(tmp_path, "one", [other]), write_trial(tmp_path, "two", [same])]
     (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
     assert (level.meaning, level.bounds) == ("Level.", (-120, 0))
 
@@ -293,7 +296,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("columns", HOSTILE.values(), ids=HOSTILE)
 def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns: str) -> None:
-    table = written(tmp_path, "one", OF_TRIAL)
+    table = write_trial(tmp_path, "one", OF_TRIAL)
     path = table.with_name("trial.yaml")
     head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
     path.write_text(f"{head}columns:\n{columns}\n", encoding="utf-8")
@@ -306,7 +309,7 @@ def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns
 
 
 def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:
-    table = written(tmp_path, "one", [Column("probe.level", "dBm", "x")])
+    table = write_trial(tmp_path, "one", [Column("probe.level", "dBm", "x")])
     path = table.with_name("trial.yaml")
     spoiled = path.read_text(encoding="utf-8").replace("name: probe.level", "name: status", 1)
     path.write_text(spoiled, encoding="utf-8")
@@ -316,7 +319,7 @@ def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:
 
 
 def test_a_plan_that_is_a_link_is_not_read(tmp_path: Path) -> None:
-    table = written(tmp_path, "one", [Column("probe.level", "dBm", "x")])
+    table = write_trial(tmp_path, "one", [Column("probe.level", "dBm", "x")])
     plan = table.with_name("trial.yaml")
     plan.rename(tmp_path / "elsewhere.yaml")
     plan.symlink_to(tmp_path / "elsewhere.yaml")

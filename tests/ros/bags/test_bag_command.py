@@ -42,7 +42,7 @@ def expected(count: int) -> list[Message]:
     ]
 
 
-def written(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
+def write_bag(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
     """Return a bag written by rosbags; for ROS 1 compressed, with about 20 messages per chunk."""
     if form is BagFormat.ROS1:
         types = get_typestore(Stores.ROS1_NOETIC)
@@ -100,7 +100,7 @@ def data_file(bag: Path) -> Path:
 
 @pytest.mark.parametrize("form", BagFormat)
 def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: pytest.CaptureFixture[str]) -> None:
-    bag = written(tmp_path, form, expected(31))
+    bag = write_bag(tmp_path, form, expected(31))
     assert main(["bag", "info", str(bag), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["format"], report["messages"], report["problems"]) == (form.value, 31, [])
@@ -117,7 +117,7 @@ def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: 
 @pytest.mark.parametrize("share", [0.35, 0.8, 0.97])
 def test_start_of_a_truncated_file_is_recovered(tmp_path: Path, form: BagFormat, share: float) -> None:
     messages = expected(300)
-    bag = written(tmp_path, form, messages)
+    bag = write_bag(tmp_path, form, messages)
     file = data_file(bag)
     with file.open("r+b") as opened:
         opened.truncate(int(share * file.stat().st_size))
@@ -165,7 +165,7 @@ def test_ros_reads_a_repaired_bag(tmp_path: Path) -> None:
 
 def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path) -> None:
     messages = expected(40)
-    bag = written(tmp_path, BagFormat.SQLITE, messages)
+    bag = write_bag(tmp_path, BagFormat.SQLITE, messages)
     file, remaining = data_file(bag), tmp_path / "left"
     remaining.mkdir()
     with closing(sqlite3.connect(file)) as database:
@@ -193,7 +193,7 @@ def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path)
 @pytest.mark.parametrize("to", BagFormat)
 def test_conversion_keeps_all_messages(tmp_path: Path, form: BagFormat, to: BagFormat) -> None:
     messages = expected(30)
-    bag = written(tmp_path, form, messages)
+    bag = write_bag(tmp_path, form, messages)
     new = tmp_path / ("new.bag" if to is BagFormat.ROS1 else "new")
     storage = () if to is BagFormat.ROS1 else ("--storage", to.value)
     assert main(["bag", "convert", str(bag), str(new), *storage]) == 0
@@ -261,7 +261,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_impossible_requests_are_reported(
     here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, output_text: str
 ) -> None:
-    written(here, BagFormat.ROS1, expected(5))
+    write_bag(here, BagFormat.ROS1, expected(5))
     Path("text.bag").write_text("a text")
     Path("packed.bag.gz").write_bytes(gzip.compress(b"a bag"))
     Path("empty.bag").touch()
@@ -301,7 +301,7 @@ def test_single_mcap_file_is_a_bag(
 
 
 def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = data_file(written(tmp_path, BagFormat.SQLITE, expected(300)))
+    whole = data_file(write_bag(tmp_path, BagFormat.SQLITE, expected(300)))
     cut = tmp_path / "cut.db3"
     cut.write_bytes(whole.read_bytes()[:30_000])
     assert main(["bag", "check", str(cut)]) == EvidenceError.exit_code
