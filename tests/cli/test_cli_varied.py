@@ -117,7 +117,7 @@ def test_runs_with_different_definitions_of_a_column_are_not_compared(
         plan = vendor_trials.plan(name, distance="30ft", metres=9.144, columns=[column])
         vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan))
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force"]) == 2
-    assert "probe.level is another column here (mW, median) than in" in capsys.readouterr().err
+    assert "probe.level is a different column here (mW, median) than in" in capsys.readouterr().err
 
 
 def test_exports_have_types_units_and_meanings_of_all_columns(

@@ -37,7 +37,7 @@ from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
 from tests.helpers.casts import CAST, los_plan
 from tests.motion.logs.test_drive_log import drive
-from tests.ros.bags.test_bag_positions import BEGAN_NS, S, fix, odometry, transform, written
+from tests.ros.bags.test_bag_positions import BEGAN_NS, S, fix, odometry, transform, write_bag
 from tests.ros.bags.test_recorded_topics import ROS2, log, write
 
 _ENDS: Final = (Role.SENDER, Role.RECEIVER)
@@ -134,7 +134,7 @@ def _tracks() -> dict[str, bytes]:
     found = {}
     for name, messages in messages_by_kind.items():
         with tempfile.TemporaryDirectory() as folder:
-            found[name] = written(Path(folder), messages).read_bytes()
+            found[name] = write_bag(Path(folder), messages).read_bytes()
     return found
 
 

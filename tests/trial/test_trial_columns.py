@@ -264,7 +264,7 @@ def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: P
 )
 def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path, other: Column) -> None:
     paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", [other])]
-    with pytest.raises(ConfigurationError, match=r"probe\.level is another column here") as refused:
+    with pytest.raises(ConfigurationError, match=r"probe\.level is a different column here") as refused:
         tables.declared_in(paths)
     assert refused.value.where == str(paths[1].with_name("trial.yaml"))
 

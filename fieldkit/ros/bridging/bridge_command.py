@@ -73,7 +73,7 @@ def add(parser: Parser) -> None:
         metavar="IP",
         action="append",
         default=[],
-        help="peer over DDS or Zenoh, contacted in place of multicast discovery; may be given more than once",
+        help="peer over DDS or Zenoh, contacted instead of multicast discovery; may be given more than once",
     )
     parser.add_argument(
         "--domain", type=shared.natural, metavar="N", help="domain of ROS 2 (default: ROS_DOMAIN_ID, or 0)"
@@ -100,7 +100,7 @@ def add(parser: Parser) -> None:
     parser.add_argument(
         "--json",
         action="store_true",
-        help="print a list with an object per topic and direction in place of the table",
+        help="print a list with an object per topic and direction instead of the table",
     )
     parser.set_defaults(run=f"{__name__}:run")
 

@@ -100,7 +100,7 @@ class TrackedRobot(Strict):
         times: Time of a message: `header`, its stamp, or `received`, when the recorder received it, for stamps of
             another clock.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
-        at: A fixed position, in place of a topic.
+        at: A fixed position, instead of a topic.
     """
 
     topic: TopicName | None = None

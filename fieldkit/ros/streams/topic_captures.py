@@ -202,7 +202,7 @@ class _Arrivals:
         early_ns = -int(self.after_ns.min(initial=0))
         if early_ns > STAMP_NS:
             early_count = int((self.after_ns < -STAMP_NS).sum())
-            early_text = f"{format_count(early_count, 'sample')} in the subscriber's log are up to"
+            early_text = f"{format_count(early_count, 'sample')} in the subscriber's log arrived up to"
             yield f"{early_text} {early_ns / 1e9:.6f} s earlier than their packets in its capture"
         if self.latency_s is not None and len(self.latency_s) > 2:
             least_s = float(self.latency_s.min())
@@ -339,7 +339,7 @@ def _early_samples(samples: TopicSamples, times_ns: Ints, payload_bytes: Ints, s
     needed_bytes = size_bytes * np.arange(1, len(arrival) + 1)
     if early_count := int((captured_bytes < needed_bytes).sum()):
         early_text = f"{format_count(early_count, 'sample')} in the subscriber's log"
-        yield f"{early_text} are earlier than their bytes in its capture"
+        yield f"{early_text} arrived earlier than their bytes in its capture"
 
 
 def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, complete: bool) -> int:

@@ -54,7 +54,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     Attributes:
         duration: How long it sends, in whole seconds; 10 s without `size`.
-        size: How much it sends, `10MB`, in place of `duration`.
+        size: How much it sends, `10MB`, instead of `duration`.
         reverse: Whether the server sends and the client receives.
         limit: A test that takes longer is stopped, and the repeat is void. With `along` it is added to the duration.
     """

@@ -18,7 +18,7 @@ from fieldkit.measure.positions import position_columns, position_sources
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, PLACED, WGS84
 from fieldkit.measure.robot_clock import Offset
-from tests.ros.bags.test_bag_positions import BEGAN_NS, S, odometry, stamped, written
+from tests.ros.bags.test_bag_positions import BEGAN_NS, S, odometry, stamped, write_bag
 
 SENDER, RECEIVER = Role.SENDER, Role.RECEIVER
 ENDS = (SENDER, RECEIVER)
@@ -64,7 +64,7 @@ def test_sources_of_the_trial_precede_those_of_the_attempt_and_of_the_testbed(at
     assert mean_m(attempt) == "the positions of the robots are unknown"
     (attempt / track.FILE).write_text(track.text(ORACLE), encoding="ascii")
     assert mean_m(attempt) == pytest.approx(100)
-    written(attempt, AWAY)
+    write_bag(attempt, AWAY)
     write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt) == pytest.approx(12)
     assert position_columns.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
@@ -97,7 +97,7 @@ def test_times_of_robots_are_converted_to_one_clock(
     attempt: Path, clocks: Mapping[Role, float], metres: float
 ) -> None:
     wrong_ns = round(1e9 * clocks.get(RECEIVER, 0.0)) if clocks.get(RECEIVER) == -3600 else 0
-    written(attempt, [odometry(BEGAN_NS + wrong_ns + n * S, float(n), 0.0) for n in range(-1, 6)], late_ns=wrong_ns)
+    write_bag(attempt, [odometry(BEGAN_NS + wrong_ns + n * S, float(n), 0.0) for n in range(-1, 6)], late_ns=wrong_ns)
     start = PositionSource(
         file="track.bag",
         topic="/where",
@@ -123,20 +123,20 @@ def test_times_of_robots_are_converted_to_one_clock(
 def test_times_that_are_not_covered_are_missing_with_a_reason(
     attempt: Path, begin_s: float, end_s: float, why: str
 ) -> None:
-    written(attempt, AWAY)
+    write_bag(attempt, AWAY)
     write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt, begin_s, end_s) == why
 
 
 def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
-    written(attempt, AWAY[:2] + AWAY[3:])
+    write_bag(attempt, AWAY[:2] + AWAY[3:])
     write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     why = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
     assert mean_m(attempt) == why
 
 
 def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt: Path) -> None:
-    written(attempt, AWAY[:2] + AWAY[3:])
+    write_bag(attempt, AWAY[:2] + AWAY[3:])
     write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
     distances = position_columns.distances_m(AttemptEvidence(attempt), ENDS)
     begin_ns = BEGAN_NS + S // 4
@@ -147,7 +147,7 @@ def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt
 
 
 def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
-    written(attempt, AWAY)
+    write_bag(attempt, AWAY)
     write_sources(attempt, {RECEIVER: ODOMETRY})
     assert mean_m(attempt) == "no source has the position of the sender"
     (attempt / "track.bag").unlink()
@@ -156,7 +156,7 @@ def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
 
 
 def test_a_tracker_and_a_fixed_place_in_its_frame(attempt: Path) -> None:
-    written(attempt, [stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
+    write_bag(attempt, [stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
     tracker = PositionSource(file="track.bag", topic="/where")
     write_sources(attempt, {SENDER: PositionSource(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
