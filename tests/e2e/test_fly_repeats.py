@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.model import Role, Vector
-from tests.helpers.outside import robots_outside
+from tests.helpers.field_robots import start_field_robots
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, only_trial, rows
 
@@ -83,10 +83,10 @@ def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, mon
     )
     (tmp_path / "lab.yaml").write_text(LAB, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    with robots_outside(tmp_path, site=tmp_path / "lab.yaml") as outside:
+    with start_field_robots(tmp_path, site=tmp_path / "lab.yaml") as field_robots:
         run = fieldkit(tmp_path, "trial", "again", "5m", "--yes", "--allow-motion", "--allow-motion-after-fault")
         assert run.code == 0, run.err
-        track = [place for place in outside.testbed.oracle.track(0) if place.role is Role.RECEIVER]
+        track = [place for place in field_robots.testbed.oracle.track(0) if place.role is Role.RECEIVER]
     places_m = [place.position_m for place in track if place.position_m is not None]
     flown = list(flights(places_m))
     home_m = places_m[0]
