@@ -2,11 +2,11 @@
 
 The captures are of a UDP transfer of 200,000 IP packets with a loss of 10 %: fragments of 8,192-byte datagrams, with
 128 bytes captured of each, as in a trial. Each peer reads both captures into columns and matches the packets by
-identification and offset; in every round all peers run in turn, and all must compute the same losses. fieldkit does
-all that `fieldkit.measure.transfers.transfer_measures` does with captures: losses of packets, datagrams and bytes,
-the transfer's time, the paper's counts. The peers, dpkt, tshark and scapy, only count lost packets. scapy would take
-minutes and reads only the first packets; tshark is omitted if it is not installed. Times are processor times,
-children included, which other load disturbs less.
+identification and offset; in every round all peers run one after the other, and all must compute the same losses.
+fieldkit does all that `fieldkit.measure.transfers.transfer_measures` does with captures: losses of packets, datagrams
+and bytes, the transfer's time, the paper's counts. The peers, dpkt, tshark and scapy, only count lost packets. scapy
+would take minutes and reads only the first packets; tshark is omitted if it is not installed. Times are processor
+times, children included, which other load disturbs less.
 
 At the end fieldkit streams a sparse file of 10 GB in a separate process, whose peak memory is printed. With `--whole
 MIB` another process reads a capture of this size into columns, as a trial does.

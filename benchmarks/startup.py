@@ -1,8 +1,8 @@
 """Start-up time of commands: `python -m benchmarks.startup`; needs no root.
 
-Each command of fieldkit runs in turn with its references: Python that does nothing, `git --version`, and Python that
-only imports the libraries of the command. It measures wall time, processor time and the peak memory of the process,
-which is at least the 16 MB of this benchmark. The main figure is fieldkit's processor time minus that of its
+Each command of fieldkit runs alternately with its references: Python that does nothing, `git --version`, and Python
+that only imports the libraries of the command. It measures wall time, processor time and the peak memory of the
+process, which is at least the 16 MB of this benchmark. The main figure is fieldkit's processor time minus that of its
 libraries. `--peer PYTHON` runs fieldkit of another checkout with that Python.
 """
 

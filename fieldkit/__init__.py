@@ -3,7 +3,7 @@
 `fieldkit.load("trials")` gives the repeats, cells and packets of trials as tables: docs/python-api.md.
 """
 
-TYPE_CHECKING = False  # of `typing`, which alone takes longer to import than this; checkers know it by its name
+TYPE_CHECKING = False  # importing it from `typing` would take longer; type checkers recognize the name
 if TYPE_CHECKING:
     from fieldkit.api.trials import Trials, load
 
@@ -13,7 +13,7 @@ __version__ = "0.1.0"
 if not TYPE_CHECKING:
 
     def __getattr__(name):  # noqa: ANN001, ANN202 (types are those above)
-        """Import what reads trials when it is first asked for: a command that needs none starts without it."""
+        """Import the reader of trials on first use, so that commands that do not need it start faster."""
         if name not in {"Trials", "load"}:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from fieldkit.api import trials  # noqa: PLC0415

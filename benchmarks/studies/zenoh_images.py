@@ -3,7 +3,7 @@
 It needs root. Two emulated robots of a separate lab are 20 m apart. The agent of the step `topics` is compared with a
 plain pair of Zenoh sessions on the same robots (benchmarks/studies/zenoh_plain.py, which imports nothing of
 fieldkit), with several settings; each round runs all of them in sequence. Losses of this stream are bimodal, so each
-repeat is printed and no mean.
+repeat is printed instead of a mean.
 
 A repeat takes 11 s, a round of six settings about 70 s.
 """
@@ -226,8 +226,8 @@ def main() -> None:
         lost_images = measure(Path(folder), options.rounds)
     control = Path("/proc/sys/net/ipv4/tcp_congestion_control").read_text(encoding="ascii").strip()
     conditions = (
-        f"{time.strftime('%Y-%m-%d', time.gmtime())}: {options.rounds} repeats of each, in turn; TCP with {control}; "
-        f"load average of the last 15 minutes {os.getloadavg()[2]:.1f}."
+        f"{time.strftime('%Y-%m-%d', time.gmtime())}: {options.rounds} repeats of each, alternating; TCP with "
+        f"{control}; load average of the last 15 minutes {os.getloadavg()[2]:.1f}."
     )
     if options.json:
         files.write(options.json, json.dumps(lost_images).encode())

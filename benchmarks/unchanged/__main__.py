@@ -122,7 +122,7 @@ def _tests(base: Tree, head: Tree) -> bool:
     print(f"\n{changes.summary()}")
     for line in changes.lines():
         print(f"  {line}")
-    return not changes.found
+    return not changes.has_differences
 
 
 if __name__ == "__main__":

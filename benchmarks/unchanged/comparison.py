@@ -1,8 +1,8 @@
-"""Compare two recorded outputs: they are equal, differ only in words, or differ.
+"""Compare two recorded outputs: they are equal, differ only in words, or differ in other parts.
 
-What programs read (commands of dry runs, tables, exports, hashes, exit codes) must be equal byte by byte. What people
-read (help, messages, tables on a terminal, reports) may differ in words, which are listed as labels; numbers and
-options must be the same ones, in the same order.
+Machine-readable output (commands of dry runs, tables, exports, hashes, exit codes) must be equal byte by byte. Other
+text (help, messages, tables on a terminal, reports) may differ in words, which are listed as labels; its numbers and
+options must be equal and in the same order.
 """
 
 import difflib
@@ -25,7 +25,7 @@ _VARYING: Final = (
     (re.compile(r"(job|agent|fieldkit)-[0-9a-f]{12}\b"), r"\1-HASH"),
 )
 _FIXED: Final = re.compile(r"--[a-z][a-z-]+|\d+(?:\.\d+)?")
-"""The parts of a text for people that must not change: options and numbers."""
+"""Parts of other text that must not change: options and numbers."""
 
 _WORDS_IN_EVENTS: Final = frozenset(
     ("text", "how", "note", "detail", "remedy", "reason", "summary", "question", "why")
@@ -56,7 +56,7 @@ class Differences:
 
 
 def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
-    """Compare what an item printed and wrote with both trees.
+    """Compare the outputs of an item with both trees.
 
     Args:
         item: The item.
@@ -69,7 +69,7 @@ def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
     code = (before / "exit_code").read_text(encoding="ascii").strip()
     if item.succeeds and code != "0":
         error = (before / "stderr").read_text(encoding="utf-8", errors="replace").strip()
-        differences.real.append(f"no proof: exit code {code} with the base\n{error}")
+        differences.real.append(f"nothing is proved: exit code {code} with the base\n{error}")
     names = [{str(path.relative_to(top)) for path in top.rglob("*") if path.is_file()} for top in (before, after)]
     if item.kind is Class.TRIALS:
         differences.add(_trials(before, after))

@@ -66,7 +66,7 @@ class Changes:
     bodies: list[str] = field(default_factory=list)
 
     @property
-    def found(self) -> bool:
+    def has_differences(self) -> bool:
         """True if anything differs except for added tests."""
         return bool(self.removed or self.assertions or self.bodies)
 

@@ -63,7 +63,7 @@ class Concern:
 
     Attributes:
         what: The column, or a description of a value that is computed from columns.
-        a: Value of A, formatted for people; `unknown` if its rows do not contain it.
+        a: Value of A as text; `unknown` if its rows do not contain it.
         b: Value of B.
         cells: Names of the affected conditions; empty for all.
         refuses: Whether the difference makes the runs incomparable; otherwise it is only a note.

@@ -1,4 +1,4 @@
-"""Texts for people about estimates, judgements and comparisons: numbers with units, intervals, verdicts, cautions."""
+"""Texts about estimates, judgements and comparisons: numbers with units, intervals, verdicts, cautions."""
 
 import math
 import re

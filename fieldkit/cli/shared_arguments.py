@@ -1,4 +1,4 @@
-"""Arguments that several commands share. Nothing here imports what a command runs."""
+"""Arguments that several commands share. This module imports no code that the commands run."""
 
 import argparse
 from pathlib import Path
@@ -159,5 +159,5 @@ def repeats(text: str) -> int:
 
 
 def free_text(text: str) -> str:
-    """Return a text with `?` in place of bytes that are not UTF-8 and of control characters."""
+    """Return a text with `?` instead of bytes that are not UTF-8 and of control characters."""
     return sanitized(text)

@@ -13,7 +13,7 @@ class Named(Strict):
 
     Attributes:
         name: The file's name without `.yaml`.
-        summary: One line for people.
+        summary: Description in one line.
     """
 
     name: str
@@ -38,8 +38,8 @@ def validate_named(document: schema.Document, model: type[Item], name: str) -> I
     loaded = schema.validate(document, model)
     if loaded.name != name:
         raise ConfigurationError(
-            f"name is {loaded.name!r}, the file is called {name!r}",
+            f"name is {loaded.name!r}, but the file name is {name!r}",
             where=document.where(("name",)),
-            remedy="make them equal",
+            remedy="change one of them, so that they are equal",
         )
     return loaded

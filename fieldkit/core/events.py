@@ -215,9 +215,9 @@ class ExpectationJudged:
         expectation: The expectation as written in the procedure.
         protocol: Protocol of the repeats; empty if there are no repeats.
         ruling: `holds`, `does not hold` or `undecided`.
-        why: Reason of the ruling that the numbers do not show; empty if they show it.
-        measured: Measured value, formatted for people.
-        interval: Its interval or bound, formatted for people; empty if there is none.
+        why: Reason for the ruling, if the numbers do not show it; empty otherwise.
+        measured: Measured value as text with a unit.
+        interval: Its interval or bound as text; empty if there is none.
         n: Number of valid repeats that have the figure.
         n_valid: Number of valid repeats.
         n_censored: Number of repeats among `n` with a right-censored value.

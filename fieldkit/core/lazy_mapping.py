@@ -1,4 +1,4 @@
-"""What entry points name, loaded at first use."""
+"""Objects of entry points, which are loaded on first use."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 
 
 class LazyMapping(Mapping[str, Item]):
-    """What entry points name, by name. An object is loaded when it is looked up.
+    """The objects of entry points by name. An object is loaded when its key is read.
 
     Args:
         points: The entry points.

@@ -96,7 +96,7 @@ def format_count(count: int, noun: str) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """Return a duration for people: `0.4 s`, `12 s`, `3 min 05 s`, `1 h 02 min`."""
+    """Return a duration as text: `0.4 s`, `12 s`, `3 min 05 s`, `1 h 02 min`."""
     if seconds < 9.95:
         return f"{seconds:.1f} s"
     whole = round(seconds)
@@ -129,13 +129,13 @@ class TimeEstimate:
         return self.most_s <= _CERTAIN_RATIO * self.likely_s
 
     def __str__(self) -> str:
-        """Return the text for people: `4 min 00 s`, followed by `, up to 19 min 00 s` if that is clearly more."""
+        """Return the duration as text: `4 min 00 s`, followed by `, up to 19 min 00 s` if that is clearly more."""
         most = "" if self.is_certain else f", up to {format_duration(self.most_s)}"
         return f"{format_duration(self.likely_s)}{most}"
 
 
 def format_bytes(size_bytes: float) -> str:
-    """Return a size for people: `0.2 kB`, `35 MB`, `1.2 GB`."""
+    """Return a size as text: `0.2 kB`, `35 MB`, `1.2 GB`."""
     for unit in ("kB", "MB", "GB"):
         size_bytes /= 1000
         if size_bytes < 1000 or unit == "GB":

@@ -252,7 +252,7 @@ def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterato
     for reply in pings.replies:
         if reply.at_utc_ns is not None:
             yield Message(channel, reply.at_utc_ns, schemas.rtt(reply.at_utc_ns, repeat, reply))
-    log = _channel(record, role, "log", schemas.LOG, "ICMP errors in place of a reply to ping.")
+    log = _channel(record, role, "log", schemas.LOG, "ICMP errors instead of a reply to ping.")
     for problem in pings.problems:
         if problem.at_utc_ns is not None:
             text = f"icmp_seq={problem.seq}: {problem.source} reports {problem.text}"

@@ -1,1 +1,1 @@
-"""Robots that move by themselves: they drive, or fly over MAVLink. Entry points add this package to the harness."""
+"""Robots that drive automatically, or fly over MAVLink. Entry points add this package to the harness."""

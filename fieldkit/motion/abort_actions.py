@@ -58,7 +58,7 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
 
     @override
     def around_steps(self, plan: "Plan", scene: Scene, shells: Shells) -> AbstractContextManager[None]:
-        from fieldkit.motion.running.guards import guarded  # noqa: PLC0415 (it imports what flies a drone)
+        from fieldkit.motion.running.guards import guarded  # noqa: PLC0415 (it imports the code that flies drones)
 
         return guarded(self, plan, scene, shells)
 

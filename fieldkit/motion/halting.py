@@ -34,20 +34,20 @@ class Halted:
         return max(states, key=BY_SEVERITY.index, default=MotionState.NOTHING)
 
 
-def halt(shell: Shell, who: str, deadline: Deadline) -> Halted:
+def halt(shell: Shell, operator: str, deadline: Deadline) -> Halted:
     """Stop all programs that move a robot, from any trial, and the trial that has locked the robot.
 
     The script is not installed for it, as for `jobs.abort`: a full disk must not prevent a stop.
 
     Args:
         shell: The robot.
-        who: Name of the operator, which is reported to the stopped trial.
-        deadline: When to give up.
+        operator: Name of the operator, which is reported to the stopped trial.
+        deadline: Time limit.
 
     Raises:
         LinkError: The robot did not answer.
     """
-    argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "halt_motion", word(who))
+    argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "halt_motion", word(operator))
     done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
     error = None
     try:
@@ -57,18 +57,18 @@ def halt(shell: Shell, who: str, deadline: Deadline) -> Halted:
     return Halted(_states(done.stdout), error)
 
 
-def halt_attempt(shell: Shell, folder: str, who: str, deadline: Deadline) -> Halted:
+def halt_attempt(shell: Shell, folder: str, operator: str, deadline: Deadline) -> Halted:
     """Stop all programs that move a robot for the attempt with this folder; the job script must be installed.
 
     Raises:
         LinkError: The robot did not answer.
         RobotError: The script failed.
     """
-    return Halted(_states(call(shell, "halt_motion", word(who), folder, deadline=deadline)))
+    return Halted(_states(call(shell, "halt_motion", word(operator), folder, deadline=deadline)))
 
 
 def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Halted:
-    """Return the present state of programs from `halt_attempt`; raises as that."""
+    """Return the present state of programs that `halt_attempt` returned; raises as `halt_attempt`."""
     return Halted(_states(call(shell, "motion_states", *programs, deadline=deadline)))
 
 
@@ -79,7 +79,7 @@ def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
 
 def halt_all(
     robots: Mapping[str, Shell | FieldkitError],
-    who: str,
+    operator: str,
     within_s: float,
     report: Callable[[str, Halted], None] = lambda _name, _halted: None,
 ) -> Mapping[str, Halted]:
@@ -87,9 +87,9 @@ def halt_all(
 
     Args:
         robots: The robots, from `Backend.persistent_shells`.
-        who: Name of the operator, see `halt`.
+        operator: Name of the operator, see `halt`.
         within_s: Timeout for each robot.
-        report: Called with each result as soon as it exists, in any thread.
+        report: Called with each result as soon as it is known, in any thread.
     """
 
     def stop(name: str) -> Halted:
@@ -98,7 +98,7 @@ def halt_all(
             halted = (
                 Halted(error=robot)
                 if isinstance(robot, FieldkitError)
-                else halt(robot, who, Deadline.after(within_s))
+                else halt(robot, operator, Deadline.after(within_s))
             )
         except FieldkitError as error:
             halted = Halted(error=error)

@@ -1,4 +1,4 @@
-"""Origins of robots that move by themselves, and the record of their motions: the interface for steps."""
+"""Interface for steps: the origins of robots that drive or fly automatically, and the record of their motions."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -46,7 +46,7 @@ class RobotMotion:
         self.is_over = False
 
     def mark_ended(self, at: MotionOrigin | None = None) -> None:
-        """Record that the motion ended as planned; `at` is as the attribute."""
+        """Record that the motion ended as planned; for `at`, see the attribute."""
         self.at, self.is_over = at, True
 
 
@@ -81,7 +81,7 @@ class Origins(Protocol):
         """Record the origin of a robot; it is on disk when this returns.
 
         Raises:
-            OSError: The disk is full or gone. The robot must not move.
+            OSError: The disk is full or was removed. The robot must not move.
         """
         ...
 
@@ -98,8 +98,8 @@ class Origins(Protocol):
     def moving(self, role: Role) -> AbstractContextManager[RobotMotion]:
         """Record that a robot moves while the body runs. The record is on disk before the body begins.
 
-        Unless the body calls `RobotMotion.mark_ended`, no robot moves again before a person has confirmed. The call
-        is missing after a fault, and after this process was killed within the body.
+        Unless the body calls `RobotMotion.mark_ended`, no robot moves again before a person has confirmed. The body
+        does not call it after a fault, or if this process is killed.
 
         Raises:
             MotionHeldError: A fault stopped a robot earlier, and no person has confirmed since.

@@ -1,4 +1,4 @@
-"""Permissions of the operator that robots need to move by themselves; each is an option `--allow-NAME`."""
+"""Permissions of the operator, without which robots do not drive or fly; each is an option `--allow-NAME`."""
 
 from typing import Final
 
@@ -11,5 +11,5 @@ MOTION: Final = Permission(
     "allow fieldkit to drive real robots in steps that move them (safety: `fieldkit docs motion`)", is_repeated=True
 )
 AFTER_FAULT: Final = Permission(
-    "after a fault stopped a robot, let robots move again from their positions without a question"
+    "after a fault stopped a robot, let robots move again from their positions without a confirmation"
 )

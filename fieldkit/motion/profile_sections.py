@@ -1,4 +1,4 @@
-"""Sections of robot profiles for robots that move by themselves: `drive` for ground robots, `mavlink` for drones."""
+"""Sections of robot profiles for robots that move automatically: `drive` for ground robots, `mavlink` for drones."""
 
 from collections.abc import Iterable
 from typing import Annotated, Final
@@ -14,7 +14,7 @@ DRIVE: Final = "drive"
 MAVLINK: Final = "mavlink"
 
 MIN_CHARGE: Final = 0.2
-"""No drone starts a flight below this charge. Battery makers recommend to keep 20 %."""
+"""No drone starts a flight below this charge. Battery makers recommend keeping 20 %."""
 
 _CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
 
@@ -24,7 +24,7 @@ BOOT_S: Final = 2.0
 
 
 class Mavlink(ProfileSection):
-    """Its autopilot, if it has one; an emulated robot has an [emulated autopilot](emulated-autopilot.md).
+    """The robot's autopilot, if it has one; an emulated robot has an [emulated autopilot](emulated-autopilot.md).
 
     Attributes:
         port: UDP port on which it listens on the radio.

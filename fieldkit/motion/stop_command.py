@@ -1,7 +1,7 @@
 """`fieldkit stop`: stop robots that fieldkit moves, immediately.
 
-An operator waits for it, so it imports only the code that reaches robots: neither pydantic nor profiles, steps and
-trials.
+An operator waits for it, so it imports only the code that connects to robots: neither pydantic nor profiles, steps
+and trials.
 """
 
 import argparse
@@ -31,11 +31,11 @@ from fieldkit.remote.shell import Shell
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit stop`."""
     parser.description = (
-        "Stop all robots that fieldkit drives or flies, immediately, in parallel and without questions, even if the "
-        "program that started them is another one or has ended: ground robots stop, drones land, or return and "
-        "land. Nothing is sent to a robot that no program of fieldkit moves. A trial that holds one of the robots "
-        "ends, with exit code 3. Prints a line per robot. Exit code 3 if a robot was not reached or has not "
-        "confirmed; the other robots are stopped nevertheless."
+        "Stop all robots that fieldkit drives or flies, immediately, in parallel and without questions, even if "
+        "another instance of fieldkit moves them, or that instance has exited: ground robots stop, drones land, or "
+        "return and land. Nothing is sent to a robot that no program of fieldkit moves. A trial that has locked one "
+        "of the robots ends, with exit code 3. Prints a line per robot. Exit code 3 if a robot was not reached or "
+        "has not confirmed; the other robots are stopped nevertheless."
     )
     shared.add_site(parser)
     which = parser.add_mutually_exclusive_group(required=True)
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     def report(name: str, result: Halted) -> None:
         with printing:
-            print_text(f"{name}: {_in_words(result)}", flush=True)
+            print_text(f"{name}: {_state_text(result)}", flush=True)
 
     with _robots(arguments) as robots:
         if not robots:
@@ -124,7 +124,7 @@ def _failed(result: Halted) -> bool:
     return result.error is not None or result.state in {MotionState.SILENT, MotionState.ALARM}
 
 
-def _in_words(result: Halted) -> str:
+def _state_text(result: Halted) -> str:
     """Return the state of a robot after the order to stop, in one line."""
     if result.error is None:
         return STATE_TEXTS[result.state]

@@ -17,8 +17,8 @@ from fieldkit.report.trial_folders import Evidence
 
 MAX_DISTANCES: Final = 3
 """Maximum number of distances with a panel: the nearest, the middle and the farthest."""
-_ROOM: Final = 1.03
-_LOG_ROOM: Final = 1.1
+_MARGIN: Final = 1.03
+_LOG_MARGIN: Final = 1.1
 """Factor between the ends of an axis and the extreme times."""
 _LOG: Final = ", on a logarithmic axis"
 MAX_STEPS: Final = 120
@@ -110,8 +110,8 @@ def _chart(
                     series=series,
                     words=_words(f"{title}, {condition}, {place}", place_samples, identities, scale),
                     top=1.0,
-                    left=scale.factor * float(same_protocol_s.min()) / _LOG_ROOM if is_log else 0.0,
-                    right=scale.factor * float(same_protocol_s.max()) * (_LOG_ROOM if is_log else _ROOM),
+                    left=scale.factor * float(same_protocol_s.min()) / _LOG_MARGIN if is_log else 0.0,
+                    right=scale.factor * float(same_protocol_s.max()) * (_LOG_MARGIN if is_log else _MARGIN),
                     x_log=is_log,
                 )
             )

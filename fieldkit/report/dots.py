@@ -20,7 +20,7 @@ _DODGE: Final = 0.7
 """Share of a lane over which the conditions of one quantity are spread."""
 _ASIDE: Final = 0.12
 """Offset of single repeats below their estimate, as a share of the height of a condition."""
-_LOG_ROOM: Final = 1.25
+_LOG_MARGIN: Final = 1.25
 """Factor between the ends of a logarithmic axis and the extreme values."""
 _LABELS: Final = {
     "share": "share",
@@ -147,7 +147,7 @@ def _with_limits(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
     """Return a panel with the ends of its axis of values, which is logarithmic if values need it."""
     values = list(chain.from_iterable((point.value, *point.repeats) for point in points))
     if needs_log(values):
-        return replace(panel, x_log=True, left=min(values) / _LOG_ROOM, right=max(values) * _LOG_ROOM)
+        return replace(panel, x_log=True, left=min(values) / _LOG_MARGIN, right=max(values) * _LOG_MARGIN)
     left, right = axis_limits(points, unit)
     return replace(panel, left=left, right=right)
 

@@ -19,7 +19,7 @@ class AlongStep(Step, DependsOnCast, ChecksPlacement):
 
     Attributes:
         duration_key: The key that sets its duration without `along`: `duration` or `count`.
-        along: Whether the step lasts as long as the path of the `move` around it, in place of its own duration or
+        along: Whether the step lasts as long as the path of the `move` around it, instead of its own duration or
             count. Inside `fly` it is not possible.
     """
 
@@ -53,6 +53,6 @@ class AlongStep(Step, DependsOnCast, ChecksPlacement):
 
     @override
     def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
-        if self.along and not any(nest.leads for nest in within):
+        if self.along and not any(nest.has_path for nest in within):
             return f"along: true needs a move around it; put it into a move, or write {self.duration_key}"
         return None

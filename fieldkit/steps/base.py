@@ -25,14 +25,14 @@ from fieldkit.steps.view import View
 StepName = Annotated[
     str,
     schema.pattern_field(
-        r"^[a-z][a-z0-9_]{0,30}$", "a name: small letters, digits and _, a small letter first, 31 in all"
+        r"^[a-z][a-z0-9_]{0,30}$", "a name: at most 31 lower-case letters, digits and _, a letter first"
     ),
 ]
 """Name of a step or a bag."""
 FileName = Annotated[
     str,
     schema.pattern_field(
-        r"^[a-z][a-z0-9_.-]{0,40}$", "the name of a file: small letters, digits, _ . and -, 41 in all"
+        r"^[a-z][a-z0-9_.-]{0,40}$", "the name of a file: at most 41 lower-case letters, digits, _ . and -"
     ),
 ]
 """Name of a file in the folder of an attempt."""

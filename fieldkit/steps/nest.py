@@ -23,12 +23,12 @@ class Nest(Step, DependsOnCast, ABC):
         during: The steps inside.
         disturbs: Whether the step may make the steps inside fail, so that their evidence may be incomplete.
         parallel: Whether the steps inside run at the same time.
-        leads: Whether the step has a path whose duration steps inside can use (`along: true`).
+        has_path: Whether the step has a path whose duration steps inside can use (`along: true`).
     """
 
     disturbs: ClassVar[bool] = False
     parallel: ClassVar[bool] = False
-    leads: ClassVar[bool] = False
+    has_path: ClassVar[bool] = False
 
     during: tuple[StepEntry, ...]
 

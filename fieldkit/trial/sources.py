@@ -176,7 +176,7 @@ def find_each(runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = Fal
 def _find_tables(paths: Sequence[Path], note: Note, *, rebuild: bool) -> list[Path]:
     by_identity = {_identity(table): table for path in paths for table in _tables(path, note, rebuild=rebuild)}
     if not by_identity:
-        remedy = "add --rebuild, or make each as the notes above say"
+        remedy = "add --rebuild, or run the commands in the notes above"
         raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=_paths_text(paths), remedy=remedy)
     return list(by_identity.values())
 
@@ -203,7 +203,7 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
         )
     for folder in folders:
         if not rebuild and (reason := files.unexpected_type(folder / store.TRIAL_CSV)):
-            note(f"{folder / store.TRIAL_CSV}: {reason}, and is left out")
+            note(f"{folder / store.TRIAL_CSV}: {reason}; it is left out")
         elif rebuild or (folder / store.TRIAL_CSV).is_file():
             yield folder / store.TRIAL_CSV
         else:

@@ -60,7 +60,8 @@ def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str
             first, kept = merged.setdefault(column.name, (path, column))
             if _type_of(kept) != _type_of(column):
                 raise ConfigurationError(
-                    f"{column.name} is another column here ({_in_words(column)}) than in {first} ({_in_words(kept)})",
+                    f"{column.name} is a different column here ({_description(column)}) "
+                    f"than in {first} ({_description(kept)})",
                     where=str(path),
                     remedy="combine only trials in which it is the same",
                 )
@@ -95,5 +96,5 @@ def _type_of(column: Column) -> tuple[object, ...]:
     return column.unit, figure and (figure.kind, figure.arrived, figure.sent)
 
 
-def _in_words(column: Column) -> str:
+def _description(column: Column) -> str:
     return f"{column.unit}, {column.figure.kind}" if column.figure else column.unit

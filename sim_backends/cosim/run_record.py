@@ -25,7 +25,7 @@ class Fate:
         arrived_ns: Time when the network delivered it, or None.
         counted_ns: Time from which the arrival counts for its receiver: by the policy, `arrived_ns` or the end of the
             window.
-        late_ns: Time by which the receiver had already passed `counted_ns`.
+        late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; else 0.
         reason: The reason why it never arrived; empty if it arrived or is under way.
         position_error_m: Largest error of the relative position that the network assumed for two of the agents that
             affect the packet; None if these are source and destination only (`packet_ledger.position_error_m`).

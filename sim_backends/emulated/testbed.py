@@ -152,7 +152,7 @@ class EmulatedTestbed:
                 robot.kill(fault.process)
         return 0.0
 
-    def bring_back(self, role: Role, *, has_returned: bool) -> None:  # noqa: ARG002 (all repeats must start alike)
+    def bring_back(self, role: Role, *, has_returned: bool) -> None:  # noqa: ARG002 (all repeats must start in the same way)
         """Implement `Testbed.bring_back`; the robot is exactly at its place, independently of its odometry."""
         self._mobility.return_to_place(role)
 

@@ -181,7 +181,7 @@ class FrameReader:
             layout: Layout of the count.
 
         Raises:
-            MalformedFrameError: The frame has no room for that many items.
+            MalformedFrameError: The frame is too small for that many items.
         """
         position = self.position
         (count,) = self.unpack(layout)

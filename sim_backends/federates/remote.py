@@ -113,7 +113,7 @@ class RemotePhysics(_RemoteFederate):
         )
         if states_ns != at_ns:
             self.session.fail(
-                f"{self.session.name}, asked to advance to {seconds_text(to_ns)}, returned the states at "
+                f"{self.session.name}, requested to advance to {seconds_text(to_ns)}, returned the states at "
                 f"{seconds_text(states_ns)} instead of {seconds_text(at_ns)}, its last step until then"
             )
         self._states, self._states_ns = states, at_ns
@@ -171,7 +171,7 @@ class RemoteNetwork(_RemoteFederate):
         )
         if outcomes.at_ns != to_ns:
             self.session.fail(
-                f"{self.session.name}, asked to advance to {seconds_text(to_ns)}, advanced to "
+                f"{self.session.name}, requested to advance to {seconds_text(to_ns)}, advanced to "
                 f"{seconds_text(outcomes.at_ns)}"
             )
         self._next_event_ns = outcomes.next_event_ns

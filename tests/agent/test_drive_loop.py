@@ -138,7 +138,7 @@ class World:
 def run(
     world: World, monkeypatch: pytest.MonkeyPatch, folder: Path
 ) -> tuple[str, list[dict[str, Any]], dict[str, Any]]:
-    """Drive; return the reason of the end, the log and the last status."""
+    """Drive; return the reason for the end, the log and the last status."""
     monkeypatch.setattr(drive, "time", world)
     monkeypatch.setattr(drive, "now_s", world.monotonic)
     arguments: Mapping[str, Any] = {

@@ -223,16 +223,16 @@ def test_duration_of_a_path_is_predicted(
 def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
     driver, pose = Driver(replace(TASK, legs=[leg]), 0.0), OdometryPose(0.0, 0.0, math.atan2(*reversed(leg)))
     driver.on_odometry(0.0, OdometryPose(0.0, 0.0, 0.0))
-    way_m = 0.0
+    distance_m = 0.0
     for number in range(1, 1200):
         at_s = number * TICK_S
         driver.on_odometry(at_s, pose if driver.phase != "waits" else OdometryPose(0.0, 0.0, 0.0))
         driver.on_order(at_s, OUT)
-        way_m += driver.tick(at_s).forward_m_s * TICK_S
+        distance_m += driver.tick(at_s).forward_m_s * TICK_S
         if driver.stop_reason:
             break
     assert driver.stop_reason.startswith("1.3 m were commanded, but by its odometry the robot drove 0.0 m")
-    assert way_m < 1.5, "of 5 m to its fence"
+    assert distance_m < 1.5, "of 5 m to its fence"
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ def test_holms_procedure_with_four_p_values() -> None:
 
 
 @given(st.lists(st.floats(0, 1), max_size=20))
-def test_holm_rejects_where_the_sequential_procedure_does(p_values: list[float]) -> None:
+def test_holm_rejects_if_the_sequential_procedure_does(p_values: list[float]) -> None:
     rejected = set()
     for rank, index in enumerate(sorted(range(len(p_values)), key=lambda position: p_values[position])):
         if p_values[index] * (len(p_values) - rank) >= 0.05:

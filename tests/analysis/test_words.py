@@ -42,14 +42,15 @@ def cell(*words: str) -> Cell:
 
 
 @given(st.lists(st.tuples(st.sampled_from(("tcp", "udp")), st.sampled_from(("", "wet", "dry", "a=b"))), min_size=1))
-def test_each_word_is_counted_in_its_condition(given_: list[tuple[str, str]]) -> None:
+def test_each_word_is_counted_in_its_condition(words_by_protocol: list[tuple[str, str]]) -> None:
     expected = {
-        protocol: Counter(word for entry, word in given_ if entry == protocol and word) for protocol, _ in given_
+        protocol: Counter(word for entry, word in words_by_protocol if entry == protocol and word)
+        for protocol, _ in words_by_protocol
     }
     names = [column.name for column in COLUMNS]
     rows_of = [
         {**replace(COMPARABLE, repeat=1 + number, protocol=protocol), "grass": word}
-        for number, (protocol, word) in enumerate(given_)
+        for number, (protocol, word) in enumerate(words_by_protocol)
     ]
     text = csv_text(names, ([entry.get(name) for name in names] for entry in rows_of))
     for entry in aggregate(repeats.parse(text.encode(), COLUMNS)):

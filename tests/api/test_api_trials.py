@@ -20,7 +20,7 @@ from fieldkit.core.columns import cell
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.export.table import Table
 from fieldkit.trial import store
-from tests.helpers import recorded, varied
+from tests.helpers import recorded, vendor_trials
 from tests.helpers.recorded import AHEAD_NS, LOST, PACKETS, SECOND_NS, START_NS
 from tests.helpers.stored_trials import TRIALS
 
@@ -31,9 +31,11 @@ LOSSY = next(path for path in STORED if path.name.startswith("20261122T013134"))
 @pytest.fixture
 def named(tmp_path: Path) -> Path:
     """Two trials with named steps and a vendor's columns."""
-    for number, columns in enumerate((varied.NAMED, (*varied.NAMED, *varied.VENDOR))):
-        plan = varied.plan(f"named-{number}", distance="10m", metres=10.0, columns=columns)
-        varied.write(tmp_path / "trials", plan, varied.measured(plan, seed=number))
+    for number, columns in enumerate(
+        (vendor_trials.NAMED_STEP_COLUMNS, (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS))
+    ):
+        plan = vendor_trials.plan(f"named-{number}", distance="10m", metres=10.0, columns=columns)
+        vendor_trials.write(tmp_path / "trials", plan, vendor_trials.valid_rows(plan, seed=number))
     return tmp_path / "trials"
 
 

@@ -112,7 +112,7 @@ def test_everything_else_is_a_difference(tmp_path: Path, item: Item, before: Fil
 def test_failure_at_the_base_commit_is_no_proof(tmp_path: Path) -> None:
     failed: Files = {"exit_code": "3\n", "stderr": "error: no namespaces"}
     (difference,) = compare_outputs(tmp_path, Item(Class.TRIALS), failed, failed).real
-    assert difference.startswith("no proof: exit code 3")
+    assert difference.startswith("nothing is proved: exit code 3")
 
 
 def test_emulated_trials_may_differ_in_numbers_but_not_in_fields_files_and_columns(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def changes(tmp_path: Path, after: str, name: str = "test_a.py", before: str = B
 @pytest.mark.parametrize("name", ["test_a.py", "motion/test_b.py"])
 def test_names_imports_labels_and_files_may_change(tmp_path: Path, name: str) -> None:
     found = changes(tmp_path, RENAMED, name)
-    assert (found.found, found.same, list(found.lines())) == (False, 2, [])
+    assert (found.has_differences, found.same, list(found.lines())) == (False, 2, [])
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_names_imports_labels_and_files_may_change(tmp_path: Path, name: str) ->
 def test_a_changed_check_is_listed(tmp_path: Path, old: str, new: str, shown: str) -> None:
     assert old in BEFORE
     found = changes(tmp_path, BEFORE.replace(old, new, 1))
-    assert found.found
+    assert found.has_differences
     assert any(line.startswith(shown) for line in found.lines()), list(found.lines())
 
 

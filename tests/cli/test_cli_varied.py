@@ -11,7 +11,7 @@ import pytest
 
 from fieldkit.cli import main
 from fieldkit.core.columns import Column, Figure, Kind
-from tests.helpers import varied
+from tests.helpers import vendor_trials
 
 DISTANCES = {"10ft": 3.048, "30ft": 9.144}
 
@@ -20,9 +20,12 @@ DISTANCES = {"10ft": 3.048, "30ft": 9.144}
 def trials(tmp_path: Path) -> Path:
     """For each distance, a trial with two transfers, two pings and a vendor's meter, and one with only the meter."""
     for index, (distance, metres) in enumerate(DISTANCES.items()):
-        for name, columns in (("all", (*varied.NAMED, *varied.VENDOR)), ("meter", varied.VENDOR)):
-            plan = varied.plan(f"{name}-{distance}", distance=distance, metres=metres, columns=columns)
-            varied.write(tmp_path, plan, varied.measured(plan, seed=index))
+        for name, columns in (
+            ("all", (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS)),
+            ("meter", vendor_trials.VENDOR_COLUMNS),
+        ):
+            plan = vendor_trials.plan(f"{name}-{distance}", distance=distance, metres=metres, columns=columns)
+            vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, seed=index))
     return tmp_path
 
 
@@ -90,8 +93,8 @@ def test_width_in_any_unit_gives_the_number_of_repeats_needed(
 
 def test_two_runs_are_compared_in_any_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, level_dbm in (("a", -40.0), ("b", -46.0)):
-        plan = varied.plan(name, distance="30ft", metres=9.144, columns=varied.VENDOR)
-        varied.write(tmp_path, plan, varied.measured(plan, repeats=20, seed=3, level_dbm=level_dbm))
+        plan = vendor_trials.plan(name, distance="30ft", metres=9.144, columns=vendor_trials.VENDOR_COLUMNS)
+        vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, repeats=20, seed=3, level_dbm=level_dbm))
     words = ("compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force")
     text = output_of(capsys, *words, "--format", "csv")
     level = next(line for line in records(text) if line["quantity"] == "probe.level")
@@ -110,11 +113,11 @@ def test_runs_with_different_definitions_of_a_column_are_not_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = Column("probe.level", "mW", "In another unit.", figure=Figure("level", Kind.MEDIAN))
-    for name, column in (("a", varied.VENDOR[0]), ("b", other)):
-        plan = varied.plan(name, distance="30ft", metres=9.144, columns=[column])
-        varied.write(tmp_path, plan, varied.measured(plan))
+    for name, column in (("a", vendor_trials.VENDOR_COLUMNS[0]), ("b", other)):
+        plan = vendor_trials.plan(name, distance="30ft", metres=9.144, columns=[column])
+        vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan))
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force"]) == 2
-    assert "probe.level is another column here (mW, median) than in" in capsys.readouterr().err
+    assert "probe.level is a different column here (mW, median) than in" in capsys.readouterr().err
 
 
 def test_exports_have_types_units_and_meanings_of_all_columns(
@@ -123,7 +126,7 @@ def test_exports_have_types_units_and_meanings_of_all_columns(
     monkeypatch.chdir(trials)
     output_of(capsys, "export", ".", "--format", "parquet", "-o", "all.parquet")
     table = pyarrow.parquet.read_table(trials / "all.parquet")
-    for column in (*varied.NAMED, *varied.VENDOR):
+    for column in (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS):
         kept = table.schema.field(column.name).metadata
         assert (kept[b"unit"].decode(), kept[b"meaning"].decode()) == (column.unit, column.meaning)
     assert table.column("probe.level").null_count == 0
@@ -164,8 +167,8 @@ def test_report_lists_the_quantities_that_it_does_not_draw(
     monkeypatch.chdir(tmp_path)
     many = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
     for distance, metres in DISTANCES.items():
-        plan = varied.plan(distance, distance=distance, metres=metres, columns=many)
-        varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
+        plan = vendor_trials.plan(distance, distance=distance, metres=metres, columns=many)
+        vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, repeats=2))
     output_of(capsys, "report", ".", "-o", "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "a: m11 against distance" in page
@@ -180,8 +183,8 @@ def test_quantities_of_one_distance_do_not_displace_curves(
     many = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
     last = Column("b.level", "V", "Voltage.", figure=Figure("b: level", Kind.MEDIAN))
     for (distance, metres), columns in zip(DISTANCES.items(), ((*many, last), (last,)), strict=True):
-        plan = varied.plan(distance, distance=distance, metres=metres, columns=columns)
-        varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
+        plan = vendor_trials.plan(distance, distance=distance, metres=metres, columns=columns)
+        vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, repeats=2))
     output_of(capsys, "report", ".", "-o", "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "b: level against distance" in page
@@ -200,8 +203,8 @@ def test_texts_of_a_plan_are_escaped_in_all_formats(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     column = Column("a", text[:20], text, figure=Figure(text, Kind.MEDIAN))
-    plan = varied.plan("one", distance="30ft", metres=9.144, columns=[column])
-    varied.write(tmp_path, plan, varied.measured(plan, repeats=2))
+    plan = vendor_trials.plan("one", distance="30ft", metres=9.144, columns=[column])
+    vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, repeats=2))
     output_of(capsys, "report", ".", "-o", "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<script" not in page

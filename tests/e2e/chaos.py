@@ -20,8 +20,8 @@ from fieldkit.core.model import Fault, FaultKind, Protocol, Role, Status
 from fieldkit.remote import jobs
 from fieldkit.trial import journal
 from sim_backends.emulated.backend import DEFAULT_SITE
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import write_procedure
-from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit, only_trial, rows, start
 
 MAX_STARTS: Final = 60
@@ -147,14 +147,14 @@ class Chaos:
     """One trial with injected faults.
 
     Args:
-        outside: The robots.
+        field_robots: The robots.
         seed: Seed of the faults, their times and robots.
         repeats: Repeats per protocol.
         faults: Maximum number of faults; the trial may end before the last.
     """
 
-    def __init__(self, outside: Outside, *, seed: int, repeats: int, faults: int) -> None:
-        self._outside = outside
+    def __init__(self, field_robots: FieldRobots, *, seed: int, repeats: int, faults: int) -> None:
+        self._field_robots = field_robots
         self._random = random.Random(seed)
         self._budget = faults
         self._deck: list[str] = []
@@ -163,7 +163,7 @@ class Chaos:
         self._process: subprocess.Popen[str] | None = None
 
     def run(self) -> Tally:
-        lab = self._outside.folder
+        lab = self._field_robots.folder
         name = write_procedure(lab, PROCEDURE)
         words: tuple[str, ...] = ("trial", name, "5m", "--repeats", str(self._repeats), "--yes", "--json")
         while (ended := self._run_once(*words)).code != 0 and self.tally.starts < MAX_STARTS:
@@ -183,12 +183,12 @@ class Chaos:
 
     def _trial_exists(self) -> bool:
         """Return True if there is a trial to resume."""
-        return any((self._outside.folder / "trials").glob("*/trial.yaml"))
+        return any((self._field_robots.folder / "trials").glob("*/trial.yaml"))
 
     def _run_once(self, *words: str) -> Run:
         """Start fieldkit and inject faults until it ends."""
         self.tally.starts += 1
-        self._process = start(self._outside.folder, *words)
+        self._process = start(self._field_robots.folder, *words)
         while self._process.poll() is None and self._budget > 0:
             try:
                 self._process.wait(self._random.uniform(0.2, 4.0))
@@ -210,14 +210,16 @@ class Chaos:
     def _unexplained(self) -> list[Void]:
         """Return the void attempts so far that no fault explains."""
         return (
-            unexplained(_voids(only_trial(self._outside.folder)), self.tally.faults) if self._trial_exists() else []
+            unexplained(_voids(only_trial(self._field_robots.folder)), self.tally.faults)
+            if self._trial_exists()
+            else []
         )
 
     def _inject(self) -> None:
-        inject = self._outside.testbed.inject
+        inject = self._field_robots.testbed.inject
         faults: dict[str, Callable[[Role], object]] = {
             "link cut": self._cut,
-            "link reset": self._outside.links.drop,
+            "link reset": self._field_robots.links.drop,
             "radio down": lambda role: inject(Fault(FaultKind.LINK_DOWN, role, self._random.uniform(0.2, 3.0))),
             "sshd killed": lambda role: inject(Fault(FaultKind.KILL, role, process="sshd")),
             "robot rebooted": lambda role: inject(Fault(FaultKind.REBOOT, role)),
@@ -233,7 +235,7 @@ class Chaos:
         self.tally.faults.append(InjectedFault(kind, began_ns, time.time_ns()))
 
     def _cut(self, role: Role) -> None:
-        self._outside.links.cut(role)
+        self._field_robots.links.cut(role)
         duration_s = self._random.uniform(0.2, 12.0)
         assert self._process is not None
         try:
@@ -241,7 +243,7 @@ class Chaos:
         except subprocess.TimeoutExpired:
             pass
         finally:
-            self._outside.links.restore(role)
+            self._field_robots.links.restore(role)
 
     def _kill(self, _role: Role) -> None:
         assert self._process is not None
@@ -249,7 +251,7 @@ class Chaos:
 
     def _judge(self) -> None:
         """Check the folder of the trial, and that nothing is left on the robots."""
-        lab, tally = self._outside.folder, self.tally
+        lab, tally = self._field_robots.folder, self.tally
         trial = only_trial(lab)
         table = rows(trial)
         planned = {(str(protocol), str(number + 1)) for protocol in Protocol for number in range(self._repeats)}
@@ -268,7 +270,7 @@ class Chaos:
             tally.problems.append(verified.err)
         if "the same bytes" not in (rebuilt := fieldkit(lab, "rebuild", str(trial))).out:
             tally.problems.append(f"rebuild: {rebuilt.out} {rebuilt.err}")
-        for role, shell in self._outside.testbed.shells.items():
+        for role, shell in self._field_robots.testbed.shells.items():
             if remaining := jobs.list_running(shell, Deadline.after(20)):
                 tally.problems.append(f"left on {role}: {remaining}")
 
@@ -294,8 +296,8 @@ def chaos(folder: Path, *, seed: int, repeats: int, faults: int, debian: bool = 
 
     The robots have Debian's ROS, or the built-in one.
     """
-    with robots_outside(folder, site=DEFAULT_SITE if debian else None) as outside:
-        return Chaos(outside, seed=seed, repeats=repeats, faults=faults).run()
+    with start_field_robots(folder, site=DEFAULT_SITE if debian else None) as field_robots:
+        return Chaos(field_robots, seed=seed, repeats=repeats, faults=faults).run()
 
 
 def main() -> int:

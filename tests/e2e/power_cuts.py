@@ -1,4 +1,4 @@
-"""Power cuts at random moments, in sequence, on each file system in turn: part of `make soak`.
+"""Power cuts at random moments, in sequence, on one file system after the other: part of `make soak`.
 
 tests/trial/test_power_cuts.py cuts at every sync, and a few times at random.
 """

@@ -12,7 +12,7 @@ from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.running.locks import Holder, locked
-from tests.helpers.outside import robots_outside
+from tests.helpers.field_robots import start_field_robots
 from tests.helpers.runs import fieldkit
 from tests.helpers.sshd import free_port, make_key
 
@@ -23,9 +23,9 @@ ANNA = Holder("trial-a", "anna@one", "trial-a")
 
 @pytest.mark.emulated
 def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) -> None:
-    with robots_outside(tmp_path) as outside:
-        shells = outside.testbed.shells
-        sender, receiver = (outside.cast[role].name for role in (Role.SENDER, Role.RECEIVER))
+    with start_field_robots(tmp_path) as field_robots:
+        shells = field_robots.testbed.shells
+        sender, receiver = (field_robots.cast[role].name for role in (Role.SENDER, Role.RECEIVER))
         with locked(shells, ANNA, sink=print):
             for role in (Role.SENDER, Role.RECEIVER):
                 evidence.begin(shells[role], FOLDER, role, "wlan0", token=ANNA.token)
@@ -33,7 +33,7 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
 
             site = tmp_path / SITE_FILE
             complete_site = site.read_text(encoding="utf-8")
-            port = outside.links.port(Role.RECEIVER)
+            port = field_robots.links.port(Role.RECEIVER)
             site.write_text(complete_site.replace(f"port: {port},", f"port: {free_port()},"), encoding="utf-8")
             run = fieldkit(tmp_path, "abort", "--yes")
             assert run.code == 3

@@ -13,7 +13,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from tests.e2e.test_bad_inputs import Row, check, table
 from tests.helpers import labs
-from tests.helpers.outside import Outside, robots_outside
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.runs import fieldkit
 from tests.helpers.sshd import free_port, make_key
 
@@ -26,11 +26,11 @@ BEGIN = "mkdir -p .fieldkit/other/one/.jobs"
 class Testbed:
     """A lab's folder with the site file of running robots, and the changes of a case."""
 
-    def __init__(self, folder: Path, outside: Outside) -> None:
+    def __init__(self, folder: Path, field_robots: FieldRobots) -> None:
         self.folder = folder
-        self.outside = outside
+        self.field_robots = field_robots
         self.undo = ExitStack()
-        self._write("fieldkit.yaml", (outside.folder / "fieldkit.yaml").read_text(encoding="utf-8"))
+        self._write("fieldkit.yaml", (field_robots.folder / "fieldkit.yaml").read_text(encoding="utf-8"))
 
     def change(self, pattern: str, by: str) -> None:
         """Change the sender's line of the site file."""
@@ -42,12 +42,12 @@ class Testbed:
         self._write("fieldkit.yaml", "\n".join(lines) + "\n")
 
     def on(self, role: Role, script: str) -> None:
-        shell = self.outside.testbed.shells[role]
+        shell = self.field_robots.testbed.shells[role]
         shell.run(("sh", "-c", script), deadline=Deadline.after(20))
 
     def start(self, role: Role, *argv: str) -> None:
         """Start a job on a robot that ends with the case."""
-        shell = self.outside.testbed.shells[role]
+        shell = self.field_robots.testbed.shells[role]
         jobs.install(shell, Deadline.after(30))
         self.on(role, BEGIN)
         job = Job(".fieldkit/other/one", "job", argv, limit_s=120, log="log")
@@ -146,14 +146,14 @@ ON_ROBOTS: dict[str, Setup] = {
 
 
 @pytest.fixture(scope="module")
-def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
-    with robots_outside(tmp_path_factory.mktemp("outside")) as robots:
+def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
+    with start_field_robots(tmp_path_factory.mktemp("field")) as robots:
         yield robots
 
 
 @contextmanager
-def prepared(folder: Path, outside: Outside) -> Iterator[Testbed]:
-    lab = Testbed(folder, outside)
+def prepared(folder: Path, field_robots: FieldRobots) -> Iterator[Testbed]:
+    lab = Testbed(folder, field_robots)
     with lab.undo:
         yield lab
 
@@ -163,7 +163,9 @@ def test_the_page_lists_the_tested_errors() -> None:
 
 
 @pytest.mark.parametrize("row", table("On the robots").values(), ids=lambda row: row.situation)
-def test_an_error_of_a_robot_gives_one_message_with_a_remedy(row: Row, outside: Outside, tmp_path: Path) -> None:
-    with prepared(tmp_path, outside) as lab:
+def test_an_error_of_a_robot_gives_one_message_with_a_remedy(
+    row: Row, field_robots: FieldRobots, tmp_path: Path
+) -> None:
+    with prepared(tmp_path, field_robots) as lab:
         run = fieldkit(tmp_path, *ON_ROBOTS[row.situation](lab).split())
     check(row, run.code, run.err)

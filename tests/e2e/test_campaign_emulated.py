@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from fieldkit.core.model import Topology
+from tests.helpers.field_robots import start_field_robots
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.labs import built_in_ros
-from tests.helpers.outside import robots_outside
 from tests.helpers.runs import Run, fieldkit, finish, rows, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -94,7 +94,7 @@ def answered(lab: Path, *answers: str) -> Run:
 
 def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> None:
     folder = begin(tmp_path, "10ft")
-    with robots_outside(tmp_path, topology=Topology.MASTER):
+    with start_field_robots(tmp_path, topology=Topology.MASTER):
         site = tmp_path / "fieldkit.yaml"
         roles = "roles: {masterless: {sender: turtlebot-1, receiver: duckiedrone-1}, "
         site.write_text(site.read_text(encoding="utf-8").replace("roles: {", roles), encoding="utf-8")
@@ -131,7 +131,7 @@ def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> 
 
 def test_a_program_can_answer_through_a_pipe(tmp_path: Path) -> None:
     folder = begin(tmp_path, "10ft")
-    with robots_outside(tmp_path, topology=Topology.MASTERLESS):
+    with start_field_robots(tmp_path, topology=Topology.MASTERLESS):
         text = (tmp_path / "lawn.yaml").read_text(encoding="utf-8").replace("[master, masterless]", "[masterless]")
         (tmp_path / "lawn.yaml").write_text(text, encoding="utf-8")
         process = subprocess.Popen(

@@ -14,8 +14,8 @@ from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import Holder
 from sim_backends.emulated.backend import DEFAULT_SITE
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import copy_shipped
-from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import LIMIT_S, Run, fieldkit
 
 pytestmark = pytest.mark.emulated
@@ -32,16 +32,16 @@ def failed(run: Run) -> set[tuple[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
     """Robots with Debian's ROS, whose programs are checked."""
-    with robots_outside(tmp_path_factory.mktemp("lab"), site=DEFAULT_SITE) as robots:
+    with start_field_robots(tmp_path_factory.mktemp("lab"), site=DEFAULT_SITE) as robots:
         yield robots
 
 
 @pytest.fixture
-def lab(outside: Outside, tmp_path: Path) -> Path:
+def lab(field_robots: FieldRobots, tmp_path: Path) -> Path:
     """Return a separate folder with the site file of the robots."""
-    (tmp_path / "fieldkit.yaml").write_bytes((outside.folder / "fieldkit.yaml").read_bytes())
+    (tmp_path / "fieldkit.yaml").write_bytes((field_robots.folder / "fieldkit.yaml").read_bytes())
     return tmp_path
 
 
@@ -66,20 +66,20 @@ def test_a_ready_lab_is_ok_in_every_line(tmp_path: Path) -> None:
     assert "\x1b" not in run.out, "no terminal codes off a terminal"
 
 
-def test_the_field_backend_is_ok_and_leaves_nothing_on_the_robots(outside: Outside, lab: Path) -> None:
+def test_the_field_backend_is_ok_and_leaves_nothing_on_the_robots(field_robots: FieldRobots, lab: Path) -> None:
     run = fieldkit(lab, *CHECK)
     assert run.code == 0, run.out + run.err
     scan = findings_by_check(run)["turtlebot-1", "topic /scan"]
     assert scan["status"] == "ok"
-    for shell in outside.testbed.shells.values():
+    for shell in field_robots.testbed.shells.values():
         left = shell.run(("ls", jobs.HOME), deadline=Deadline.after(30)).stdout.decode().split()
         assert [name for name in left if not name.startswith("job-")] == []
 
 
-def test_each_fault_is_reported_with_its_remedy_and_the_rest_is_checked(outside: Outside, lab: Path) -> None:
+def test_each_fault_is_reported_with_its_remedy_and_the_rest_is_checked(field_robots: FieldRobots, lab: Path) -> None:
     copy_shipped(lab, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
     copy_shipped(lab, "robots", "duckiedrone", "capture_right: direct", "capture_right: sudo")
-    receiver = outside.testbed.shells[Role.RECEIVER]
+    receiver = field_robots.testbed.shells[Role.RECEIVER]
     folder = jobs.work_folder("20260101T000000.000000Z_los_5m_masterless", "udp-01-1")
     jobs.install(receiver, Deadline.after(30))
     receiver.run(("mkdir", "-p", f"{folder}/.jobs"), deadline=Deadline.after(30))
@@ -112,11 +112,11 @@ def test_a_silent_topic_is_detected_before_the_trial(lab: Path) -> None:
     assert findings_by_check(run)["turtlebot-1", "topic /scan"]["status"] == "ok"
 
 
-def test_an_unreachable_robot_does_not_prevent_checks_of_the_others(outside: Outside, lab: Path) -> None:
+def test_an_unreachable_robot_does_not_prevent_checks_of_the_others(field_robots: FieldRobots, lab: Path) -> None:
     site = (lab / "fieldkit.yaml").read_text(encoding="utf-8")
     # 192.0.2.0/24 is for documentation (RFC 5737) and not in use. The other robot's radio has another address.
-    address = outside.cast[Role.RECEIVER].address
-    site = site.replace(f"port: {outside.links.port(Role.SENDER)}", "port: 1").replace(address, "192.0.2.1")
+    address = field_robots.cast[Role.RECEIVER].address
+    site = site.replace(f"port: {field_robots.links.port(Role.SENDER)}", "port: 1").replace(address, "192.0.2.1")
     (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
     run = fieldkit(lab, *CHECK)
     assert run.code == 3
@@ -124,8 +124,8 @@ def test_an_unreachable_robot_does_not_prevent_checks_of_the_others(outside: Out
     assert [check for robot, check in findings_by_check(run) if robot == "turtlebot-1"] == ["connection"]
 
 
-def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(outside: Outside, lab: Path) -> None:
-    sender = {Role.SENDER: outside.testbed.shells[Role.SENDER]}
+def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(field_robots: FieldRobots, lab: Path) -> None:
+    sender = {Role.SENDER: field_robots.testbed.shells[Role.SENDER]}
     with locks.locked(sender, Holder("token", "anna@one", "trial-a"), sink=lambda _: None):
         job = Job(
             folder=jobs.work_folder("trial-a", "tcp-01-1"), name="work", argv=("sleep", "99"), limit_s=99, log="l"
@@ -142,7 +142,7 @@ def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(outside: O
     assert ("turtlebot-1", "topic /scan") not in findings_by_check(run)
 
 
-def test_a_changed_host_key_names_both_fingerprints(outside: Outside, lab: Path) -> None:
+def test_a_changed_host_key_names_both_fingerprints(field_robots: FieldRobots, lab: Path) -> None:
     site = (lab / "fieldkit.yaml").read_text(encoding="utf-8")
     keys = [line.partition("host_key: ")[2].rstrip("}\n") for line in site.splitlines() if "host_key: " in line]
     assert len(keys) == 2
@@ -153,8 +153,8 @@ def test_a_changed_host_key_names_both_fingerprints(outside: Outside, lab: Path)
     assert findings_by_check(run)["turtlebot-1", "connection"]["detail"].count("SHA256:") == 2
 
 
-def test_a_full_home_directory_fails(outside: Outside, lab: Path) -> None:
-    shell = outside.testbed.shells[Role.SENDER]
+def test_a_full_home_directory_fails(field_robots: FieldRobots, lab: Path) -> None:
+    shell = field_robots.testbed.shells[Role.SENDER]
     resize = "mount -o remount,size=$1 /root && df -Pk /root"
     before = shell.run(("df", "-Pk", "/root"), deadline=Deadline.after(30)).stdout.split()[-5].decode()
     shell.run(("sh", "-c", resize, "sh", "50m"), deadline=Deadline.after(30))

@@ -19,9 +19,9 @@ from fieldkit.remote.ssh import CONNECT_S
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
 from tests.helpers.conformance import BackendConformance, RebootConformance, ShellConformance, Subject
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.forwarder import Forwarder
 from tests.helpers.loopback import Command, dropbear, openssh, serve
-from tests.helpers.outside import Outside, robots_outside
 
 pytestmark = pytest.mark.emulated
 
@@ -140,14 +140,14 @@ class TestEmulatedOverTheRadio(OfTestbed):
 class TestField(OfTestbed):
     @pytest.fixture(scope="class")
     @classmethod
-    def outside(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
-        with robots_outside(tmp_path_factory.mktemp("field"), topology=TOPOLOGY) as outside:
-            yield outside
+    def field_robots(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
+        with start_field_robots(tmp_path_factory.mktemp("field"), topology=TOPOLOGY) as field_robots:
+            yield field_robots
 
     @pytest.fixture(scope="class")
     @classmethod
-    def opened(cls, outside: Outside) -> Iterator[tuple[Cast, Testbed]]:
-        site = outside.folder / "fieldkit.yaml"
+    def opened(cls, field_robots: FieldRobots) -> Iterator[tuple[Cast, Testbed]]:
+        site = field_robots.folder / "fieldkit.yaml"
         site.write_text(f"patience: {PATIENCE_S:g}s\n{site.read_text(encoding='utf-8')}", encoding="utf-8")
         backend = load_backend("field", *load_site(site))
         cast = backend.cast(TOPOLOGY)
@@ -156,10 +156,10 @@ class TestField(OfTestbed):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def subject(cls, outside: Outside, opened: tuple[Cast, Testbed]) -> Subject:
-        cut, restore = (partial(act, Role.SENDER) for act in (outside.links.cut, outside.links.restore))
+    def subject(cls, field_robots: FieldRobots, opened: tuple[Cast, Testbed]) -> Subject:
+        cut, restore = (partial(act, Role.SENDER) for act in (field_robots.links.cut, field_robots.links.restore))
         return Subject(opened[1].shells[Role.SENDER], cut, restore, GIVE_UP_S)
 
     @pytest.fixture
-    def reboot(self, outside: Outside) -> Callable[[], object]:
-        return rebooting(outside.testbed)
+    def reboot(self, field_robots: FieldRobots) -> Callable[[], object]:
+        return rebooting(field_robots.testbed)

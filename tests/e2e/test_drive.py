@@ -27,8 +27,8 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.ros.steered import Steered
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import descendants, wait_for_end
-from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.rovers import rover_profile
 from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_during, wait_for_line
 from tests.helpers.sshd import wait_until
@@ -97,7 +97,7 @@ RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
 
 
 @pytest.fixture(scope="module")
-def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
     """Robots that outlive fieldkit; one of them is fast, so that the tests take less time."""
     folder = tmp_path_factory.mktemp("rovers")
     profile = rover_profile(fence_m=30.0)
@@ -110,12 +110,12 @@ def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
     zenoh = zenoh.replace("\nlimits:", "\n  environment: {RMW_IMPLEMENTATION: rmw_zenoh_cpp}\nlimits:")
     (folder / "robots" / "rover_three.yaml").write_text(zenoh, encoding="utf-8")
     (folder / "lab.yaml").write_text(SITE, encoding="utf-8")
-    with chdir(folder), robots_outside(folder, site=folder / "lab.yaml", topology=Topology.MASTER) as robots:
+    with chdir(folder), start_field_robots(folder, site=folder / "lab.yaml", topology=Topology.MASTER) as robots:
         yield robots
 
 
 @pytest.fixture
-def outside(rovers: Outside, monkeypatch: pytest.MonkeyPatch) -> Outside:
+def field_robots(rovers: FieldRobots, monkeypatch: pytest.MonkeyPatch) -> FieldRobots:
     """The same robots at their initial positions, reachable, without remains of an earlier trial."""
     monkeypatch.chdir(rovers.folder)
     for role, shell in rovers.testbed.shells.items():
@@ -127,8 +127,8 @@ def outside(rovers: Outside, monkeypatch: pytest.MonkeyPatch) -> Outside:
     return rovers
 
 
-def track_of(outside: Outside, role: Role) -> list[TrackPoint]:
-    return [point for point in outside.testbed.oracle.track(0) if point.role is role]
+def track_of(field_robots: FieldRobots, role: Role) -> list[TrackPoint]:
+    return [point for point in field_robots.testbed.oracle.track(0) if point.role is role]
 
 
 def place_at(track: list[TrackPoint], utc_ns: int) -> Vector:
@@ -142,12 +142,14 @@ def place_at(track: list[TrackPoint], utc_ns: int) -> Vector:
     return x, y, z
 
 
-def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(outside: Outside) -> None:
-    (outside.folder / "procedures" / "drive.yaml").write_text(BOTH, encoding="utf-8")
-    starts_m = {role: track_of(outside, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
-    run = fieldkit(outside.folder, *RUN)
+def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(field_robots: FieldRobots) -> None:
+    (field_robots.folder / "procedures" / "drive.yaml").write_text(BOTH, encoding="utf-8")
+    starts_m = {
+        role: track_of(field_robots, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)
+    }
+    run = fieldkit(field_robots.folder, *RUN)
     assert run.code == 0, run.err
-    trial = only_trial(outside.folder)
+    trial = only_trial(field_robots.folder)
     (repeat,) = (trial / "repeats").iterdir()
     (row,) = rows(trial)
     # Over ROS 1, with positions relative to the sender; over ROS 2 with DDS, facing the other way; over Zenoh.
@@ -160,7 +162,7 @@ def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(ou
         assert (log[-1]["ended"], log[-1]["phase"]) == ("home", "home")
         assert max(entry["x_m"] for entry in log) == pytest.approx(way_m[0], abs=0.1)
         assert max(entry["y_m"] for entry in log) == pytest.approx(way_m[1], abs=0.1)
-        start_m, track = starts_m[role], track_of(outside, role)
+        start_m, track = starts_m[role], track_of(field_robots, role)
         assert start_m is not None
         for entry in log:
             east_m, north_m, _ = place_at(track, entry["utc_ns"])
@@ -208,21 +210,21 @@ def test_a_robot_of_an_interactive_lab_can_be_driven(tmp_path: Path) -> None:
         assert lab.place_m("robot-1") == pytest.approx(place_m)
 
 
-def receiver_motion(outside: Outside) -> Steered | None:
-    return outside.testbed.robots[Role.RECEIVER].steered()
+def receiver_motion(field_robots: FieldRobots) -> Steered | None:
+    return field_robots.testbed.robots[Role.RECEIVER].steered()
 
 
-def test_killing_fieldkit_stops_the_robot(outside: Outside) -> None:
-    (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
-    process = start(outside.folder, *RUN)
+def test_killing_fieldkit_stops_the_robot(field_robots: FieldRobots) -> None:
+    (field_robots.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
+    process = start(field_robots.folder, *RUN)
     try:
-        wait_during(process, lambda: drives(outside))
+        wait_during(process, lambda: drives(field_robots))
     finally:
         process.kill()
         process.communicate(timeout=60)
     wait_for_end({process.pid}, within_s=60.0)
-    wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
-    shell = outside.testbed.shells[Role.RECEIVER]
+    wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
+    shell = field_robots.testbed.shells[Role.RECEIVER]
     text = ("sh", "-c", "cat .fieldkit/*/*/drive.status")
     wait_until(
         lambda: json.loads(shell.run(text, deadline=Deadline.after(30)).stdout)["ended"] != "", Deadline.after(30)
@@ -233,12 +235,12 @@ def test_killing_fieldkit_stops_the_robot(outside: Outside) -> None:
 
 
 @contextmanager
-def driving(outside: Outside, procedure: str = DRIVE) -> "Iterator[subprocess.Popen[str]]":
+def driving(field_robots: FieldRobots, procedure: str = DRIVE) -> "Iterator[subprocess.Popen[str]]":
     """Run a trial until its robot drives; kill it at the end if it still runs."""
-    (outside.folder / "procedures" / "drive.yaml").write_text(procedure, encoding="utf-8")
-    process = start(outside.folder, *RUN)
+    (field_robots.folder / "procedures" / "drive.yaml").write_text(procedure, encoding="utf-8")
+    process = start(field_robots.folder, *RUN)
     try:
-        wait_during(process, lambda: drives(outside))
+        wait_during(process, lambda: drives(field_robots))
         yield process
     finally:
         if process.poll() is None:
@@ -247,48 +249,48 @@ def driving(outside: Outside, procedure: str = DRIVE) -> "Iterator[subprocess.Po
         wait_for_end({process.pid}, within_s=60.0)
 
 
-def standstill_s(outside: Outside, since_ns: int) -> float:
+def standstill_s(field_robots: FieldRobots, since_ns: int) -> float:
     """Return the time from `since_ns` until the receiver stopped by the true track; it must not move afterwards."""
-    wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
-    moments = [point for point in track_of(outside, Role.RECEIVER) if point.utc_ns >= since_ns]
+    wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
+    moments = [point for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns >= since_ns]
     moving = [point.utc_ns for point in moments if math.hypot(*point.velocity_m_s) > 0]
     return (max(moving, default=since_ns) - since_ns) / 1e9
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_stops_the_robot_immediately(outside: Outside, number: signal.Signals) -> None:
-    with driving(outside) as process:
+def test_the_first_signal_stops_the_robot_immediately(field_robots: FieldRobots, number: signal.Signals) -> None:
+    with driving(field_robots) as process:
         sent_ns = time.time_ns()
         process.send_signal(number)
-        took_s = standstill_s(outside, sent_ns)
+        took_s = standstill_s(field_robots, sent_ns)
         run = finish(process)
     assert took_s < LEASE_S, "by the order, not by its lease"
     assert "stopping: rover-1 stops where it is" in run.err
     assert "rover-1: stopped (stationary)" in run.err
     assert run.code == 130
     assert run.err.index("stopping: rover-1") < run.err.index("rover-1: stopped")
-    assert_held(outside, "stopped by the operator")
+    assert_held(field_robots, "stopped by the operator")
 
 
-def assert_held(outside: Outside, reason: str) -> None:
+def assert_held(field_robots: FieldRobots, reason: str) -> None:
     """Assert that the stopped motion is held, and that its repeat is void for the same reason."""
-    trial = only_trial(outside.folder)
+    trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
     held = json.loads((trial / "motion.jsonl").read_text(encoding="utf-8").splitlines()[-1])
     assert reason in held["reason"]
     assert [(row["status"], row["reason"]) for row in rows(trial)] == [("void", reason)]
-    stopped_m = place_m(outside)
-    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    stopped_m = place_m(field_robots)
+    again = fieldkit(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert f"rover-1: {held['reason']}" in again.err
-    assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
+    assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
 
 
-def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(outside: Outside) -> None:
-    (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
+def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(field_robots: FieldRobots) -> None:
+    (field_robots.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
     master, terminal = pty.openpty()
     words = ("setsid", "--ctty", sys.executable, "-m", "fieldkit", *RUN)
-    process = subprocess.Popen(words, cwd=outside.folder, stdin=terminal, stdout=terminal, stderr=terminal)
+    process = subprocess.Popen(words, cwd=field_robots.folder, stdin=terminal, stdout=terminal, stderr=terminal)
     os.close(terminal)
     shown: list[bytes] = []
 
@@ -300,10 +302,10 @@ def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(outside: Outside) -> N
     reader = threading.Thread(target=read)
     reader.start()
     try:
-        wait_until(lambda: drives(outside), Deadline.after(90))
+        wait_until(lambda: drives(field_robots), Deadline.after(90))
         sent_ns = time.time_ns()
         os.write(master, b"\x03")
-        took_s = standstill_s(outside, sent_ns)
+        took_s = standstill_s(field_robots, sent_ns)
         assert process.wait(timeout=180) == 130
     finally:
         process.kill()
@@ -315,60 +317,62 @@ def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(outside: Outside) -> N
     assert text.index("stopping: rover-1") < text.index("rover-1: stopped (stationary)")
 
 
-def test_ctrl_c_while_the_robot_drives_back_stops_it(outside: Outside) -> None:
-    (outside.folder / "procedures" / "drive.yaml").write_text(SHORT, encoding="utf-8")
-    home_m = place_m(outside)
-    process = start(outside.folder, *RUN)
+def test_ctrl_c_while_the_robot_drives_back_stops_it(field_robots: FieldRobots) -> None:
+    (field_robots.folder / "procedures" / "drive.yaml").write_text(SHORT, encoding="utf-8")
+    home_m = place_m(field_robots)
+    process = start(field_robots.folder, *RUN)
     try:
-        wait_during(process, lambda: drives(outside))
-        wait_during(process, lambda: (now := receiver_motion(outside)) is not None and now.velocity_m_s[0] < -0.3)
+        wait_during(process, lambda: drives(field_robots))
+        wait_during(
+            process, lambda: (now := receiver_motion(field_robots)) is not None and now.velocity_m_s[0] < -0.3
+        )
         sent_ns = time.time_ns()
         process.send_signal(signal.SIGINT)
-        took_s = standstill_s(outside, sent_ns)
+        took_s = standstill_s(field_robots, sent_ns)
         run = finish(process)
     finally:
         process.kill()
         wait_for_end({process.pid}, within_s=60.0)
     assert took_s < LEASE_S, "by the order, not by its lease"
     assert run.code == 130
-    assert math.dist(place_m(outside), home_m) > 0.3, "on its way"
-    assert_held(outside, "stopped by the operator")
+    assert math.dist(place_m(field_robots), home_m) > 0.3, "on its way"
+    assert_held(field_robots, "stopped by the operator")
 
 
-def test_a_robot_outside_its_fence_does_not_start(outside: Outside) -> None:
+def test_a_robot_outside_its_fence_does_not_start(field_robots: FieldRobots) -> None:
     fence_m = 2.0
-    profile = outside.folder / "robots" / "rover.yaml"
+    profile = field_robots.folder / "robots" / "rover.yaml"
     text = profile.read_text(encoding="utf-8")
     assert "fence_m: 30" in text
     profile.write_text(text.replace("fence_m: 30", f"fence_m: {fence_m:g}"), encoding="utf-8")
     try:
-        with driving(outside, SHORT) as process:
+        with driving(field_robots, SHORT) as process:
             process.send_signal(signal.SIGINT)
             assert finish(process).code == 130
-        home_m = place_m(outside)
+        home_m = place_m(field_robots)
         topic = ("rostopic", "pub", "-r", "10", "/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 1.0}}")
         words = ("sh", "-c", '"$@" & cat >/dev/null; kill $!', "sh", *with_environment(topic, setup=SETUP))
-        session = outside.testbed.shells[Role.RECEIVER].begin(words, deadline=Deadline.after(30))
-        wait_until(lambda: math.dist(place_m(outside), home_m) > fence_m + 0.2, Deadline.after(60))
+        session = field_robots.testbed.shells[Role.RECEIVER].begin(words, deadline=Deadline.after(30))
+        wait_until(lambda: math.dist(place_m(field_robots), home_m) > fence_m + 0.2, Deadline.after(60))
         session.end(deadline=Deadline.after(60), check=False)
-        wait_until(lambda: stationary(outside), Deadline.after(60))
-        moved_m = place_m(outside)
-        trial = only_trial(outside.folder)
-        run = fieldkit(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+        wait_until(lambda: stationary(field_robots), Deadline.after(60))
+        moved_m = place_m(field_robots)
+        trial = only_trial(field_robots.folder)
+        run = fieldkit(field_robots.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
         assert run.code == 5, run.err
         assert f"outside its fence of {fence_m:g} m" in run.err
-        assert place_m(outside) == pytest.approx(moved_m, abs=0.01)
+        assert place_m(field_robots) == pytest.approx(moved_m, abs=0.01)
         assert motions(trial) == ["origin", "begun", "held", "allowed", "held"]
     finally:
         profile.write_text(text, encoding="utf-8")
 
 
-def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(outside: Outside) -> None:
-    with driving(outside) as process:
+def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(field_robots: FieldRobots) -> None:
+    with driving(field_robots) as process:
         process.send_signal(signal.SIGSTOP)
         sent_ns = time.time_ns()
-        run = fieldkit(outside.folder, "stop", "--all")
-        took_s = standstill_s(outside, sent_ns)
+        run = fieldkit(field_robots.folder, "stop", "--all")
+        took_s = standstill_s(field_robots, sent_ns)
         assert run.code == 0, run.err + run.out
         assert sorted(run.out.splitlines()) == [
             "rover-1: stopped (stationary)",
@@ -379,60 +383,62 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(outside: O
         ended = finish(process)
     assert ended.code == 3, ended.err
     assert "stopped the robots at" in ended.err
-    assert standstill_s(outside, sent_ns + int(1e9 * took_s) + 1) == 0.0, "nothing moved again"
-    again = fieldkit(outside.folder, "stop", "rover-1")
+    assert standstill_s(field_robots, sent_ns + int(1e9 * took_s) + 1) == 0.0, "nothing moved again"
+    again = fieldkit(field_robots.folder, "stop", "rover-1")
     assert (again.code, again.out) == (0, "rover-1: no program of fieldkit moves it; nothing was sent to it\n")
-    outside.links.cut(Role.SENDER)
-    partly = fieldkit(outside.folder, "stop", "--all")
+    field_robots.links.cut(Role.SENDER)
+    partly = fieldkit(field_robots.folder, "stop", "--all")
     assert partly.code == 3
     assert "rover-2: NOT REACHED: stop it by hand" in partly.out
     assert "rover-1: no program of fieldkit moves it" in partly.out
 
 
-def test_ctrl_c_while_the_program_starts_prevents_motion(outside: Outside) -> None:
-    (outside.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
+def test_ctrl_c_while_the_program_starts_prevents_motion(field_robots: FieldRobots) -> None:
+    (field_robots.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
     began_ns = time.time_ns()
-    process = start(outside.folder, *RUN, "--json")
+    process = start(field_robots.folder, *RUN, "--json")
     wait_for_line(process, '"move rover-1"')
     process.send_signal(signal.SIGINT)
     run = finish(process)
     assert run.code == 130
     assert "stopping: " in run.err
     speeds = [
-        math.hypot(*point.velocity_m_s) for point in track_of(outside, Role.RECEIVER) if point.utc_ns > began_ns
+        math.hypot(*point.velocity_m_s) for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns > began_ns
     ]
     assert max(speeds, default=0.0) == 0.0
-    assert not [name for name in only_trial(outside.folder).rglob("drive.jsonl") if name.read_text(encoding="ascii")]
+    assert not [
+        name for name in only_trial(field_robots.folder).rglob("drive.jsonl") if name.read_text(encoding="ascii")
+    ]
 
 
-def test_ctrl_c_with_an_unreachable_robot_reports_that_its_lease_stops_it(outside: Outside) -> None:
-    with driving(outside) as process:
-        outside.links.cut(Role.RECEIVER)
+def test_ctrl_c_with_an_unreachable_robot_reports_that_its_lease_stops_it(field_robots: FieldRobots) -> None:
+    with driving(field_robots) as process:
+        field_robots.links.cut(Role.RECEIVER)
         process.send_signal(signal.SIGINT)
-        wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
+        wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
         run = finish(process)
     assert run.code == 130
     assert f"no answer from rover-1: it stops automatically within {LEASE_S:g} s" in run.err
 
 
-def test_stop_of_a_suspended_agent_prevents_further_velocities(outside: Outside) -> None:
-    with driving(outside) as process:
+def test_stop_of_a_suspended_agent_prevents_further_velocities(field_robots: FieldRobots) -> None:
+    with driving(field_robots) as process:
         (agent,) = [pid for pid in descendants(os.getpid()) if b"drive" in command_line(pid)]
         os.kill(agent, signal.SIGSTOP)
-        wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
+        wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
         stands_ns = time.time_ns()
-        stopped = fieldkit(outside.folder, "stop", "rover-1")
+        stopped = fieldkit(field_robots.folder, "stop", "rover-1")
         assert (stopped.code, stopped.out) == (0, "rover-1: stopped (stationary)\n")
         wait_for_end({agent}, within_s=60.0)
-        assert standstill_s(outside, stands_ns) == 0.0
+        assert standstill_s(field_robots, stands_ns) == 0.0
         assert finish(process).code == 3
-    assert standstill_s(outside, stands_ns) == 0.0
-    trial = only_trial(outside.folder)
+    assert standstill_s(field_robots, stands_ns) == 0.0
+    trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
-    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    again = fieldkit(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert "no robot moves before a person confirms: rover-1" in again.err
-    assert standstill_s(outside, stands_ns) == 0.0
+    assert standstill_s(field_robots, stands_ns) == 0.0
 
 
 def command_line(pid: int) -> list[bytes]:
@@ -448,18 +454,18 @@ AFTER = DRIVE.replace("repeats: 1\nattempts: 1", "repeats: 2\nattempts: 2").repl
 RESUME = ("--yes", "--allow-motion")
 
 
-def place_m(outside: Outside) -> Vector:
-    place = track_of(outside, Role.RECEIVER)[-1].position_m
+def place_m(field_robots: FieldRobots) -> Vector:
+    place = track_of(field_robots, Role.RECEIVER)[-1].position_m
     assert place is not None
     return place
 
 
-def drives(outside: Outside) -> bool:
-    return (now := receiver_motion(outside)) is not None and now.velocity_m_s[0] > SPEED_M_S / 2
+def drives(field_robots: FieldRobots) -> bool:
+    return (now := receiver_motion(field_robots)) is not None and now.velocity_m_s[0] > SPEED_M_S / 2
 
 
-def stationary(outside: Outside) -> bool:
-    return (now := receiver_motion(outside)) is not None and not now.moves
+def stationary(field_robots: FieldRobots) -> bool:
+    return (now := receiver_motion(field_robots)) is not None and not now.moves
 
 
 def motions(trial: Path) -> list[str]:
@@ -467,42 +473,42 @@ def motions(trial: Path) -> list[str]:
     return [json.loads(line)["event"] for line in lines]
 
 
-def test_after_a_fault_nothing_moves_before_it_is_confirmed(outside: Outside) -> None:
-    (outside.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
-    home_m = place_m(outside)
-    process = start(outside.folder, *RUN)
+def test_after_a_fault_nothing_moves_before_it_is_confirmed(field_robots: FieldRobots) -> None:
+    (field_robots.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
+    home_m = place_m(field_robots)
+    process = start(field_robots.folder, *RUN)
     try:
-        wait_during(process, lambda: drives(outside))
-        outside.links.cut(Role.RECEIVER)
-        wait_until(lambda: stationary(outside), Deadline.after(60))
-        stopped_m = place_m(outside)
-        outside.links.restore(Role.RECEIVER)
+        wait_during(process, lambda: drives(field_robots))
+        field_robots.links.cut(Role.RECEIVER)
+        wait_until(lambda: stationary(field_robots), Deadline.after(60))
+        stopped_m = place_m(field_robots)
+        field_robots.links.restore(Role.RECEIVER)
         _, err = process.communicate(timeout=180)
     finally:
         process.kill()
     assert process.returncode == 5, err
     assert 0.1 < math.dist(stopped_m, home_m) < FAR_M
-    trial = only_trial(outside.folder)
+    trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
     # --yes is no confirmation, in any run.
-    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    again = fieldkit(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert "no order from the laptop for 2 s" in again.err
-    assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
+    assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
     # Pressing Enter does not confirm either: the default is to stop.
-    answers = outside.folder / "answers"
+    answers = field_robots.folder / "answers"
     answers.write_text("\n\n", encoding="utf-8")
-    enter = fieldkit(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    enter = fieldkit(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
     assert enter.code == 5, enter.err
-    assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
+    assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
     # With the option the robot first drives back along its path, and then as at the start.
-    begun_ns = track_of(outside, Role.RECEIVER)[-1].utc_ns
-    option = fieldkit(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+    begun_ns = track_of(field_robots, Role.RECEIVER)[-1].utc_ns
+    option = fieldkit(field_robots.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
     assert option.code == 0, option.err
-    track = [point for point in track_of(outside, Role.RECEIVER) if point.utc_ns > begun_ns and point.position_m]
+    track = [point for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns > begun_ns and point.position_m]
     off_m = [math.dist(point.position_m or home_m, home_m) for point in track]
     assert max(off_m) == pytest.approx(FAR_M, abs=0.3), "not as far again from where it stopped"
-    assert place_m(outside) == pytest.approx(home_m, abs=0.3)
+    assert place_m(field_robots) == pytest.approx(home_m, abs=0.3)
     assert motions(trial)[3:] == ["allowed", *("begun", "ended") * 2]
 
 
@@ -515,20 +521,20 @@ done
 """
 
 
-def test_a_suspended_driver_does_not_continue_until_a_person_confirms(outside: Outside) -> None:
-    (outside.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
-    shell = outside.testbed.shells[Role.RECEIVER]
+def test_a_suspended_driver_does_not_continue_until_a_person_confirms(field_robots: FieldRobots) -> None:
+    (field_robots.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
+    shell = field_robots.testbed.shells[Role.RECEIVER]
 
     def send(name: str) -> None:
-        words = ("sh", "-c", SUSPEND, "sh", only_trial(outside.folder).name, name)
+        words = ("sh", "-c", SUSPEND, "sh", only_trial(field_robots.folder).name, name)
         shell.run(words, deadline=Deadline.after(30), check=False)
 
-    process = start(outside.folder, *RUN)
+    process = start(field_robots.folder, *RUN)
     try:
-        wait_during(process, lambda: drives(outside))
+        wait_during(process, lambda: drives(field_robots))
         send("STOP")
-        wait_until(lambda: stationary(outside), Deadline.after(60))  # by the base's own time limit
-        stopped_m, since_s = place_m(outside), time.monotonic()
+        wait_until(lambda: stationary(field_robots), Deadline.after(60))  # by the base's own time limit
+        stopped_m, since_s = place_m(field_robots), time.monotonic()
         wait_until(lambda: time.monotonic() > since_s + 1.0, Deadline.after(60))
         send("CONT")
         _, err = process.communicate(timeout=180)
@@ -537,11 +543,11 @@ def test_a_suspended_driver_does_not_continue_until_a_person_confirms(outside: O
         process.kill()
     assert process.returncode == 5, err
     assert "its program was suspended for" in err
-    assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
-    trial = only_trial(outside.folder)
-    answers = outside.folder / "answers"
+    assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
+    trial = only_trial(field_robots.folder)
+    answers = field_robots.folder / "answers"
     answers.write_text("\nconfirm\n", encoding="utf-8")
-    outside.testbed.place(PLACEMENT)
-    confirmed = fieldkit(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    field_robots.testbed.place(PLACEMENT)
+    confirmed = fieldkit(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
     assert confirmed.code == 0, confirmed.err
     assert motions(trial)[2:6] == ["held", "confirmed", "origin", "begun"]

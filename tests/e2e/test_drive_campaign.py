@@ -17,7 +17,7 @@ from tests.helpers.runs import Run, fieldkit, finish, rows, start
 pytestmark = pytest.mark.emulated
 
 FENCE_M = 2.5
-WAY_M = 1.0
+PATH_M = 1.0
 BEYOND_M = 0.3
 """Braking from 0.6 m/s at 2 m/s² takes 0.09 m, two cycles of the loop 0.06 m; the rest is a margin for a busy
 machine.
@@ -73,7 +73,7 @@ def assert_unmoved(lab: RoverLab, run: Run, reason: str, since_ns: int) -> None:
 
 def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_applies_to_all_trials(lab: RoverLab) -> None:
     out, site = "held", ("--site", RECEIVER_SITE)
-    lab.write_procedure(Role.RECEIVER, WAY_M)
+    lab.write_procedure(Role.RECEIVER, PATH_M)
     lab.place_at("5m")
     home_m, begun_ns = lab.place_m, time.time_ns()
     process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
@@ -99,7 +99,9 @@ def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_applies_to_all_tria
     assert motions(lab, out) == ["origin", "begun", "held", "allowed", *("begun", "ended") * 2], "one origin"
     assert [row["status"] for trial in trials(lab, out) for row in rows(trial)] == ["void", "valid", "valid"]
     farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(begun_ns))
-    assert farthest_m == pytest.approx(WAY_M, abs=BEYOND_M), "not the whole distance again from the point of the stop"
+    assert farthest_m == pytest.approx(PATH_M, abs=BEYOND_M), (
+        "not the whole distance again from the point of the stop"
+    )
     assert lab.place_m == pytest.approx(home_m, abs=0.1)
 
 

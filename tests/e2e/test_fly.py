@@ -14,8 +14,8 @@ import pytest
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role, Vector
 from fieldkit.measure.evidence import track
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import descendants, wait_for_end
-from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
 from tests.helpers.sshd import wait_until
@@ -148,7 +148,7 @@ NEWEST = 'cat "$(ls -t .fieldkit/*/*/fly.log | head -n 1)"'
 
 
 @pytest.fixture(scope="module")
-def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
+def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
     folder = tmp_path_factory.mktemp("drones")
     (folder / "robots").mkdir()
     profile = (
@@ -160,15 +160,15 @@ def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
     with ExitStack() as stack:
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)  # profiles are searched there
-            outside = stack.enter_context(robots_outside(folder, site=folder / "drones.yaml"))
-        yield outside
+            field_robots = stack.enter_context(start_field_robots(folder, site=folder / "drones.yaml"))
+        yield field_robots
 
 
-def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(outside: Outside) -> None:
-    set_parameter(outside, Role.SENDER, "RTL_ALT", 100)
-    set_parameter(outside, Role.SENDER, "WPNAV_RADIUS", 10)
-    process = flying(outside, Role.SENDER, how="return", lease="60s")
-    wait_until(lambda: far_m(outside, Role.SENDER) > 1.5, Deadline.after(60))
+def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(field_robots: FieldRobots) -> None:
+    set_parameter(field_robots, Role.SENDER, "RTL_ALT", 100)
+    set_parameter(field_robots, Role.SENDER, "WPNAV_RADIUS", 10)
+    process = flying(field_robots, Role.SENDER, how="return", lease="60s")
+    wait_until(lambda: far_m(field_robots, Role.SENDER) > 1.5, Deadline.after(60))
     process.send_signal(signal.SIGINT)
     stopped = finish(process)
     assert stopped.code == 130
@@ -181,29 +181,29 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(out
         ),
     )
     assert stops < comes < ground
-    assert height_m(outside, Role.SENDER) < 1e-3, "confirmed when it is there"
-    assert_landed(outside, Role.SENDER, "return: the job was cancelled")
-    assert far_m(outside, Role.SENDER) < NEAR_M
+    assert height_m(field_robots, Role.SENDER) < 1e-3, "confirmed when it is there"
+    assert_landed(field_robots, Role.SENDER, "return: the job was cancelled")
+    assert far_m(field_robots, Role.SENDER) < NEAR_M
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def test_a_drone_flies_on_without_its_laptop_until_abort(outside: Outside) -> None:
+def test_a_drone_continues_without_its_laptop_until_abort(field_robots: FieldRobots) -> None:
     """If fieldkit is killed, the drone lands when its lease ends; `fieldkit abort` ends its job before that."""
-    process = flying(outside, Role.RECEIVER, how="land", lease="60s")
+    process = flying(field_robots, Role.RECEIVER, how="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
     wait_for_end({process.pid}, within_s=60.0)
     assert agents()
-    assert height_m(outside, Role.RECEIVER) > 0.2, "it still flies"
-    aborted = fieldkit(outside.folder, "abort", "--yes")
+    assert height_m(field_robots, Role.RECEIVER) > 0.2, "it still flies"
+    aborted = fieldkit(field_robots.folder, "abort", "--yes")
     assert aborted.code == 0
     assert "/fly " in aborted.out, aborted.err
-    assert_landed(outside, Role.RECEIVER, "land: the job was cancelled")
+    assert_landed(field_robots, Role.RECEIVER, "land: the job was cancelled")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def test_a_second_ctrl_c_does_not_wait_for_the_landing(outside: Outside) -> None:
-    process = flying(outside, Role.RECEIVER, how="land", lease="60s")
+def test_a_second_ctrl_c_does_not_wait_for_the_landing(field_robots: FieldRobots) -> None:
+    process = flying(field_robots, Role.RECEIVER, how="land", lease="60s")
     assert process.stderr is not None
     process.send_signal(signal.SIGINT)
     assert any("duckiedrone-1: coming down (land)" in line for line in process.stderr)
@@ -211,69 +211,69 @@ def test_a_second_ctrl_c_does_not_wait_for_the_landing(outside: Outside) -> None
     stopped = finish(process)
     assert stopped.code == 130
     assert "the order to stop was sent" in stopped.err
-    assert_landed(outside, Role.RECEIVER, "land: the job was cancelled")
+    assert_landed(field_robots, Role.RECEIVER, "land: the job was cancelled")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def test_stop_lands_a_drone_after_fieldkit_was_killed(outside: Outside) -> None:
-    process = flying(outside, Role.RECEIVER, how="land", lease="60s")
+def test_stop_lands_a_drone_after_fieldkit_was_killed(field_robots: FieldRobots) -> None:
+    process = flying(field_robots, Role.RECEIVER, how="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
-    stopped = fieldkit(outside.folder, "stop", "--all")
+    stopped = fieldkit(field_robots.folder, "stop", "--all")
     assert stopped.code == 0, stopped.err
     assert sorted(stopped.out.splitlines()) == [
         "copter-1: no program of fieldkit moves it; nothing was sent to it",
         "duckiedrone-1: coming down (land)",
     ]
-    assert_landed(outside, Role.RECEIVER, "land: the job was cancelled")
+    assert_landed(field_robots, Role.RECEIVER, "land: the job was cancelled")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def set_parameter(outside: Outside, role: Role, name: str, value: float) -> None:
+def set_parameter(field_robots: FieldRobots, role: Role, name: str, value: float) -> None:
     """Set a parameter of an autopilot, for example the minimum return height or the distance at which it starts to
     land.
     """
     program = SET_PARAMETER.format(name=name, value=value)
-    outside.testbed.shells[role].run((sys.executable, "-c", program), deadline=Deadline.after(60))
+    field_robots.testbed.shells[role].run((sys.executable, "-c", program), deadline=Deadline.after(60))
 
 
-def flying(outside: Outside, role: Role, *, how: str, lease: str) -> "subprocess.Popen[str]":
+def flying(field_robots: FieldRobots, role: Role, *, how: str, lease: str) -> "subprocess.Popen[str]":
     """Wait for stopped motors after a landing; start a trial, and return when its drone is in the air."""
-    outside.testbed.shells[role].run((sys.executable, "-c", STANDS), deadline=Deadline.after(60))
-    (outside.folder / "procedures").mkdir(exist_ok=True)
+    field_robots.testbed.shells[role].run((sys.executable, "-c", STANDS), deadline=Deadline.after(60))
+    (field_robots.folder / "procedures").mkdir(exist_ok=True)
     text = GIVEN_UP
     for word, value in (("ROLE", role), ("HOW", how), ("LEASE", lease)):
         text = text.replace(word, value)
-    (outside.folder / "procedures/givenup.yaml").write_text(text, encoding="utf-8")
-    process = start(outside.folder, "trial", "givenup", "5m", "--yes", "--allow-motion", "--json")
-    wait_for_line(process, f'"fly {outside.cast[role].name}"')
-    wait_until(lambda: height_m(outside, role) > 0.4, Deadline.after(60))
+    (field_robots.folder / "procedures/givenup.yaml").write_text(text, encoding="utf-8")
+    process = start(field_robots.folder, "trial", "givenup", "5m", "--yes", "--allow-motion", "--json")
+    wait_for_line(process, f'"fly {field_robots.cast[role].name}"')
+    wait_until(lambda: height_m(field_robots, role) > 0.4, Deadline.after(60))
     return process
 
 
-def assert_landed(outside: Outside, role: Role, why: str) -> None:
+def assert_landed(field_robots: FieldRobots, role: Role, why: str) -> None:
     """Wait until the drone is on the ground, and check the reason that its program reports for the landing."""
-    wait_until(lambda: height_m(outside, role) < 1e-3, Deadline.after(60))
-    shell = outside.testbed.shells[role]
+    wait_until(lambda: height_m(field_robots, role) < 1e-3, Deadline.after(60))
+    shell = field_robots.testbed.shells[role]
     assert why in shell.run(("sh", "-c", NEWEST), deadline=Deadline.after(30)).stdout.decode()
 
 
-def moved_m(outside: Outside, role: Role) -> Vector:
+def moved_m(field_robots: FieldRobots, role: Role) -> Vector:
     """Return the distance of the drone from its initial position, by the lab."""
     (*_, now), (start, *_) = 2 * [
-        [point.position_m for point in outside.testbed.oracle.track(0) if point.role is role]
+        [point.position_m for point in field_robots.testbed.oracle.track(0) if point.role is role]
     ]
     assert now is not None
     assert start is not None
     return now[0] - start[0], now[1] - start[1], now[2] - start[2]
 
 
-def far_m(outside: Outside, role: Role) -> float:
-    return math.hypot(*moved_m(outside, role)[:2])
+def far_m(field_robots: FieldRobots, role: Role) -> float:
+    return math.hypot(*moved_m(field_robots, role)[:2])
 
 
-def height_m(outside: Outside, role: Role) -> float:
-    return moved_m(outside, role)[2]
+def height_m(field_robots: FieldRobots, role: Role) -> float:
+    return moved_m(field_robots, role)[2]
 
 
 def agents() -> list[str]:

@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.model import Role, Vector
-from tests.helpers.outside import robots_outside
+from tests.helpers.field_robots import start_field_robots
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
 
-WAY_M = 1.0
+PATH_M = 1.0
 HEIGHT_M = 0.4
 AIRBORNE_M = 0.1
 LAB = """\
@@ -42,7 +42,7 @@ steps:
   - fly:
       robot: receiver
       height: {height_m:g}m
-      path: [{{away: {way_m:g}m}}]
+      path: [{{away: {path_m:g}m}}]
       speed: 3m/s
       climb: 2m/s
       then: return
@@ -79,20 +79,22 @@ def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, mon
     profile = profile.replace("port: 14550", "port: 14550\n  autopilot: ardupilot\n  boot_s: 0")
     (tmp_path / "robots/copter.yaml").write_text(profile, encoding="utf-8")
     (tmp_path / "procedures/again.yaml").write_text(
-        PROCEDURE.format(repeats=repeats, height_m=HEIGHT_M, way_m=WAY_M), encoding="utf-8"
+        PROCEDURE.format(repeats=repeats, height_m=HEIGHT_M, path_m=PATH_M), encoding="utf-8"
     )
     (tmp_path / "lab.yaml").write_text(LAB, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    with robots_outside(tmp_path, site=tmp_path / "lab.yaml") as outside:
+    with start_field_robots(tmp_path, site=tmp_path / "lab.yaml") as field_robots:
         run = fieldkit(tmp_path, "trial", "again", "5m", "--yes", "--allow-motion", "--allow-motion-after-fault")
         assert run.code == 0, run.err
-        track = [place for place in outside.testbed.oracle.track(0) if place.role is Role.RECEIVER]
+        track = [place for place in field_robots.testbed.oracle.track(0) if place.role is Role.RECEIVER]
     places_m = [place.position_m for place in track if place.position_m is not None]
     flown = list(flights(places_m))
     home_m = places_m[0]
     for flight in flown:
-        away_m, aside_m = farthest_m(flight, home_m)
-        assert 0.4 * WAY_M < away_m < 1.3 * WAY_M, "it is called back on its way where the machine is busy"
+        apath_m, aside_m = farthest_m(flight, home_m)
+        assert 0.4 * PATH_M < apath_m < 1.3 * PATH_M, (
+            "it is ordered back before the end of its path if the machine is busy"
+        )
         assert abs(aside_m) < 0.3
     results = rows(only_trial(tmp_path))
     assert [row["status"] for row in results] == ["valid"] * repeats

@@ -1,4 +1,4 @@
-"""Each tool on a robot hangs in turn, during its work or when queried for its version: the trial still ends."""
+"""One tool at a time hangs on a robot, during its work or when queried for its version: the trial still ends."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,8 +7,8 @@ import pytest
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.remote import jobs
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import copy_shipped, write_procedure
-from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import fieldkit, only_trial, rows
 
 pytestmark = pytest.mark.emulated
@@ -39,26 +39,26 @@ HANGS = "#!/bin/sh\nexec sleep 600\n"
 
 
 @pytest.fixture(scope="module")
-def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
-    with robots_outside(tmp_path_factory.mktemp("outside")) as robots:
+def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
+    with start_field_robots(tmp_path_factory.mktemp("field")) as robots:
         yield robots
 
 
 @pytest.fixture
-def lab(outside: Outside, tmp_path: Path) -> Path:
-    (tmp_path / "fieldkit.yaml").write_bytes((outside.folder / "fieldkit.yaml").read_bytes())
+def lab(field_robots: FieldRobots, tmp_path: Path) -> Path:
+    (tmp_path / "fieldkit.yaml").write_bytes((field_robots.folder / "fieldkit.yaml").read_bytes())
     write_procedure(tmp_path, PROCEDURE)
     return tmp_path
 
 
-def replace_tool(outside: Outside, lab: Path, tool: str, program: str, script: str) -> None:
+def replace_tool(field_robots: FieldRobots, lab: Path, tool: str, program: str, script: str) -> None:
     """Set a program of the robot in place of a tool in the sender's profile."""
-    place_program(outside, tool, script.format(program=program))
+    place_program(field_robots, tool, script.format(program=program))
     copy_shipped(lab, "robots", "turtlebot3_burger", f"  {tool}: {program}\n", f"  {tool}: /root/{tool}\n")
 
 
-def place_program(outside: Outside, name: str, script: str) -> None:
-    for shell in outside.testbed.shells.values():
+def place_program(field_robots: FieldRobots, name: str, script: str) -> None:
+    for shell in field_robots.testbed.shells.values():
         place = 'cat >"$1" && chmod 755 "$1"'
         shell.run(("sh", "-c", place, "sh", f"/root/{name}"), stdin=script.encode(), deadline=Deadline.after(30))
 
@@ -72,9 +72,9 @@ def place_program(outside: Outside, name: str, script: str) -> None:
     ],
 )
 def test_a_hanging_tool_is_ended_at_its_limit(
-    outside: Outside, lab: Path, tool: str, program: str, message: str
+    field_robots: FieldRobots, lab: Path, tool: str, program: str, message: str
 ) -> None:
-    replace_tool(outside, lab, tool, program, HANGS_AT_WORK)
+    replace_tool(field_robots, lab, tool, program, HANGS_AT_WORK)
     run = fieldkit(lab, "trial", "short", "5m", "--yes")
     assert run.code in {0, 4}, run.err
     (row,) = rows(only_trial(lab))
@@ -85,26 +85,26 @@ def test_a_hanging_tool_is_ended_at_its_limit(
     else:
         assert row["status"] == "failed"
         assert message in row["reason"]
-    for shell in outside.testbed.shells.values():
+    for shell in field_robots.testbed.shells.values():
         assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 @pytest.mark.parametrize(("tool", "program"), [("netcat", "nc.traditional"), ("ping", "ping")])
 def test_a_tool_that_hangs_on_version_queries_is_rejected_before_repeat_1(
-    outside: Outside, lab: Path, tool: str, program: str
+    field_robots: FieldRobots, lab: Path, tool: str, program: str
 ) -> None:
-    replace_tool(outside, lab, tool, program, HANGS)
+    replace_tool(field_robots, lab, tool, program, HANGS)
     run = fieldkit(lab, "trial", "short", "5m", "--yes")
     assert run.code == 3
     assert f"/root/{tool}" in run.err
     assert "remedy" in run.err
 
 
-def test_a_hanging_recorder_is_ended_at_its_limit(outside: Outside, lab: Path) -> None:
+def test_a_hanging_recorder_is_ended_at_its_limit(field_robots: FieldRobots, lab: Path) -> None:
     copy_shipped(
         lab, "robots", "turtlebot3_burger", '[rosbag, record, "--duration', '[/root/rosbag, record, "--duration'
     )
-    place_program(outside, "rosbag", HANGS_AT_WORK.replace("-V |", "*--help* | -V |").format(program="rosbag"))
+    place_program(field_robots, "rosbag", HANGS_AT_WORK.replace("-V |", "*--help* | -V |").format(program="rosbag"))
     run = fieldkit(lab, "trial", "short", "5m", "--yes")
     assert run.code == 4, run.err
     (row,) = rows(only_trial(lab))

@@ -46,7 +46,7 @@ def test_recommended_settings_are_written_with_their_evidence(measured: Path) ->
     assert len(re.findall(r"(?m)^passed: (dds|zenoh)", run.out)) == 2, run.out
     for path in out.iterdir():
         text = path.read_text(encoding="utf-8")
-        assert f"{REPEATS} of {REPEATS} repeats count" in text
+        assert f"{REPEATS} of {REPEATS} repeats are valid" in text
         assert only_trial(measured).name in text
         assert "loss at most 20 %, in each repeat" in text
     domain = ET.parse(out / "cyclonedds.xml").getroot().find("Domain")

@@ -37,7 +37,7 @@ from fieldkit.trial.procedure import Procedure
 from tests.fuzz.harness import Target
 from tests.helpers.casts import CAST, los_plan
 from tests.motion.logs.test_drive_log import drive
-from tests.ros.bags.test_bag_positions import BEGAN_NS, S, fix, odometry, transform, written
+from tests.ros.bags.test_bag_positions import BEGAN_NS, S, fix, odometry, transform, write_bag
 from tests.ros.bags.test_recorded_topics import ROS2, log, write
 
 _ENDS: Final = (Role.SENDER, Role.RECEIVER)
@@ -134,7 +134,7 @@ def _tracks() -> dict[str, bytes]:
     found = {}
     for name, messages in messages_by_kind.items():
         with tempfile.TemporaryDirectory() as folder:
-            found[name] = written(Path(folder), messages).read_bytes()
+            found[name] = write_bag(Path(folder), messages).read_bytes()
     return found
 
 
@@ -184,7 +184,7 @@ def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
     assert math.isfinite(position_columns.clock_error_s(evidence) or 0.0)
 
 
-def _accounts() -> tuple[bytes, ...]:
+def _position_sources() -> tuple[bytes, ...]:
     by_odometry = PositionSource(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
     at_rest = PositionSource(place=(0.0, 0.0, 0.2))
     degrees = PositionSource(place=(48.1, 11.5, None), frame=WGS84)
@@ -228,4 +228,4 @@ def motion_targets() -> Iterator[Target]:
     yield Target("positions-gpx", (_GPX,), partial(_read_positions_file, "gpx"))
     yield Target("positions-bag", tuple(_tracks().values()), _read_bag, 0.3)
     for name, of_trial in (("attempt", False), ("trial", True)):
-        yield Target(f"positions-of-{name}", _accounts(), partial(_measure_positions, of_trial), 0.5)
+        yield Target(f"positions-of-{name}", _position_sources(), partial(_measure_positions, of_trial), 0.5)

@@ -24,7 +24,7 @@ ATTEMPTS = tuple(
 _PCAP_HEADER_BYTES = 24
 _PCAP_RECORD = struct.Struct("<IIII")
 
-OF_THE_TESTBED = ("track.csv", "link.csv", "lateness.txt", "*medium.txt")
+TESTBED_FILES = ("track.csv", "link.csv", "lateness.txt", "*medium.txt")
 """Files written by the emulator; no second source exists to verify them."""
 
 TOLERANCES: Mapping[str, float] = {
@@ -52,21 +52,21 @@ TOLERANCES: Mapping[str, float] = {
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredAttempt:
     """A stored attempt and its measured values."""
 
     plan: Plan
     repeat: RepeatId
     folder: Path
-    judged: EvidenceVerdict
+    verdict: EvidenceVerdict
 
     def files(self) -> list[str]:
         """Sorted names of the files that robots wrote."""
         names = sorted(path.name for path in self.folder.iterdir())
-        return [name for name in names if not any(fnmatch(name, pattern) for pattern in OF_THE_TESTBED)]
+        return [name for name in names if not any(fnmatch(name, pattern) for pattern in TESTBED_FILES)]
 
-    def changed(self, name: str, content: bytes | None, place: Path) -> EvidenceVerdict:
-        """The judgement with different content for one file; None removes the file."""
+    def judge_changed(self, name: str, content: bytes | None, place: Path) -> EvidenceVerdict:
+        """The verdict with different content for one file; None removes the file."""
         for path in self.folder.iterdir():
             (place / path.name).symlink_to(path)
         (place / name).unlink(missing_ok=True)
@@ -74,22 +74,22 @@ class Stored:
             (place / name).write_bytes(content)
         return gates.judge(self.plan, self.repeat, AttemptEvidence(place))
 
-    def wrong(self, judged: EvidenceVerdict) -> dict[str, tuple[Value | None, Value]]:
+    def wrongly_changed(self, verdict: EvidenceVerdict) -> dict[str, tuple[Value | None, Value]]:
         """Columns that changed although the attempt is still valid: the values before and after."""
-        if judged.problems:
+        if verdict.problems:
             return {}
-        before = self.judged.measured.values
+        before = self.verdict.measured.values
         return {
             name: (before.get(name), value)
-            for name, value in judged.measured.values.items()
-            if not _within_tolerance(name, before, judged.measured.values)
+            for name, value in verdict.measured.values.items()
+            if not _within_tolerance(name, before, verdict.measured.values)
         }
 
 
-def stored(trial: Path, protocol: Protocol) -> Stored:
+def load_attempt(trial: Path, protocol: Protocol) -> StoredAttempt:
     plan, repeat = store.read_plan(trial), RepeatId(protocol, 1)
     folder = trial / "repeats" / f"{protocol}-01"
-    return Stored(plan, repeat, folder, gates.judge(plan, repeat, AttemptEvidence(folder)))
+    return StoredAttempt(plan, repeat, folder, gates.judge(plan, repeat, AttemptEvidence(folder)))
 
 
 def _within_tolerance(name: str, before: Mapping[str, Value], after: Mapping[str, Value]) -> bool:
@@ -110,7 +110,9 @@ def _within_tolerance(name: str, before: Mapping[str, Value], after: Mapping[str
     return abs(float(old) - float(new)) <= tolerance
 
 
-def changes(attempt: Stored, other: Stored, draw: random.Random) -> Iterator[tuple[str, str, bytes | None]]:
+def changes(
+    attempt: StoredAttempt, other: StoredAttempt, draw: random.Random
+) -> Iterator[tuple[str, str, bytes | None]]:
     """Yield an endless sequence of changes: the kind of change, the file, and its new content."""
     names = attempt.files()
     while True:
@@ -124,7 +126,7 @@ def changes(attempt: Stored, other: Stored, draw: random.Random) -> Iterator[tup
             yield kind, name, new
 
 
-def _same_suffix_files(attempt: Stored, other: Stored, name: str) -> list[Path]:
+def _same_suffix_files(attempt: StoredAttempt, other: StoredAttempt, name: str) -> list[Path]:
     ending = name.rpartition(".")[2]
     paths = (path for folder in (attempt.folder, other.folder) for path in sorted(folder.iterdir()))
     return [path for path in paths if path.suffix == f".{ending}"]

@@ -144,7 +144,7 @@ def tcp(
     """A TCP transfer; lost segments are sent again after 30 ms, and a share `again` of the others without need.
 
     A frame in the sender's capture has up to `offload` segments; in the receiver's capture, contiguous segments are
-    coalesced likewise.
+    coalesced in the same way.
     """
     frames: list[list[Segment]] = []
     times_ns: list[int] = []

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from pymavlink import mavutil
 
-from tests.helpers.mavsdk_flight import CORNERS_M, HEIGHT_M, M_PER_DEGREE, PATIENCE_S, lossy, until
+from tests.helpers.mavsdk_flight import CORNERS_M, HEIGHT_M, M_PER_DEGREE, PATIENCE_S, forward_with_losses, until
 
 PROGRAM: Final = Path(sys.executable).with_name("mavproxy.py")
 LOADED: Final = b"Loaded 4 waypoints in "
@@ -147,7 +147,9 @@ def main(host: str, port: str, loss: str) -> None:
     threading.Thread(target=watch, args=(host, port, state), daemon=True).start()
     client_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     client_socket.bind(("127.0.0.1", 0))
-    threading.Thread(target=lossy, args=(client_socket, (host, int(port)), float(loss)), daemon=True).start()
+    threading.Thread(
+        target=forward_with_losses, args=(client_socket, (host, int(port)), float(loss)), daemon=True
+    ).start()
     sys.stdout.write(json.dumps(fly(client_socket.getsockname()[1], state)) + "\n")
 
 

@@ -31,7 +31,7 @@ UPLOADS: Final = 5
 NAN: Final = float("nan")
 
 
-def lossy(client_socket: socket.socket, drone: tuple[str, int], loss: float) -> None:
+def forward_with_losses(client_socket: socket.socket, drone: tuple[str, int], loss: float) -> None:
     """Forward datagrams between the client of `client_socket` and the drone, with random losses."""
     random_source = random.Random(1)
     drone_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -76,7 +76,7 @@ def corner(latitude: float, longitude: float, north_m: float, east_m: float) -> 
 
 
 def upload(mission: Mission, plan: MissionPlan) -> None:
-    """Upload a mission, repeatedly if it fails: MAVSDK waits without effect for a lost last MISSION_ACK."""
+    """Upload a mission, repeatedly if it fails: MAVSDK never receives a last MISSION_ACK that was lost."""
     for _ in range(UPLOADS - 1):
         with suppress(MissionError):
             mission.upload_mission(plan)
@@ -130,7 +130,9 @@ def main(host: str, port: str, loss: str) -> None:
     """Fly the drone at this address."""
     client_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     client_socket.bind(("127.0.0.1", 0))
-    threading.Thread(target=lossy, args=(client_socket, (host, int(port)), float(loss)), daemon=True).start()
+    threading.Thread(
+        target=forward_with_losses, args=(client_socket, (host, int(port)), float(loss)), daemon=True
+    ).start()
     sys.stdout.write(json.dumps(fly(f"udpout://127.0.0.1:{client_socket.getsockname()[1]}")) + "\n")
 
 

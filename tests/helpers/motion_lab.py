@@ -18,6 +18,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role, Topology, Vector
 from sim_backends.emulated.nodes import EmulatedRobot
 from tests.helpers import motion_router
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import descendants
 from tests.helpers.labs import BOX, replace_text, write_procedure
 from tests.helpers.motion_cells import (
@@ -32,7 +33,6 @@ from tests.helpers.motion_cells import (
     MotionCell,
 )
 from tests.helpers.motion_parties import agents_on, command_line, send
-from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.paths import ROOT
 from tests.helpers.rovers import rover_profile
 from tests.helpers.runs import fieldkit
@@ -123,10 +123,10 @@ class MotionLab:
     """The lab.
 
     Attributes:
-        outside: Its robots.
+        field_robots: Its robots.
     """
 
-    outside: Outside
+    field_robots: FieldRobots
     _routers: dict[Craft, "subprocess.Popen[str]"] = field(default_factory=dict)
 
     def role(self, craft: Craft) -> Role:
@@ -135,13 +135,13 @@ class MotionLab:
 
     def robot(self, craft: Craft) -> EmulatedRobot:
         """The robot of a kind."""
-        return self.outside.testbed.robots[_ROLES[craft]]
+        return self.field_robots.testbed.robots[_ROLES[craft]]
 
     def place_m(self, craft: Craft) -> Vector:
         """Position of a stationary robot."""
         role = _ROLES[craft]
         positions = [
-            position.position_m for position in self.outside.testbed.oracle.track(0) if position.role is role
+            position.position_m for position in self.field_robots.testbed.oracle.track(0) if position.role is role
         ]
         assert positions[-1] is not None
         return positions[-1]
@@ -159,11 +159,11 @@ class MotionLab:
 
     def prepare(self, cell: MotionCell, folder: Path) -> None:
         """Write the folder of a cell's trial, in which fieldkit runs."""
-        outside, craft = self.outside, cell.craft
-        shutil.copytree(outside.folder / "robots", folder / "robots")
-        lines = (outside.folder / SITE_FILE).read_text(encoding="utf-8").splitlines()
-        other = outside.cast[_ROLES[Craft.ROVER if craft.flies else Craft.PX4]].name
-        name = outside.cast[_ROLES[craft]].name
+        field_robots, craft = self.field_robots, cell.craft
+        shutil.copytree(field_robots.folder / "robots", folder / "robots")
+        lines = (field_robots.folder / SITE_FILE).read_text(encoding="utf-8").splitlines()
+        other = field_robots.cast[_ROLES[Craft.ROVER if craft.flies else Craft.PX4]].name
+        name = field_robots.cast[_ROLES[craft]].name
         roles = f"roles: {{masterless: {{sender: {other}, receiver: {name}}}}}"
         lines = [line for line in lines if not line.startswith("roles:")] + [roles]
         text = "\n".join(lines) + "\n"
@@ -220,10 +220,10 @@ class MotionLab:
             craft: The robot that moved.
             folder: The folder of the trial.
         """
-        for role in self.outside.cast:
-            self.outside.links.restore(role)
-            self.outside.links.delay(role, 0.0)
-            self.outside.links.drop(role)
+        for role in self.field_robots.cast:
+            self.field_robots.links.restore(role)
+            self.field_robots.links.delay(role, 0.0)
+            self.field_robots.links.drop(role)
         if craft in self._routers:  # a new router, so that the drone's programs can land it
             self.stop_router(craft)
             self.start_router(craft)
@@ -239,7 +239,7 @@ class MotionLab:
             problems = [f"left running: {' '.join(argv)[:80]}" for argv in remaining.values()]
             send(signal.SIGKILL, remaining)
         self.stop_router(craft)
-        self.outside.testbed.bring_back(_ROLES[craft], has_returned=False)
+        self.field_robots.testbed.bring_back(_ROLES[craft], has_returned=False)
         return problems
 
     def close(self) -> None:
@@ -262,8 +262,10 @@ def motion_lab(folder: Path) -> Iterator[MotionLab]:
     with ExitStack() as stack:
         with pytest.MonkeyPatch.context() as monkeypatch:
             monkeypatch.chdir(folder)  # profiles are loaded from here
-            outside = stack.enter_context(robots_outside(folder, site=folder / "lab.yaml", topology=Topology.MASTER))
-        yield stack.enter_context(MotionLab(outside))
+            field_robots = stack.enter_context(
+                start_field_robots(folder, site=folder / "lab.yaml", topology=Topology.MASTER)
+            )
+        yield stack.enter_context(MotionLab(field_robots))
 
 
 def start_trial(folder: Path) -> "subprocess.Popen[bytes]":

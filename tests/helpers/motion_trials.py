@@ -193,7 +193,7 @@ class MotionTrial:
 
     def _disturb_link(self) -> None:
         """Cut or delay the control link."""
-        links, role = self.lab.outside.links, self.lab.role(self.cell.craft)
+        links, role = self.lab.field_robots.links, self.lab.role(self.cell.craft)
         if self.cell.fault is InjectedFault.SLOW:
             links.delay(role, DELAY_S)
             self._restorers.append(lambda: links.delay(role, 0.0))
@@ -294,7 +294,7 @@ class MotionTrial:
         return replace(outcome, problems=tuple(problems(cell, outcome)))
 
     def _disarmed(self) -> bool:
-        shell = self.lab.outside.testbed.shells[self.lab.role(self.cell.craft)]
+        shell = self.lab.field_robots.testbed.shells[self.lab.role(self.cell.craft)]
         completed = shell.run((sys.executable, "-c", _DISARM_CHECK), deadline=Deadline.after(LONG_S), check=False)
         return completed.exit_code == 0
 

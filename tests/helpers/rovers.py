@@ -13,8 +13,8 @@ from fieldkit.core.model import Placement, Role, Scenario, Topology, Vector
 from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from sim_backends.emulated.ros.steered import Steered
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import BOX, replace_text
-from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
 
@@ -43,7 +43,7 @@ attempts: 1
 steps:
   - move:
       robot: {role}
-      path: [{{away: {way_m:g}m}}]
+      path: [{{away: {path_m:g}m}}]
       speed: {speed_m_s:g}m/s
       during: [{{wait: {{duration: {wait_s:.1f}s}}}}]
 """
@@ -66,20 +66,20 @@ class RoverLab:
     """The lab.
 
     Attributes:
-        outside: Its robots; `outside.folder` contains `fieldkit.yaml` and `receiver.yaml`.
+        field_robots: Its robots; `field_robots.folder` contains `fieldkit.yaml` and `receiver.yaml`.
     """
 
-    outside: Outside
+    field_robots: FieldRobots
 
     @property
     def folder(self) -> Path:
         """The working folder for fieldkit."""
-        return self.outside.folder
+        return self.field_robots.folder
 
     @property
     def motion(self) -> Steered | None:
         """Motion of the rover as its base reports it to the lab; None before the first report."""
-        return self.outside.testbed.robots[Role.SENDER].steered()
+        return self.field_robots.testbed.robots[Role.SENDER].steered()
 
     @property
     def drives(self) -> bool:
@@ -98,7 +98,7 @@ class RoverLab:
 
     def track_m(self, since_ns: int) -> list[Vector]:
         """Positions of the rover since a UTC time in ns."""
-        track = self.outside.testbed.oracle.track(0)
+        track = self.field_robots.testbed.oracle.track(0)
         return [
             position.position_m
             for position in track
@@ -107,7 +107,7 @@ class RoverLab:
 
     def place_at(self, distance: str) -> None:
         """Place the stationary rover at a distance from the box, as a person would carry it."""
-        self.outside.testbed.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance(distance)))
+        self.field_robots.testbed.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance(distance)))
 
     def wait_until_it_drives(self) -> None:
         """Wait until the rover drives."""
@@ -118,15 +118,15 @@ class RoverLab:
         start_m = self.place_m
         topic = ("rostopic", "pub", "-r", "10", "/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 1.0}}")
         argv = ("sh", "-c", '"$@" & cat >/dev/null; kill $!', "sh", *with_environment(topic, setup=_SETUP))
-        session = self.outside.testbed.shells[Role.SENDER].begin(argv, deadline=Deadline.after(LONG_S))
+        session = self.field_robots.testbed.shells[Role.SENDER].begin(argv, deadline=Deadline.after(LONG_S))
         wait_until(lambda: math.dist(self.place_m, start_m) > distance_m, Deadline.after(LONG_S))
         session.end(deadline=Deadline.after(LONG_S), check=False)
         wait_until(lambda: self.stationary, Deadline.after(LONG_S))
 
-    def write_procedure(self, role: Role, way_m: float) -> None:
+    def write_procedure(self, role: Role, path_m: float) -> None:
         """Write the procedure `drive`, in which the robot of a role moves."""
-        wait_s = way_m / SPEED_M_S + 1.0  # it returns after the inner steps
-        text = _DRIVE.format(role=role, way_m=way_m, wait_s=wait_s, speed_m_s=SPEED_M_S)
+        wait_s = path_m / SPEED_M_S + 1.0  # it returns after the inner steps
+        text = _DRIVE.format(role=role, path_m=path_m, wait_s=wait_s, speed_m_s=SPEED_M_S)
         (self.folder / "procedures").mkdir(exist_ok=True)
         (self.folder / "procedures" / "drive.yaml").write_text(text, encoding="utf-8")
 
@@ -138,8 +138,8 @@ def rover_lab(folder: Path, *, fence_m: float = 30.0, lease_s: float = 2.0) -> I
     (folder / "robots" / "rover.yaml").write_text(rover_profile(fence_m=fence_m, lease_s=lease_s), encoding="utf-8")
     (folder / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (folder / "lab.yaml").write_text(_SITE, encoding="utf-8")
-    with chdir(folder), robots_outside(folder, site=folder / "lab.yaml") as outside:
+    with chdir(folder), start_field_robots(folder, site=folder / "lab.yaml") as field_robots:
         site = (folder / SITE_FILE).read_text(encoding="utf-8")
         swapped = replace_text(site, _ROLES, "roles: {masterless: {sender: box-1, receiver: rover-1}}")
         (folder / RECEIVER_SITE).write_text(swapped, encoding="utf-8")
-        yield RoverLab(outside)
+        yield RoverLab(field_robots)

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.emulated
 
 LASTS_S = 8
 EDGE = 3
-"""Messages that may differ: one of each stream is on its way when the counters begin, and one when they end."""
+"""Messages that may differ: one of each stream is in flight when the counters begin, and one when they end."""
 REQUESTED = (("ATTITUDE", 50_000), ("LOCAL_POSITION_NED", 50_000))
 
 

@@ -277,14 +277,14 @@ def test_serve_reports_a_job_that_was_not_ready(shell: LocalShell) -> None:
         assert FOLDER in caught.value.remedy
 
 
-PARTS = "trap 'echo counted; sleep 0.3; echo gone; exit {code}' INT; echo up; while :; do sleep 0.05; done"
+PRINT_END_TEXT = "trap 'echo counted; sleep 0.3; echo gone; exit {code}' INT; echo up; while :; do sleep 0.05; done"
 
 
 @pytest.mark.parametrize("code", [0, 3])
-def test_job_after_its_parting_text_may_run_until_the_evidence_is_fetched(
+def test_job_may_run_after_its_end_text_until_the_evidence_is_fetched(
     shell: LocalShell, tmp_path: Path, code: int
 ) -> None:
-    job_spec = replace(job("sh", "-c", PARTS.format(code=code)), ready="log:up")
+    job_spec = replace(job("sh", "-c", PRINT_END_TEXT.format(code=code)), ready="log:up")
     into = tmp_path / "local"
     into.mkdir()
     jobs.start(shell, job_spec)
@@ -299,7 +299,7 @@ def test_job_after_its_parting_text_may_run_until_the_evidence_is_fetched(
     assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
-def test_job_that_does_not_end_after_its_parting_text_is_killed(shell: LocalShell, tmp_path: Path) -> None:
+def test_job_that_does_not_end_after_its_end_text_is_killed(shell: LocalShell, tmp_path: Path) -> None:
     script = "trap 'echo counted; while :; do sleep 0.05; done' INT; echo up; while :; do sleep 0.05; done"
     job_spec = replace(job("sh", "-c", script), ready="log:up")
     jobs.start(shell, job_spec)
@@ -309,7 +309,7 @@ def test_job_that_does_not_end_after_its_parting_text_is_killed(shell: LocalShel
     assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
-def test_job_that_ends_without_its_parting_text_returns_its_exit_code(shell: LocalShell) -> None:
+def test_job_that_ends_without_its_end_text_returns_its_exit_code(shell: LocalShell) -> None:
     job_spec = replace(job("sh", "-c", "trap 'exit 9' INT; echo up; while :; do sleep 0.05; done"), ready="log:up")
     jobs.start(shell, job_spec)
     assert jobs.stop(shell, job_spec, grace_s=30, end_text="counted") == 9
@@ -338,7 +338,7 @@ def test_no_job_starts_in_a_folder_whose_jobs_were_stopped(shell: LocalShell) ->
         jobs.run(shell, job("true"))
 
 
-def held_up(shell: LocalShell, name: str) -> tuple[Path, Path]:
+def wrap_with_pause(shell: LocalShell, name: str) -> tuple[Path, Path]:
     """Replace the robot's program `name`: it creates a file when it is called, and waits for another file."""
     called, go = shell.home / "called", shell.home / "go"
     replace_program(shell, name, f'touch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {{program}} "$@"')
@@ -349,7 +349,7 @@ def held_up(shell: LocalShell, name: str) -> tuple[Path, Path]:
 def test_job_that_starts_during_an_abort_does_not_run(
     shell: LocalShell, call: Callable[[LocalShell, Job], object]
 ) -> None:
-    called, go = held_up(shell, "mkfifo")  # after the job's folder is created, before its identity is written
+    called, go = wrap_with_pause(shell, "mkfifo")  # after the job's folder is created, before its identity is written
     job_spec = job("sh", "-c", "touch started; exec sleep 60")
     with ThreadPoolExecutor(1) as pool:
         starting = pool.submit(call, shell, job_spec)

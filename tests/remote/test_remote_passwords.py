@@ -98,7 +98,7 @@ def test_wrong_password_is_refused_and_not_shown(password_server: Server) -> Non
 
 
 @pytest.mark.emulated
-def test_field_backend_asks_once_per_robot_and_run(password_server: Server, tmp_path: Path) -> None:
+def test_field_backend_prompts_once_per_robot_and_run(password_server: Server, tmp_path: Path) -> None:
     asked: list[tuple[str, str, str]] = []
 
     def answer(user: str, host: str, robot: str) -> str:

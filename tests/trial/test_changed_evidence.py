@@ -19,21 +19,28 @@ from hypothesis import strategies as st
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates
-from tests.helpers.changed_evidence import ATTEMPTS, Stored, changes, stored, with_changed_bit, with_wrong_time
+from tests.helpers.changed_evidence import (
+    ATTEMPTS,
+    StoredAttempt,
+    changes,
+    load_attempt,
+    with_changed_bit,
+    with_wrong_time,
+)
 
 Change = Callable[[bytes], bytes]
 TRIAL = ATTEMPTS[0][0]
 
 
 @cache
-def attempt(protocol: Protocol) -> Stored:
-    return stored(TRIAL, protocol)
+def attempt(protocol: Protocol) -> StoredAttempt:
+    return load_attempt(TRIAL, protocol)
 
 
 @pytest.mark.parametrize("protocol", Protocol)
 def test_the_stored_attempts_are_valid(protocol: Protocol) -> None:
-    assert attempt(protocol).judged.problems == ()
-    assert attempt(protocol).judged.measured.values["rtt_received"] in range(10, 20), "of 20, some lost"
+    assert attempt(protocol).verdict.problems == ()
+    assert attempt(protocol).verdict.measured.values["rtt_received"] in range(10, 20), "of 20, some lost"
 
 
 @settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -42,10 +49,10 @@ def test_the_stored_attempts_are_valid(protocol: Protocol) -> None:
 def test_a_source_changed_at_random_never_moves_a_column_of_a_valid_repeat(
     tmp_path_factory: pytest.TempPathFactory, protocol: Protocol, seed: int
 ) -> None:
-    other = attempt(next(one for one in Protocol if one is not protocol))
+    other = attempt(next(candidate for candidate in Protocol if candidate is not protocol))
     kind, name, content = next(changes(attempt(protocol), other, random.Random(seed)))
-    judged = attempt(protocol).changed(name, content, tmp_path_factory.mktemp("changed"))
-    assert attempt(protocol).wrong(judged) == {}, (kind, name)
+    verdict = attempt(protocol).judge_changed(name, content, tmp_path_factory.mktemp("changed"))
+    assert attempt(protocol).wrongly_changed(verdict) == {}, (kind, name)
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -55,16 +62,16 @@ def test_one_wrong_time_in_a_capture_never_moves_the_clock_offset_beyond_its_err
 ) -> None:
     name = f"{role}.pcap"
     changed = with_wrong_time((attempt(protocol).folder / name).read_bytes(), index, microseconds)
-    judged = attempt(protocol).changed(name, changed, tmp_path_factory.mktemp("changed"))
-    assert attempt(protocol).wrong(judged) == {}
+    verdict = attempt(protocol).judge_changed(name, changed, tmp_path_factory.mktemp("changed"))
+    assert attempt(protocol).wrongly_changed(verdict) == {}
 
 
-def demand(protocol: Protocol, name: str, change: Change | None, place: Path, reason: str) -> None:
+def require_problem(protocol: Protocol, name: str, change: Change | None, place: Path, reason: str) -> None:
     old = (attempt(protocol).folder / name).read_bytes()
     new = None if change is None else change(old)
     assert new != old
-    found = attempt(protocol).changed(name, new, place).problems
-    assert any(reason in one for one in found), found
+    problems = attempt(protocol).judge_changed(name, new, place).problems
+    assert any(reason in problem for problem in problems), problems
 
 
 def of_json(edit: Callable[[Any], object]) -> Change:
@@ -103,7 +110,9 @@ def test_one_changed_bit_in_an_address_of_a_packet_is_found(
     def change(capture: bytes) -> bytes:
         return with_changed_bit(capture, index, 8 * _ADDRESSES_AT + bit)
 
-    demand(protocol, name, change, tmp_path_factory.mktemp("changed"), "packets have a wrong IPv4 header checksum")
+    require_problem(
+        protocol, name, change, tmp_path_factory.mktemp("changed"), "packets have a wrong IPv4 header checksum"
+    )
 
 
 _ADDRESSES_AT = 12
@@ -141,7 +150,7 @@ SENT = "sender-iperf3.json"
 def test_iperf3_results_contradicted_by_other_evidence(
     protocol: Protocol, name: str, change: Change, reason: str, tmp_path: Path
 ) -> None:
-    demand(protocol, name, change, tmp_path, reason)
+    require_problem(protocol, name, change, tmp_path, reason)
 
 
 @pytest.mark.parametrize("protocol", Protocol)
@@ -207,7 +216,7 @@ STAMP = r"(\[)([0-9.]+)"
     ],
 )
 def test_pings_that_captures_contradict(protocol: Protocol, change: Change, reason: str, tmp_path: Path) -> None:
-    demand(protocol, "ping.txt", change, tmp_path, reason)
+    require_problem(protocol, "ping.txt", change, tmp_path, reason)
 
 
 def test_changed_ping_times_with_a_consistent_summary(tmp_path: Path) -> None:
@@ -221,7 +230,7 @@ def test_changed_ping_times_with_a_consistent_summary(tmp_path: Path) -> None:
         times = [float(one) for one in re.findall(r"time=([0-9.]+)", text)]
         return f"{min(times):.3f}/{sum(times) / len(times):.3f}/{max(times):.3f}/0.1"
 
-    demand(Protocol.TCP, "ping.txt", longer, tmp_path, "ms longer than in the sender's capture")
+    require_problem(Protocol.TCP, "ping.txt", longer, tmp_path, "ms longer than in the sender's capture")
 
 
 @pytest.mark.parametrize(
@@ -235,7 +244,7 @@ def test_changed_ping_times_with_a_consistent_summary(tmp_path: Path) -> None:
 )
 def test_a_udp_file_that_differs_from_the_received_data(change: Change, reason: str, tmp_path: Path) -> None:
     assert len((attempt(Protocol.UDP).folder / "recv.bag").read_bytes()) > 8192
-    demand(Protocol.UDP, "recv.bag", change, tmp_path, reason)
+    require_problem(Protocol.UDP, "recv.bag", change, tmp_path, reason)
 
 
 def test_datagrams_dropped_by_the_kernel_are_a_loss_of_the_receiver(tmp_path: Path) -> None:

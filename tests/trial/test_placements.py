@@ -22,7 +22,7 @@ DEGREE_M = 110_574.28
 """Metres per degree of latitude at the equator."""
 
 
-def stood(folder: Path, receiver: PositionSource, sender: PositionSource) -> AttemptEvidence:
+def write_sources(folder: Path, receiver: PositionSource, sender: PositionSource) -> AttemptEvidence:
     stored = PositionSources({Role.SENDER: sender, Role.RECEIVER: receiver})
     (folder / position_sources.FILE).write_text(position_sources.text(stored), encoding="utf-8")
     return AttemptEvidence(folder)
@@ -30,12 +30,12 @@ def stood(folder: Path, receiver: PositionSource, sender: PositionSource) -> Att
 
 def in_metres(folder: Path, apart_m: float) -> AttemptEvidence:
     sender, receiver = (PositionSource(place=(at_m, 0.0, 0.0), frame=LOCAL) for at_m in (5.0, 5.0 + apart_m))
-    return stood(folder, receiver, sender)
+    return write_sources(folder, receiver, sender)
 
 
 def on_earth(folder: Path, apart_m: float) -> AttemptEvidence:
     sender, receiver = (PositionSource(place=(at_m / DEGREE_M, 0.0, None), frame=WGS84) for at_m in (0.0, apart_m))
-    return stood(folder, receiver, sender)
+    return write_sources(folder, receiver, sender)
 
 
 PLAN = los_plan()
@@ -81,7 +81,9 @@ def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
 ) -> None:
     places_m = SCENE.places_m
     x, y, z = places_m[Role.RECEIVER]
-    evidence = stood(tmp_path, PositionSource(place=(x + off_m, y, z)), PositionSource(place=places_m[Role.SENDER]))
+    evidence = write_sources(
+        tmp_path, PositionSource(place=(x + off_m, y, z)), PositionSource(place=places_m[Role.SENDER])
+    )
     problems = list(follow.problems(View(SCENE, evidence), ()))
     assert (problems == []) if why is None else [why in reason for reason in problems] == [True]
 

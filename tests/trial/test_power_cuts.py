@@ -104,7 +104,7 @@ def test_removing_any_sync_is_detected(place: Path) -> None:
 
 
 @strictest_in_ci
-def test_cuts_at_random_moments_one_after_the_other_lose_nothing(place: Path, file_system: FileSystem) -> None:
+def test_consecutive_cuts_at_random_moments_lose_nothing(place: Path, file_system: FileSystem) -> None:
     draw, calls = random.Random(file_system.name), calls_of_a_trial(place)
     assert sum(cuts_in_a_row(file_system, place, draw, calls=calls, most=4) for _ in range(3)) > 3
 

@@ -18,7 +18,7 @@ from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.columns import IDENTITY, filled_by, installed, measures, of_steps, trial_columns
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.procedure import Procedure
-from tests.helpers import meter, varied
+from tests.helpers import meter, vendor_trials
 from tests.helpers.casts import los_plan
 from tests.helpers.outside_packages import write_package
 
@@ -82,7 +82,7 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     assert [read.column(name)[0] for name in row] == kept
 
 
-def test_common_columns_come_first_whatever_their_rank() -> None:
+def test_common_columns_are_first_independently_of_their_rank() -> None:
     beyond = [Column("probe.level", "dBm", "x", rank=1), Column("status", "count", "not this one")]
     assert trial_columns(beyond) == (*trial_columns(), beyond[0])
     assert trial_columns()[: len(IDENTITY)] == IDENTITY
@@ -207,37 +207,48 @@ def test_columns_of_other_packages_are_only_in_trials_that_use_them() -> None:
 
 # Tables.
 
-OF_TRIAL = [column for column in varied.VENDOR if column.name.startswith("probe")]
+OF_TRIAL = [column for column in vendor_trials.VENDOR_COLUMNS if column.name.startswith("probe")]
 
 
-def written(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bool = True) -> Path:
-    plan = varied.plan(name, distance="30ft", metres=9.144, columns=columns)
-    return varied.write(folder, plan, varied.measured(plan, repeats=2), with_plan=with_plan) / "trial.csv"
+def write_trial(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bool = True) -> Path:
+    plan = vendor_trials.plan(name, distance="30ft", metres=9.144, columns=columns)
+    return (
+        vendor_trials.write(folder, plan, vendor_trials.valid_rows(plan, repeats=2), with_plan=with_plan)
+        / "trial.csv"
+    )
 
 
 def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Path) -> None:
-    found = tables.declared_in([written(tmp_path, "one", varied.VENDOR)])
-    assert found == (*trial_columns(), *(Column(**{**vars(column), "rank": 100}) for column in varied.VENDOR))
+    found = tables.declared_in([write_trial(tmp_path, "one", vendor_trials.VENDOR_COLUMNS)])
+    assert found == (
+        *trial_columns(),
+        *(Column(**{**vars(column), "rank": 100}) for column in vendor_trials.VENDOR_COLUMNS),
+    )
 
 
 def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
-    paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", varied.NAMED)]
+    paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", vendor_trials.NAMED_STEP_COLUMNS)]
     read = repeats.read(paths, tables.declared_in(paths))
     assert [value is None for value in read.column("probe.level")] == [False] * 4 + [True] * 4
     assert [value is None for value in read.column("up.transfer_s")] == [True] * 4 + [False] * 4
 
 
 def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path: Path) -> None:
-    alone = written(tmp_path, "one", (*varied.NAMED, *varied.VENDOR), with_plan=False)
+    alone = write_trial(
+        tmp_path, "one", (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS), with_plan=False
+    )
     found = {column.name: column for column in tables.declared_in([alone])}
-    for column in varied.NAMED:
+    for column in vendor_trials.NAMED_STEP_COLUMNS:
         assert found[column.name] == column
-    for column in varied.VENDOR:
+    for column in vendor_trials.VENDOR_COLUMNS:
         assert found[column.name] == repeats.undeclared(column.name)
 
 
 def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: Path) -> None:
-    paths = [written(tmp_path / "a", "one", OF_TRIAL, with_plan=False), written(tmp_path / "b", "two", OF_TRIAL)]
+    paths = [
+        write_trial(tmp_path / "a", "one", OF_TRIAL, with_plan=False),
+        write_trial(tmp_path / "b", "two", OF_TRIAL),
+    ]
     (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
     assert level.unit == "dBm"
 
@@ -252,8 +263,8 @@ def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: P
     ],
 )
 def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path, other: Column) -> None:
-    paths = [written(tmp_path, "one", OF_TRIAL), written(tmp_path, "two", [other])]
-    with pytest.raises(ConfigurationError, match=r"probe\.level is another column here") as refused:
+    paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", [other])]
+    with pytest.raises(ConfigurationError, match=r"probe\.level is a different column here") as refused:
         tables.declared_in(paths)
     assert refused.value.where == str(paths[1].with_name("trial.yaml"))
 
@@ -261,7 +272,7 @@ def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path
 def test_plans_may_differ_in_meaning_and_bounds_of_a_column(tmp_path: Path) -> None:
     other = Column("probe.level", "dBm", "Level.", bounds=(-90, 0), figure=Figure("signal", Kind.MEDIAN))
     same = Column("probe.level", "dBm", "What it says.", bounds=(-120, -10), figure=Figure("level", Kind.MEDIAN))
-    paths = [written(tmp_path, "one", [other]), written(tmp_path, "two", [same])]
+    paths = [write_trial(tmp_path, "one", [other]), write_trial(tmp_path, "two", [same])]
     (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
     assert (level.meaning, level.bounds) == ("Level.", (-120, 0))
 
@@ -285,7 +296,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("columns", HOSTILE.values(), ids=HOSTILE)
 def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns: str) -> None:
-    table = written(tmp_path, "one", OF_TRIAL)
+    table = write_trial(tmp_path, "one", OF_TRIAL)
     path = table.with_name("trial.yaml")
     head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
     path.write_text(f"{head}columns:\n{columns}\n", encoding="utf-8")
@@ -298,7 +309,7 @@ def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns
 
 
 def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:
-    table = written(tmp_path, "one", [Column("probe.level", "dBm", "x")])
+    table = write_trial(tmp_path, "one", [Column("probe.level", "dBm", "x")])
     path = table.with_name("trial.yaml")
     spoiled = path.read_text(encoding="utf-8").replace("name: probe.level", "name: status", 1)
     path.write_text(spoiled, encoding="utf-8")
@@ -308,7 +319,7 @@ def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:
 
 
 def test_a_plan_that_is_a_link_is_not_read(tmp_path: Path) -> None:
-    table = written(tmp_path, "one", [Column("probe.level", "dBm", "x")])
+    table = write_trial(tmp_path, "one", [Column("probe.level", "dBm", "x")])
     plan = table.with_name("trial.yaml")
     plan.rename(tmp_path / "elsewhere.yaml")
     plan.symlink_to(tmp_path / "elsewhere.yaml")

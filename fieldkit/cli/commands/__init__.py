@@ -1,4 +1,4 @@
-"""Every command with its help line, in a module of its name: `add` declares its arguments, `run` runs it.
+"""All commands with their help lines. Each has a module of its name: `add` declares its arguments, `run` runs it.
 
 Commands that list items share the module `listings`, with a pair of functions for each, such as `add_robots`.
 A module is imported when its command is used. Slow imports are inside of the functions that need them, so that help
@@ -30,7 +30,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "export": "write trials for pandas, R or Foxglove",
         "bag": "inspect, check, repair and convert bags of ROS 1 and ROS 2",
         "middleware": "recommend a middleware's configuration from measured trials",
-        "bridge": "carry topics between ROS 1, DDS and Zenoh",
+        "bridge": "forward topics between ROS 1, DDS and Zenoh",
         "robots": "list robots, or show NAME",
         "procedures": "list procedures, or show NAME",
         "columns": "list the CSV columns, those of PROCEDURE, or show NAME",

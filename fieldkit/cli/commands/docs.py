@@ -21,7 +21,7 @@ def add(parser: Parser) -> None:
     )
     output_options = parser.add_mutually_exclusive_group()
     output_options.add_argument(
-        "--path", action="store_true", help="print the path of the page in place of opening it"
+        "--path", action="store_true", help="print the path of the page instead of opening it"
     )
     output_options.add_argument("--list", action="store_true", help="list all topics with their pages")
     parser.set_defaults(run=run)

@@ -81,7 +81,7 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     folder: Path = arguments.paths[0]
     if len(arguments.paths) > 1:
         raise ConfigurationError(
-            f"an MCAP file holds one trial, {len(arguments.paths)} are given",
+            f"an MCAP file contains one trial, but {len(arguments.paths)} are given",
             remedy="one at a time: "
             + shell_command("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )

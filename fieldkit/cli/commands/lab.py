@@ -229,7 +229,7 @@ def plot(arguments: argparse.Namespace) -> int:
 
 
 def _place(place_m: Vector) -> str:
-    """Format a position for people, to the centimetre: `198.5, 200, 0.2`."""
+    """Return a position as text, to the centimetre: `198.5, 200, 0.2`."""
     return ", ".join(f"{round(metres, 2):.10g}" for metres in place_m)
 
 

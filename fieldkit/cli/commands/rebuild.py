@@ -1,4 +1,4 @@
-"""`fieldkit rebuild TRIAL`: the tables again, from raw evidence."""
+"""`fieldkit rebuild TRIAL`: regenerate the tables from raw evidence."""
 
 import argparse
 
@@ -10,7 +10,9 @@ from fieldkit.core.text import print_text
 
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit rebuild`."""
-    parser.description = "Make trial.csv and summary.csv again from plan, journal and raw evidence: the same bytes."
+    parser.description = (
+        "Regenerate trial.csv and summary.csv from plan, journal and raw evidence. The result is byte-identical."
+    )
     shared.add_trial(parser)
     shared.add_all(parser)
     parser.set_defaults(run=run)

@@ -329,7 +329,7 @@ def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Itera
     first, arrived_ns = matched.sent.where(matched.first), deliveries.arrivals_ns(matched)
     for mask in load.datagram_masks(first):
         if (np.append(mask, False)[matched.datagram] & matched.match.ambiguous).any():
-            raise EvidenceError("its packets cannot be distinguished, so it is unknown which of them arrived when")
+            raise EvidenceError("its packets cannot be distinguished, so their times of arrival are unknown")
         complete = mask & (arrived_ns != NO_TIME)
         if complete.any():
             order = np.argsort(arrived_ns[complete], kind="stable")

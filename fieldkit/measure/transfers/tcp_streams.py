@@ -96,7 +96,7 @@ _CONNECTION_BITS: Final = 33
 
 @dataclass(frozen=True, eq=False)
 class ByteIntervals:
-    """ByteIntervals of positions from `starts` up to and excluding `stops`; they may overlap."""
+    """Intervals of byte positions from `starts` up to and excluding `stops`; they may overlap."""
 
     starts: Ints
     stops: Ints

@@ -102,7 +102,7 @@ def _system(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
 def incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     """Return the reason why no loss can be computed from two undamaged captures, or None if it can.
 
-    The captures contradict the file or each other. None as well if there are not two captures.
+    The reason is a contradiction between the captures, or with the file. Without two captures there is none.
     """
     return evidence.cached(_incomparability_reason, transfer) if transfer.captured else None
 

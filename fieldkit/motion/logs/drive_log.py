@@ -1,7 +1,7 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
 The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.drive`): time, pose by its
-odometry in the frame of the start, and driven distance. The last line has the reason of the end. All values are
+odometry in the frame of the start, and driven distance. The last line has the reason for the end. All values are
 measured by the robot itself.
 """
 
@@ -80,8 +80,8 @@ class DriveMoment:
         y_m: Position to the left of the start.
         yaw_rad: Heading relative to the start, positive to the left.
         driven_m: Driven distance since the start.
-        forward_m_s: Commanded speed; 0 while the robot stands or turns.
-        ended: Reason of the end; empty before the end.
+        forward_m_s: Commanded speed; 0 while the robot is stationary or turns.
+        ended: Reason for the end; empty before the end.
         utc_ns: Time by the robot's clock, nanoseconds since 1970 UTC; 0 if the line does not have it.
     """
 

@@ -73,7 +73,7 @@ def telemetry_contradiction(log: Sequence[FlightMoment], places_m: Floats) -> st
         )
         # The bounding boxes have different axes; rotation changes the diagonal by a factor of up to sqrt(2).
         if telemetry_m > math.sqrt(2) * logged_m + POSITION_ERROR_M:
-            return f"its telemetry moved {telemetry_m:.1f} m {direction}, but its log only {logged_m:.1f} m"
+            return f"moved {telemetry_m:.1f} m {direction} in its telemetry, but only {logged_m:.1f} m in its log"
     return None
 
 

@@ -53,11 +53,11 @@ COLUMNS: Final = columns(
 )
 """Columns of trials with a step `fly`."""
 
-_ON_WAY: Final = "flying"
-_STEP_PHASES: Final = frozenset({_ON_WAY, "there"})
+_ON_PATH: Final = "flying"
+_STEP_PHASES: Final = frozenset({_ON_PATH, "there"})
 """Phases in which the inner steps run."""
 _LAST_PHASE: Final = "coming down"
-PHASES: Final = ("standing", "climbing", "up", _ON_WAY, "there", "coming back", _LAST_PHASE)
+PHASES: Final = ("standing", "climbing", "up", _ON_PATH, "there", "coming back", _LAST_PHASE)
 """Phases of a flight in the order of time."""
 
 
@@ -121,7 +121,7 @@ def measure(log: Sequence[FlightMoment] | None) -> Measured:
     if not log:
         return Measured.all_missing(COLUMNS, "the drone wrote no log of its flight")
     heights_m = [moment.up_m for moment in log if moment.phase in _STEP_PHASES]
-    speeds_m_s = [moment.speed_m_s for moment in log if moment.phase == _ON_WAY]
+    speeds_m_s = [moment.speed_m_s for moment in log if moment.phase == _ON_PATH]
     values: dict[str, Value | None] = {
         "fly_height_median_m": float(np.median(heights_m)) if heights_m else None,
         "fly_height_max_m": max(moment.up_m for moment in log),

@@ -71,6 +71,6 @@ def time_contradictions(log: Sequence[MotionMoment], window: tuple[int, int] | N
         yield "has lines from before the attempt or after it, by the robot's clock"
     offsets_s = [moment.utc_ns / 1e9 - moment.at_s for moment in timed]
     if max(offsets_s) - min(offsets_s) > _STALL_S:
-        yield "its two clocks do not advance equally"
+        yield "its two clocks do not advance at the same rate"
     if times_ns != sorted(times_ns):
         yield "its lines are not in the order of the robot's clock"

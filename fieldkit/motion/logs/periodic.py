@@ -5,8 +5,8 @@ their numbers are missing too. So a message counts as lost only if the autopilot
 one was due, and a number is missing there.
 
 An autopilot sends late when it is busy, and catches up. The received messages of a stream are therefore assigned to
-its periods together, by the least sum of squared deviations from the schedule (a beam search over the number of lost
-messages), and not one gap at a time.
+its periods together, not one gap at a time. The assignment with the least sum of squared deviations from the schedule
+is used (a beam search over the number of lost messages).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,26 +17,26 @@ from typing import Final, NamedTuple
 
 from fieldkit.measure.evidence.sequence import NUMBERS, SILENCE_US
 
-LEAST: Final = 10
+_MIN_MESSAGES: Final = 10
 """A stream with fewer messages is not counted."""
-_COMPLETE: Final = 3
-"""With fewer intervals in which no number is missing, they do not show a period."""
+_MIN_INTERVALS: Final = 3
+"""Minimum number of intervals without a missing number from which a period is estimated."""
 _REQUEST_TOLERANCE: Final = 0.25
-"""Relative difference of the observed period up to which a request was met. A station that changes the rate changes
-it by more. The observed mean is too short, because long intervals more often contain a missing number, and are left
-out."""
+"""Maximum relative difference between the observed and the requested period of a granted request. A station that
+changes the rate changes it by more. The observed mean is too short, because long intervals contain a missing number
+more often, and are omitted."""
 _RATE_TOLERANCE: Final = 0.08
-"""Relative difference up to which a whole rate explains an observed one that was not requested."""
-_HIGHEST_HZ: Final = 10
-"""Whole rates above it are too close to be distinguished."""
+"""Maximum relative difference between the observed rate and an integer rate, for a stream without a request."""
+_MAX_RATE_HZ: Final = 10
+"""Higher integer rates are too similar to be distinguished."""
 _PHASE_GAIN: Final = 0.03
-"""Share of a deviation by which the schedule is corrected. A larger gain follows late messages; a smaller one does
-not follow the drift of a period that is known to 0.1 %."""
+"""Share of a deviation by which the schedule is corrected. With a larger gain, late messages shift the schedule; with
+a smaller one, it does not follow the drift of a period that is known to 0.1 %."""
 _SKIP_COST: Final = 1.0
 """Cost of a period that the autopilot skipped, in squared periods: more than the deviation of a late message,
 less than two of them."""
 _HYPOTHESES: Final = 4
-"""Hypotheses that are kept; late messages leave two or three undecided."""
+"""Number of hypotheses that are kept; after late messages two or three are still possible."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,10 @@ class StreamMessage:
 
 
 class _Hypothesis(NamedTuple):
-    """An assignment of the messages so far to periods; the cheapest compares as least.
+    """An assignment of the messages so far to periods; hypotheses are ordered by cost.
 
     Attributes:
-        cost: Sum of squared deviations and of costs of skipped periods, in periods.
+        cost: Sum of squared deviations and of costs of skipped periods, in squared periods.
         phase_ms: Scheduled time of the last message, milliseconds.
         lost: Number of lost messages.
     """
@@ -77,52 +77,51 @@ def lost(
     """Return the number of received and of lost messages of all periodic streams.
 
     In a silence of more than 1 s, and between the last message and the end, sequence numbers are ambiguous (they
-    repeat after 256 messages), and the period counts alone. A period that an overloaded autopilot skips counts as a
+    repeat after 256 messages), so only the period is used. A period that an overloaded autopilot skips counts as a
     loss if a number is missing at that time.
 
     Args:
         numbers: Time of arrival (microseconds) and sequence number of each message of the autopilot, in this order.
         streams: Messages with a time by message name, in order of arrival.
         ended_us: End of the recording; 0 if unknown.
-        intervals_us: Requested intervals by message name. Other messages are counted if their rate is a whole number
-        of
-            hertz up to 10.
+        intervals_us: Requested intervals by message name. Other messages are counted if their rate is an integer
+            number of hertz up to 10.
     """
     indices = _unwrapped([number for _, number in numbers])
     received = missing = 0
     tail_us = max(ended_us - numbers[-1][0], 0) if numbers else 0
     for name, messages in streams.items():
-        if len(messages) < LEAST:
+        if len(messages) < _MIN_MESSAGES:
             continue
         if (period_ms := _period_ms(messages, indices, (intervals_us or {}).get(name))) is None:
             continue
         received += len(messages)
-        missing += _assigned(messages, indices, period_ms).lost
+        missing += _best_assignment(messages, indices, period_ms).lost
         if tail_us > SILENCE_US:
             missing += max(round(tail_us / 1e3 / period_ms) - 1, 0)
     return received, missing
 
 
-def _assigned(messages: Sequence[StreamMessage], indices: Sequence[int], period_ms: float) -> _Hypothesis:
+def _best_assignment(messages: Sequence[StreamMessage], indices: Sequence[int], period_ms: float) -> _Hypothesis:
     """Return the best hypothesis about the messages of a stream that were lost between its first and its last one."""
     hypotheses = [_Hypothesis(0.0, float(messages[0].boot_ms), 0)]
     for before, after in pairwise(messages):
         if after.at_us - before.at_us > SILENCE_US:
-            silent = max(round((after.boot_ms - before.boot_ms) / period_ms) - 1, 0)
+            lost_in_silence = max(round((after.boot_ms - before.boot_ms) / period_ms) - 1, 0)
             best = hypotheses[0]
-            hypotheses = [_Hypothesis(best.cost, float(after.boot_ms), best.lost + silent)]
+            hypotheses = [_Hypothesis(best.cost, float(after.boot_ms), best.lost + lost_in_silence)]
             continue
         missing = max(indices[after.position] - indices[before.position] - (after.position - before.position), 0)
         cheapest = dict[int, _Hypothesis]()
         for hypothesis in hypotheses:
-            for following in _following(hypothesis, after.boot_ms, missing, period_ms):
+            for following in _next_hypotheses(hypothesis, after.boot_ms, missing, period_ms):
                 cheapest[following.lost] = min(cheapest.get(following.lost, following), following)
         hypotheses = sorted(cheapest.values())[:_HYPOTHESES]
     return hypotheses[0]
 
 
-def _following(before: _Hypothesis, boot_ms: int, missing: int, period_ms: float) -> list[_Hypothesis]:
-    """Return the hypotheses about the next message, of which at most `missing` predecessors were lost."""
+def _next_hypotheses(before: _Hypothesis, boot_ms: int, missing: int, period_ms: float) -> list[_Hypothesis]:
+    """Return the hypotheses after the next message; at most `missing` messages before it were lost."""
     elapsed = (boot_ms - before.phase_ms) / period_ms
     nearest = max(round(elapsed), 1)
     hypotheses = list[_Hypothesis]()
@@ -142,14 +141,14 @@ def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interv
     """Return the period of a stream in milliseconds, or None if it is unknown.
 
     That is the requested interval if the stream has about this period. Otherwise it is the period of the nearest
-    whole rate up to 10 Hz, as autopilots are configured in hertz.
+    integer rate up to 10 Hz, because autopilots are configured in hertz.
     """
     intervals_ms = sorted(
         after.boot_ms - before.boot_ms
         for before, after in pairwise(messages)
         if indices[after.position] - indices[before.position] == after.position - before.position
     )
-    if len(intervals_ms) < _COMPLETE:
+    if len(intervals_ms) < _MIN_INTERVALS:
         if interval_us:
             return interval_us / 1e3
         intervals_ms = sorted(after.boot_ms - before.boot_ms for before, after in pairwise(messages))
@@ -160,7 +159,7 @@ def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interv
     if interval_us and abs(observed_ms * 1e3 / interval_us - 1) <= _REQUEST_TOLERANCE:
         return interval_us / 1e3
     rate_hz = max(round(1e3 / observed_ms), 1)
-    is_near = rate_hz <= _HIGHEST_HZ and abs(rate_hz * observed_ms / 1e3 - 1) <= _RATE_TOLERANCE
+    is_near = rate_hz <= _MAX_RATE_HZ and abs(rate_hz * observed_ms / 1e3 - 1) <= _RATE_TOLERANCE
     return 1e3 / rate_hz if is_near else None
 
 

@@ -196,7 +196,7 @@ class Tlog:
 
     Attributes:
         frames: Number of frames of all senders.
-        kinds: Number of messages of the autopilot, by their names.
+        kinds: Number of messages of the autopilot by message name.
         values: Values of columns.
         first_us: Earliest time of a frame, microseconds since 1970 UTC by the recorder's clock.
         last_us: Latest time of a frame.
@@ -216,7 +216,7 @@ def read(path: Path, system: int, ended_us: int, intervals_us: tuple[tuple[str, 
 
     Args:
         path: The log.
-        system: System ID of the autopilot; 0 for the only one.
+        system: System ID of the autopilot; 0 if the log has only one.
         ended_us: End of the recording; 0 if unknown.
         intervals_us: Names of messages with their requested intervals.
 
@@ -249,17 +249,17 @@ def read(path: Path, system: int, ended_us: int, intervals_us: tuple[tuple[str, 
 
 
 def contradictions(
-    log: Tlog, summary: RecorderSummary, sum_of_file: int, window: tuple[int, int] | None
+    log: Tlog, summary: RecorderSummary, file_crc32: int, window: tuple[int, int] | None
 ) -> Iterator[str]:
     """Yield the contradictions between a log, the recorder's summary and the attempt, one sentence each.
 
     Args:
         log: The log.
         summary: Summary of the recorder.
-        sum_of_file: CRC-32 of the log's file.
+        file_crc32: CRC-32 of the log's file.
         window: The recorder's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
     """
-    if summary.crc32 is not None and summary.crc32 != sum_of_file:
+    if summary.crc32 is not None and summary.crc32 != file_crc32:
         yield "was changed: its checksum differs from the one that its recorder wrote"
     if log.last_us > summary.ended_us + _TIME_TOLERANCE_US:
         yield f"has a frame {(log.last_us - summary.ended_us) / 1e6:.3f} s after its recorder ended"
@@ -297,7 +297,7 @@ def _possible_value(column: Column, value: Value | None) -> Value | None:
 
 
 def positions(path: Path, system: int, kind: str) -> list[list[Any]]:
-    """Return the autopilot's positions in messages of a name; see `tlog_reader`.
+    """Return the autopilot's positions in the messages with the name `kind`; see `tlog_reader`.
 
     Raises:
         EvidenceError: As `read`.

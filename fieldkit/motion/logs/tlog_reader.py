@@ -115,7 +115,7 @@ def answer(question: Json) -> Json:
     """Return the answer to a query about the log at `path`.
 
     A query with `positions` returns the positions in messages of this name, and any other query a summary of the log.
-    Both are of the autopilot with the system ID `system`, 0 for the only one.
+    Both are of the autopilot with the system ID `system`; 0 selects the only autopilot in the log.
 
     Raises:
         ValueError: The file is not a log, or does not contain exactly one such autopilot.
@@ -127,7 +127,7 @@ def answer(question: Json) -> Json:
     return _summary(data, autopilot, question["ended_us"], question["intervals_us"])
 
 
-def _autopilot(data: bytes, wanted: int) -> Source:
+def _autopilot(data: bytes, system_id: int) -> Source:
     """Return the sender of an autopilot's heartbeats.
 
     Raises:
@@ -135,16 +135,16 @@ def _autopilot(data: bytes, wanted: int) -> Source:
     """
     decoder, heartbeats = TlogDecoder(), Counter[Source]()
     for frame in frames(data):
-        if frame.kind == dialect.MAVLINK_MSG_ID_HEARTBEAT and wanted in {0, frame.source[0]}:
+        if frame.kind == dialect.MAVLINK_MSG_ID_HEARTBEAT and system_id in {0, frame.source[0]}:
             heartbeat = decoder.message(frame)
             is_autopilot = heartbeat is not None and heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
             heartbeats[frame.source] += is_autopilot
     heartbeats += Counter()  # removes senders with a count of 0
     if not heartbeats:
-        raise ValueError(f"no heartbeat of an autopilot{f' of system {wanted}' if wanted else ''}")
+        raise ValueError(f"no heartbeat of an autopilot{f' of system {system_id}' if system_id else ''}")
     if len(heartbeats) > 1:
         systems = ", ".join(str(system) for system, _ in sorted(heartbeats))
-        raise ValueError(f"autopilots of systems {systems}: name one")
+        raise ValueError(f"it has autopilots of systems {systems}: choose one with the key system")
     return next(iter(heartbeats))
 
 
@@ -218,9 +218,9 @@ def _column_values(series: dict[str, list[float]]) -> Iterator[tuple[str, float]
             yield f"{quantity}_begin_{unit}".rstrip("_"), values[0]
             yield f"{quantity}_end_{unit}".rstrip("_"), values[-1]
     reductions: dict[str, Callable[[list[float]], float]] = {"min": min, "mean": fmean, "max": max}
-    for name, wanted in _REDUCTIONS.items():
+    for name, statistics in _REDUCTIONS.items():
         quantity, _, unit = name.partition("_")
-        for statistic in wanted:
+        for statistic in statistics:
             if values := series[name]:
                 yield f"{quantity}_{statistic}_{unit}".rstrip("_"), float(reductions[statistic](values))
     for name, source in (("armed", "armed"), ("drop_rate", "drop_rate"), ("rssi_min", "rssi")):
@@ -256,7 +256,9 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
             position = message.y, message.x, -message.z
             rows.append((frame.at_us, message.time_boot_ms, *position, heading_rad))
     bounds = (90.0, 180.0, _MAX_DISTANCE_M) if kind == tlog.GLOBAL else (_MAX_DISTANCE_M,) * 3
-    if not all(abs(value) <= bound for row in rows for value, bound in zip(row[2:5], bounds, strict=True)):  # nor NaN
+    if not all(
+        abs(value) <= bound for row in rows for value, bound in zip(row[2:5], bounds, strict=True)
+    ):  # NaN fails, too
         raise ValueError(f"a {kind} contains no valid position")
     first_rad = next((row[5] for row in rows if math.isfinite(row[5])), 0.0)
     for row in rows:

@@ -1,1 +1,1 @@
-"""What surrounds a trial with robots that move by themselves: permission, journal of motions, guards of drones."""
+"""Parts of a trial with robots that move automatically: permission, journal of motions, guards of drones."""

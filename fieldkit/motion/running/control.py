@@ -1,4 +1,4 @@
-"""The control of robots that move by themselves, as the harness calls it: the entry point of `fieldkit.motion`."""
+"""Interface of the harness to robots that move automatically: the entry point `control` of `fieldkit.motion`."""
 
 from typing import Final
 

@@ -1,8 +1,9 @@
 """Guards of drones that other programs fly: each lands its drone if the attempt is aborted (`on_abort`).
 
 A guard runs on the drone's computer while the steps run, and exits without an action when they are done. It lands the
-drone or lets it return if the attempt's jobs are ended (Ctrl-C, an error, `fieldkit abort`), or if the laptop was not
-heard for `piloting.LEASE_S`; but not while a person or a failsafe controls the drone (`fieldkit.agent.flying.guard`).
+drone or lets it return if the attempt's jobs are stopped (Ctrl-C, an error, `fieldkit abort`), or if no order arrives
+from the laptop for `piloting.LEASE_S`; but not while a person or a failsafe controls the drone
+(`fieldkit.agent.flying.guard`).
 A step `fly` has a separate guard.
 """
 

@@ -177,7 +177,7 @@ def read(path: Path) -> list[MotionEntry]:
     return jsonl.read(path, _CODEC.parse, remedy="restore it from a copy") if path.is_file() else []
 
 
-class KeptOrigins:
+class JournaledOrigins:
     """Implements `Origins` for robots that stay at the end of a motion, with a journal on disk.
 
     Args:
@@ -245,7 +245,7 @@ class KeptOrigins:
     def moving(self, role: Role) -> Iterator[RobotMotion]:
         """Record start and end of a motion; a motion that is not over when the body ends leaves the robot held."""
         self.require()
-        name, motion, why = self._robots[role], RobotMotion(), "it stopped on its way"
+        name, motion, why = self._robots[role], RobotMotion(), "it stopped on its path"
         self._journal.add(MotionEvent.BEGUN, name)
         self._in_motion.add(name)
         try:

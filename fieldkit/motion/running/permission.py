@@ -1,4 +1,4 @@
-"""Confirmations by a person before robots move: that they are at their places, and may move again after a fault."""
+"""Confirmations by a person that robots are at their places, and that they may move again after a fault."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ from fieldkit.motion import permissions
 from fieldkit.motion.origins import MemoryOrigins, Origins
 from fieldkit.motion.profile_sections import drives, flies
 from fieldkit.motion.running import motion_journal
-from fieldkit.motion.running.motion_journal import KeptOrigins, MotionJournal
+from fieldkit.motion.running.motion_journal import JournaledOrigins, MotionJournal
 from fieldkit.trial.plan import Plan
 
 CONFIRM: Final = "confirm"
@@ -65,14 +65,16 @@ class MotionPermission:
         self.origins: Origins
         self._moving = {role: plan.cast[role].name for role in _self_moving(plan)}
         self._testbed = testbed
-        self._kept: KeptOrigins | None = None
+        self._journaled: JournaledOrigins | None = None
         if isinstance(testbed, Transient):
             self.origins = MemoryOrigins()
             return
         self._journal = MotionJournal(motion_journal.journal_of(folder))
         allowed = isinstance(testbed, Attended) and permissions.MOVE_AFTER_FAULT in testbed.permissions
         robots = {role: robot.name for role, robot in plan.cast.items()}
-        self.origins = self._kept = KeptOrigins(self._journal, folder, robots, plan.placement, may_return=allowed)
+        self.origins = self._journaled = JournaledOrigins(
+            self._journal, folder, robots, plan.placement, may_return=allowed
+        )
 
     def require(self) -> None:
         """Check that robots may move in the next attempt. After a fault, a person must type `confirm`.
@@ -82,36 +84,36 @@ class MotionPermission:
             MotionHeldError: No person has confirmed.
             OSError: The disk is full or was removed.
         """
-        if self._kept is None or not self._moving:
+        if self._journaled is None or not self._moving:
             return
-        self._require_placed(self._kept)
+        self._require_placed(self._journaled)
         if self._journal.holds:
-            self._require_confirmed(self._kept)
+            self._require_confirmed(self._journaled)
 
     @contextmanager
-    def noting(self, sink: Sink) -> Iterator[None]:
-        """Run the body; if the operator stops it, note each robot that may not move again without a confirmation."""
+    def reporting_holds(self, sink: Sink) -> Iterator[None]:
+        """Run the body; if the operator stops it, report each robot that must not move without a confirmation."""
         try:
             yield
         except KeyboardInterrupt:
-            for hold in self._journal.holds if self._kept is not None else ():
+            for hold in self._journal.holds if self._journaled is not None else ():
                 place = f"before {hold.robot} moves again, a person must put it at its place and type {CONFIRM}"
                 sink(Note(f"{hold.reason}: {place}"))
             raise
 
-    def _require_placed(self, kept: KeptOrigins) -> None:
+    def _require_placed(self, origins: JournaledOrigins) -> None:
         """Raise an error if a robot must be at a new place but no person was asked: its origin would be wrong."""
         testbed = self._testbed
         if isinstance(testbed, Attended) and not isinstance(testbed.operator, Unattended):
             return  # a person was asked to move it there
         for role, name in self._moving.items():
-            if kept.is_new_place(role):
+            if origins.is_new_place(role):
                 raise MotionHeldError(
                     f"{name} must be at another place than before, and --yes does not confirm that it is there",
                     remedy="put it at its place for this trial, clear its path, then repeat this without --yes",
                 )
 
-    def _require_confirmed(self, kept: KeptOrigins) -> None:
+    def _require_confirmed(self, origins: JournaledOrigins) -> None:
         testbed = self._testbed
         if isinstance(testbed, Attended):
             if permissions.MOVE_AFTER_FAULT in testbed.permissions:
@@ -126,4 +128,4 @@ class MotionPermission:
             if testbed.operator.enter(Question(text, choices=(CONFIRM, _STOP), usual=_STOP)) == CONFIRM:
                 self._journal.confirm("a person confirmed", at_place=True)
                 return
-        kept.require()
+        origins.require()

@@ -1,1 +1,1 @@
-"""Kinds of step of robots that move by themselves, and what these kinds share."""
+"""Kinds of step of robots that move automatically, and code that these kinds share."""

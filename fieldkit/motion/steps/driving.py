@@ -331,7 +331,7 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
     drive_lease = DriveLease(shell, plan.job, name, lease_s)
     with scene.motions.moving(mover), lease.start_program(shell, plan.job), drive_lease, ExitStack() as stack:
         try:
-            _commit(scene, drive_lease, move)
+            _wait_until_ready(scene, drive_lease, move)
             motion = stack.enter_context(origins_of(scene).moving(move.role))
         except BaseException:
             _end(shell, plan.job)
@@ -339,7 +339,7 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
         yield from _out_and_back(scene, testbed, shell, plan.job, drive_lease, move, motion)
 
 
-def _commit(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
+def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
     """Wait until a robot is stationary at its place, and record its origin before its first start there."""
     drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.end_state, Deadline.after(_START_S))
     if drive_lease.is_refused:

@@ -15,7 +15,7 @@ from fieldkit.steps.scene import Announce, Planned
 
 @contextmanager
 def alarmed(
-    flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, announce: Announce, *, lands_s: float
+    flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, announce: Announce, *, landing_s: float
 ) -> Iterator[None]:
     """If the body fails, wait for the landing; raise an alarm if the drone may still be in the air.
 
@@ -27,12 +27,12 @@ def alarmed(
         rescue: Rescue of the same flight; must be active until this context is left.
         log: File of the drone's positions.
         announce: Receives the alarm.
-        lands_s: Maximum duration of a landing.
+        landing_s: Maximum duration of a landing.
     """
     try:
         yield
     except BaseException as error:
-        if text := _alarm(flight, guard, rescue, log, lands_s if isinstance(error, RobotError) else 0.0):
+        if text := _alarm(flight, guard, rescue, log, landing_s if isinstance(error, RobotError) else 0.0):
             announce(text, None)
             if isinstance(error, FieldkitError):
                 error.what, error.remedy = f"{error.what}. {text}", f"{MANUAL_ACTION}; then {error.remedy}"

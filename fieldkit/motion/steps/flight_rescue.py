@@ -20,17 +20,18 @@ from fieldkit.remote.shell import Shell
 MANUAL_ACTION: Final = "TAKE IT OVER BY REMOTE CONTROL, OR COMMAND LAND OR RTL AT THE GROUND STATION"
 
 SILENCE_TIMEOUT_S: Final = 0.6
-"""Programs whose counters do not change for this time of the robot's clock do not run; they count ten a second."""
+"""If the counters do not change for this time by the robot's clock, neither program runs: a running program
+increments its counter ten times a second."""
 _POLL_S: Final = 0.15
 _MAX_STEP_S: Final = 0.4
-"""Maximum time that counts between two polls: after a suspension of the robot its programs still run."""
+"""Maximum time that is counted between two polls, because the programs still run after a suspension of the robot."""
 
 
-class LifeSigns:
+class LivenessMonitor:
     """Detects from the counters of a pilot and its guard that neither of them runs."""
 
     def __init__(self) -> None:
-        self._turns: tuple[int, int] | None = None
+        self._iterations: tuple[int, int] | None = None
         self._polled_s = self._silent_s = 0.0
 
     def update(self, sample: bytes) -> bool:
@@ -44,10 +45,10 @@ class LifeSigns:
             now_s = float(sample[SIZE:].split()[0])
         except (ValueError, IndexError):
             return False
-        turns = programs[PILOT].iterations, programs[GUARD].iterations
+        iterations = programs[PILOT].iterations, programs[GUARD].iterations
         elapsed_s, self._polled_s = min(now_s - self._polled_s, _MAX_STEP_S), now_s
-        self._silent_s = self._silent_s + elapsed_s if turns == self._turns else 0.0
-        self._turns = turns
+        self._silent_s = self._silent_s + elapsed_s if iterations == self._iterations else 0.0
+        self._iterations = iterations
         flies = programs[PILOT].state in {FLYING, LANDING} or programs[GUARD].state == LANDING
         return flies and self._silent_s >= SILENCE_TIMEOUT_S
 
@@ -60,46 +61,48 @@ class FlightRescue:
         job: The job of the rescue.
         liveness: The file that pilot and guard share, in the folder of the job.
         alarm: Called with the alarm, from another thread.
-        sends: Whether the control connection may be used during the flight; otherwise nothing is monitored.
+        may_send: Whether the control connection may be used during the flight; otherwise nothing is monitored.
 
     Attributes:
         job: The job of the rescue.
         failure: Why the rescue could not be started; empty otherwise.
     """
 
-    def __init__(self, shell: Shell, job: Job, liveness: str, alarm: Callable[[str], None], *, sends: bool) -> None:
+    def __init__(
+        self, shell: Shell, job: Job, liveness: str, alarm: Callable[[str], None], *, may_send: bool
+    ) -> None:
         self.job = job
         self.failure = ""
         self._shell = shell
         self._file = f"{job.folder}/{liveness}"
         self._alarm = alarm
-        self._sends = sends
+        self._may_send = may_send
         self._left = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="rescue", daemon=True)
 
     def __enter__(self) -> Self:
-        if self._sends:
+        if self._may_send:
             self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._left.set()
-        if self._sends:
+        if self._may_send:
             self._thread.join()
 
     @property
     def may_land(self) -> bool:
         """Whether the rescue can still land the drone: it monitors, or has started the job."""
-        return self._sends and not self.failure
+        return self._may_send and not self.failure
 
     def _watch(self) -> None:
-        signs = LifeSigns()
+        monitor = LivenessMonitor()
         while not self._left.wait(_POLL_S):
             try:
                 sample = halting.read_liveness(self._shell, self._file, Deadline.after(jobs.REPLY_S))
             except FieldkitError:  # the link may be restored
                 continue
-            if signs.update(sample):
+            if monitor.update(sample):
                 self._start()
                 return
 

@@ -45,7 +45,7 @@ from fieldkit.steps.view import View
 
 _Distance = Annotated[Length, Field(gt=0)] | None
 
-STANDS_S: Final = 60.0
+_MOTORS_OFF_S: Final = 60.0
 """Timeout until the motors are off; after an aborted attempt the drone may still be landing."""
 _SLACK_S: Final = 30.0
 """Additional time for the change of mode, the motors and the last metre; again for the landing."""
@@ -101,14 +101,14 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         robot: Role that flies.
         height: Height above the take-off point to which it climbs first; together with all segments upwards at most
             `limits.max_height_m`.
-        path: Its path then, a list of straight segments; forward is where its nose points before take-off. Without a
-            path it hovers; at the end of the path it waits. Every corner must be within `limits.fence_m` of the
-            take-off point.
+        path: Its path after the climb, a list of straight segments; forward is where its nose points before
+            take-off. Without a path it hovers; at the end of the path it waits. Every corner must be within
+            `limits.fence_m` of the take-off point.
         speed: Speed, at most `limits.max_speed_m_s`.
         climb: Rate of climb, at most `limits.max_speed_m_s`.
         then: Where it lands: `return` to the take-off point, or `land` where it is.
-        lease: How long it continues without contact to the laptop, 3 s to 10 min; then it does what `on_abort` says,
-            or lands.
+        lease: How long it continues without contact to the laptop, 3 s to 10 min; then it performs the action of
+            `on_abort`, or lands.
         during: Steps that run at the same time.
     """
 
@@ -212,8 +212,8 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
 
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:
-        takes = format_duration(self._descent_s + _SLACK_S)
-        note = f"if it is in the air: this takes up to about {takes}, also after fieldkit has exited"
+        duration = format_duration(self._descent_s + _SLACK_S)
+        note = f"if it is in the air: this takes up to about {duration}, also after fieldkit has exited"
         yield f"{scene.robot(self.robot).name} {self._abort_action(scene)}, {note}"
 
     @override
@@ -268,10 +268,10 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         with (
             piloting.guarding(scene, shell, guard, lease_s=self._lease_s, body_s=flight_s),
             piloting.leased_program(
-                scene, shell, self._pilot(scene), lease_s=self.lease, body_s=body_s, ends_s=_SLACK_S
+                scene, shell, self._pilot(scene), lease_s=self.lease, body_s=body_s, exit_s=_SLACK_S
             ) as flight,
             self._rescue(scene, shell, flight, announce) as rescue,
-            alarmed(flight, guard, rescue, self._log, announce, lands_s=self._descent_s + _SLACK_S),
+            alarmed(flight, guard, rescue, self._log, announce, landing_s=self._descent_s + _SLACK_S),
         ):
             self._fly(scene, testbed, announce, flight)
 
@@ -284,8 +284,8 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
 
         guard_name = self.prefixed_name("guard")
         job = piloting.rescue(scene, self.robot, self.prefixed_name("rescue"), guard_name)
-        sends = scene.robot(self.robot).control is not Control.RADIO
-        return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, sends=sends)
+        may_send = scene.robot(self.robot).control is not Control.RADIO
+        return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, may_send=may_send)
 
     def _fly(self, scene: Scene, testbed: Testbed, announce: Announce, flight: piloting.FlightLease) -> None:
         """Give the orders of the flight; the origin is stored before the first one that moves the drone."""
@@ -306,7 +306,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     def _wait_for_start(self, scene: Scene, flight: piloting.FlightLease) -> None:
         """Wait until the drone is ready at its origin; record the origin before the first start."""
         try:
-            flight.wait_for("standing", STANDS_S)
+            flight.wait_for("standing", _MOTORS_OFF_S)
         except RobotError as error:
             if flight.is_misplaced:
                 origins_of(scene).refuse(self.robot, error.what)

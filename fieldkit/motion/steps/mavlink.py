@@ -74,12 +74,12 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
     """Records the telemetry of a robot's autopilot while the steps in `during` run.
 
     That is position, speed, attitude, battery and losses; see [MAVLink](mavlink.md#record-telemetry), also for
-    the columns. The profile of its robot has `mavlink`. Leaves `mavlink.tlog`, `mavlink.json` (counters of the
+    the columns. The profile of the robot needs `mavlink`. Leaves `mavlink.tlog`, `mavlink.json` (counters of the
     recorder) and `ROLE-mavlink.log`; with `positions` also `positions.json` and the columns of a `track`.
 
     Attributes:
         robot: Role of the robot with the autopilot.
-        at: Role of the robot that records, over the radio; without it, the robot's own computer.
+        at: Role of the robot that records over the radio; by default the computer of `robot` records.
         system: The autopilot's system id; 0 for the first one received, which is then the only one in the log.
         rates: Requested messages per second, of `SYS_STATUS`, `GPS_RAW_INT`, `ATTITUDE`, `LOCAL_POSITION_NED`,
             `GLOBAL_POSITION_INT`, `VFR_HUD`, `RADIO_STATUS`, `BATTERY_STATUS`, `ESTIMATOR_STATUS`, `HOME_POSITION`
@@ -171,19 +171,19 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         agent.install(testbed.shells[self.recorder])
         announce("record MAVLink", None)
-        ((planned, code),) = follow.follow(
+        ((planned, code),) = follow.run_while_recording(
             self,
             scene,
             testbed,
             announce,
             [self._recording(scene)],
-            make_accounts=partial(self._accounts, scene) if self.positions else None,
+            make_sources=partial(self._position_sources, scene) if self.positions else None,
             extra_s=lambda _: _EXTRA_S,
         )
         if code != 0:
             raise scene.failure(planned, f"{planned.job.name} ended with exit code {code}")
 
-    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
+    def _position_sources(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
         """Return the sources of the robots' positions in an attempt."""
         position_source = PositionSource(
             file=self._file,

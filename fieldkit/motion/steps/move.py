@@ -76,7 +76,7 @@ class MoveStep(
         during: Steps that run at the same time.
     """
 
-    leads = True
+    has_path = True
     cross_checks = motion_sources.OF_DRIVE
 
     robot: Role

@@ -1,7 +1,7 @@
 """Control of drones from the laptop: jobs of the programs on the drone that fly or guard it, and their leases.
 
 The programs are parts of the agent (`fieldkit.agent.flight`, `fieldkit.agent.flying.guard`). If this process is
-killed, or the control link is down for longer than the lease, they end the flight as `on_abort` says.
+killed, or the control link is down for longer than the lease, they end the flight by the action of `on_abort`.
 """
 
 import json
@@ -38,7 +38,8 @@ LEASE_S: Final = 15.0
 READY: Final = " ready"
 _GUARD_S: Final = 86_400.0
 _RESCUE_S: Final = 900.0
-"""Longer than any landing, and shorter than the lock of a flight, which the start therefore need not extend."""
+"""Longer than any landing, and shorter than the time until the robot's lock expires, so that the start of the rescue
+need not extend the lock."""
 _RENEWALS: Final = 3
 """Renewals per lease, so that one may be late."""
 _GUARD_EXIT_S: Final = 10.0
@@ -132,7 +133,7 @@ def guarding(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float
 ) -> Iterator["FlightLease"]:
     """Start the guard of a drone, yield its lease, and stop it after the body; errors as `leased_program`."""
-    with leased_program(scene, shell, program, lease_s=lease_s, body_s=body_s, ends_s=_GUARD_EXIT_S) as flight:
+    with leased_program(scene, shell, program, lease_s=lease_s, body_s=body_s, exit_s=_GUARD_EXIT_S) as flight:
         yield flight
         flight.release()
 
@@ -269,7 +270,7 @@ def _motion_origin(values: Mapping[str, Any]) -> MotionOrigin:
 
 @contextmanager
 def leased_program(
-    scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float, ends_s: float
+    scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float, exit_s: float
 ) -> Iterator[FlightLease]:
     """Start a flight program on a drone, yield its lease, and wait for its exit after the body has ordered it.
 
@@ -281,7 +282,7 @@ def leased_program(
         program: The job, from `planned`.
         lease_s: Time in seconds until an order expires.
         body_s: Approximate duration of the body, needed if the control connection must be silent meanwhile.
-        ends_s: Maximum time for the exit of the program.
+        exit_s: Maximum time for the exit of the program.
 
     Raises:
         LinkError: The robot did not answer.
@@ -297,7 +298,7 @@ def leased_program(
         FlightLease(shell, program, lease_s, silent_lease_s) as flight,
     ):
         yield flight
-        code = jobs.begin_wait(shell, program.job, ends_s).end(ends_s + jobs.REPLY_S)
+        code = jobs.begin_wait(shell, program.job, exit_s).end(exit_s + jobs.REPLY_S)
         if code != 0:
             flight.renew()
             raise flight.failure(flight.end_reason or f"{program.job.name} ended with exit code {code}")

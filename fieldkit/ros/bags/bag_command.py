@@ -23,7 +23,10 @@ DISTRIBUTIONS: Final = ("noetic", "foxy", "humble", "jazzy", "kilted")
 
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit bag`."""
-    parser.description = "Bags of ROS 1 (.bag) and ROS 2 (SQLite, MCAP), without ROS. A bag is never changed."
+    parser.description = (
+        "Inspect, check, repair and convert bags of ROS 1 (.bag) and ROS 2 (SQLite, MCAP). ROS need not be "
+        "installed. A bag is never changed."
+    )
     actions = parser.add_commands(title="commands", metavar="COMMAND")
     action = actions.add_parser("info", help="list the contents of a bag from its index")
     shared.add_bag(action)
@@ -91,9 +94,9 @@ def _show_problems(path: Path, bag_contents: BagContents) -> None:
         show_error(f"{path}: {problem}")
     if bag_contents.recoverable_messages:
         repair = shell_command("fieldkit", "bag", "repair", path, "NEW")
-        show_note(f"{format_count(bag_contents.recoverable_messages, 'message')} can be saved: {repair}")
+        show_note(f"{format_count(bag_contents.recoverable_messages, 'message')} can be recovered: {repair}")
     elif bag_contents.problems:
-        show_note("; ".join(filter(None, ("no message can be saved", LAST_RESORT.get(bag_contents.format)))))
+        show_note("; ".join(filter(None, ("no message can be recovered", LAST_RESORT.get(bag_contents.format)))))
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -118,7 +121,7 @@ def _check_bag(path: Path) -> int:
 def repair(arguments: argparse.Namespace) -> int:
     """Write the readable messages of a bag into a new one."""
     result = contents.repair(arguments.bag, arguments.to)
-    print_text(f"{arguments.to}: {format_count(result.messages or 0, 'message')} saved")
+    print_text(f"{arguments.to}: {format_count(result.messages or 0, 'message')} recovered")
     for note in result.notes:
         show_note(f"{arguments.bag}: {note}")
     return 0

@@ -11,8 +11,8 @@ from fieldkit.measure.positions.samples import PLACED, WGS84, Samples
 from fieldkit.ros.bags import bag
 
 
-def read_bag(path: Path, account: PositionSource) -> Samples:
-    """Return the samples in a topic of a bag. Times are the robot's.
+def read_bag(path: Path, position_source: PositionSource) -> Samples:
+    """Return the samples in a topic of a bag. Times are by the robot's clock.
 
     If several messages have the same time, the first is used.
 
@@ -20,8 +20,8 @@ def read_bag(path: Path, account: PositionSource) -> Samples:
         EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or its stamps
             are from another clock.
     """
-    topic = account.topic
-    topic_data = bag.positions(path, topic, account.child)
+    topic = position_source.topic
+    topic_data = bag.positions(path, topic, position_source.child)
     if not topic_data["rows"]:
         raise EvidenceError(
             f"no position in {topic}", where=str(path), remedy="check that a node publishes the topic"
@@ -31,11 +31,11 @@ def read_bag(path: Path, account: PositionSource) -> Samples:
         raise EvidenceError(
             f"{topic} has positions in several frames: {', '.join(topic_data['frames'])}",
             where=str(path),
-            remedy="name the child frame",
+            remedy="write the robot's frame as child: FRAME, in the step track",
         )
     times = np.array([row[:2] for row in topic_data["rows"]], dtype=np.int64)
     values = np.array([row[2:] for row in topic_data["rows"]], dtype=float)
-    stamped = account.stamps == "header"
+    stamped = position_source.stamps == "header"
     stale_s = abs(np.median(times[:, 0] - times[:, 1])) / 1e9
     if stamped and stale_s > MAX_STALE_S:
         raise EvidenceError(

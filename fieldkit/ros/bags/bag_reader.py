@@ -56,12 +56,14 @@ def _open_ros2(path: Path) -> "rosbag2.Reader":
 
 
 def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
-    """Return the contents of a bag, keyed by the attributes of `Bag`."""
+    """Return the contents of a bag, keyed by the attributes of `RecordingContents`."""
     with reader:
         by_topic = {_checked_topic(topic): _checked_count(info.msgcount) for topic, info in reader.topics.items()}
         messages, started_ns = _checked_count(reader.message_count), _checked_count(reader.start_time)
         if len(by_topic) > _MAX_TOPICS or sum(by_topic.values()) != messages:
-            raise ValueError(f"its {len(by_topic)} topics do not have the {messages} messages that it counts")
+            raise ValueError(
+                f"its index counts {messages} messages, but the counts of its {len(by_topic)} topics differ"
+            )
         # The duration of rosbags ends one nanosecond after the last message.
         duration_s = (_checked_count(reader.duration) - 1) / 1e9 if messages else 0.0
         return {

@@ -46,7 +46,7 @@ class BagContents:
         started_utc_ns: Time of the first message by the recorder's clock, nanoseconds since 1970.
         duration_s: Time from the first message to the last, in seconds.
         compression: Compression of a ROS 2 bag: `none` or `zstd`.
-        problems: Its damages, one sentence each.
+        problems: Descriptions of its damage, one sentence each.
         recoverable_messages: Number of messages that can be recovered; None for a bag without problems.
     """
 
@@ -83,7 +83,7 @@ def inspect(path: Path, *, read_all: bool = False) -> BagContents:
 
     Args:
         path: A file, or the folder of a ROS 2 bag.
-        read_all: Whether to read and decode all messages, which takes time, to find damages beyond the index.
+        read_all: Whether to read and decode all messages, which takes time, to find damage outside the index.
 
     Raises:
         ConfigurationError: There is no bag, or it cannot be opened.
@@ -120,7 +120,7 @@ def repair(path: Path, to: Path) -> WriteResult:
     def write(temporary_path: Path) -> WriteResult:
         answer = _query_worker(bag, {"do": "repair", "to": str(temporary_path)})
         if not answer["messages"]:
-            what = f"no message can be saved: {answer['why']}"
+            what = f"no message can be recovered: {answer['why']}"
             raise EvidenceError(what, where=str(path), remedy=LAST_RESORT.get(bag.format, ""))
         return WriteResult(answer["messages"], (answer["why"],) if answer["why"] else ())
 

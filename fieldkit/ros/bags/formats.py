@@ -45,7 +45,7 @@ _COMPRESSED: Final = {
 
 
 LAST_RESORT: Final = {BagFormat.SQLITE: "SQLite may read more of it: sqlite3 OLD.db3 .recover | sqlite3 NEW.db3"}
-"""What an operator can try if fieldkit cannot read any message."""
+"""Commands that an operator can try if fieldkit cannot read any message."""
 
 
 @dataclass(frozen=True)
@@ -111,17 +111,17 @@ def _bag_in_folder(folder: Path) -> BagFiles:
         return _bag_from_file(*bag_files[0])
     formats = {bag_format for _, bag_format in bag_files}
     if not formats:
-        raise ConfigurationError("no bag is in this folder", where=str(folder), remedy=_WHAT_TO_NAME)
+        raise ConfigurationError("there is no bag in this folder", where=str(folder), remedy=_WHAT_TO_NAME)
     if len(formats) > 1 or formats == {BagFormat.ROS1}:
         names = ", ".join(file.name for file, _ in bag_files)
         raise ConfigurationError(
-            f"this folder holds several bags: {names}", where=str(folder), remedy="name one of them"
+            f"this folder contains several bags: {names}", where=str(folder), remedy="name one of them"
         )
     return BagFiles(folder, formats.pop(), tuple(file for file, _ in bag_files), (folder / METADATA).is_file())
 
 
 def _is_closed_mcap(file: Path, bag_format: BagFormat) -> bool:
-    """Return True if a file shows that its recorder closed it, which only MCAP files do."""
+    """Return True if a file has the end mark of a closed recording, which exists only in MCAP files."""
     if bag_format is not BagFormat.MCAP:
         return False
     with file.open("rb") as stream:

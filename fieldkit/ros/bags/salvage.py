@@ -55,14 +55,14 @@ SavedMessage = tuple[BagConnection, int, bytes]
 """Connection of a message, time of its recording in nanoseconds since 1970, and the serialized message."""
 
 
-def messages(form: BagFormat, file: Path) -> Iterator[SavedMessage]:
+def messages(bag_format: BagFormat, file: Path) -> Iterator[SavedMessage]:
     """Yield the messages of a data file in their order in the file.
 
     Raises:
         DamagedError: The file is damaged; all readable messages were yielded before.
     """
     readers = {BagFormat.ROS1: _ros1, BagFormat.SQLITE: _sqlite, BagFormat.MCAP: _mcap}
-    return readers[form](file)
+    return readers[bag_format](file)
 
 
 # ROS 1: wiki.ros.org/Bags/Format/2.0.
@@ -88,11 +88,11 @@ def _records(data: memoryview, connections: dict[int, BagConnection]) -> Iterato
         fields = _fields(head)
         (kind,) = fields.get("op", b"\0")
         if kind not in _KNOWN_KINDS:
-            raise DamagedError(f"a record of unknown kind {kind} {len(data) - offset} bytes before the end")
+            raise DamagedError(f"a record has the unknown kind {kind}, {len(data) - offset} bytes before the end")
         if kind == _CHUNK and bytes(data[offset : offset + 4]) == b"\0\0\0\0":
-            offset += 4  # still open when its recorder was killed: the records of the chunk follow
+            offset += 4  # the chunk was open when its recorder was killed; its records follow
             if fields.get("compression") != b"none":
-                raise DamagedError("the recorder was killed within a chunk that is compressed")
+                raise DamagedError("the recorder was killed while it wrote a compressed chunk")
             continue
         if kind == _CHUNK:
             # The start of a truncated chunk can be decompressed.
@@ -105,9 +105,9 @@ def _records(data: memoryview, connections: dict[int, BagConnection]) -> Iterato
         elif kind == _MESSAGE:
             number = _number(fields, "conn")
             if number not in connections:
-                raise DamagedError(f"a message of connection {number}, which the bag has not defined")
+                raise DamagedError(f"a message is of connection {number}, which the bag does not define")
             if len(fields.get("time", b"")) != _TIME.size:
-                raise DamagedError("a message without time")
+                raise DamagedError("a message has no time")
             seconds, nanoseconds = _TIME.unpack(fields["time"])
             yield connections[number], seconds * 10**9 + nanoseconds, bytes(body)
 
@@ -133,14 +133,14 @@ def _fields(head: memoryview) -> dict[str, bytes]:
         field, offset = _read_sized(head, offset)
         name, separator, value = bytes(field).partition(b"=")
         if not separator:
-            raise DamagedError("a header without field names")
+            raise DamagedError("a field of a header has no name")
         fields[name.decode(errors="replace")] = value
     return fields
 
 
 def _number(fields: dict[str, bytes], name: str) -> int:
     if len(fields.get(name, b"")) != _LENGTH.size:
-        raise DamagedError(f"a record without {name}")
+        raise DamagedError(f"a record has no valid field {name}")
     (number,) = _LENGTH.unpack(fields[name])
     return int(number)
 
@@ -161,16 +161,16 @@ def _decompress(fields: dict[str, bytes], body: memoryview) -> bytes:
     """Return the decompressed records of a chunk, limited to the size in its header."""
     size, compression = _number(fields, "size"), fields.get("compression", b"")
     if size > _MAX_CHUNK_BYTES:
-        raise DamagedError(f"a chunk of {size} bytes")
+        raise DamagedError(f"a chunk of {size} bytes is larger than the limit of {_MAX_CHUNK_BYTES}")
     try:
         if compression == b"bz2":
             return bz2.BZ2Decompressor().decompress(bytes(body), size)
         if compression == b"lz4":
             return bytes(lz4.frame.LZ4FrameDecompressor().decompress(bytes(body), size))
     except (OSError, RuntimeError, EOFError) as error:
-        raise DamagedError(f"a chunk that cannot be unpacked: {error}") from error
+        raise DamagedError(f"a chunk cannot be decompressed: {error}") from error
     if compression != b"none":
-        raise DamagedError(f"a chunk compressed by {compression.decode(errors='replace')!r:.20}")
+        raise DamagedError(f"a chunk has the unknown compression {compression.decode(errors='replace')!r:.20}")
     return bytes(body)
 
 
@@ -199,12 +199,12 @@ def _rows(database: sqlite3.Connection) -> Iterator[SavedMessage]:
         "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
     ):
         if topic not in connections:
-            raise DamagedError(f"message {number} is of topic {topic}, which the bag has not defined")
+            raise DamagedError(f"message {number} is of topic {topic}, which the bag does not define")
         last = number
         yield connections[topic], int(at_ns), bytes(data)
     (last_id,) = database.execute("SELECT max(id) FROM messages").fetchone()
     if last_id is not None and last_id > last:
-        raise DamagedError(f"of {last_id} messages only {last} can be read")
+        raise DamagedError(f"only {last} of {last_id} messages can be read")
 
 
 def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, BagConnection]]:
@@ -249,7 +249,7 @@ class _ExactReader:
 
     def read(self, length: int) -> bytes:
         if length > self._size_bytes:  # a corrupt length may be above what `read` accepts
-            raise EOFError(f"a record of {length} bytes in a file of {self._size_bytes}")
+            raise EOFError(f"a record states a length of {length} bytes, but the file has {self._size_bytes}")
         data = self._file.read(length)
         if len(data) < length:
             raise EOFError(f"the file ends {length - len(data)} bytes before a record does")

@@ -49,12 +49,12 @@ class Side:
     network: Network
 
 
-class Carrier:
+class Forwarder:
     """Forwards a topic in one direction.
 
     Args:
         crossing: The topic and its direction.
-        source: The side that it comes from.
+        source: The side whose nodes publish it.
         target: The side that it is forwarded to.
         described: The topic as described for the source, and for the target.
         convert: Converts a message of the source to one of the target; raises `SerdeError` for an invalid message.
@@ -74,9 +74,9 @@ class Carrier:
         self._lock = threading.Lock()
         self._ended = False
         self._publisher: Publisher = target.running.publisher(described[1])
-        source.running.subscribe(described[0], self._carry)
+        source.running.subscribe(described[0], self._forward)
 
-    def _carry(self, data: bytes, arrived_ns: int) -> None:
+    def _forward(self, data: bytes, arrived_ns: int) -> None:
         """Forward a sample. Called in threads of the source; samples are forwarded in sequence."""
         with self._lock:
             if self._ended:
@@ -92,14 +92,14 @@ class Carrier:
                 self._tally.refused += 1
 
     def end(self) -> None:
-        """Stop to forward samples; a sample that is being forwarded is finished first."""
+        """Stop forwarding samples, after the one that is being forwarded."""
         with self._lock:
             self._ended = True
 
     def other_types(self) -> Sequence[str]:
         """Return a sentence for each different type of the topic on either side, which is not forwarded."""
         sides = zip((self._source, self._target), self._described, strict=True)
-        return [sentence for end, topic in sides for sentence in end.other_types(topic)]
+        return [sentence for side, topic in sides for sentence in side.other_types(topic)]
 
     def counts(self) -> CrossingCounts:
         """Return the counters of the forwarded samples."""
@@ -122,7 +122,9 @@ class _RunningSide:
 
 
 @contextmanager
-def bridged(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes) -> Iterator[Sequence[Carrier]]:
+def bridged(
+    near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes
+) -> Iterator[Sequence[Forwarder]]:
     """Bridge two sides while the body runs.
 
     Args:
@@ -132,7 +134,7 @@ def bridged(near: Side, far: Side, crossings: Sequence[Crossing], types: Message
         types: The message types.
 
     Yields:
-        A carrier for each crossing.
+        A forwarder for each crossing.
 
     Raises:
         ConfigurationError: A topic cannot be bridged, or has a different type on one side.
@@ -141,12 +143,12 @@ def bridged(near: Side, far: Side, crossings: Sequence[Crossing], types: Message
     check(near, far, crossings, types)
     with ExitStack() as stack:
         sides = [stack.enter_context(_running_side(side)) for side in (near, far)]
-        carriers: list[Carrier] = []
+        forwarders: list[Forwarder] = []
         for number, crossing in enumerate(crossings, 1):
             source, target = reversed(sides) if crossing.back else sides
-            carriers.append(_create_carrier(crossing, source, target, types, number))
-            stack.callback(carriers[-1].end)
-        yield carriers
+            forwarders.append(_create_forwarder(crossing, source, target, types, number))
+            stack.callback(forwarders[-1].end)
+        yield forwarders
 
 
 def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes) -> None:
@@ -192,9 +194,9 @@ def _running_side(side: Side) -> Iterator[_RunningSide]:
         yield _RunningSide(side.over, side.network, running)
 
 
-def _create_carrier(
+def _create_forwarder(
     crossing: Crossing, source: _RunningSide, target: _RunningSide, types: MessageTypes, number: int
-) -> Carrier:
+) -> Forwarder:
     sides = (source, target)
     pair = counterparts.of_type(types, crossing.type_name) if _is_ros1(*sides) else None
     described = [
@@ -202,28 +204,28 @@ def _create_carrier(
             topics.describe(
                 types,
                 crossing.topic,
-                _type_at(end, crossing, pair),
+                _type_at(side, crossing, pair),
                 crossing.qos,
-                domain=end.network.domain,
-                node=end.network.node,
+                domain=side.network.domain,
+                node=side.network.node,
                 number=number,
             )
         )
-        for end in sides
+        for side in sides
     ]
-    for end, topic in zip(sides, described, strict=True):
+    for side, topic in zip(sides, described, strict=True):
         # With gradual discovery, endpoints with another type may be discovered only later.
-        for sentence in end.other_types(topic):
+        for sentence in side.other_types(topic):
             raise ConfigurationError(sentence, remedy="name the topic with that type")
     convert = _conversion(_is_ros1(source), pair, types)
-    return Carrier(crossing, source, target, (described[0], described[1]), convert)
+    return Forwarder(crossing, source, target, (described[0], described[1]), convert)
 
 
-def _type_at(end: _RunningSide, crossing: Crossing, pair: Counterparts | None) -> str:
+def _type_at(side: _RunningSide, crossing: Crossing, pair: Counterparts | None) -> str:
     """Return the name of a crossing's type on one side."""
     if pair is None:
         return crossing.type_name
-    return pair.ros1 if _is_ros1(end) else pair.ros2
+    return pair.ros1 if _is_ros1(side) else pair.ros2
 
 
 def _conversion(from_ros1: bool, pair: Counterparts | None, types: MessageTypes) -> Convert:

@@ -1,4 +1,4 @@
-"""`fieldkit bridge`: carry topics between middlewares until a signal, then report the counts."""
+"""`fieldkit bridge`: forward topics between middlewares until a signal arrives, then report the counts."""
 
 import argparse
 import ipaddress
@@ -24,7 +24,7 @@ from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
 from fieldkit.core.text import json_text, print_text
 from fieldkit.core.units import format_bytes
 from fieldkit.ros.bridging import bridge
-from fieldkit.ros.bridging.bridge import Carrier, Side
+from fieldkit.ros.bridging.bridge import Forwarder, Side
 from fieldkit.ros.bridging.crossings import Crossing, CrossingCounts
 from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 from fieldkit.ros.middlewares.ports import MAX_DOMAIN
@@ -39,8 +39,8 @@ That adapter needs the Python of a robot's ROS 2.
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit bridge`."""
     parser.description = (
-        "Carry topics from one middleware to another until Ctrl-C or SIGTERM, then report the number of messages and "
-        "their delay. TOPIC is NAME:TYPE, or NAME:TYPE:QOS. QOS is a profile of ROS 2 (default, sensor_data, "
+        "Forward topics from one middleware to another until Ctrl-C or SIGTERM, then report the number of messages "
+        "and their delay. TOPIC is NAME:TYPE, or NAME:TYPE:QOS. QOS is a profile of ROS 2 (default, sensor_data, "
         "services_default, parameters, parameter_events, system_default), or policies (reliable, best_effort, "
         "keep_all, transient_local, depth=N), or a profile and then policies, separated by commas."
     )
@@ -49,7 +49,7 @@ def add(parser: Parser) -> None:
         "--back /cmd_vel:geometry_msgs/Twist"
     )
     parser.add_choice("--from", MIDDLEWARES, dest="near", required=True, help=f"one of: {', '.join(MIDDLEWARES)}")
-    parser.add_choice("--to", MIDDLEWARES, dest="far", required=True, help="another of them")
+    parser.add_choice("--to", MIDDLEWARES, dest="far", required=True, help="another one of these")
     parser.add_argument("topics", metavar="TOPIC", nargs="*", help="topic from the first middleware to the second")
     for option, text in (("--back", "topic in the other direction"), ("--both", "topic in both directions")):
         parser.add_argument(
@@ -73,7 +73,7 @@ def add(parser: Parser) -> None:
         metavar="IP",
         action="append",
         default=[],
-        help="peer over DDS or Zenoh, contacted in place of multicast discovery; may be given more than once",
+        help="peer over DDS or Zenoh, contacted instead of multicast discovery; may be given more than once",
     )
     parser.add_argument(
         "--domain", type=shared.natural, metavar="N", help="domain of ROS 2 (default: ROS_DOMAIN_ID, or 0)"
@@ -100,7 +100,7 @@ def add(parser: Parser) -> None:
     parser.add_argument(
         "--json",
         action="store_true",
-        help="print a list with an object per topic and direction in place of the table",
+        help="print a list with an object per topic and direction instead of the table",
     )
     parser.set_defaults(run=f"{__name__}:run")
 
@@ -111,16 +111,16 @@ _NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Carry topics until SIGINT or SIGTERM."""
+    """Forward topics until SIGINT or SIGTERM."""
     crossings = _crossings(arguments)
     types = MessageTypes(Distribution(arguments.distribution), dict(map(_definition, arguments.type)))
     near, far = (Side(middleware, _network(middleware, arguments)) for middleware in (arguments.near, arguments.far))
-    with _until_signal() as stopped, bridge.bridged(near, far, crossings, types) as carriers:
+    with _until_signal() as stopped, bridge.bridged(near, far, crossings, types) as forwarders:
         show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C stops it")
-        _watch(carriers, stopped)
-        counts = [carrier.counts() for carrier in carriers]
+        _watch(forwarders, stopped)
+        counts = [forwarder.counts() for forwarder in forwarders]
     if arguments.json:
-        print_text(json_text([asdict(crossed) for crossed in counts]))
+        print_text(json_text([asdict(topic_counts) for topic_counts in counts]))
     else:
         _show(counts)
     return 0
@@ -207,34 +207,34 @@ def _until_signal() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def _watch(carriers: Sequence[Carrier], stopped: threading.Event) -> None:
+def _watch(forwarders: Sequence[Forwarder], stopped: threading.Event) -> None:
     """Wait for `stopped`. If other nodes use a topic with another type, report this once."""
     reported: set[str] = set()
     while not stopped.wait(_POLL_S):
-        for sentence in chain.from_iterable(carrier.other_types() for carrier in carriers):
+        for sentence in chain.from_iterable(forwarder.other_types() for forwarder in forwarders):
             if sentence not in reported:
                 reported.add(sentence)
                 show_error(
                     f"{sentence}\n  remedy: give the topic with the type of its publishers; messages of another type "
-                    "are not carried"
+                    "are not forwarded"
                 )
 
 
 def _show(counts: Sequence[CrossingCounts]) -> None:
-    head = ("topic", "direction", "messages", "a second", "bytes", "refused", "unreadable", "median", "99 %")
+    head = ("topic", "direction", "messages", "per second", "bytes", "refused", "unreadable", "median", "99 %")
     rows = [
         (
-            crossed.topic,
-            f"{crossed.source} to {crossed.target}",
-            str(crossed.messages),
-            "" if crossed.per_s is None else f"{crossed.per_s:.4g}",
-            format_bytes(crossed.bytes),
-            str(crossed.refused),
-            str(crossed.unreadable),
-            _milliseconds(crossed.delay_median_s),
-            _milliseconds(crossed.delay_p99_s),
+            topic_counts.topic,
+            f"{topic_counts.source} to {topic_counts.target}",
+            str(topic_counts.messages),
+            "" if topic_counts.per_s is None else f"{topic_counts.per_s:.4g}",
+            format_bytes(topic_counts.bytes),
+            str(topic_counts.refused),
+            str(topic_counts.unreadable),
+            _milliseconds(topic_counts.delay_median_s),
+            _milliseconds(topic_counts.delay_p99_s),
         )
-        for crossed in counts
+        for topic_counts in counts
     ]
     table(head, rows, right=range(2, len(head)))
 

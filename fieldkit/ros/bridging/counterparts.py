@@ -70,7 +70,7 @@ class Counterparts:
 
 @contextmanager
 def _any_error_as_serde_error(kind: str) -> Iterator[None]:
-    """Convert the exceptions of rosbags for truncated messages to `SerdeError`, which it raises for most others."""
+    """Convert exceptions of rosbags for truncated messages to `SerdeError`, as it raises for other invalid ones."""
     try:
         yield
     except (ValueError, IndexError, AssertionError, struct.error) as error:

@@ -1,4 +1,4 @@
-"""Topics that a bridge forwards: their notation, and the counters of each."""
+"""Topics that a bridge forwards: their notation on the command line, and the counters of each topic."""
 
 import math
 import re

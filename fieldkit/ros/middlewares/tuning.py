@@ -1,4 +1,4 @@
-"""Settings of middlewares for a lossy radio that their developers, or ROS 2, recommend to try first.
+"""Settings of middlewares that their developers or ROS 2 recommend as a first attempt for a lossy radio.
 
 Comments contain the default and the source of each setting. Kernel settings (`net.core.rmem_max`,
 `net.ipv4.ipfrag_time`) are not included, because they apply to the whole machine, need root and remain after a trial;
@@ -11,9 +11,9 @@ from types import MappingProxyType
 from typing import Final
 
 _DDS: Final = {
-    # Default 14720 B: ten IP packets, and if one is lost, all are. With these settings a datagram is one packet,
-    # with one fragment (default 1344 B) and its headers. docs.ros.org, How-To-Guides/DDS-tuning, on IP fragments;
-    # defaults: CycloneDDS, docs/manual/config/config_file_reference.rst.
+    # Default 14720 B: a datagram of ten IP packets is lost if one of them is lost. With these settings it is one
+    # packet, with one fragment (default 1344 B) and its headers. docs.ros.org, How-To-Guides/DDS-tuning, on IP
+    # fragments; defaults: CycloneDDS, docs/manual/config/config_file_reference.rst.
     "General/MaxMessageSize": "1400 B",
     "General/FragmentSize": "1300 B",
 }

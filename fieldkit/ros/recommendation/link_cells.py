@@ -17,11 +17,12 @@ from fieldkit.core.columns import Kind, step_prefixed
 MIN_REPEATS: Final = 5
 """Losses over TCP may be bimodal (docs/studies/middleware-link.md): fewer repeats may all be of one mode."""
 _DECIMALS: Final = 12
-"""Decimals of the bound: 29 of 1,000 must count as equal to a bound of 2.9 %, which is smaller in binary."""
-_WANTED: Final = "topic_wanted"
+"""Decimals to which a bound is rounded: 2.9 % is stored as slightly less than 0.029, but a loss of 29 of 1,000 must
+not exceed it."""
+_INTENDED: Final = "topic_intended"
 _CELL: Final = "cell"
 _LOSS: Final = Quantity(
-    "loss", "loss, samples never sent included", Kind.COUNTED, "share", "topic_received", _WANTED, (0.0, 1.0)
+    "loss", "loss, samples never sent included", Kind.COUNTED, "share", "topic_received", _INTENDED, (0.0, 1.0)
 )
 _DELAY: Final = Quantity(
     "topic_delay_p95_s", "delay, 95 %", Kind.MEDIAN, "s", possible=(0.0, math.inf), of_sent="topic_delay_p95_sent_s"
@@ -145,8 +146,8 @@ def link_cell(place: str, size_bytes: float, tables: Sequence[Repeats]) -> LinkC
     texts = {name: np.concatenate([table.texts[name] for table in tables]) for name in tables[0].texts}
     intended = numbers["topic_sent"] + numbers["topic_refused"] + numbers["topic_skipped"]
     # The loss of a repeat in which no sample was due is undefined, so it has no value.
-    numbers[_WANTED] = np.where(intended > 0, intended, np.nan)
-    numbers[_LOSS.name] = (numbers[_WANTED] - numbers["topic_received"]) / numbers[_WANTED]
+    numbers[_INTENDED] = np.where(intended > 0, intended, np.nan)
+    numbers[_LOSS.name] = (numbers[_INTENDED] - numbers["topic_received"]) / numbers[_INTENDED]
     texts[_CELL] = np.full(len(intended), place, dtype=np.object_)
     (cell,) = aggregate(Repeats(numbers, texts, ()), (_CELL,), quantities=(_LOSS, _DELAY), words=())
     return LinkCell(place, size_bytes, tuple(dict.fromkeys(map(str, texts[SOURCE]))), cell)

@@ -28,7 +28,7 @@ example: fieldkit middleware recommend trials/ -o config/ --max-loss 1% --max-de
 
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit middleware`."""
-    parser.description = "Configure middlewares by measured trials."
+    parser.description = "Recommend settings of middlewares from measured trials."
     actions = parser.add_commands(title="commands", metavar="COMMAND")
     action = actions.add_parser(
         "recommend",
@@ -40,7 +40,9 @@ def add(parser: Parser) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     action.add_argument("trials", type=Path, nargs="+", metavar="TRIALS", help=shared.PATH_HELP)
-    action.add_argument("-o", "--out", type=Path, required=True, metavar="FOLDER", help="where files are written")
+    action.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder for the written files"
+    )
     action.add_argument(
         "--max-loss", default="1%", metavar="SHARE", help="largest loss of samples in each repeat (default 1%%)"
     )
@@ -50,8 +52,8 @@ def add(parser: Parser) -> None:
     action.add_argument(
         "--share",
         metavar="SHARE",
-        help="share of all repeats that must meet the limits, shown with 95 %% confidence (default: each measured "
-        "one)",
+        help="share of all repeats that must meet the limits, shown with 95 %% confidence (default: every "
+        "measured repeat must meet them)",
     )
     action.set_defaults(run=f"{__name__}:recommend")
 

@@ -168,7 +168,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         if actual is Recorder.NONE:
             yield Refusal(self.robot, f"its record command cannot write {expected}", install)
         else:
-            what = f"its record command writes {actual}, but its profile has {command.writes}"
+            what = f"its record command writes {actual}, but its profile names {command.writes}"
             yield Refusal(self.robot, what, f"correct --storage in record, or writes, in the profile {profile.name}")
 
     @override
@@ -194,7 +194,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         yield Need(
             self.robot, "ROS", argv, lambda answer: _judge(robot, answer), missing_program=ros.command.record[0]
         )
-        yield from ros_master.needs(scene, self.robot, explains=ros.command.record[0])
+        yield from ros_master.needs(scene, self.robot, program=ros.command.record[0])
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:

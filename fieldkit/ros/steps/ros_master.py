@@ -20,20 +20,20 @@ _POST: Final = f"POST /RPC2 HTTP/1.0\r\nContent-Type: text/xml\r\nContent-Length
 _REQUEST: Final = 'exec 3<>"/dev/tcp/$1/$2" && printf %s "$3" >&3 && read -r line <&3 && echo "$line"'
 
 
-def needs(scene: Scene, role: Role, *, explains: str) -> Iterator[Need]:
+def needs(scene: Scene, role: Role, *, program: str) -> Iterator[Need]:
     """Yield the check that the shared master answers a robot; nothing if the robot shares no master.
 
     Args:
         scene: Any scene of the trial.
         role: Role of the robot.
-        explains: Program that cannot work without the master.
+        program: Program that needs the master.
     """
     robot = scene.robot(role)
     if robot.ros_master:
         master = next(other for other in scene.cast.values() if other.address == robot.ros_master)
         arguments = (robot.ros_master, str(ROS_MASTER_PORT), _POST)
         argv = ("timeout", str(_TIMEOUT_S), "bash", "-c", _REQUEST, "bash", *arguments)
-        yield Need(role, "ROS master", argv, lambda answer: judge(master, answer), missing_program=explains)
+        yield Need(role, "ROS master", argv, lambda answer: judge(master, answer), missing_program=program)
 
 
 def judge(master: Robot, answer: CommandResult) -> tuple[Verdict, str, str]:

@@ -79,7 +79,7 @@ def _check_battery(path: Path, topic: str, report: Report) -> None:
     try:
         share = bag.battery_share(path, topic)
     except EvidenceError as error:
-        report.ok("battery", f"not known: {error.what}")
+        report.ok("battery", f"unknown: {error.what}")
         return
     if share is not None:
         judge_battery(topic, 100 * share, report)
@@ -167,7 +167,7 @@ def judge(
             report.fail(
                 check,
                 f"silent: {why}" if why else "silent",
-                f"{tool} {topic}   # start what publishes it, or correct the procedure",
+                f"{tool} {topic}   # start the node that publishes it, or correct the procedure",
             )
         elif rate_hz is None:
             report.ok(check, f"{count} messages in {content.duration_s:.1f} s; the profile gives no rate")
@@ -178,7 +178,7 @@ def judge(
 def _judge_rate(check: str, count: int, span_s: float, rate_hz: float, report: Report) -> None:
     # The span is from the first message of any topic to the last, so the count may be off by one.
     low, high = ((count + sign) / max(span_s, 1e-9) for sign in (-1, 1))
-    detail = f"{count} messages in {span_s:.1f} s, of {rate_hz:g} Hz"
+    detail = f"{count} messages in {span_s:.1f} s, expected {rate_hz:g} Hz"
     if high < (1 - TOLERANCE) * rate_hz or (count > 1 and low > (1 + TOLERANCE) * rate_hz):
         report.warn(check, detail, "correct the rate in the profile, or find out what slows the topic: top")
     else:

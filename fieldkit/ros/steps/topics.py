@@ -139,17 +139,17 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         """Install the agent and start all jobs except the publisher; return the function that publishes."""
         roles = sort_roles(self.participants)
         run_parallel(lambda role: agent.install(testbed.shells[role]), roles)
-        *before, publish = self.jobs(scene)
-        for planned in before:
+        *other_jobs, publish = self.jobs(scene)
+        for planned in other_jobs:
             jobs.start(testbed.shells[planned.role], planned.job)
-        return partial(self._stream, scene, testbed, before, publish)
+        return partial(self._stream, scene, testbed, other_jobs, publish)
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         self.prepare(scene, testbed)(announce)
 
     def _stream(
-        self, scene: Scene, testbed: Testbed, before: list[Planned], publish: Planned, announce: Announce
+        self, scene: Scene, testbed: Testbed, other_jobs: list[Planned], publish: Planned, announce: Announce
     ) -> None:
         announce("topics", self.expected_s(scene.protocol))
         with ExitStack() as silent:
@@ -158,7 +158,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             code = jobs.run(testbed.shells[publish.role], publish.job)
         stopped = [
             (planned, jobs.stop(testbed.shells[planned.role], planned.job, grace_s=_GRACE_S))
-            for planned in reversed(before)
+            for planned in reversed(other_jobs)
         ]
         for planned, exit_code in ((publish, code), *stopped):
             if exit_code != 0:

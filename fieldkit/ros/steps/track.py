@@ -100,7 +100,7 @@ class TrackedRobot(Strict):
         times: Time of a message: `header`, its stamp, or `received`, when the recorder received it, for stamps of
             another clock.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
-        at: A fixed position, in place of a topic.
+        at: A fixed position, instead of a topic.
     """
 
     topic: TopicName | None = None
@@ -180,13 +180,13 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """Run the steps inside while the topics are recorded; `check` reads the bags, so exit codes are ignored."""
         announce("record positions", None)
-        follow.follow(
+        follow.run_while_recording(
             self,
             scene,
             testbed,
             announce,
             self._recordings(scene),
-            make_accounts=partial(self._accounts, scene),
+            make_sources=partial(self._position_sources, scene),
             extra_s=lambda recording: self._period_s(scene, recording.role),
         )
 
@@ -200,7 +200,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         )
         return math.ceil(_PERIODS / min(rates_hz, default=1.0))
 
-    def _accounts(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
+    def _position_sources(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
         """Return the sources of the robots' positions in an attempt."""
         places_m = scene.places_m
         sources = dict(follow.stationary_robots(self, scene))

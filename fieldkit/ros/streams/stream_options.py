@@ -137,7 +137,7 @@ class StreamOptions(Strict):
         methods = DISCOVERY_METHODS[self.over]
         if self.discovery is not None and self.discovery not in methods:
             raise schema.validation_error(
-                f"{self.over} has {' and '.join(methods)}, not {self.discovery}", "discovery"
+                f"{self.over} cannot use {self.discovery}; use {' or '.join(methods)}", "discovery"
             )
         if self.transport != "tcp" and self.over is not MiddlewareName.ZENOH:
             raise schema.validation_error("only zenoh has a choice of transport; leave it out", "transport")

@@ -28,12 +28,12 @@ STAMP_NS: Final = 2_000
 MAX_LATENCY_NS: Final = 5_000_000
 MAX_LATENCY_FEW_NS: Final = 20_000_000
 MIN_SAMPLES: Final = 20
-"""Largest time between the packet of a sample and its record, for the fastest sample; the larger value is for fewer
+"""Maximum time between the packet of a sample and its record, for the fastest sample; the larger value is for fewer
 than `MIN_SAMPLES` samples. A program on a busy robot delays single samples for longer, but not all of them."""
 
 SLOW_S: Final = 0.02
 """A delay is withheld if the subscriber's program caused more than this and more than a tenth of it: such a program
-cannot be distinguished from a log with wrong times. On two idle hosts the largest of 100 was 0.3 to 13 ms."""
+cannot be distinguished from a log with wrong times. On two idle hosts the maximum of 100 delays was 0.3 to 13 ms."""
 
 PROGRAM_DELAY_FIGURES: Final = {
     "topic_delay_median_s": "median",
@@ -119,7 +119,7 @@ def _arrival_contradictions(
     yield from _surplus_copies(received.samples, subscriber)
     yield from _uncaptured_samples(plan, arrived, subscriber)
     if missing := _missing_count(plan, received, subscriber, complete=complete):
-        missing_text = f"{format_count(missing, 'sample')} arrived by the subscriber's capture"
+        missing_text = f"{format_count(missing, 'sample')} arrived according to the subscriber's capture"
         yield f"{missing_text}, but are not in the subscriber's log"
 
 
@@ -202,8 +202,8 @@ class _Arrivals:
         early_ns = -int(self.after_ns.min(initial=0))
         if early_ns > STAMP_NS:
             early_count = int((self.after_ns < -STAMP_NS).sum())
-            early_text = f"{format_count(early_count, 'sample')} in the subscriber's log came up to"
-            yield f"{early_text} {early_ns / 1e9:.6f} s before their packets in its capture"
+            early_text = f"{format_count(early_count, 'sample')} in the subscriber's log arrived up to"
+            yield f"{early_text} {early_ns / 1e9:.6f} s earlier than their packets in its capture"
         if self.latency_s is not None and len(self.latency_s) > 2:
             least_s = float(self.latency_s.min())
             if least_s > (MAX_LATENCY_NS if len(self.latency_s) >= MIN_SAMPLES else MAX_LATENCY_FEW_NS) / 1e9:
@@ -287,22 +287,23 @@ def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
     after_ns = first.at_ns - first.sent_ns
     if len(after_ns) and int(after_ns.min()) < -STAMP_NS:
         early_s = -int(after_ns.min()) / 1e9
-        yield f"a sample was sent {early_s:.6f} s before it was created, by the publisher's capture and log"
+        yield f"a sample was sent {early_s:.6f} s before it was created, according to the publisher's capture and log"
     if len(after_ns) > 2 and after_ns.min() > (
         MAX_LATENCY_NS if len(after_ns) >= MIN_SAMPLES else MAX_LATENCY_FEW_NS
     ):
         late_s = int(after_ns.min()) / 1e9
-        yield f"every sample was sent {late_s:.6f} s or more after it was created, by the publisher's capture and log"
+        late_text = f"every sample was sent {late_s:.6f} s or more after it was created"
+        yield f"{late_text}, according to the publisher's capture and log"
 
 
 def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
     """Yield a contradiction if a log has samples more often than the capture."""
     numbers, copies = np.unique(samples.sequence, return_counts=True)
-    shown_numbers, shown_copies = np.unique(subscriber.heads.sequence, return_counts=True)
-    known = np.isin(numbers, shown_numbers)
+    captured_numbers, captured_copies = np.unique(subscriber.heads.sequence, return_counts=True)
+    known = np.isin(numbers, captured_numbers)
     max_copies = np.ones(len(numbers), dtype=np.int64)
     if not subscriber.is_tcp:  # TCP delivers every byte once, even if it arrived several times
-        max_copies[known] = shown_copies[np.searchsorted(shown_numbers, numbers[known])]
+        max_copies[known] = captured_copies[np.searchsorted(captured_numbers, numbers[known])]
     if surplus := int(((copies > max_copies) & (known | subscriber.is_tcp)).sum()):
         yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"
 
@@ -337,7 +338,8 @@ def _early_samples(samples: TopicSamples, times_ns: Ints, payload_bytes: Ints, s
     captured_bytes = bytes_until[np.searchsorted(times_ns[order], arrival + STAMP_NS, side="right")]
     needed_bytes = size_bytes * np.arange(1, len(arrival) + 1)
     if early_count := int((captured_bytes < needed_bytes).sum()):
-        yield f"{format_count(early_count, 'sample')} in the subscriber's log came before their bytes in its capture"
+        early_text = f"{format_count(early_count, 'sample')} in the subscriber's log"
+        yield f"{early_text} arrived earlier than their bytes in its capture"
 
 
 def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, complete: bool) -> int:

@@ -334,10 +334,10 @@ def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
     data, discovery = list(flow.data_ports), list(flow.discovery_ports)
     packets = with_ports(sender)
     to_data, to_discovery = np.isin(packets.dport, data), np.isin(packets.dport, discovery)
-    of_data, of_discovery = np.isin(packets.sport, data), np.isin(packets.sport, discovery)
+    from_data, from_discovery = np.isin(packets.sport, data), np.isin(packets.sport, discovery)
     kinds = {
-        "data": to_data | (of_data & ~to_discovery),
-        "discovery": to_discovery | (of_discovery & ~to_data),
+        "data": to_data | (from_data & ~to_discovery),
+        "discovery": to_discovery | (from_discovery & ~to_data),
     }
     values: dict[str, Value | None] = {}
     for name, mask in kinds.items():

@@ -22,7 +22,7 @@ _CDR_BYTES: Final = 16
 _ROS1_QUEUE: Final = 1000
 """Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.ros1`)."""
 _LATE_S: Final = 0.1
-"""Permitted delay of the first sample after discovery and the publisher's wait; else discovery is withheld."""
+"""If the first sample after discovery and the publisher's wait is later than this, the discovery time is withheld."""
 
 
 def plan(step: StreamOptions) -> TopicPlan:
@@ -114,7 +114,7 @@ def checked(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog], meas
 
 
 def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
-    """Return the complete logs by role, and a sentence for each other log on what is wrong."""
+    """Return the complete logs by role, and an error message for each other log."""
     logs, errors = dict[Role, TopicLog](), list[str]()
     for role, name in files.items():
         try:

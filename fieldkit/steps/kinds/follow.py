@@ -25,7 +25,7 @@ from fieldkit.steps.view import View
 LIMIT_S: Final = 900.0
 """Time limit of a recording beyond the limits of the steps inside."""
 CLOSE_S: Final = 10.0
-ASK_S: Final = 15.0
+_QUERY_S: Final = 15.0
 _ROUNDING_M: Final = 1e-3
 
 COLUMNS: Final = columns(
@@ -35,19 +35,19 @@ COLUMNS: Final = columns(
 )
 """Columns of trials with a step that records positions."""
 
-MakeAccounts = Callable[[int, Mapping[Role, Offset]], PositionSources]
+MakeSources = Callable[[int, Mapping[Role, Offset]], PositionSources]
 """Returns the sources of positions. Receives the start of the steps inside, in nanoseconds since 1970 UTC of the
 laptop's clock, and the offsets of the robots' clocks from it."""
 
 
-def follow(
+def run_while_recording(
     nest: Nest,
     scene: Scene,
     testbed: Testbed,
     announce: Announce,
     recordings: Sequence[Planned],
     *,
-    make_accounts: MakeAccounts | None,
+    make_sources: MakeSources | None,
     extra_s: Callable[[Planned], int],
 ) -> Sequence[tuple[Planned, int]]:
     """Run the steps inside `nest` while recordings run; return each recording with its exit code.
@@ -58,17 +58,17 @@ def follow(
         testbed: The robots.
         announce: As for `Step.run`.
         recordings: Jobs that record until they are stopped.
-        make_accounts: Returns the sources of positions; None if the recordings contain no positions.
+        make_sources: Returns the sources of positions; None if the recordings contain no positions.
         extra_s: Returns the whole seconds for which a recording continues after the last step, so that a position at
             the end of the step can be interpolated between two messages.
 
     Raises:
         FieldkitError: A step inside failed, or a robot did not answer.
     """
-    exchanges: dict[Role, list[Exchange]] = {role: [] for role in nest.roles()} if make_accounts else {}
+    exchanges: dict[Role, list[Exchange]] = {role: [] for role in nest.roles()} if make_sources else {}
 
     def query_clock(role: Role) -> None:
-        exchanges[role] += clocks.exchanges(testbed.shells[role], ASK_S)
+        exchanges[role] += clocks.exchanges(testbed.shells[role], _QUERY_S)
 
     def wait(recording: Planned) -> None:
         seconds = extra_s(recording)
@@ -88,12 +88,12 @@ def follow(
             _stop(testbed, recordings)
         raise
     codes = _stop(testbed, recordings)
-    if scene.laptop_folder is not None and make_accounts is not None:
+    if scene.laptop_folder is not None and make_sources is not None:
         offsets = {role: offset(results) for role, results in exchanges.items() if results}
         path = scene.laptop_folder / position_sources.FILE
         # Steps inside may have written the sources for other robots.
         earlier = position_sources.read(path) if path.exists() else PositionSources()
-        merge = position_sources.merge(earlier, make_accounts(began_utc_ns, offsets))
+        merge = position_sources.merge(earlier, make_sources(began_utc_ns, offsets))
         path.write_text(position_sources.text(merge), encoding="utf-8")
     return list(zip(recordings, codes, strict=True))
 
@@ -107,15 +107,15 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
 
 def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]:
     """Return the fixed positions of the robots that stay where they were placed while the steps inside run."""
-    leads = (step for step in steps_inside(nest) if isinstance(step, Nest) and step.leads)
-    moving = frozenset[Role]().union(*(step.moves() for step in leads if isinstance(step, Moves)))
+    movers = (step for step in steps_inside(nest) if isinstance(step, Nest) and step.has_path)
+    moving = frozenset[Role]().union(*(step.moves() for step in movers if isinstance(step, Moves)))
     places_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moving}
     return {role: PositionSource(place=places_m[role]) for role in nest.roles() if role in places_m}
 
 
 def placement_error(what: str, within: Sequence[Nest]) -> str | None:
     """Return why a step `what`, which records positions, must not be inside the steps `within`; None if it may."""
-    if any(nest.leads for nest in within):
+    if any(nest.has_path for nest in within):
         return f"a {what} starts where robots were placed: put the move into the {what}"
     if any(nest.disturbs or nest.parallel for nest in within):
         return f"a {what} must not be inside a fault or a together: put them into the {what}"

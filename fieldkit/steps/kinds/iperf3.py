@@ -54,7 +54,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     Attributes:
         duration: How long it sends, in whole seconds; 10 s without `size`.
-        size: How much it sends, `10MB`, in place of `duration`.
+        size: How much it sends, `10MB`, instead of `duration`.
         reverse: Whether the server sends and the client receives.
         limit: A test that takes longer is stopped, and the repeat is void. With `along` it is added to the duration.
     """
@@ -72,7 +72,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
     limit: Annotated[Duration, Field(gt=0)] = 120.0
 
     @schema.model_validator(mode="after")
-    def _has_one_end(self) -> "Iperf3Step":
+    def _has_duration_or_size(self) -> "Iperf3Step":
         if self.size is not None and self.duration is not None:
             raise schema.validation_error("a test has a duration or a size, not both; leave one out", "size")
         if self.size is not None and self.along:
@@ -221,12 +221,12 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
         """Yield the contradictions between both JSON reports, the procedure, captures and interface counters."""
         protocol = self.carried_by(view.scene.protocol)
         duration_s = self._duration_s if self.size is None else None
-        order = IperfSettings(protocol, self.streams, self.payload_bytes, self.reverse, duration_s)
-        yield from iperf3_checks.compare_ends(tests[self.sender], tests[self.receiver], order)
+        settings = IperfSettings(protocol, self.streams, self.payload_bytes, self.reverse, duration_s)
+        yield from iperf3_checks.compare_ends(tests[self.sender], tests[self.receiver], settings)
         sent, received = tests[self.source], tests[self.destination]
         source_capture, destination_capture = (view.capture(role) for role in (self.source, self.destination))
         if source_capture is not None and destination_capture is not None:
-            witness = LoadEvidence(
+            load_evidence = LoadEvidence(
                 sender=source_capture.packets,
                 receiver=destination_capture.packets,
                 server_port=self.port,
@@ -234,7 +234,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
                 sender_counters=view.evidence.counters(self.source),
                 receiver_counters=view.evidence.counters(self.destination),
             )
-            yield from load_checks.find(self._flow(view, sent, received), sent, received, witness)
+            yield from load_checks.find(self._flow(view, sent, received), sent, received, load_evidence)
         interface = view.scene.robot(self.destination).profile.radio.interface
         interface_bytes = view.evidence.interface_bytes(self.destination, interface)
         payload_bytes = sum(interval.payload_bytes for interval in received.intervals)

@@ -54,13 +54,13 @@ class PrintedColumn(Strict):
         expression: In place of `json`, a regular expression ([RE2](https://github.com/google/re2/wiki/Syntax)) with
             one group; its first match is the value. `^` and `$` match at ends of a line.
         optional: Whether the value may be missing in a valid repeat.
-        label: Label in tables and figures, in place of its name.
+        label: Label in tables and figures, instead of its name.
     """
 
     name: Annotated[
         str,
         schema.pattern_field(
-            r"^[a-z][a-z0-9_]{0,40}$", "a name: small letters, digits and _, a small letter first, 41 in all"
+            r"^[a-z][a-z0-9_]{0,40}$", "a name: at most 41 lower-case letters, digits and _, a letter first"
         ),
     ]
     unit: Annotated[
@@ -150,9 +150,9 @@ class RunStep(Step, UsesSpace, Summarizes):
         robot: Role of the robot on which it runs.
         command: The command, split into words as a shell does, without shell operators such as a pipe; with
             variables.
-        argv: The command as a list of words, in place of `command`.
+        argv: The command as a list of words, instead of `command`.
         put: A program of the lab, at most 8.4 MB, which is copied to the robot before the first step: a path relative
-            to the folder of the procedure, else of the lab; links must not lead out of them. `{put}` is its path on
+            to the folder of the procedure, else of the lab; links must not point outside. `{put}` is its path on
             the robot. In `trial.yaml` it is a mapping with the keys below; in a procedure it is a path.
         takes: Approximate duration, for the estimate of the time left.
         limit: A program that runs longer is stopped, and the repeat is void.

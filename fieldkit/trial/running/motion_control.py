@@ -22,7 +22,7 @@ class MotionClearance(Protocol):
 
     @property
     def origins(self) -> object:
-        """The object that the steps get as `Scene.origins`."""
+        """The value of `Scene.origins` for the steps."""
         ...
 
     def require(self) -> None:
@@ -35,8 +35,8 @@ class MotionClearance(Protocol):
         """
         ...
 
-    def noting(self, sink: Sink) -> AbstractContextManager[None]:
-        """Run the body; if the operator stops it, note each robot that may not move again without a confirmation."""
+    def reporting_holds(self, sink: Sink) -> AbstractContextManager[None]:
+        """Run the body; if the operator stops it, report each robot that must not move without a confirmation."""
         ...
 
 
@@ -69,7 +69,7 @@ class _NoMotion:
         """Allow the attempt."""
 
     @contextmanager
-    def noting(self, sink: Sink) -> Iterator[None]:  # noqa: ARG002 (there is nothing to note)
+    def reporting_holds(self, sink: Sink) -> Iterator[None]:  # noqa: ARG002 (there is nothing to report)
         """Run the body."""
         yield
 

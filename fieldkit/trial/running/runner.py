@@ -184,7 +184,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
                 permission.require()
                 expected_s = plan.procedure.expected_s(repeat.protocol)
                 notes = plan.abort_notes(plan.scene(repeat, ""))
-                with permission.noting(sink), stop.finishing(expected_s, notes):
+                with permission.reporting_holds(sink), stop.finishing(expected_s, notes):
                     remedy = attempts.make(repeat)
                     if ledger.is_finished(repeat):
                         finished.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))

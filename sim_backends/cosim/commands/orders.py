@@ -27,7 +27,7 @@ from sim_backends.cosim.studies.local_errors import (
     LocalErrors,
     local_errors,
     low_discrepancy_times_ns,
-    pooled,
+    pool,
 )
 from sim_backends.cosim.studies.seeds import Task, run_many
 
@@ -95,7 +95,7 @@ def _measure(
             failures.setdefault(task.policy, result)
         else:
             errors_by_policy.setdefault(task.policy, []).append(result)
-    return {name: pooled(errors) for name, errors in errors_by_policy.items() if name not in failures}, failures
+    return {name: pool(errors) for name, errors in errors_by_policy.items() if name not in failures}, failures
 
 
 def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Task) -> LocalErrors | PolicyError:

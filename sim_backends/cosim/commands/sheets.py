@@ -1,4 +1,4 @@
-"""Tables for people and programs: columns with a unit and a meaning, printed in four formats."""
+"""Tables of results: columns with a unit and a meaning, printed in four formats."""
 
 import math
 import re
@@ -29,7 +29,7 @@ class SheetColumn:
 
     Attributes:
         name: Its name in CSV and JSON, with its SI unit.
-        head: Its heading in tables for people, with the unit shown there.
+        head: Its heading in printed tables, with the unit shown there.
         meaning: Explanation of the heading; empty if the heading is sufficient.
         factor: Factor from the SI unit to the shown unit.
         digits: Number of significant digits that are shown.
@@ -42,7 +42,7 @@ class SheetColumn:
     digits: int = 3
 
     def shown(self, value: Value) -> str:
-        """Return the text of a value in a table for people."""
+        """Return the text of a value in a printed table."""
         if value is None or isinstance(value, str):
             return value or _MISSING
         scaled = value * self.factor
@@ -53,7 +53,7 @@ class SheetColumn:
 
 @dataclass(frozen=True)
 class SheetPart:
-    """Some columns of a table, which are printed as a separate table for people.
+    """Some columns of a table, which are printed as a separate table.
 
     Attributes:
         title: Its title.
@@ -71,7 +71,7 @@ class Sheet:
     Attributes:
         columns: Its columns.
         rows: Its rows, each with a value per column.
-        parts: The tables for people.
+        parts: The printed tables.
     """
 
     columns: Sequence[SheetColumn]

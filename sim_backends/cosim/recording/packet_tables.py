@@ -65,7 +65,12 @@ _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
             _field(
                 "counted_ns", pa.int64(), "ns", "time of arrival by the policy; empty if the packet never arrived"
             ),
-            _field("late_ns", pa.int64(), "ns", "time by which the receiver had already passed counted_ns"),
+            _field(
+                "late_ns",
+                pa.int64(),
+                "ns",
+                "time from counted_ns to the receiver's simulated time at delivery, if that is later; else 0",
+            ),
             _field(
                 "reason",
                 _TEXT,

@@ -52,7 +52,8 @@ def robots() -> list[str]:
 def limits(robot: str) -> DriveLimits | QuadrotorLimits:
     """Return the limits of a robot's body.
 
-    A robot profile that is not a kind of body has the body of the paper's robot of its kind, with its own top speed.
+    For the name of a robot profile, these are the limits of the paper's ground robot or quadrotor, with the top speed
+    of the profile.
     """
     if robot in BODIES:
         return BODIES[robot]

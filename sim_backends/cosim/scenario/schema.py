@@ -168,7 +168,7 @@ class CosimScenario(Named):
 
     Attributes:
         name: The file's name without `.yaml`.
-        summary: One line for people.
+        summary: Description in one line.
         world: Surroundings of the agents: a file of the lab's folder `worlds/`, or a shipped one.
         line: The line of the world along which agents start.
         duration: Its duration, in simulated time.

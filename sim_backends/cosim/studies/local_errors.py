@@ -1,8 +1,8 @@
-"""Local errors: the errors of single windows of a method that begin in the state of the exact reference.
+"""Local errors: the errors of a method in single windows that start from the state of the exact reference.
 
-The method is that for solvers of differential equations: the reference runs exactly; at many times a fork of it runs
-one window with the method and continues exactly. Differences from the reference are then caused by that window only,
-and not by earlier windows. If the window is halved, the errors decrease according to the order of the method.
+They are measured as for solvers of differential equations: the reference runs exactly; at many times a fork of it
+runs one window with the method and continues exactly. Differences from the reference are then caused by that window
+only, and not by earlier windows. If the window is halved, the errors decrease according to the order of the method.
 
 A window affects the packets that, in the reference, were sent or arrived within it.
 """
@@ -69,9 +69,9 @@ class LocalErrors:
         return jackknife(value, np.array(without))
 
 
-def pooled(several: Iterable[LocalErrors]) -> LocalErrors:
+def pool(errors_by_run: Iterable[LocalErrors]) -> LocalErrors:
     """Return the local errors of one method over the windows of several runs, for example of several seeds."""
-    runs = list(several)
+    runs = list(errors_by_run)
     return LocalErrors(
         np.concatenate([run.window_s for run in runs], axis=1),
         {measure: np.concatenate([run.sums[measure] for run in runs], axis=1) for measure in MEASURES},
@@ -109,7 +109,7 @@ def local_errors(
     reference = make(EventDriven())
     for column, start_ns in enumerate(starts_ns):
         _delete_decided(reference.advance(start_ns))
-        exact_by_end: dict[int, _Aftermath] = {}
+        exact_by_end: dict[int, _Outcome] = {}
         for name, method in methods.items():
             for row, parameter in enumerate(parameters):
                 fork = reference.fork()
@@ -120,8 +120,8 @@ def local_errors(
                 if end_ns not in exact_by_end:
                     exact_fork = reference.fork()
                     exact_fork.advance(end_ns)
-                    exact_by_end[end_ns] = _aftermath(exact_fork, end_ns, tail_ns)
-                actual = _aftermath(fork, end_ns, tail_ns)
+                    exact_by_end[end_ns] = _run_to_outcome(exact_fork, end_ns, tail_ns)
+                actual = _run_to_outcome(fork, end_ns, tail_ns)
                 results[name].window_s[row, column] = (end_ns - start_ns) / 1e9
                 for measure, values in _differences(start_ns, end_ns, exact_by_end[end_ns], actual).items():
                     results[name].sums[measure][row, column] = sum(values)
@@ -141,21 +141,21 @@ def low_discrepancy_times_ns(start_ns: int, end_ns: int, count: int, step_ns: in
 
 
 @dataclass(frozen=True)
-class _Aftermath:
+class _Outcome:
     """The fates of packets some time after a window, and the states of the agents at its end."""
 
     fates: Mapping[PacketIdentity, Fate]
     states: Mapping[str, State]
 
 
-def _aftermath(fork: Coordinator, end_ns: int, tail_ns: int) -> _Aftermath:
+def _run_to_outcome(fork: Coordinator, end_ns: int, tail_ns: int) -> _Outcome:
     """Continue a fork that has reached the end of a window with the exact policy."""
     states = fork.situation.states
     fork.policy = EventDriven()
-    return _Aftermath(fork.advance(end_ns + tail_ns).fates, states)
+    return _Outcome(fork.advance(end_ns + tail_ns).fates, states)
 
 
-def _differences(start_ns: int, end_ns: int, exact: _Aftermath, actual: _Aftermath) -> dict[str, list[float]]:
+def _differences(start_ns: int, end_ns: int, exact: _Outcome, actual: _Outcome) -> dict[str, list[float]]:
     """Return each error of a window for all packets and agents that it affected."""
     differences: dict[str, list[float]] = {measure: [] for measure in MEASURES}
     for identity, fate in exact.fates.items():

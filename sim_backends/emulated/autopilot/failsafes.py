@@ -46,7 +46,7 @@ class Reaction:
     """Reaction of a fail-safe.
 
     Attributes:
-        text: Text for people, or empty.
+        text: Text of the STATUSTEXT message, or empty.
         severity: MAV_SEVERITY of the text.
         mode: Mode to change to; None to keep the mode.
         disarm: True to stop the motors.

@@ -40,7 +40,7 @@ class ParameterService:
         firmware: Family of the autopilot.
         parameters: Its parameters.
         changed: Called with the name of a parameter that was set.
-        report: Called with the severity and a text for people.
+        report: Called with the severity and the text of a STATUSTEXT message.
     """
 
     def __init__(

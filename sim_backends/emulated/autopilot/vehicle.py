@@ -23,11 +23,12 @@ _CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
 _PREARM_NS: Final = 30_000_000_000
 """ArduPilot repeats the reasons why it cannot be armed at this interval (AP_Arming)."""
 _OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
-"""Mode when set-points are missing, by COM_OBL_RC_ACT; PX4 holds instead of a pilot's mode, which needs sticks."""
+"""Mode when set-points are missing, by COM_OBL_RC_ACT; for the modes of a remote control, which need its sticks, PX4
+holds the position instead."""
 
 
 class Refused(Exception):  # noqa: N818 (an answer of the autopilot, not an error)
-    """The vehicle refuses a command; the text is for people, and empty if the firmware sends none."""
+    """The vehicle refuses a command; the message is the text that the firmware sends, which may be empty."""
 
 
 class Vehicle(VehicleBase):

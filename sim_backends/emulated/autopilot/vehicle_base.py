@@ -16,7 +16,7 @@ from sim_backends.physics.quadrotor import QuadrotorLimits
 
 
 class StatusText(NamedTuple):
-    """A text for people: STATUSTEXT."""
+    """Severity and text of a STATUSTEXT message."""
 
     severity: int
     text: str
@@ -120,7 +120,7 @@ class VehicleBase:
         return reasons
 
     def report(self, severity: int, text: str) -> None:
-        """Add a text for people."""
+        """Add a text that is sent as STATUSTEXT."""
         self.status_texts.append(StatusText(severity, text))
 
     @property

@@ -1,8 +1,8 @@
 """Record of the motion of a robot that steers itself, read by its sensors and by the lab.
 
-One process of a robot writes it: its base controller, or its autopilot. Each record has the position and velocity
-and a time of the monotonic clock, which all processes of a machine share; readers extrapolate from there. Two slots
-are written in turn, each with a CRC, so that a reader finds a complete record while one is being written, and after
+One process of a robot writes it: its base controller, or its autopilot. Each record has the position and velocity and
+a time of the monotonic clock, which all processes of a machine share; readers extrapolate from there. Two slots are
+written alternately, each with a CRC, so that a reader finds a complete record while one is being written, and after
 the writer was killed.
 """
 

@@ -62,7 +62,7 @@ class _Account:
         outcomes = self._probe.network(to_ns, states, packets, copy=copy)
         self._packets |= {packet.packet_id: packet for packet in packets}
         if outcomes.at_ns != to_ns:
-            raise CheckError(f"asked to advance to {to_ns} ns, it advanced to {outcomes.at_ns} ns")
+            raise CheckError(f"requested to advance to {to_ns} ns, it advanced to {outcomes.at_ns} ns")
         if self._probe.has(FederateCapability.NEXT_EVENT):
             self._check_next_event(outcomes, to_ns, has_packets=bool(packets))
         for arrival in outcomes.arrivals:

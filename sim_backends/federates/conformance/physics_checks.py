@@ -54,7 +54,7 @@ def _check_time(probe: FederateProbe, to_ns: int, advanced: Advanced) -> None:
     expected_ns = to_ns - to_ns % step_ns
     if advanced.at_ns != expected_ns:
         raise CheckError(
-            f"asked to advance to {to_ns} ns, it returned the states at {advanced.at_ns} ns instead of "
+            f"requested to advance to {to_ns} ns, it returned the states at {advanced.at_ns} ns instead of "
             f"{expected_ns} ns, its last step of {step_ns} ns until then"
         )
 
@@ -151,7 +151,7 @@ def check_limits(target: Target) -> None:
 
 
 def check_command_time(target: Target) -> None:
-    """A command applies from `from_ns` on, even if the federate was not asked to advance to it before."""
+    """A command applies from `from_ns` on, even if the federate was not requested to advance to it before."""
     exact = target.open()
     exact.require(FederateCapability.DETERMINISTIC)
     step_ns, commands = exact.welcome.step_ns, _commands(exact)

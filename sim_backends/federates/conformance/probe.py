@@ -62,7 +62,7 @@ class Advanced:
 
 
 def frame_text(frame: bytes) -> str:
-    """Return a frame for people: its size, and its first bytes in hexadecimal."""
+    """Return a description of a frame: its size, and its first bytes in hexadecimal."""
     rest = "" if len(frame) <= _SHOWN_BYTES else "..."
     return f"{len(frame)} bytes: {frame[:_SHOWN_BYTES].hex(' ', 4)}{rest}"
 

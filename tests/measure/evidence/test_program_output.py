@@ -70,7 +70,7 @@ def test_a_number_as_text_is_accepted_and_words_are_sanitized() -> None:
     assert len(str(program_output.value(column("text"), 500 * "d"))) == 200
 
 
-def test_an_expression_finds_what_its_group_matches_first(output: Path) -> None:
+def test_an_expression_finds_the_first_match_of_its_group(output: Path) -> None:
     output.write_text("signal: -61 dBm\nnoise: -95 dBm\nsignal: -70 dBm\n", encoding="utf-8")
     assert program_output.by_expression(output, r"^signal: (-?[0-9]+)") == "-61"
     assert program_output.by_expression(output, r"(?s).*signal: (-?[0-9]+)") == "-70"

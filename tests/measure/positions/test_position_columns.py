@@ -18,7 +18,7 @@ from fieldkit.measure.positions import position_columns, position_sources
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, PLACED, WGS84
 from fieldkit.measure.robot_clock import Offset
-from tests.ros.bags.test_bag_positions import BEGAN_NS, S, odometry, stamped, written
+from tests.ros.bags.test_bag_positions import BEGAN_NS, S, odometry, stamped, write_bag
 
 SENDER, RECEIVER = Role.SENDER, Role.RECEIVER
 ENDS = (SENDER, RECEIVER)
@@ -42,7 +42,7 @@ def attempt(tmp_path: Path) -> Path:
     return folder
 
 
-def write_accounts(
+def write_sources(
     folder: Path, robots: Mapping[Role, PositionSource], clocks: Mapping[Role, float] | None = None
 ) -> None:
     offsets = {role: Offset(offset_s, 0.01) for role, offset_s in (clocks or {}).items()}
@@ -60,24 +60,24 @@ def mean_m(folder: Path, begin_s: float = 1.0, end_s: float = 3.0) -> float | st
     return float(measured.values[name]) if name in measured.values else measured.missing[name]
 
 
-def test_the_trials_sources_precede_the_attempts_and_those_the_testbeds(attempt: Path) -> None:
+def test_sources_of_the_trial_precede_those_of_the_attempt_and_of_the_testbed(attempt: Path) -> None:
     assert mean_m(attempt) == "the positions of the robots are unknown"
     (attempt / track.FILE).write_text(track.text(ORACLE), encoding="ascii")
     assert mean_m(attempt) == pytest.approx(100)
-    written(attempt, AWAY)
-    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_bag(attempt, AWAY)
+    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt) == pytest.approx(12)
     assert position_columns.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
     trial = attempt.parent.parent
     lines = "".join(f"{BEGAN_NS + n * S},{30 + n},0\n" for n in range(5))
     (trial / "positions-receiver.csv").write_text(f"t_ns,x_m,y_m\n{lines}", encoding="ascii")
     local = PositionSource(place=(0.0, 0.0, 0.0), frame=LOCAL)
-    write_accounts(trial, {SENDER: local, RECEIVER: PositionSource(file="positions-receiver.csv")})
+    write_sources(trial, {SENDER: local, RECEIVER: PositionSource(file="positions-receiver.csv")})
     assert mean_m(attempt) == pytest.approx(32)
     later = PositionSource(file="positions-receiver.csv", offset_s=-1.0)
-    write_accounts(trial, {SENDER: local, RECEIVER: later})
+    write_sources(trial, {SENDER: local, RECEIVER: later})
     assert mean_m(attempt) == pytest.approx(33), "each line was so a second before"
-    write_accounts(trial, {RECEIVER: later})
+    write_sources(trial, {RECEIVER: later})
     assert (
         mean_m(attempt)
         == f"the positions of the robots are in different frames: the sender {PLACED}, the receiver {LOCAL}"
@@ -97,7 +97,7 @@ def test_times_of_robots_are_converted_to_one_clock(
     attempt: Path, clocks: Mapping[Role, float], metres: float
 ) -> None:
     wrong_ns = round(1e9 * clocks.get(RECEIVER, 0.0)) if clocks.get(RECEIVER) == -3600 else 0
-    written(attempt, [odometry(BEGAN_NS + wrong_ns + n * S, float(n), 0.0) for n in range(-1, 6)], late_ns=wrong_ns)
+    write_bag(attempt, [odometry(BEGAN_NS + wrong_ns + n * S, float(n), 0.0) for n in range(-1, 6)], late_ns=wrong_ns)
     start = PositionSource(
         file="track.bag",
         topic="/where",
@@ -105,7 +105,7 @@ def test_times_of_robots_are_converted_to_one_clock(
         heading_rad=0.0,
         began_utc_ns=BEGAN_NS - round(1e9 * clocks.get(RECEIVER, 0.0)) * (not wrong_ns),
     )
-    write_accounts(attempt, {SENDER: HERE, RECEIVER: start}, clocks)
+    write_sources(attempt, {SENDER: HERE, RECEIVER: start}, clocks)
     begin_s, end_s = (1.0 + wrong_ns / 1e9, 3.0 + wrong_ns / 1e9)
     assert mean_m(attempt, begin_s, end_s) == pytest.approx(metres)
     assert position_columns.clock_error_s(AttemptEvidence(attempt)) == (
@@ -123,21 +123,21 @@ def test_times_of_robots_are_converted_to_one_clock(
 def test_times_that_are_not_covered_are_missing_with_a_reason(
     attempt: Path, begin_s: float, end_s: float, why: str
 ) -> None:
-    written(attempt, AWAY)
-    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_bag(attempt, AWAY)
+    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt, begin_s, end_s) == why
 
 
 def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
-    written(attempt, AWAY[:2] + AWAY[3:])
-    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_bag(attempt, AWAY[:2] + AWAY[3:])
+    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     why = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
     assert mean_m(attempt) == why
 
 
 def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt: Path) -> None:
-    written(attempt, AWAY[:2] + AWAY[3:])
-    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
+    write_bag(attempt, AWAY[:2] + AWAY[3:])
+    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
     distances = position_columns.distances_m(AttemptEvidence(attempt), ENDS)
     begin_ns = BEGAN_NS + S // 4
     in_gap = (begin_ns + S + 1, None)
@@ -147,20 +147,20 @@ def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt
 
 
 def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
-    written(attempt, AWAY)
-    write_accounts(attempt, {RECEIVER: ODOMETRY})
+    write_bag(attempt, AWAY)
+    write_sources(attempt, {RECEIVER: ODOMETRY})
     assert mean_m(attempt) == "no source has the position of the sender"
     (attempt / "track.bag").unlink()
-    write_accounts(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert "cannot be read" in str(mean_m(attempt))
 
 
 def test_a_tracker_and_a_fixed_place_in_its_frame(attempt: Path) -> None:
-    written(attempt, [stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
+    write_bag(attempt, [stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
     tracker = PositionSource(file="track.bag", topic="/where")
-    write_accounts(attempt, {SENDER: PositionSource(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
+    write_sources(attempt, {SENDER: PositionSource(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
-    write_accounts(attempt, {SENDER: HERE, RECEIVER: tracker})
+    write_sources(attempt, {SENDER: HERE, RECEIVER: tracker})
     assert (
         mean_m(attempt)
         == "the positions of the robots are in different frames: the sender as placed, the receiver frame map"
@@ -172,7 +172,7 @@ def test_wgs84_heights_are_used_only_if_requested(attempt: Path) -> None:
     to_longitude, to_latitude, _ = Geod(ellps="WGS84").fwd(longitude, latitude, 60.0, 1000.0)
     high, low = (latitude, longitude, 1650.0), (to_latitude, to_longitude, 1600.0)
     robots = {SENDER: PositionSource(place=high, frame=WGS84), RECEIVER: PositionSource(place=low, frame=WGS84)}
-    write_accounts(attempt, robots)
+    write_sources(attempt, robots)
     level_m = 1000 * (1 + 1625 / 6_371_000)
     assert mean_m(attempt) == pytest.approx(level_m, abs=0.002)
     (attempt / position_sources.FILE).write_text(
@@ -208,7 +208,7 @@ ANY_ACCOUNTS = st.builds(
 
 
 @given(ANY_ACCOUNTS)
-def test_accounts_are_read_as_they_were_written(
+def test_sources_are_read_as_they_were_written(
     tmp_path_factory: pytest.TempPathFactory, written_accounts: PositionSources
 ) -> None:
     path = tmp_path_factory.getbasetemp() / position_sources.FILE
@@ -239,7 +239,7 @@ def test_accounts_are_read_as_they_were_written(
         {"more": 1},
     ],
 )
-def test_invalid_accounts_are_rejected_and_leave_the_columns_empty(attempt: Path, damage: object) -> None:
+def test_invalid_sources_are_rejected_and_leave_the_columns_empty(attempt: Path, damage: object) -> None:
     assert isinstance(damage, dict)
     path = attempt / position_sources.FILE
     path.write_text(json.dumps({"robots": {}, "clocks": {}, "heights": False} | damage), encoding="utf-8")

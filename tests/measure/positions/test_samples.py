@@ -29,7 +29,7 @@ GPX = """\
 """
 
 
-def written(folder: Path, text: str, name: str = "walk.csv") -> Path:
+def write_file(folder: Path, text: str, name: str = "walk.csv") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
@@ -37,7 +37,7 @@ def written(folder: Path, text: str, name: str = "walk.csv") -> Path:
 
 def test_lengths_in_any_unit_and_order(tmp_path: Path) -> None:
     text = "\ufeffy_ft,note,t,x_cm\n10,begin,2026-11-22T12:00:00Z,-50\n20,,2026-11-22T14:00:00.000001+02:00,50\n"
-    samples = read_csv(written(tmp_path, text))
+    samples = read_csv(write_file(tmp_path, text))
     assert samples.frame == LOCAL
     assert samples.times_ns.tolist() == [NOON_NS, NOON_NS + 1000]
     assert samples.values == pytest.approx(np.array([[-0.5, 3.048, 0], [0.5, 6.096, 0]]))
@@ -54,7 +54,7 @@ def test_lengths_in_any_unit_and_order(tmp_path: Path) -> None:
 )
 def test_times_in_any_unit_keep_every_nanosecond(tmp_path: Path, name: str, first: str, second: str) -> None:
     samples = read_csv(
-        written(tmp_path, f"{name},lat,lon_deg,alt_m\n{first},48.1,11.5,520\n{second},48.1,11.5,521\n")
+        write_file(tmp_path, f"{name},lat,lon_deg,alt_m\n{first},48.1,11.5,520\n{second},48.1,11.5,521\n")
     )
     assert samples.frame == WGS84
     assert samples.times_ns.tolist() == [NOON_NS, NOON_NS + 1]
@@ -62,7 +62,7 @@ def test_times_in_any_unit_keep_every_nanosecond(tmp_path: Path, name: str, firs
 
 
 def test_an_unknown_height_is_not_zero(tmp_path: Path) -> None:
-    assert math.isnan(read_csv(written(tmp_path, "t_s,lat,lon\n1,48.1,11.5\n")).values[0, 2])
+    assert math.isnan(read_csv(write_file(tmp_path, "t_s,lat,lon\n1,48.1,11.5\n")).values[0, 2])
 
 
 @pytest.mark.parametrize(
@@ -94,12 +94,12 @@ def test_an_unknown_height_is_not_zero(tmp_path: Path) -> None:
 )
 def test_invalid_positions_and_times_are_rejected_with_their_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(EvidenceError, match=message):
-        read_csv(written(tmp_path, text))
+        read_csv(write_file(tmp_path, text))
 
 
 @given(st.text(alphabet='t_snxy,m\n"1.-eZ:latlo', max_size=60))
 def test_any_content_raises_only_evidence_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
-    path = written(tmp_path_factory.getbasetemp(), text)
+    path = write_file(tmp_path_factory.getbasetemp(), text)
     try:
         samples = read_csv(path)
     except EvidenceError:
@@ -109,7 +109,7 @@ def test_any_content_raises_only_evidence_error(tmp_path_factory: pytest.TempPat
 
 
 def test_gpx_tracks_are_read(tmp_path: Path) -> None:
-    samples = position_files.read_file(written(tmp_path, GPX, "walk.GPX"))
+    samples = position_files.read_file(write_file(tmp_path, GPX, "walk.GPX"))
     assert samples.frame == WGS84
     assert (samples.times_ns - NOON_NS).tolist() == [0, 1_250_000_000, 3_000_000_000]
     assert samples.values[:, :2].tolist() == [[48.1374, 11.5755], [48.1375, 11.5756], [48.1376, 11.5757]]
@@ -134,7 +134,7 @@ def test_gpx_tracks_are_read(tmp_path: Path) -> None:
 def test_gpx_without_valid_positions_and_times_is_rejected(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in GPX
     with pytest.raises(EvidenceError, match=message):
-        position_files.read_file(written(tmp_path, GPX.replace(old, new), "walk.gpx"))
+        position_files.read_file(write_file(tmp_path, GPX.replace(old, new), "walk.gpx"))
 
 
 def test_gpx_that_expands_while_it_is_read_is_rejected(tmp_path: Path) -> None:
@@ -143,9 +143,9 @@ def test_gpx_that_expands_while_it_is_read_is_rejected(tmp_path: Path) -> None:
         f'<?xml version="1.0"?><!DOCTYPE gpx [<!ENTITY e0 "boom">{entities}]><gpx><trk><name>&e9;</name></trk></gpx>'
     )
     with pytest.raises(EvidenceError, match="cannot be read as GPX"):
-        position_files.read_file(written(tmp_path, bomb, "walk.gpx"))
+        position_files.read_file(write_file(tmp_path, bomb, "walk.gpx"))
 
 
 def test_other_file_types_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="neither GPX nor CSV"):
-        position_files.read_file(written(tmp_path, GPX, "walk.kml"))
+        position_files.read_file(write_file(tmp_path, GPX, "walk.kml"))

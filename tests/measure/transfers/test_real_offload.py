@@ -76,7 +76,7 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
     assert matched.arrived.all()
     assert not matched.duplicates.any()
     # Joined segments that TCP retransmits within one millisecond have equal time stamps, and the router cuts both.
-    assert set(np.flatnonzero(matched.ambiguous)) <= repeated_at_once(sent)
+    assert set(np.flatnonzero(matched.ambiguous)) <= frames_with_repeated_bytes(sent)
     assert (counts.ambiguous_frames > 0) == matched.ambiguous.any()
     if counts.ambiguous_frames:
         assert counts.spurious_frames is counts.reordered_frames is None
@@ -86,13 +86,13 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
         assert (counts.reordered_frames > 0) >= (late > 0)
 
 
-def repeated_at_once(sent: Packets) -> set[int]:
+def frames_with_repeated_bytes(sent: Packets) -> set[int]:
     """Return the frames with a byte that is also in another frame with the same time stamp, compared pair by pair."""
     carries = np.flatnonzero(sent.tcp_payload_bytes)
     first, stamp = sent.tcp_seq[carries], sent.tcp_stamp[carries]
     end = first + sent.tcp_payload_bytes[carries]
-    alike = (stamp == stamp[:, None]) & (first < end[:, None]) & (first[:, None] < end)
-    return set(carries[alike.sum(axis=1) > 1])
+    overlaps = (stamp == stamp[:, None]) & (first < end[:, None]) & (first[:, None] < end)
+    return set(carries[overlaps.sum(axis=1) > 1])
 
 
 def counted(table: Path) -> int:

@@ -34,7 +34,7 @@ def lines() -> list[dict[str, Any]]:
     return [{**line, "utc_ns": START_NS + round(1e9 * line["at_s"])} for line in made]
 
 
-def written(folder: Path, lines_: list[dict[str, Any]], *, numbered: bool = True) -> Path:
+def write_log(folder: Path, lines_: list[dict[str, Any]], *, numbered: bool = True) -> Path:
     """Write lines in the format of the agent; without numbers in that of older versions."""
     text = StringIO()
     log = NumberedLines(text)
@@ -55,14 +55,14 @@ def reasons(path: Path) -> list[str]:
 
 @pytest.mark.parametrize("numbered", [True, False])
 def test_an_unchanged_log_has_no_contradiction(numbered: bool, tmp_path: Path) -> None:
-    path = written(tmp_path, lines(), numbered=numbered)
+    path = write_log(tmp_path, lines(), numbered=numbered)
     assert reasons(path) == []
     assert drive_log.measure(drive_log.read(path)).values["drive_farthest_m"] == pytest.approx(2.0)
 
 
 @given(cut=st.integers(1, 2000))
 def test_a_truncated_log_is_detected(cut: int, tmp_path_factory: pytest.TempPathFactory) -> None:
-    path = written(tmp_path_factory.mktemp("drive"), lines())
+    path = write_log(tmp_path_factory.mktemp("drive"), lines())
     content = path.read_bytes()
     path.write_bytes(content[: max(len(content) - cut, 1)])
     try:
@@ -72,7 +72,7 @@ def test_a_truncated_log_is_detected(cut: int, tmp_path_factory: pytest.TempPath
 
 
 def test_a_truncated_log_of_an_older_agent_is_detected(tmp_path: Path) -> None:
-    path = written(tmp_path, lines()[:40], numbered=False)
+    path = write_log(tmp_path, lines()[:40], numbered=False)
     assert reasons(path) == ["does not end with the robot at its starting position, but on its path"]
 
 
@@ -92,12 +92,12 @@ def test_a_changed_line_is_detected(name: str, tmp_path: Path) -> None:
         made[45] = {**made[45], field: made[45][field] + by}
     if "driven_m" in change:
         made = [{**line, "driven_m": line["driven_m"] + (at > 45)} for at, line in enumerate(made)]
-    assert any(why in reason for reason in reasons(written(tmp_path, made)))
+    assert any(why in reason for reason in reasons(write_log(tmp_path, made)))
 
 
 def test_a_deviation_from_the_planned_path_is_detected(tmp_path: Path) -> None:
     made = [{**line, "x_m": 3 * line["x_m"], "driven_m": 3 * line["driven_m"]} for line in lines()]
-    contradictions = reasons(written(tmp_path, made))
+    contradictions = reasons(write_log(tmp_path, made))
     assert any("deviates by 4.0 m" in reason for reason in contradictions)
     assert any("drove at 3.00 m/s instead of 1 m/s" in reason for reason in contradictions)
 
@@ -112,10 +112,10 @@ def test_a_change_of_a_field_is_detected_or_leaves_the_distance(
     field: str, some: tuple[int, int], by: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder, made = tmp_path_factory.getbasetemp(), lines()
-    before = drive_log.measure(drive_log.read(written(folder, made))).values
+    before = drive_log.measure(drive_log.read(write_log(folder, made))).values
     for at in range(some[0], min(some[0] + some[1], len(made))):
         made[at] = {**made[at], field: made[at][field] + by}
-    path = written(folder, made)
+    path = write_log(folder, made)
     try:
         if reasons(path):
             return
@@ -129,7 +129,7 @@ def test_a_change_of_a_field_is_detected_or_leaves_the_distance(
 
 @given(chosen=st.sets(st.integers(0, 80), min_size=1))
 def test_missing_lines_are_detected(chosen: set[int], tmp_path_factory: pytest.TempPathFactory) -> None:
-    path = written(tmp_path_factory.mktemp("drive"), lines())
+    path = write_log(tmp_path_factory.mktemp("drive"), lines())
     kept = [line for at, line in enumerate(path.read_text("ascii").splitlines(keepends=True)) if at not in chosen]
     path.write_text("".join(kept), encoding="ascii")
     assert reasons(path)
@@ -137,7 +137,7 @@ def test_missing_lines_are_detected(chosen: set[int], tmp_path_factory: pytest.T
 
 @given(place=st.integers(0), bit=st.integers(0, 6))
 def test_any_flipped_bit_is_detected(place: int, bit: int, tmp_path_factory: pytest.TempPathFactory) -> None:
-    path = written(tmp_path_factory.mktemp("drive"), lines())
+    path = write_log(tmp_path_factory.mktemp("drive"), lines())
     content = bytearray(path.read_bytes())
     content[place % len(content)] ^= 1 << bit
     path.write_bytes(content)

@@ -49,14 +49,14 @@ def drive(out_s: float, speed_m_s: float, back_m_s: float) -> Iterator[dict[str,
     yield {**LINE, "at_s": at_s, "driven_m": 2 * long_m, **end}
 
 
-def written(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
+def write_log(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
     path = folder / drive_log.FILE
     path.write_text("".join(f"{json.dumps(line)}\n" for line in lines) + end, encoding="ascii")
     return path
 
 
 def test_the_columns_of_a_known_path(tmp_path: Path) -> None:
-    log = drive_log.read(written(tmp_path, list(drive(4.0, 0.5, 1.0))))
+    log = drive_log.read(write_log(tmp_path, list(drive(4.0, 0.5, 1.0))))
     measured = drive_log.measure(log)
     assert not measured.missing
     assert measured.values["drive_ended"] == "home"
@@ -77,16 +77,16 @@ def test_unknown_values_are_missing_with_a_reason(tmp_path: Path) -> None:
     assert drive_log.measure(None).missing.keys() == NAMES
     # An interrupted drive: the last line is incomplete, and no line has the end.
     lines = [line for line in drive(1.0, 0.5, 1.0) if line["phase"] == "out"]
-    measured = drive_log.measure(drive_log.read(written(tmp_path, lines, end='{"utc_ns": 1')))
+    measured = drive_log.measure(drive_log.read(write_log(tmp_path, lines, end='{"utc_ns": 1')))
     assert measured.missing.keys() == {"drive_back_off_m", "drive_back_turned_rad", "drive_ended"}
     assert measured.values["drive_out_m"] == 0.5
-    short = drive_log.measure(drive_log.read(written(tmp_path, lines[:22])))
+    short = drive_log.measure(drive_log.read(write_log(tmp_path, lines[:22])))
     assert "drive_speed_median_m_s" in short.missing
 
 
-def test_control_characters_in_the_reason_of_the_end_are_replaced(tmp_path: Path) -> None:
+def test_control_characters_in_the_reason_for_the_end_are_replaced(tmp_path: Path) -> None:
     lines = [LINE, {**LINE, "at_s": 1.0, "ended": "odometry\x1b[2J was silent" + "!" * 999}]
-    measured = drive_log.measure(drive_log.read(written(tmp_path, lines)))
+    measured = drive_log.measure(drive_log.read(write_log(tmp_path, lines)))
     text = str(measured.values["drive_ended"])
     assert text.startswith("odometry?[2J was silent!")
     assert len(text) == 200
@@ -112,18 +112,18 @@ def test_control_characters_in_the_reason_of_the_end_are_replaced(tmp_path: Path
 )
 def test_an_invalid_line_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
     with pytest.raises(EvidenceError, match="line 2 is not a line of a drive log"):
-        drive_log.read(written(tmp_path, [LINE, {**LINE, **wrong}]))
+        drive_log.read(write_log(tmp_path, [LINE, {**LINE, **wrong}]))
 
 
 def test_a_missing_or_empty_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="contains no position of a"):
-        drive_log.read(written(tmp_path, []))
+        drive_log.read(write_log(tmp_path, []))
     with pytest.raises(EvidenceError, match="not in the order of time"):
-        drive_log.read(written(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))
+        drive_log.read(write_log(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))
     with pytest.raises(EvidenceError, match="cannot be read"):
         drive_log.read(tmp_path / "none")
     with pytest.raises(EvidenceError, match="line 1"):
-        drive_log.read(written(tmp_path, [], end="[1]\n"))
+        drive_log.read(write_log(tmp_path, [], end="[1]\n"))
 
 
 numbers = st.floats(allow_nan=True, allow_infinity=True) | st.integers() | st.none() | st.text(max_size=3)

@@ -44,7 +44,7 @@ def lines() -> list[dict[str, Any]]:
 PHASES = (("standing", 0.5), ("climbing", 3.0), ("up", 4.0), ("flying", 14.0), ("there", 14.5), ("coming down", 20.0))
 
 
-def written(folder: Path, lines_: list[dict[str, Any]], *, ended: bool = True) -> Path:
+def write_log(folder: Path, lines_: list[dict[str, Any]], *, ended: bool = True) -> Path:
     text = StringIO()
     log = NumberedLines(text)
     for line in lines_:
@@ -62,12 +62,12 @@ def reasons(path: Path) -> list[str]:
 
 
 def test_an_unchanged_log_has_no_contradiction(tmp_path: Path) -> None:
-    assert reasons(written(tmp_path, lines())) == []
+    assert reasons(write_log(tmp_path, lines())) == []
 
 
 def test_a_log_without_its_end_is_detected(tmp_path: Path) -> None:
-    assert reasons(written(tmp_path, lines(), ended=False)) == ["its last line is missing: its writer was killed"]
-    short = reasons(written(tmp_path, lines()[:90]))
+    assert reasons(write_log(tmp_path, lines(), ended=False)) == ["its last line is missing: its writer was killed"]
+    short = reasons(write_log(tmp_path, lines()[:90]))
     assert short == ["ends while the drone was flying, not coming down"]
 
 
@@ -84,7 +84,7 @@ def test_a_log_without_its_end_is_detected(tmp_path: Path) -> None:
 def test_a_changed_line_is_detected(field: str, by: float, why: str, tmp_path: Path) -> None:
     made = lines()
     made[80] = {**made[80], field: made[80][field] + by}
-    contradictions = reasons(written(tmp_path, made))
+    contradictions = reasons(write_log(tmp_path, made))
     assert any(why in reason for reason in contradictions) if why else contradictions == []
 
 
@@ -98,10 +98,10 @@ def test_any_change_of_a_field_is_detected(
     field: str, some: tuple[int, int], by: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder, made = tmp_path_factory.getbasetemp(), lines()
-    before = fly_log.measure(fly_log.read(written(folder, made))).values
+    before = fly_log.measure(fly_log.read(write_log(folder, made))).values
     for at in range(some[0], min(sum(some), len(made))):
         made[at] = {**made[at], field: made[at][field] + by}
-    path = written(folder, made)
+    path = write_log(folder, made)
     try:
         if reasons(path):
             return
@@ -112,7 +112,7 @@ def test_any_change_of_a_field_is_detected(
 
 
 def test_telemetry_of_another_flight_is_detected(tmp_path: Path) -> None:
-    log = fly_log.read(written(tmp_path, lines()))
+    log = fly_log.read(write_log(tmp_path, lines()))
     own = np.array([(moment.ahead_m, moment.left_m, moment.up_m) for moment in log])
     turned = own @ np.array([[math.cos(0.7), -math.sin(0.7), 0], [math.sin(0.7), math.cos(0.7), 0], [0, 0, 1]])
     assert fly_checks.telemetry_contradiction(log, turned + 300.0) is None

@@ -31,7 +31,7 @@ LINE = {
 }
 
 
-def written(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
+def write_log(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
     path = folder / fly_log.FILE
     path.write_text("".join(f"{json.dumps(line)}\n" for line in lines) + end, encoding="ascii")
     return path
@@ -84,7 +84,7 @@ def test_the_columns_of_a_known_flight(tmp_path: Path, yaw_rad: float) -> None:
 
 def test_unknown_values_are_missing_with_a_reason(tmp_path: Path) -> None:
     assert fly_log.measure(None).missing.keys() == NAMES
-    torn = written(tmp_path, [{**LINE, "phase": "up"}], end='{"utc_ns": 1')
+    torn = write_log(tmp_path, [{**LINE, "phase": "up"}], end='{"utc_ns": 1')
     measured = fly_log.measure(fly_log.read(torn))
     assert measured.missing.keys() == {"fly_height_median_m", "fly_speed_median_m_s", "fly_back_off_m"}
 
@@ -115,14 +115,14 @@ def test_a_flight_continues_if_its_log_cannot_be_written(place: str) -> None:
 )
 def test_an_invalid_line_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
     with pytest.raises(EvidenceError, match="line 2 is not a line of a flight log"):
-        fly_log.read(written(tmp_path, [LINE, {**LINE, **wrong}]))
+        fly_log.read(write_log(tmp_path, [LINE, {**LINE, **wrong}]))
 
 
 def test_a_missing_or_empty_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="contains no position of a"):
-        fly_log.read(written(tmp_path, []))
+        fly_log.read(write_log(tmp_path, []))
     with pytest.raises(EvidenceError, match="not in the order of time"):
-        fly_log.read(written(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))
+        fly_log.read(write_log(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))
     with pytest.raises(EvidenceError, match="cannot be read"):
         fly_log.read(tmp_path / "none")
 

@@ -34,7 +34,7 @@ def test_a_number_that_a_router_filtered_is_no_loss() -> None:
     assert periodic.lost(numbers, {"ATTITUDE": stream}, 0, REQUESTED) == (100, 0)
 
 
-def jittery(
+def late_messages(
     lost_share: float, seed: int, rate_hz: int
 ) -> tuple[list[tuple[int, int]], dict[str, list[StreamMessage]], int]:
     """Return the numbers and streams of an autopilot that sends late by up to 30 ms, and the number of losses.
@@ -64,14 +64,14 @@ def jittery(
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.2])
 def test_late_messages_and_withheld_answers_are_not_counted_as_lost(share: float, rate_hz: int) -> None:
     for seed in range(20):
-        numbers, streams, lost = jittery(share, seed, rate_hz)
+        numbers, streams, lost = late_messages(share, seed, rate_hz)
         received, counted = periodic.lost(numbers, streams, 0, REQUESTED if rate_hz == 20 else None)
         assert received == len(numbers)
         assert abs(counted - lost) <= 1 + 0.02 * lost, seed
 
 
 def test_a_stream_whose_period_is_unknown_is_not_counted() -> None:
-    numbers, streams, _ = jittery(0.2, 1, 20)
+    numbers, streams, _ = late_messages(0.2, 1, 20)
     assert periodic.lost(numbers, streams, 0) == (0, 0)
 
 

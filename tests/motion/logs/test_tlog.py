@@ -18,14 +18,14 @@ from fieldkit.motion.logs.periodic import StreamMessage
 from tests.helpers.drones import Sender, beat, flight, stamped
 
 
-def written(tmp_path: Path, data: bytes) -> Path:
+def write_log(tmp_path: Path, data: bytes) -> Path:
     path = tmp_path / "x.tlog"
     path.write_bytes(data)
     return path
 
 
 def measured(tmp_path: Path, data: bytes, ended_us: int = 0) -> dict[str, object]:
-    measured_log = tlog.measure(tlog.read(written(tmp_path, data), 0, ended_us))
+    measured_log = tlog.measure(tlog.read(write_log(tmp_path, data), 0, ended_us))
     assert measured_log.values.keys() | measured_log.missing.keys() == {column.name for column in tlog.COLUMNS}
     return dict(measured_log.values)
 
@@ -132,8 +132,8 @@ def test_logs_of_mavlink_1_and_of_signed_frames(how: str, tmp_path: Path) -> Non
 
 def test_one_of_two_autopilots_must_be_named(tmp_path: Path) -> None:
     frames = [(0, Sender(system).frame(beat())) for system in (3, 4)]
-    path = written(tmp_path, stamped(frames))
-    with pytest.raises(EvidenceError, match="autopilots of systems 3, 4: name one"):
+    path = write_log(tmp_path, stamped(frames))
+    with pytest.raises(EvidenceError, match="autopilots of systems 3, 4: choose one"):
         tlog.read(path, 0, 0)
     assert tlog.read(path, 4, 0).frames == 2
     with pytest.raises(EvidenceError, match="no heartbeat of an autopilot of system 5"):
@@ -153,7 +153,7 @@ def test_one_of_two_autopilots_must_be_named(tmp_path: Path) -> None:
 )
 def test_an_incomplete_log_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match=complaint):
-        tlog.read(written(tmp_path, data), 0, 0)
+        tlog.read(write_log(tmp_path, data), 0, 0)
 
 
 def test_a_log_that_is_missing(tmp_path: Path) -> None:

@@ -16,7 +16,13 @@ from fieldkit.core.errors import MotionHeldError
 from fieldkit.core.model import Distance, Placement, Role, Scenario, Topology
 from fieldkit.motion.logs import drive_checks
 from fieldkit.motion.origins import MotionOrigin
-from fieldkit.motion.running.motion_journal import MOTION_FILE, KeptOrigins, MotionEvent, MotionJournal, journal_of
+from fieldkit.motion.running.motion_journal import (
+    MOTION_FILE,
+    JournaledOrigins,
+    MotionEvent,
+    MotionJournal,
+    journal_of,
+)
 
 ORIGIN = MotionOrigin("odometry", "boot", 1.0, 2.0, 0.5)
 ROBOTS = {Role.SENDER: "rover-2", Role.RECEIVER: "rover-1"}
@@ -39,9 +45,9 @@ TASK = DriveTask(
 )
 
 
-def kept(folder: Path, placement: Placement = NEAR, *, may_return: bool = False) -> KeptOrigins:
+def kept(folder: Path, placement: Placement = NEAR, *, may_return: bool = False) -> JournaledOrigins:
     """Return the origins of a trial as read by another run of fieldkit."""
-    return KeptOrigins(MotionJournal(folder / MOTION_FILE), folder, ROBOTS, placement, may_return=may_return)
+    return JournaledOrigins(MotionJournal(folder / MOTION_FILE), folder, ROBOTS, placement, may_return=may_return)
 
 
 def test_an_origin_is_valid_over_runs_that_leave_the_robot_at_its_place(tmp_path: Path) -> None:
@@ -86,11 +92,11 @@ def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_p
 def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -> None:
     (tmp_path / laptop_files.CAMPAIGN).write_text("{}", encoding="utf-8")
     trials = tmp_path / "first", tmp_path / "second"
-    first = KeptOrigins(MotionJournal(journal_of(trials[0])), trials[0], ROBOTS, NEAR)
+    first = JournaledOrigins(MotionJournal(journal_of(trials[0])), trials[0], ROBOTS, NEAR)
     first.require()
     with pytest.raises(KeyboardInterrupt), first.moving(Role.RECEIVER):
         raise KeyboardInterrupt
-    later = KeptOrigins(MotionJournal(journal_of(trials[1])), trials[1], ROBOTS, NEAR)
+    later = JournaledOrigins(MotionJournal(journal_of(trials[1])), trials[1], ROBOTS, NEAR)
     with pytest.raises(MotionHeldError, match="rover-1: stopped by the operator") as held:
         later.require()
     assert "fieldkit campaign, as before" in held.value.remedy

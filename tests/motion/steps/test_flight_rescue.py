@@ -10,7 +10,7 @@ import pytest
 from fieldkit.agent.flying.liveness import ENDED, FLYING, IDLE, LANDING
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError
-from fieldkit.motion.steps.flight_rescue import MANUAL_ACTION, FlightRescue, LifeSigns
+from fieldkit.motion.steps.flight_rescue import MANUAL_ACTION, FlightRescue, LivenessMonitor
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed, Shell
 from tests.helpers.sshd import wait_until
@@ -25,7 +25,7 @@ def sample(at_s: float, pilot: tuple[int, int], guard: tuple[int, int]) -> bytes
 
 def losses(samples: Sequence[bytes]) -> list[bool]:
     """Return for each sample whether the loss of both programs is detected."""
-    signs = LifeSigns()
+    signs = LivenessMonitor()
     return [signs.update(sample) for sample in samples]
 
 
@@ -79,7 +79,7 @@ class Robot:
 
 
 def rescue(robot: Robot, alarms: list[str], *, sends: bool = True) -> FlightRescue:
-    return FlightRescue(cast("Shell", robot), RESCUE, ".jobs/guard/liveness", alarms.append, sends=sends)
+    return FlightRescue(cast("Shell", robot), RESCUE, ".jobs/guard/liveness", alarms.append, may_send=sends)
 
 
 def test_rescue_starts_once_with_an_alarm() -> None:
@@ -100,7 +100,7 @@ def test_blocked_alarm_does_not_delay_the_rescue() -> None:
     def hang(_text: str) -> None:
         is_released.wait(60)
 
-    with FlightRescue(cast("Shell", robot), RESCUE, ".jobs/guard/liveness", hang, sends=True):
+    with FlightRescue(cast("Shell", robot), RESCUE, ".jobs/guard/liveness", hang, may_send=True):
         wait_until(lambda: "start" in robot.calls, Deadline.after(60))
         is_released.set()
 

@@ -111,7 +111,7 @@ def attempt(
     tmp_path: Path, step: MavlinkStep, log: bytes, clock: Offset | None = None, counters: dict[str, object] = NOTHING
 ) -> View:
     """Return an attempt with this log, which has 10 messages per second from `START_US` on."""
-    began = step._accounts(SCENE, START_NS + round(1e9 * START_S), {Role.SENDER: clock} if clock else {})
+    began = step._position_sources(SCENE, START_NS + round(1e9 * START_S), {Role.SENDER: clock} if clock else {})
     (tmp_path / position_sources.FILE).write_text(position_sources.text(began), encoding="utf-8")
     (tmp_path / "mavlink.tlog").write_bytes(log)
     all_counters = {"frames": 203, "left_out": 0, "ended_us": START_US + 10_000_000, "refused": {}} | counters

@@ -42,7 +42,7 @@ def expected(count: int) -> list[Message]:
     ]
 
 
-def written(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
+def write_bag(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
     """Return a bag written by rosbags; for ROS 1 compressed, with about 20 messages per chunk."""
     if form is BagFormat.ROS1:
         types = get_typestore(Stores.ROS1_NOETIC)
@@ -100,7 +100,7 @@ def data_file(bag: Path) -> Path:
 
 @pytest.mark.parametrize("form", BagFormat)
 def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: pytest.CaptureFixture[str]) -> None:
-    bag = written(tmp_path, form, expected(31))
+    bag = write_bag(tmp_path, form, expected(31))
     assert main(["bag", "info", str(bag), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["format"], report["messages"], report["problems"]) == (form.value, 31, [])
@@ -117,7 +117,7 @@ def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: 
 @pytest.mark.parametrize("share", [0.35, 0.8, 0.97])
 def test_start_of_a_truncated_file_is_recovered(tmp_path: Path, form: BagFormat, share: float) -> None:
     messages = expected(300)
-    bag = written(tmp_path, form, messages)
+    bag = write_bag(tmp_path, form, messages)
     file = data_file(bag)
     with file.open("r+b") as opened:
         opened.truncate(int(share * file.stat().st_size))
@@ -145,7 +145,7 @@ def test_as_many_messages_are_recovered_as_by_ros(
     """`rosbag reindex` 1.15.15 recovers 0, 225 and 225 messages of these."""
     saved = tmp_path / "saved.bag"
     assert main(["bag", "check", str(KILLED / name)]) == EvidenceError.exit_code
-    assert f"{least} messages can be saved: fieldkit bag repair" in capsys.readouterr().err
+    assert f"{least} messages can be recovered: fieldkit bag repair" in capsys.readouterr().err
     assert main(["bag", "repair", str(KILLED / name), str(saved)]) == 0
     recovered = read(saved)
     assert len(recovered) == least
@@ -165,7 +165,7 @@ def test_ros_reads_a_repaired_bag(tmp_path: Path) -> None:
 
 def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path) -> None:
     messages = expected(40)
-    bag = written(tmp_path, BagFormat.SQLITE, messages)
+    bag = write_bag(tmp_path, BagFormat.SQLITE, messages)
     file, remaining = data_file(bag), tmp_path / "left"
     remaining.mkdir()
     with closing(sqlite3.connect(file)) as database:
@@ -193,7 +193,7 @@ def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path)
 @pytest.mark.parametrize("to", BagFormat)
 def test_conversion_keeps_all_messages(tmp_path: Path, form: BagFormat, to: BagFormat) -> None:
     messages = expected(30)
-    bag = written(tmp_path, form, messages)
+    bag = write_bag(tmp_path, form, messages)
     new = tmp_path / ("new.bag" if to is BagFormat.ROS1 else "new")
     storage = () if to is BagFormat.ROS1 else ("--storage", to.value)
     assert main(["bag", "convert", str(bag), str(new), *storage]) == 0
@@ -236,20 +236,20 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (("info", "nowhere.bag"), 2, "nowhere.bag: the bag cannot be read: No such file or directory"),
         (("info", "circle.bag"), 2, "circle.bag: the bag cannot be read: Too many levels of symbolic links"),
         (("info", "x" * 300), 2, "File name too long"),
-        (("info", "none"), 2, "no bag is in this folder"),
+        (("info", "none"), 2, "there is no bag in this folder"),
         (("info", "pipe.bag"), 2, "this is neither a file nor a folder"),
         (("info", "text.bag"), 2, "this is not a bag of ROS 1, SQLite or MCAP"),
         (("info", "packed.bag.gz"), 2, "remedy: gunzip -k packed.bag.gz, then try again"),
         (("info", "all.db3"), 2, "remedy: mv all.db3 all.db3.bag"),
         (("info", "empty.bag"), 4, "the file is empty"),
         (("info", "zeros.mcap"), 4, "the file begins with zeros"),
-        (("info", "."), 2, "this folder holds several bags"),
+        (("info", "."), 2, "this folder contains several bags"),
         (("check", "nowhere.bag"), 2, "No such file"),
-        (("check", "nowhere.bag", "killed.bag", "all.bag"), 4, "225 messages can be saved"),
+        (("check", "nowhere.bag", "killed.bag", "all.bag"), 4, "225 messages can be recovered"),
         (("repair", "nowhere.bag", "new.bag"), 2, "No such file"),
         (("repair", "zeros.mcap", "new"), 4, "the file begins with zeros"),
         (("convert", "nowhere.bag", "new"), 2, "No such file"),
-        (("convert", "none", "new"), 2, "no bag is in this folder"),
+        (("convert", "none", "new"), 2, "there is no bag in this folder"),
         (("repair", "all.bag", "all.bag"), 2, "it exists already"),
         (("repair", "all.bag", "new"), 2, "a repaired bag keeps its format, ros1: the new one must be NAME.bag"),
         (("convert", "all.bag", "no/new"), 2, "cannot write there"),
@@ -261,7 +261,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_impossible_requests_are_reported(
     here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, output_text: str
 ) -> None:
-    written(here, BagFormat.ROS1, expected(5))
+    write_bag(here, BagFormat.ROS1, expected(5))
     Path("text.bag").write_text("a text")
     Path("packed.bag.gz").write_bytes(gzip.compress(b"a bag"))
     Path("empty.bag").touch()
@@ -297,11 +297,11 @@ def test_single_mcap_file_is_a_bag(
     output_text = capsys.readouterr().err
     assert "there is no metadata.yaml" in output_text
     assert "bytes before a record does" in output_text
-    assert "messages can be saved: fieldkit bag repair" in output_text
+    assert "messages can be recovered: fieldkit bag repair" in output_text
 
 
 def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = data_file(written(tmp_path, BagFormat.SQLITE, expected(300)))
+    whole = data_file(write_bag(tmp_path, BagFormat.SQLITE, expected(300)))
     cut = tmp_path / "cut.db3"
     cut.write_bytes(whole.read_bytes()[:30_000])
     assert main(["bag", "check", str(cut)]) == EvidenceError.exit_code
@@ -309,7 +309,7 @@ def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureF
     assert "there is no metadata.yaml" in output_text
     assert f"{cut}: database disk image is malformed" in output_text
     assert (
-        "no message can be saved; SQLite may read more of it: sqlite3 OLD.db3 .recover | sqlite3 NEW.db3"
+        "no message can be recovered; SQLite may read more of it: sqlite3 OLD.db3 .recover | sqlite3 NEW.db3"
         in output_text
     )
     assert main(["bag", "repair", str(cut), str(tmp_path / "new")]) == EvidenceError.exit_code
@@ -321,7 +321,7 @@ def test_sparse_file_is_reported_in_time(tmp_path: Path, capsys: pytest.CaptureF
     with whole.open("r+b") as opened:
         opened.truncate(1 << 42)
     assert main(["bag", "check", str(whole)]) == EvidenceError.exit_code
-    assert "can be saved" in capsys.readouterr().err
+    assert "can be recovered" in capsys.readouterr().err
 
 
 def test_command_line_accepts_all_distributions_of_the_library() -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fieldkit.ros.bags import bag, contents
 from fieldkit.ros.bags.formats import BagFormat
-from tests.ros.bags.test_bag_command import data_file, expected, written
+from tests.ros.bags.test_bag_command import data_file, expected, write_bag
 
 COUNT = 9
 NAMES = st.binary(min_size=1, max_size=40).filter(
@@ -20,7 +20,7 @@ NAMES = st.binary(min_size=1, max_size=40).filter(
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[BagFormat, Path]:
-    return {form: written(tmp_path_factory.mktemp(form.value), form, expected(COUNT)) for form in BagFormat}
+    return {form: write_bag(tmp_path_factory.mktemp(form.value), form, expected(COUNT)) for form in BagFormat}
 
 
 @pytest.mark.parametrize("form", BagFormat)

@@ -63,7 +63,7 @@ def covered(at_ns: int, x: float, y: float) -> Any:  # noqa: ANN401 (of rosbags)
     return TYPES["geometry_msgs/msg/PoseWithCovarianceStamped"](header(at_ns, "map"), with_covariance)
 
 
-def written(folder: Path, messages: Iterable[Any], topic: str = "/where", late_ns: int = 1000) -> Path:
+def write_bag(folder: Path, messages: Iterable[Any], topic: str = "/where", late_ns: int = 1000) -> Path:
     """Write a ROS 1 bag of messages that were received a little after their stamps."""
     path = folder / "track.bag"
     with rosbag1.Writer(path) as writer:
@@ -90,13 +90,13 @@ def written(folder: Path, messages: Iterable[Any], topic: str = "/where", late_n
 def test_every_message_type_has_positions(
     tmp_path: Path, made: Callable[[int, float, float], Any], frame: str, places: list[list[float]]
 ) -> None:
-    path = written(tmp_path, [made(BEGAN_NS, 0.0, 0.0), made(BEGAN_NS + S, 1.0, 2.0)])
+    path = write_bag(tmp_path, [made(BEGAN_NS, 0.0, 0.0), made(BEGAN_NS + S, 1.0, 2.0)])
     samples = bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert (samples.frame, samples.values.tolist()) == (frame, places)
     assert samples.times_ns.tolist() == [BEGAN_NS, BEGAN_NS + S]
 
 
-def written_ros2(folder: Path, message: Any, kind: str) -> Path:  # noqa: ANN401 (of rosbags)
+def write_ros2_bag(folder: Path, message: Any, kind: str) -> Path:  # noqa: ANN401 (of rosbags)
     with rosbag2.Writer(folder / "track", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connection = writer.add_connection("/where", kind, typestore=STORE2)
         writer.write(connection, BEGAN_NS, bytes(STORE2.serialize_cdr(message, kind)))
@@ -118,7 +118,7 @@ def test_ros_2_bags_and_the_child_frame_of_a_transform_tree(tmp_path: Path) -> N
     kind = "tf2_msgs/msg/TFMessage"
     tree: Any = STORE2.types[kind]
     both = tree([transform2(1.0, 2.0, "world", "/base"), transform2(5.0, 5.0, "base", "wheel")])
-    path = written_ros2(tmp_path, both, kind)
+    path = write_ros2_bag(tmp_path, both, kind)
     samples = bag_positions.read_bag(path, PositionSource(topic="/where", child="base"))
     assert (samples.frame, samples.values.tolist()) == ("frame world", [[1, 2, 0]])
     with pytest.raises(EvidenceError, match="has positions in several frames: base, world"):
@@ -129,13 +129,13 @@ def test_ros_2_bags_and_the_child_frame_of_a_transform_tree(tmp_path: Path) -> N
 
 def test_messages_without_a_fix_and_with_equal_times_are_ignored(tmp_path: Path) -> None:
     lost, nan = fix(BEGAN_NS, 0.0, 0.0, status=-1), fix(BEGAN_NS + 2 * S, math.nan, 11.0)
-    path = written(tmp_path, [lost, fix(BEGAN_NS + S, 48.0, 11.0), fix(BEGAN_NS + S, 49.0, 11.0), nan])
+    path = write_bag(tmp_path, [lost, fix(BEGAN_NS + S, 48.0, 11.0), fix(BEGAN_NS + S, 49.0, 11.0), nan])
     samples = bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert (samples.times_ns.tolist(), samples.values.tolist()) == ([BEGAN_NS + S], [[48, 11, 520]])
 
 
 def test_stamps_of_another_clock_are_rejected_unless_times_are_the_recorders(tmp_path: Path) -> None:
-    path = written(tmp_path, [stamped(7 * S, 1.0, 1.0)])
+    path = write_bag(tmp_path, [stamped(7 * S, 1.0, 1.0)])
     with pytest.raises(EvidenceError, match="the stamps of /where differ by 1795348793 s from") as caught:
         bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert caught.value.remedy == "write times: received, in the step"
@@ -153,14 +153,14 @@ def test_stamps_of_another_clock_are_rejected_unless_times_are_the_recorders(tmp
 )
 def test_topics_without_positions_are_rejected(tmp_path: Path, messages: list[Any], topic: str, message: str) -> None:
     with pytest.raises(EvidenceError, match=message):
-        bag_positions.read_bag(written(tmp_path, messages), PositionSource(topic=topic))
+        bag_positions.read_bag(write_bag(tmp_path, messages), PositionSource(topic=topic))
 
 
 def test_odometry_is_transformed_to_the_robots_place_and_heading(tmp_path: Path) -> None:
     # The robot was driven before the step: its odometry starts 5 m away, turned to the left.
     began = (5.0, 5.0, math.pi / 2)
     messages = [odometry(BEGAN_NS, *began), odometry(BEGAN_NS + S, 5.0, 7.0, math.pi / 2)]
-    odometry_samples = bag_positions.read_bag(written(tmp_path, messages), PositionSource(topic="/where"))
+    odometry_samples = bag_positions.read_bag(write_bag(tmp_path, messages), PositionSource(topic="/where"))
     position_source = PositionSource(
         topic="/where", start=(10.0, 0.0, 0.0), heading_rad=math.pi, began_utc_ns=BEGAN_NS + S // 2
     )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fieldkit.ros.bags import salvage
 from fieldkit.ros.bags.formats import BagFormat
 from fieldkit.ros.bags.salvage import DamagedError
-from tests.ros.bags.test_bag_command import KILLED, data_file, expected, written
+from tests.ros.bags.test_bag_command import KILLED, data_file, expected, write_bag
 
 WHOLE = (KILLED / "open.bag.active").read_bytes()
 
@@ -20,7 +20,7 @@ WHOLE = (KILLED / "open.bag.active").read_bytes()
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[BagFormat, bytes]:
     return {
-        form: data_file(written(tmp_path_factory.mktemp(form.value), form, expected(20))).read_bytes()
+        form: data_file(write_bag(tmp_path_factory.mktemp(form.value), form, expected(20))).read_bytes()
         for form in BagFormat
     }
 
@@ -41,7 +41,7 @@ def test_changed_bytes(
 
 
 def test_a_table_of_topics_without_a_needed_column_is_damaged(tmp_path: Path) -> None:
-    bag = data_file(written(tmp_path / "bag", BagFormat.SQLITE, expected(3)))
+    bag = data_file(write_bag(tmp_path / "bag", BagFormat.SQLITE, expected(3)))
     with closing(sqlite3.connect(bag)) as database, database:
         database.execute("ALTER TABLE topics RENAME COLUMN id TO ie")
     with pytest.raises(DamagedError, match="the table topics has no id"):
@@ -49,7 +49,7 @@ def test_a_table_of_topics_without_a_needed_column_is_damaged(tmp_path: Path) ->
 
 
 def test_a_record_longer_than_an_integer_of_the_platform_is_damaged(tmp_path: Path) -> None:
-    bag = data_file(written(tmp_path / "bag", BagFormat.MCAP, expected(3)))
+    bag = data_file(write_bag(tmp_path / "bag", BagFormat.MCAP, expected(3)))
     data = bytearray(bag.read_bytes())
     data[9:17] = b"\xff" * 8  # the length of the first record, behind the magic and its opcode
     bag.write_bytes(data)

@@ -173,7 +173,7 @@ def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:
 def test_the_evidence_contains_every_repeat() -> None:
     own = cell([0, 1, 0, 0, 1], delay_s=[0.01, 0.02, 0.03, UNKNOWN, 0.01])
     text = "\n".join(candidates.evidence(judge(own), ONE_PERCENT))
-    assert "loss <= 0.01 in 5 of 5 repeats: at least 55 % of all repeats do, with 95 % confidence" in text
+    assert "loss <= 0.01 in 5 of 5 repeats: in at least 55 % of all repeats, with 95 % confidence" in text
     assert "by repeat 0.0, 1.0, 0.0, 0.0, 1.0" in text
     assert "by repeat 10.0, 20.0, 30.0, 10.0, unknown in 1" in text
     assert "Criterion: loss at most 1 %, in each repeat." in text

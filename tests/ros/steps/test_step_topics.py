@@ -36,9 +36,9 @@ def topics(keys: str = "over: dds") -> TopicsStep:
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("over: dds, discovery: router", "dds has multicast and peers, not router"),
-        ("over: ros1, discovery: multicast", "ros1 has master, not multicast"),
-        ("over: ros2, discovery: router", "ros2 has environment and multicast and peers, not router"),
+        ("over: dds, discovery: router", "dds cannot use router; use multicast or peers"),
+        ("over: ros1, discovery: multicast", "ros1 cannot use multicast; use master"),
+        ("over: ros2, discovery: router", "ros2 cannot use router; use environment or multicast or peers"),
         ("over: ros2, settings: {'General/x': '1'}", "environment variables, not 'General/x'"),
         ("over: ros2, settings: {ROS_DOMAIN_ID: '1'}", "ROS_DOMAIN_ID is set by the key domain"),
         ("over: dds, transport: udp", "only zenoh has a choice of transport"),

@@ -90,7 +90,7 @@ def test_odometry_needs_facing() -> None:
 
 
 def sources_of(step: TrackStep) -> dict[Role, PositionSource]:
-    stored = step._accounts(SCENE, 7, {Role.SENDER: Offset(0.5, 0.1)})
+    stored = step._position_sources(SCENE, 7, {Role.SENDER: Offset(0.5, 0.1)})
     assert stored.clocks == {Role.SENDER: Offset(0.5, 0.1)}
     return dict(stored.robots)
 

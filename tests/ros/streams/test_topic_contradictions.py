@@ -84,7 +84,7 @@ def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_pa
     received = with_samples(made.received, lambda _, row: later(row, shift_ns))
     reasons, _ = topic_attempts.judge_attempt(replace(made, received=received), tmp_path)
     assert reasons
-    which = "before their packets" if shift_ns < 0 else "later than its capture for every sample"
+    which = "earlier than their packets" if shift_ns < 0 else "later than its capture for every sample"
     which = "from before its start or after its end" if abs(shift_ns) == HOUR else which
     assert which in reasons[0]
 
@@ -97,7 +97,7 @@ def test_a_log_without_half_of_the_arrivals_is_noticed(kind: str, tmp_path: Path
     if kind == "reliable with samples given up":  # nothing behind a gap need ever be handed over
         assert reasons
         return
-    assert "arrived by the subscriber's capture, but are not in the subscriber's log" in reasons[0]
+    assert "arrived according to the subscriber's capture, but are not in the subscriber's log" in reasons[0]
 
 
 def other_numbers(_: int, row: Row) -> Row:
@@ -236,7 +236,7 @@ def test_a_capture_without_heads_limits_the_number_of_arrivals(tmp_path: Path) -
     assert topic_attempts.judge_attempt(cut, tmp_path)[0] == []
     early = with_samples(made.received, lambda _, row: later(row, -20 * MS))
     assert (
-        "before their bytes in its capture"
+        "earlier than their bytes in its capture"
         in topic_attempts.judge_attempt(replace(cut, received=early), tmp_path)[0][0]
     )
     few = with_samples(made.received, lambda place, row: row if place < 8 else None)

@@ -12,7 +12,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.ros.streams import topic_samples
 
 
-def written(path: Path) -> bytes:
+def write_log(path: Path) -> bytes:
     log = Log(str(path))
     log.note(records.BEGUN, 10)
     log.note(records.MATCHED, 30)
@@ -27,7 +27,7 @@ def written(path: Path) -> bytes:
 
 
 def test_logs_of_the_agent_are_read(tmp_path: Path) -> None:
-    written(tmp_path / "log")
+    write_log(tmp_path / "log")
     parsed = topic_samples.read_log(tmp_path / "log")
     assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)
     assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.whole) == (1, 6, 1, True)
@@ -38,7 +38,7 @@ def test_logs_of_the_agent_are_read(tmp_path: Path) -> None:
 
 
 def test_a_truncated_log_has_its_earlier_records_and_no_end(tmp_path: Path) -> None:
-    whole = written(tmp_path / "log")
+    whole = write_log(tmp_path / "log")
     for length in range(len(records.MAGIC), len(whole)):
         (tmp_path / "cut").write_bytes(whole[:length])
         parsed = topic_samples.read_log(tmp_path / "cut")
@@ -47,7 +47,7 @@ def test_a_truncated_log_has_its_earlier_records_and_no_end(tmp_path: Path) -> N
 
 
 def test_a_log_with_a_wrong_count_is_rejected(tmp_path: Path) -> None:
-    whole, size = written(tmp_path / "log"), topic_samples.RECORD_BYTES
+    whole, size = write_log(tmp_path / "log"), topic_samples.RECORD_BYTES
     start = len(records.MAGIC) + 2 * size
     for damaged in (whole[:start] + whole[start + size :], whole + whole[-size:]):
         (tmp_path / "log").write_bytes(damaged)
@@ -61,7 +61,7 @@ def test_zeros_after_the_last_record_are_ignored(
 ) -> None:
     """A killed writer leaves zeros: between two records, or between its last record and the end of the file."""
     log = tmp_path_factory.getbasetemp() / "zeros"
-    whole = written(log)
+    whole = write_log(log)
     log.write_bytes(whole[: None if ended else -topic_samples.RECORD_BYTES] + bytes(zeros))
     parsed = topic_samples.read_log(log)
     assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)

@@ -140,7 +140,7 @@ def test_broadcast_and_multicast_leave_by_the_radio(sender: Shell, destination: 
     assert "dev wlan0" in output_of(sender, "ip", "route", "get", destination)
 
 
-def test_the_kernel_sends_nothing_unasked(sender: Shell) -> None:
+def test_the_kernel_sends_nothing_without_a_request(sender: Shell) -> None:
     assert output_of(sender, "ip", "-6", "address") == ""
 
 

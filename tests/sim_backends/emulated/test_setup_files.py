@@ -56,7 +56,7 @@ def output_of(shell: Shell, *argv: str) -> str:
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("path", SETUP)
-def test_a_setup_file_can_be_sourced_where_the_profile_says(path: str, shell: Shell) -> None:
+def test_a_setup_file_can_be_sourced_at_the_path_in_the_profile(path: str, shell: Shell) -> None:
     assert not Path(path).exists(), "the host must not have this file"
     printed = output_of(shell, *with_environment(["sh", "-c", 'echo "$ROS_DISTRO"; command -v rosbag'], setup=[path]))
     assert printed.split("\n") == ["noetic", f"{Path(path).parent}/bin/rosbag", ""]

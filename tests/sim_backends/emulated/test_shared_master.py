@@ -113,11 +113,11 @@ def test_subscriptions_to_another_robot_cross_the_medium(up: EmulatedTestbed, tm
 def test_the_preflight_probe_detects_a_master_and_its_absence(up: EmulatedTestbed) -> None:
     cast = backend().cast(Topology.MASTER)
     scene = Scene(Protocol.TCP, cast, "f")
-    (need,) = ros_master.needs(scene, Role.SENDER, explains="rosbag")
+    (need,) = ros_master.needs(scene, Role.SENDER, program="rosbag")
     answer = answer_to(up.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RELAY], answer)[0] is Verdict.OK, answer
     wrong = {role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()}
-    (need,) = ros_master.needs(Scene(Protocol.TCP, wrong, "f"), Role.SENDER, explains="rosbag")
+    (need,) = ros_master.needs(Scene(Protocol.TCP, wrong, "f"), Role.SENDER, program="rosbag")
     answer = answer_to(up.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RECEIVER], answer)[0] is Verdict.FAIL
     assert "Connection refused" in answer.text

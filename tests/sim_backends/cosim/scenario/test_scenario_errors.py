@@ -216,7 +216,7 @@ def test_a_scenario_of_the_lab_has_priority_over_a_shipped_one(
     (tmp_path / "scenarios" / "baylands.yaml").write_text(text, encoding="utf-8")
     assert load_scenario("baylands").summary == "for tests"
     (tmp_path / "scenarios" / "meadow.yaml").write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="name is 'baylands', the file is called 'meadow'"):
+    with pytest.raises(ConfigurationError, match="name is 'baylands', but the file name is 'meadow'"):
         load_scenario("meadow")
 
 

@@ -24,7 +24,7 @@ from sim_backends.cosim.policies.window_policies import (
 )
 from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.studies.formation import SampledPhysics, Tracks
-from sim_backends.cosim.studies.local_errors import MEASURES, local_errors, low_discrepancy_times_ns, pooled
+from sim_backends.cosim.studies.local_errors import MEASURES, local_errors, low_discrepancy_times_ns, pool
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.motion import State
@@ -175,7 +175,7 @@ def test_windows_of_several_runs_are_pooled() -> None:
         local_errors(moving_pair, {"scheduled": Scheduled}, (0.05, 0.1), begins_ns, tail_ns=20 * MS)["scheduled"]
         for begins_ns in (WITHIN[:5], WITHIN[5:12])
     )
-    both = pooled([first, second])
+    both = pool([first, second])
     assert both.window_s.shape == (2, 12)
     total = first.sums["delivery_s"].sum(axis=1) + second.sums["delivery_s"].sum(axis=1)
     assert both.sums["delivery_s"].sum(axis=1) == pytest.approx(total)

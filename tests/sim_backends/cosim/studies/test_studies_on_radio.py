@@ -20,7 +20,7 @@ MS = 1_000_000
 PERIODS_NS = {("a", "b"): 3_700_001, ("b", "c"): 5_100_003, ("c", "a"): 4_300_007}
 
 
-def three(policy: SyncPolicy) -> Coordinator:
+def three_robots(policy: SyncPolicy) -> Coordinator:
     """Return three robots that pass each other at distances at which many packets are lost."""
     motions = {
         "a": WayPoints("a", [(0.0, 0.0, 1.0), (0.0, 200.0, 1.0)], 1.0),
@@ -37,26 +37,26 @@ def three(policy: SyncPolicy) -> Coordinator:
 
 
 def test_exact_policies_agree_on_the_radio_and_a_fixed_window_does_not() -> None:
-    reference = three(EventDriven()).advance(600 * MS)
+    reference = three_robots(EventDriven()).advance(600 * MS)
     assert lost_share(reference) > 0.03, "losses that could differ"
-    merged = errors(reference, three(VariableStepped()).advance(600 * MS))
+    merged = errors(reference, three_robots(VariableStepped()).advance(600 * MS))
     assert merged.packets == len(reference.fates) - sum(not fate.is_decided for fate in reference.fates.values())
     assert merged.delivery_error_s == merged.late_s == Spread(0, 0, 0)
     assert merged.position_error_m == errors(reference, reference).position_error_m, "states are held for equal steps"
     assert (merged.fate_disagreement, merged.causality_violations) == (0, 0)
-    windowed = errors(reference, three(Scheduled(0.02)).advance(600 * MS))
+    windowed = errors(reference, three_robots(Scheduled(0.02)).advance(600 * MS))
     assert windowed.delivery_error_s.mean > 0.005
     assert windowed.fate_disagreement > 0
 
 
-def test_the_rule_as_printed_names_the_pair_whose_time_runs_backwards() -> None:
+def test_the_papers_rule_reports_the_pair_for_which_time_runs_backwards() -> None:
     with pytest.raises(PolicyError, match=r"a publishes at 1 m/s to b at 5 m/s.*runs backwards"):
-        three(VelocityAwareRaw(0.001)).advance(MS)
+        three_robots(VelocityAwareRaw(0.001)).advance(MS)
 
 
 def test_local_errors_can_be_measured_from_any_state_of_the_radio() -> None:
     by_policy = local_errors(
-        three,
+        three_robots,
         {"scheduled": Scheduled, "exact": lambda _: VariableStepped()},
         (0.02, 0.04),
         [50 * MS, 100 * MS],

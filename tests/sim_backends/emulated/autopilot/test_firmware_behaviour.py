@@ -93,7 +93,7 @@ def px4() -> Station:
     return station
 
 
-def test_arducopter_sends_only_heartbeat_and_timesync_unasked(copter: Station) -> None:
+def test_arducopter_sends_only_heartbeat_and_timesync_without_a_request(copter: Station) -> None:
     counts = Counter(message.get_type() for message in copter.wait(60))
     assert counts.keys() == {"HEARTBEAT", "TIMESYNC"}
     assert counts["HEARTBEAT"] == 60

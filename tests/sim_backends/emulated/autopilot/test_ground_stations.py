@@ -53,7 +53,9 @@ def fly(up: EmulatedTestbed, program: str) -> dict[str, Any]:
     return seen
 
 
-def test_mavsdk_flies_a_mission_of_three_points_where_every_twentieth_datagram_is_lost(up: EmulatedTestbed) -> None:
+def test_mavsdk_flies_a_mission_of_three_points_although_every_twentieth_datagram_is_lost(
+    up: EmulatedTestbed,
+) -> None:
     seen = fly(up, "mavsdk_flight")
     assert seen["items"] == 3
     assert 90 <= seen["battery"] < 100.1
@@ -66,7 +68,7 @@ def test_mavsdk_flies_a_mission_of_three_points_where_every_twentieth_datagram_i
     assert math.dist(last_m, (east_m, north_m + 2.0, up_m)) < 0.6
 
 
-def test_mavproxy_flies_a_mission_where_every_twentieth_datagram_is_lost(up: EmulatedTestbed) -> None:
+def test_mavproxy_flies_a_mission_although_every_twentieth_datagram_is_lost(up: EmulatedTestbed) -> None:
     seen = fly(up, "mavproxy_flight")
     assert seen["height_m"] < 0.2
     for words in ("Loaded 4 waypoints in ", "COMPONENT_ARM_DISARM: ACCEPTED", "DISARMED"):

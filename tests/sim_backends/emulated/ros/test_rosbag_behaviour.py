@@ -153,7 +153,7 @@ def test_rosbag_behaves_like_ros_s_own(name: str, shell: Shell, observed: dict[s
 
 
 @pytest.mark.parametrize("bag", sorted(path.name for path in RECORDED.glob("*.bag*")))
-def test_info_prints_what_ros_s_own_prints(
+def test_info_prints_the_same_as_that_of_ros(
     bag: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("TZ", "UTC")

@@ -217,7 +217,7 @@ def test_a_socket_left_by_a_killed_process_is_replaced(monkeypatch: pytest.Monke
     stream.close()
 
 
-def test_equal_noise_whatever_the_process() -> None:
+def test_the_noise_does_not_depend_on_the_process() -> None:
     """A robot's sensors restart after a reboot, and Python's hashes differ from process to process."""
     program = (
         "from sim_backends.emulated.ros import messages; "

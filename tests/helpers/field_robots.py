@@ -21,7 +21,7 @@ from tests.helpers.sshd import make_key
 
 
 @dataclass(frozen=True)
-class Outside:
+class FieldRobots:
     """Running robots on the emulated medium, as a field deployment would provide them.
 
     Attributes:
@@ -38,9 +38,9 @@ class Outside:
 
 
 @contextmanager
-def robots_outside(
+def start_field_robots(
     folder: Path, *, topology: Topology = Topology.MASTERLESS, site: Path | None = None, distance: str = "5m"
-) -> Iterator[Outside]:
+) -> Iterator[FieldRobots]:
     """Yield the placed robots of an emulated testbed, and write a site file to `folder` that reaches them by SSH.
 
     The robots stop at the latest when the calling thread ends, so the thread must live as long as the test.
@@ -57,20 +57,22 @@ def robots_outside(
         assert isinstance(testbed, EmulatedTestbed)
         testbed.place(Placement(Scenario.LOS, topology, parse_distance(distance)))
         with Forwarder({role: robot.connect for role, robot in testbed.robots.items()}) as links:
-            outside = Outside(folder, cast, testbed, links)
-            (folder / SITE_FILE).write_text(_site(outside, topology), encoding="utf-8")
-            yield outside
+            field_robots = FieldRobots(folder, cast, testbed, links)
+            (folder / SITE_FILE).write_text(_site(field_robots, topology), encoding="utf-8")
+            yield field_robots
 
 
-def _site(outside: Outside, topology: Topology) -> str:
-    key = outside.folder / "login"
+def _site(field_robots: FieldRobots, topology: Topology) -> str:
+    key = field_robots.folder / "login"
     authorized = make_key(key)
     lines = ["backend: field", "robots:"]
-    for role, robot in outside.cast.items():
-        host_key = _authorize(outside.testbed, role, authorized)
-        access = f"host: 127.0.0.1, port: {outside.links.port(role)}, user: root, key: {key}, host_key: {host_key}"
+    for role, robot in field_robots.cast.items():
+        host_key = _authorize(field_robots.testbed, role, authorized)
+        access = (
+            f"host: 127.0.0.1, port: {field_robots.links.port(role)}, user: root, key: {key}, host_key: {host_key}"
+        )
         lines.append(f"  {robot.name}: {{profile: {robot.profile.name}, address: {robot.address}, {access}}}")
-    roles = ", ".join(f"{role}: {robot.name}" for role, robot in outside.cast.items())
+    roles = ", ".join(f"{role}: {robot.name}" for role, robot in field_robots.cast.items())
     return "\n".join([*lines, f"roles: {{{topology}: {{{roles}}}}}"]) + "\n"
 
 

@@ -8,8 +8,8 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role, Topology
 from fieldkit.remote import jobs
 from sim_backends.emulated.backend import DEFAULT_SITE
+from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import wait_for_end
-from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import fieldkit, only_trial, rows, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -19,33 +19,33 @@ QUICK = ("--repeats", "1", "--record", "1s", "--yes", "--backend", "field")
 
 @pytest.mark.parametrize("topology", Topology)
 def test_a_trial_of_the_field_backend_ends_valid(tmp_path: Path, topology: Topology) -> None:
-    with robots_outside(tmp_path, topology=topology, site=DEFAULT_SITE) as outside:
+    with start_field_robots(tmp_path, topology=topology, site=DEFAULT_SITE) as field_robots:
         run = fieldkit(tmp_path, "trial", "los", "5m", "--topology", topology, *QUICK)
         assert run.code == 0, run.err
         table = rows(only_trial(tmp_path))
         assert [(row["protocol"], row["status"]) for row in table] == [("tcp", "valid"), ("udp", "valid")]
-        assert {row["receiver"] for row in table} == {outside.cast[Role.RECEIVER].name}
+        assert {row["receiver"] for row in table} == {field_robots.cast[Role.RECEIVER].name}
 
 
 def test_robots_and_their_jobs_outlive_a_fieldkit_that_is_killed(tmp_path: Path) -> None:
-    with robots_outside(tmp_path) as outside:
+    with start_field_robots(tmp_path) as field_robots:
         process = start(
             tmp_path, "trial", "los", "5m", "--topology", "masterless", "--record", "30s", "--yes", "--json"
         )
         wait_for_line(process, '"record"')
-        recording = wait_until_recording(outside)
+        recording = wait_until_recording(field_robots)
         process.kill()
         process.communicate(timeout=60)
         wait_for_end({process.pid}, within_s=60.0)
-        assert jobs_left(outside, Role.SENDER) == recording
+        assert jobs_left(field_robots, Role.SENDER) == recording
 
 
-def wait_until_recording(outside: Outside) -> tuple[str, ...]:
+def wait_until_recording(field_robots: FieldRobots) -> tuple[str, ...]:
     deadline = Deadline.after(60)
-    while not (running_jobs := jobs_left(outside, Role.SENDER)):
+    while not (running_jobs := jobs_left(field_robots, Role.SENDER)):
         assert not deadline.expired, "it never began to record"
     return running_jobs
 
 
-def jobs_left(outside: Outside, role: Role) -> tuple[str, ...]:
-    return jobs.list_running(outside.testbed.shells[role], Deadline.after(30))
+def jobs_left(field_robots: FieldRobots, role: Role) -> tuple[str, ...]:
+    return jobs.list_running(field_robots.testbed.shells[role], Deadline.after(30))

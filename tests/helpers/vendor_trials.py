@@ -16,12 +16,12 @@ from fieldkit.trial.frozen import freeze
 from fieldkit.trial.plan import Plan
 from tests.helpers.casts import los_plan
 
-NAMED = (
+NAMED_STEP_COLUMNS = (
     *(with_step_name(step, column) for step in ("up", "down") for column in COLUMNS),
     *(with_step_name(step, column) for step in ("p502", "p8192") for column in ping.COLUMNS),
 )
 """Columns of two named transfers and two named pings."""
-VENDOR = columns.columns(
+VENDOR_COLUMNS = columns.columns(
     100,
     ("probe.level", "dBm", "Reading of the vendor's meter.", Figure("probe: level", Kind.MEDIAN)),
     ("probe.volt", "V", "Voltage of the battery.", Figure("probe: voltage", Kind.MEAN)),
@@ -39,27 +39,27 @@ def plan(name: str, *, distance: str, metres: float, columns: Sequence[Column]) 
     return los_plan().model_copy(update=changes)
 
 
-def write(folder: Path, of: Plan, table: Sequence[Mapping[str, Value]], *, with_plan: bool = True) -> Path:
+def write(folder: Path, plan: Plan, table: Sequence[Mapping[str, Value]], *, with_plan: bool = True) -> Path:
     """Write a trial with these rows to a new folder with its name in `folder`; return the trial's folder."""
-    trial = folder / of.trial
+    trial = folder / plan.trial
     trial.mkdir(parents=True)
-    (trial / "trial.csv").write_text(rows.to_csv(table, of.table), encoding="utf-8")
+    (trial / "trial.csv").write_text(rows.to_csv(table, plan.table), encoding="utf-8")
     if with_plan:
-        (trial / "trial.yaml").write_text(schema.dump(of), encoding="utf-8")
+        (trial / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
     return trial
 
 
-def measured(of: Plan, *, repeats: int = 8, seed: int = 1, level_dbm: float = -40.0) -> list[dict[str, Value]]:
+def valid_rows(plan: Plan, *, repeats: int = 8, seed: int = 1, level_dbm: float = -40.0) -> list[dict[str, Value]]:
     """Valid rows of a trial; each column has a possible value.
 
     Each column has a separate random stream, so that an additional column does not change the others.
     """
-    random = {column.name: np.random.default_rng([seed, *column.name.encode()]) for column in of.table}
+    random = {column.name: np.random.default_rng([seed, *column.name.encode()]) for column in plan.table}
     table = []
     for protocol in Protocol:
         for number in range(1, repeats + 1):
-            row: dict[str, Value] = {column.name: _value(column, random[column.name]) for column in of.table}
-            for column in of.table:
+            row: dict[str, Value] = {column.name: _value(column, random[column.name]) for column in plan.table}
+            for column in plan.table:
                 figure = column.figure
                 if figure is not None and figure.kind is Kind.COUNTED:
                     assert figure.sent is not None
@@ -67,27 +67,27 @@ def measured(of: Plan, *, repeats: int = 8, seed: int = 1, level_dbm: float = -4
                     row[figure.sent], row[figure.arrived] = 40, 40 - int(random[column.name].integers(0, 9))
                     row[column.name] = 1 - int(row[figure.arrived]) / 40
             if "probe.level" in row:
-                row["probe.level"] = float(level_dbm - of.distance_m + random["probe.level"].normal(0, 2))
+                row["probe.level"] = float(level_dbm - plan.distance_m + random["probe.level"].normal(0, 2))
             for step in ("p502", "p8192"):
                 if f"{step}.rtt_payload_bytes" in row:
                     row[f"{step}.rtt_payload_bytes"] = int(step.removeprefix("p"))
             row |= {
                 "schema_version": columns.SCHEMA_VERSION,
-                "trial": of.trial,
-                "procedure": of.procedure.name,
-                "scenario": str(of.procedure.scenario),
-                "topology": str(of.topology),
-                "backend": of.backend,
-                "distance": of.distance,
-                "distance_m": of.distance_m,
+                "trial": plan.trial,
+                "procedure": plan.procedure.name,
+                "scenario": str(plan.procedure.scenario),
+                "topology": str(plan.topology),
+                "backend": plan.backend,
+                "distance": plan.distance,
+                "distance_m": plan.distance_m,
                 "protocol": str(protocol),
                 "repeat": number,
                 "attempt": 1,
                 "status": "valid",
                 "started_utc_ns": 1_795_309_790_492_337_123 + number,
-                "profiles_sha256": of.profiles_sha256,
-                "procedure_sha256": of.procedure_sha256,
-                "code_sha256": of.code_sha256,
+                "profiles_sha256": plan.profiles_sha256,
+                "procedure_sha256": plan.procedure_sha256,
+                "code_sha256": plan.code_sha256,
             }
             table.append(row)
     return table
