@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Final
 
 from benchmarks.unchanged import comparison, items, recorder, structure, suite, trees
-from benchmarks.unchanged.items import Class, Item
+from benchmarks.unchanged.items import Item, ItemKind
 from benchmarks.unchanged.trees import Tree
 
 _SHOWN: Final = 100
 """Differences that are printed with their lines; all are counted."""
 
 TESTS, STRUCTURE = "tests", "structure"
-PARTS: Final = (*(kind.name.lower() for kind in Class), TESTS, STRUCTURE)
+PARTS: Final = (*(kind.name.lower() for kind in ItemKind), TESTS, STRUCTURE)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 2
         print(f"base {base.commit[:12]}, head {head.commit[:12]}\n")
         same = True
-        if kinds := [kind for kind in Class if kind.name.lower() in parts]:
+        if kinds := [kind for kind in ItemKind if kind.name.lower() in parts]:
             same &= _behaviour(base, head, kinds, labels_shown=arguments.labels)
         if TESTS in parts:
             same &= _tests(base, head)
@@ -65,7 +65,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def _behaviour(base: Tree, head: Tree, kinds: Sequence[Class], *, labels_shown: int) -> bool:
+def _behaviour(base: Tree, head: Tree, kinds: Sequence[ItemKind], *, labels_shown: int) -> bool:
     """Record the items with both trees at the same time, and print a line for each class."""
     for tree in (base, head):
         items.prepare(tree)

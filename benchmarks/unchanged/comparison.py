@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.unchanged.items import Class, Item
+from benchmarks.unchanged.items import Item, ItemKind
 from benchmarks.unchanged.trees import Tree
 
 _VARYING: Final = (
@@ -71,7 +71,7 @@ def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
         error = (before / "stderr").read_text(encoding="utf-8", errors="replace").strip()
         differences.real.append(f"nothing is proved: exit code {code} with the base\n{error}")
     names = [{str(path.relative_to(top)) for path in top.rglob("*") if path.is_file()} for top in (before, after)]
-    if item.kind is Class.TRIALS:
+    if item.kind is ItemKind.TRIALS:
         differences.add(_trials(before, after))
         return differences
     if names[0] != names[1]:

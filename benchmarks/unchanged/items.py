@@ -19,8 +19,8 @@ STORED: Final = ROOT / "tests" / "data" / "fieldkit"
 BAGS: Final = ROOT / "tests" / "data" / "rosbag" / "1.15.15"
 
 
-class Class(StrEnum):
-    """A class of items; the report has a line for each."""
+class ItemKind(StrEnum):
+    """A kind of items; the report has a line for each."""
 
     TABLES = "tables of stored trials"
     REPORTS = "reports of stored trials"
@@ -47,16 +47,16 @@ class Item:
     """A command, or a simulation.
 
     Attributes:
-        kind: Its class.
+        kind: Its kind.
         arguments: The words after `fieldkit` on the command line.
         working_folder: Relative to the laboratory folder.
         outputs: Files and folders that it makes there; they are moved away and compared.
         simulation: The simulation; then there are no arguments.
-        succeeds: True if it must succeed with the base; otherwise it would be no proof.
+        succeeds: True if it must succeed with the base; otherwise its outputs prove nothing.
         counts_lines: True to count the lines of imported modules after it; it must run first.
     """
 
-    kind: Class
+    kind: ItemKind
     arguments: tuple[str, ...] = ()
     working_folder: str = "."
     outputs: tuple[str, ...] = ()
@@ -242,24 +242,24 @@ def _site_folder(tree: Tree, name: str, text: str) -> None:
     (folder / "fieldkit.yaml").write_text(text, encoding="utf-8")
 
 
-def items(base: Tree, kinds: Sequence[Class]) -> list[Item]:
-    """Return the items of some classes. The files that ship with the base determine them."""
-    makers: dict[Class, Callable[[Tree], Iterable[Item]]] = {
-        Class.TRIALS: _trial,  # first: it counts the lines of imported modules
-        Class.TABLES: _tables,
-        Class.REPORTS: _reports,
-        Class.EXPORTS: _exports,
-        Class.DRY_RUNS: _dry_runs,
-        Class.COMMAND_LINES: _command_lines,
-        Class.HELP: _help,
-        Class.SIMULATIONS: _simulations,
+def items(base: Tree, kinds: Sequence[ItemKind]) -> list[Item]:
+    """Return the items of some kinds. The files that ship with the base determine them."""
+    makers: dict[ItemKind, Callable[[Tree], Iterable[Item]]] = {
+        ItemKind.TRIALS: _trial,  # first: it counts the lines of imported modules
+        ItemKind.TABLES: _tables,
+        ItemKind.REPORTS: _reports,
+        ItemKind.EXPORTS: _exports,
+        ItemKind.DRY_RUNS: _dry_runs,
+        ItemKind.COMMAND_LINES: _command_lines,
+        ItemKind.HELP: _help,
+        ItemKind.SIMULATIONS: _simulations,
     }
     return [item for kind, make in makers.items() if kind in kinds for item in make(base)]
 
 
 def _trial(_: Tree) -> Iterator[Item]:
     words = ("trial", "los", "30ft", "--repeats", "1", "--record", "1s", "--seed", "3", "--yes", "--json")
-    yield Item(Class.TRIALS, words, "emulated", ("trials",), counts_lines=True)
+    yield Item(ItemKind.TRIALS, words, "emulated", ("trials",), counts_lines=True)
 
 
 def _trials(tree: Tree) -> list[str]:
@@ -271,17 +271,17 @@ def _tables(tree: Tree) -> Iterator[Item]:
     old_tables = [f"old/{version}/trial.csv" for version in ("1", "2", "3", "4")]
     for trial in trials:
         for name in ("trial.csv", "summary.csv"):
-            yield Item(Class.TABLES, ("rebuild", trial), outputs=(f"{trial}/{name}",))
-        yield Item(Class.TABLES, ("verify", trial))
+            yield Item(ItemKind.TABLES, ("rebuild", trial), outputs=(f"{trial}/{name}",))
+        yield Item(ItemKind.TABLES, ("verify", trial))
     for form in ("table", "csv", "json", "markdown", "latex"):
-        yield Item(Class.TABLES, ("aggregate", "trials", "--format", form))
+        yield Item(ItemKind.TABLES, ("aggregate", "trials", "--format", form))
         if form != "latex":
-            yield Item(Class.TABLES, ("aggregate", "trials", "--all", "--format", form))
-            yield Item(Class.TABLES, ("compare", *_comparable(trials), "--force", "--format", form))
+            yield Item(ItemKind.TABLES, ("aggregate", "trials", "--all", "--format", form))
+            yield Item(ItemKind.TABLES, ("compare", *_comparable(trials), "--force", "--format", form))
     for old in old_tables:
-        yield Item(Class.TABLES, ("aggregate", old, "--all", "--format", "csv"))
+        yield Item(ItemKind.TABLES, ("aggregate", old, "--all", "--format", "csv"))
     for trial in trials:
-        yield Item(Class.TABLES, ("positions", trial))
+        yield Item(ItemKind.TABLES, ("positions", trial))
 
 
 def _comparable(trials: Sequence[str]) -> list[str]:
@@ -290,9 +290,9 @@ def _comparable(trials: Sequence[str]) -> list[str]:
 
 def _reports(tree: Tree) -> Iterator[Item]:
     for paths in (["trials"], *([trial] for trial in _trials(tree))):
-        yield Item(Class.REPORTS, ("report", *paths, "-o", "report.html"), outputs=("report.html",))
+        yield Item(ItemKind.REPORTS, ("report", *paths, "-o", "report.html"), outputs=("report.html",))
     yield Item(
-        Class.REPORTS,
+        ItemKind.REPORTS,
         ("report", "trials", "-o", "report.html", "--figures", "figures"),
         outputs=("report.html", "figures"),
     )
@@ -300,39 +300,39 @@ def _reports(tree: Tree) -> Iterator[Item]:
 
 def _exports(tree: Tree) -> Iterator[Item]:
     for form in ("csv", "parquet", "junit"):
-        yield Item(Class.EXPORTS, ("export", "trials", "--format", form, "-o", "out"), outputs=("out",))
+        yield Item(ItemKind.EXPORTS, ("export", "trials", "--format", form, "-o", "out"), outputs=("out",))
     rebuilt = ("export", "trials", "--rebuild", "--format", "csv", "-o", "out")
-    yield Item(Class.EXPORTS, rebuilt, outputs=("out",))
+    yield Item(ItemKind.EXPORTS, rebuilt, outputs=("out",))
     for trial in _trials(tree):
-        yield Item(Class.EXPORTS, ("export", trial, "--format", "mcap", "-o", "out"), outputs=("out",))
+        yield Item(ItemKind.EXPORTS, ("export", trial, "--format", "mcap", "-o", "out"), outputs=("out",))
 
 
 def _dry_runs(tree: Tree) -> Iterator[Item]:
     for profile in (*shipped(tree, "robots"), *proof_names("robots")):
         for procedure in (*shipped(tree, "procedures"), *proof_names("procedures")):
             words = ("trial", procedure, "30ft", "--dry-run", "--json")
-            yield Item(Class.DRY_RUNS, words, profile, succeeds=False)
-            yield Item(Class.DRY_RUNS, (*words, "--allow-motion"), f"{profile}-field", succeeds=False)
+            yield Item(ItemKind.DRY_RUNS, words, profile, succeeds=False)
+            yield Item(ItemKind.DRY_RUNS, (*words, "--allow-motion"), f"{profile}-field", succeeds=False)
             if "master" in procedure:
-                yield Item(Class.DRY_RUNS, words, f"{profile}-master", succeeds=False)
+                yield Item(ItemKind.DRY_RUNS, words, f"{profile}-master", succeeds=False)
 
 
 def _command_lines(_: Tree) -> Iterator[Item]:
     for line in COMMAND_LINES.splitlines():
-        yield Item(Class.COMMAND_LINES, tuple(line.split()), succeeds=False)
+        yield Item(ItemKind.COMMAND_LINES, tuple(line.split()), succeeds=False)
     for bag in sorted(BAGS.glob("*.bag")):
         for verb in ("info", "check"):
-            yield Item(Class.COMMAND_LINES, ("bag", verb, f"bags/{bag.name}"), succeeds=False)
+            yield Item(ItemKind.COMMAND_LINES, ("bag", verb, f"bags/{bag.name}"), succeeds=False)
     for words in (("trial", "los", "30ft", "--dry-run"), ("init",), ("robots",), ("check", "--backend", "field")):
-        yield Item(Class.COMMAND_LINES, words, "empty", ("fieldkit.yaml",), succeeds=False)
+        yield Item(ItemKind.COMMAND_LINES, words, "empty", ("fieldkit.yaml",), succeeds=False)
     for name, _file, _old, _new in WRONG:
-        yield Item(Class.COMMAND_LINES, ("trial", "los", "30ft", "--dry-run"), f"wrong-{name}", succeeds=False)
+        yield Item(ItemKind.COMMAND_LINES, ("trial", "los", "30ft", "--dry-run"), f"wrong-{name}", succeeds=False)
 
 
 def _help(tree: Tree) -> Iterator[Item]:
     """Yield the help of each command, and of the commands inside of commands."""
     for command in json.loads(_output(tree, recorder.__file__, "--commands")):
-        yield Item(Class.HELP, (*command, "--help"))
+        yield Item(ItemKind.HELP, (*command, "--help"))
 
 
 def _output(tree: Tree, *words: str) -> str:
@@ -348,4 +348,4 @@ def _simulations(tree: Tree) -> Iterator[Item]:
         for policy in listed["policies"]:
             for seed in range(1, SEEDS + 1):
                 simulation = Simulation(scenario["scenario"], policy["policy"], seed, SIMULATED_NS)
-                yield Item(Class.SIMULATIONS, simulation=simulation)
+                yield Item(ItemKind.SIMULATIONS, simulation=simulation)

@@ -102,7 +102,7 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
             reasons = outcome.folder / store.TRIAL_CSV
             failed = format_count(outcome.failed, "repeat")
             command = shell_command("fieldkit", "resume", outcome.folder, "--failed")
-            remedy = f"correct what the reasons name, then redo them: {command}"
+            remedy = f"remove the causes, then repeat them: {command}"
             show_error(f"{failed} failed; reasons in {reasons}\n  remedy: {remedy}")
     if not is_json:
         _show_next(ended, left_out)

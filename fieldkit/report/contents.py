@@ -101,7 +101,7 @@ class Contents:
         bursts: The packets of repeats whose captures are available.
         trials: Provenance of each trial.
         evidence: The table and the available evidence.
-        command: The command that makes this report again.
+        command: The command that regenerates this report.
     """
 
     title: str

@@ -63,24 +63,24 @@ class Absence:
         cell: The condition.
         reason: `nothing arrived`, `no value`, or `no valid repeat`.
         count: Number of repeats without a value for this reason; of attempts if none is valid.
-        of: Number of all repeats or attempts.
+        total: Number of all repeats or attempts.
     """
 
     cell: Cell
     reason: str
     count: int
-    of: int
+    total: int
 
     @property
     def is_total(self) -> bool:
         """True if the condition has no value at all."""
-        return self.count == self.of
+        return self.count == self.total
 
     @property
     def share(self) -> str:
         """Number of affected repeats, `3 of 5`; if none is valid, the outcomes of attempts, `2 failed`."""
         if self.cell.n_valid:
-            return f"{self.count} of {self.of}"
+            return f"{self.count} of {self.total}"
         outcomes = (("void", self.cell.n_void), ("failed", self.cell.n_failed))
         return ", ".join(f"{count} {status}" for status, count in outcomes if count)
 

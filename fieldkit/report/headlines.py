@@ -227,7 +227,7 @@ def _missing(
     lacking: Sequence[tuple[Quantity, Absence]], place: Callable[[Cell, Quantity], str]
 ) -> Iterator[HeadlineLine]:
     """Yield a line per reason for missing values, with the conditions; those without any value come first."""
-    ordered = sorted(lacking, key=lambda pair: -pair[1].count / pair[1].of)
+    ordered = sorted(lacking, key=lambda pair: -pair[1].count / pair[1].total)
     for reason in dict.fromkeys(absence.reason for _, absence in ordered):
         places = [
             f"{place(absence.cell, quantity)} ({absence.share})"

@@ -30,11 +30,11 @@ OF_EVERY_ATTEMPT: Final = (
         "jobs of steps inside a fault",
     ),
     CrossCheck(
-        "that a robot's notes are complete",
+        "that a robot's state files are complete",
         (),
         "sections of `ROLE-after.txt`",
         ("sections of `ROLE-before.txt`",),
-        "a section that a robot cannot provide is missing in both; trials before boots were noted have no jobs",
+        "a section that a robot cannot provide is missing in both; older trials have no jobs",
     ),
     CrossCheck(
         "which robot wrote a file",

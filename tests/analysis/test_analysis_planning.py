@@ -65,7 +65,7 @@ def test_the_planned_number_gives_the_wanted_width(rate: float, spread: float) -
     assert float(np.median(then.high - then.low)) / 2 == pytest.approx(wanted, rel=0.05)
 
 
-def test_where_nothing_was_lost_that_many_clean_repeats_are_enough() -> None:
+def test_the_planned_repeats_without_losses_give_the_required_width() -> None:
     clean = share([0] * 20, [36] * 20)
     assert clean is not None
     more = additional_repeats(clean, 20, 0.02, Kind.COUNTED)

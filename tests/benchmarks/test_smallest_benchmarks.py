@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.paths import ROOT
-from tests.helpers.smallest import CASES, run_module, run_smallest
+from tests.helpers.smallest import CASES, run_minimally, run_module
 
 NOT_RUN = {
     "firmware_flights": "needs simulated firmware, not available in CI; test_firmware_flights.py tests its rows",
@@ -24,7 +24,7 @@ PARTS = {"bash_peer", "footprint", "lifetimes", "namespaces", "own_time", "panda
 
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if not case.emulated])
 def test_a_benchmark_runs_at_its_smallest_size(name: str, tmp_path: Path) -> None:
-    run_smallest(name, tmp_path)
+    run_minimally(name, tmp_path)
 
 
 @pytest.mark.parametrize("name", NOT_RUN)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.smallest import CASES, run_smallest
+from tests.helpers.smallest import CASES, run_minimally
 
 pytestmark = pytest.mark.emulated
 
@@ -26,13 +26,13 @@ ON_LOOPBACK = ("bridge",)
 class TestOnNamespaces:
     @pytest.mark.parametrize("name", ON_NAMESPACES + ON_LOOPBACK)
     def test_a_benchmark_runs_at_its_smallest_size(self, name: str, tmp_path: Path) -> None:
-        run_smallest(name, tmp_path)
+        run_minimally(name, tmp_path)
 
 
 class TestOnRobots:
     @pytest.mark.parametrize("name", ON_ROBOTS)
     def test_a_benchmark_runs_at_its_smallest_size(self, name: str, tmp_path: Path) -> None:
-        run_smallest(name, tmp_path)
+        run_minimally(name, tmp_path)
 
 
 def test_every_emulated_benchmark_runs() -> None:

@@ -8,11 +8,11 @@ import pytest
 
 from benchmarks.unchanged import comparison
 from benchmarks.unchanged.comparison import Differences
-from benchmarks.unchanged.items import Class, Item, Simulation
+from benchmarks.unchanged.items import Item, ItemKind, Simulation
 from benchmarks.unchanged.trees import Tree
 
 Files = dict[str, str | bytes]
-ABORT = Item(Class.COMMAND_LINES, ("abort",), succeeds=False)
+ABORT = Item(ItemKind.COMMAND_LINES, ("abort",), succeeds=False)
 
 
 def trees(tmp_path: Path, *outputs: Files) -> list[Tree]:
@@ -44,7 +44,7 @@ def command(name: str, text: str) -> str:
     [
         (ABORT, {"stderr": "error: LAB/a.yaml: no such key\n"}, {"stderr": "error: LAB/a.yaml: no such key\n"}),
         (
-            Item(Class.DRY_RUNS, ("trial",)),
+            Item(ItemKind.DRY_RUNS, ("trial",)),
             {"stdout": command("a", "sh .fieldkit/job-0123456789ab.sh 20261122T010946.593049Z_los")},
             {"stdout": command("a", "sh .fieldkit/job-ffff56789abc.sh 20261123T010946.593050Z_los")},
         ),
@@ -67,13 +67,13 @@ def test_folders_stamps_and_hashes_of_programs_may_differ(
             ("mend it, 3 tell", "fix it, 3 report"),
         ),
         (
-            Item(Class.HELP, ("--help",)),
+            Item(ItemKind.HELP, ("--help",)),
             "stdout",
             "  --json  who asks\n",
             "  --json  program\n",
             ("who asks", "program"),
         ),
-        (Item(Class.REPORTS), "r.html", "<td>echo loss</td>\n", "<td>ping loss</td>\n", ("<td>echo", "<td>ping")),
+        (Item(ItemKind.REPORTS), "r.html", "<td>echo loss</td>\n", "<td>ping loss</td>\n", ("<td>echo", "<td>ping")),
         (ABORT, "stdout", '{"text": "2 told"}', '{"text": "2 shown"}', ("told", "shown")),
     ],
 )
@@ -83,7 +83,7 @@ def test_changed_words_are_labels(  # noqa: PLR0917
     assert compare_outputs(tmp_path, item, {file: before}, {file: after}) == Differences(labels=Counter([label]))
 
 
-SIMULATION = Item(Class.SIMULATIONS, simulation=Simulation("baylands", "scheduled", 1, 9))
+SIMULATION = Item(ItemKind.SIMULATIONS, simulation=Simulation("baylands", "scheduled", 1, 9))
 
 
 @pytest.mark.parametrize(
@@ -91,15 +91,15 @@ SIMULATION = Item(Class.SIMULATIONS, simulation=Simulation("baylands", "schedule
     [
         (ABORT, {"exit_code": "2\n"}, {"exit_code": "3\n"}),
         (ABORT, {"stderr": "error: 3 robots"}, {"stderr": "error: 4 robots"}),
-        (Item(Class.HELP), {"stdout": "--json x"}, {"stdout": "--lines x"}),
-        (Item(Class.TABLES, ("rebuild",)), {"trial.csv": "told,b\n"}, {"trial.csv": "shown,b\n"}),
-        (Item(Class.TABLES, ("aggregate", "csv")), {"stdout": "told,b\n"}, {"stdout": "shown,b\n"}),
-        (Item(Class.EXPORTS), {"out.mcap": b"\xff\x00"}, {"out.mcap": b"\xff\x01"}),
-        (Item(Class.EXPORTS), {"out": ""}, {}),
-        (Item(Class.DRY_RUNS), {"stdout": command("a", "ping -c 5")}, {"stdout": command("a", "ping -q 5")}),
-        (Item(Class.DRY_RUNS), {"stdout": command("told", "ping")}, {"stdout": command("shown", "ping")}),
-        (Item(Class.DRY_RUNS), {"stdout": '{"event": "note"}'}, {"stdout": '{"kind": "note"}'}),
-        (Item(Class.DRY_RUNS), {"stdout": command("a", "x") * 2}, {"stdout": command("a", "x")}),
+        (Item(ItemKind.HELP), {"stdout": "--json x"}, {"stdout": "--lines x"}),
+        (Item(ItemKind.TABLES, ("rebuild",)), {"trial.csv": "told,b\n"}, {"trial.csv": "shown,b\n"}),
+        (Item(ItemKind.TABLES, ("aggregate", "csv")), {"stdout": "told,b\n"}, {"stdout": "shown,b\n"}),
+        (Item(ItemKind.EXPORTS), {"out.mcap": b"\xff\x00"}, {"out.mcap": b"\xff\x01"}),
+        (Item(ItemKind.EXPORTS), {"out": ""}, {}),
+        (Item(ItemKind.DRY_RUNS), {"stdout": command("a", "ping -c 5")}, {"stdout": command("a", "ping -q 5")}),
+        (Item(ItemKind.DRY_RUNS), {"stdout": command("told", "ping")}, {"stdout": command("shown", "ping")}),
+        (Item(ItemKind.DRY_RUNS), {"stdout": '{"event": "note"}'}, {"stdout": '{"kind": "note"}'}),
+        (Item(ItemKind.DRY_RUNS), {"stdout": command("a", "x") * 2}, {"stdout": command("a", "x")}),
         (SIMULATION, {"stdout": "ab"}, {"stdout": "ac"}),
     ],
 )
@@ -111,7 +111,7 @@ def test_everything_else_is_a_difference(tmp_path: Path, item: Item, before: Fil
 
 def test_failure_at_the_base_commit_is_no_proof(tmp_path: Path) -> None:
     failed: Files = {"exit_code": "3\n", "stderr": "error: no namespaces"}
-    (difference,) = compare_outputs(tmp_path, Item(Class.TRIALS), failed, failed).real
+    (difference,) = compare_outputs(tmp_path, Item(ItemKind.TRIALS), failed, failed).real
     assert difference.startswith("nothing is proved: exit code 3")
 
 
@@ -122,7 +122,7 @@ def test_emulated_trials_may_differ_in_numbers_but_not_in_fields_files_and_colum
         event = {"event": "repeat_ended", "utc_ns": 1, "repeat": repeat, field: left_s}
         return {"stdout": json.dumps(event), f"trials/20261122T010946.1Z/{repeat}/trial.csv": f"{header}\n{left_s}\n"}
 
-    item = Item(Class.TRIALS)
+    item = Item(ItemKind.TRIALS)
     assert compare_outputs(tmp_path / "same", item, trial(), trial(left_s=None, repeat="udp-02")) == Differences()
     for number, other in enumerate((trial(field="left"), trial(header="a,c"), trial(repeat="tcp-01"))):
         assert compare_outputs(tmp_path / str(number), item, trial(), other).real

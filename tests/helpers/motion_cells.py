@@ -146,7 +146,7 @@ class MotionCell:
     Attributes:
         craft: The kind of robot.
         parties: The affected parties; the operator acts, and another party may be affected one second earlier.
-        blow: The fault of each party.
+        fault: The fault of each party.
         moment: The phase.
     """
 
@@ -176,13 +176,13 @@ class MotionCell:
 
 
 _CONTROL: Final = {Party.LAPTOP, Party.FIELDKIT, Party.LINK}
-_BLOWS: Final = {
+_PARTY_FAULTS: Final = {
     Party.LAPTOP: (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SUSPEND),
     Party.LINK: (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SLOW),  # cut, cut for `PAUSE_S`, delayed
     Party.OPERATOR: (InjectedFault.CTRL_C, InjectedFault.STOP),
 }
-_ALL_BLOWS: Final = (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SUSPEND, InjectedFault.SLOW)
-_PAIR_BLOWS: Final = (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SLOW)
+_ALL_FAULTS: Final = (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SUSPEND, InjectedFault.SLOW)
+_PAIR_FAULTS: Final = (InjectedFault.KILL, InjectedFault.PAUSE, InjectedFault.SLOW)
 
 
 def _parties(craft: Craft) -> tuple[Party, ...]:
@@ -212,8 +212,8 @@ def _all_cells() -> tuple[MotionCell, ...]:
         moments = FLIGHT_MOMENTS if craft.flies else DRIVE_MOMENTS
         parties = _parties(craft)
         for party in parties:
-            blows = _BLOWS.get(party, _ALL_BLOWS)
-            cells += [MotionCell(craft, (party,), blow, moment) for blow, moment in product(blows, moments)]
+            faults = _PARTY_FAULTS.get(party, _ALL_FAULTS)
+            cells += [MotionCell(craft, (party,), fault, moment) for fault, moment in product(faults, moments)]
         # `fieldkit stop` while the fieldkit process of the trial is suspended.
         cells += [
             MotionCell(craft, (Party.FIELDKIT, Party.OPERATOR), InjectedFault.STOP, moment) for moment in moments
@@ -222,9 +222,9 @@ def _all_cells() -> tuple[MotionCell, ...]:
         if craft is Craft.PX4:  # other faults affect only programs that are the same for both autopilots
             pairs = [(Party.PILOT, Party.GUARD)]
         for pair in pairs:
-            for blow, moment in product(_PAIR_BLOWS, moments):
-                if all(blow in _BLOWS.get(party, _ALL_BLOWS) for party in pair):
-                    cells.append(MotionCell(craft, pair, blow, moment))
+            for fault, moment in product(_PAIR_FAULTS, moments):
+                if all(fault in _PARTY_FAULTS.get(party, _ALL_FAULTS) for party in pair):
+                    cells.append(MotionCell(craft, pair, fault, moment))
         if craft.flies:  # only fieldkit can detect these
             cells += [MotionCell(craft, flight_programs, InjectedFault.SUSPEND, moment) for moment in moments]
             drone_programs = (*flight_programs, Party.SERVER)

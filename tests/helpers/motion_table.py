@@ -10,7 +10,7 @@ from tests.helpers.motion_outcomes import MotionOutcome
 from tests.helpers.motion_parties import Party
 
 BEGIN: Final = "<!-- written by tests/e2e/motion_faults.py -->"
-END: Final = "<!-- end of what it writes -->"
+END: Final = "<!-- end of the tables -->"
 
 _TITLES: Final = {
     Craft.ROVER: "Ground robot",
@@ -61,9 +61,9 @@ def _rows(craft: Craft, outcomes: Sequence[MotionOutcome]) -> Iterator[str]:
             groups.setdefault((cell.parties, cell.fault), []).append((cell, outcome))
     order = list(dict.fromkeys((cell.parties, cell.fault) for cell in CELLS if cell.craft is craft))
     for key in sorted(groups, key=order.index):
-        (parties, blow), members = key, groups[key]
+        (parties, fault), members = key, groups[key]
         expectation = expected(next((cell for cell, _ in members if cell.moment not in AT_REST), members[0][0]))
-        cells = [", ".join(parties), _fault(parties, blow), expectation.detected_by, expectation.does]
+        cells = [", ".join(parties), _fault(parties, fault), expectation.detected_by, expectation.does]
         cells += _times(expectation.begins_s, [(cell, outcome.begins_s) for cell, outcome in members])
         if craft.flies:
             cells += _times(expectation.ends_s, [(cell, outcome.ends_s) for cell, outcome in members])
@@ -71,14 +71,14 @@ def _rows(craft: Craft, outcomes: Sequence[MotionOutcome]) -> Iterator[str]:
         yield "| " + " | ".join([*cells, str(len(members)), str(beyond)]) + " |"
 
 
-def _fault(parties: Sequence[Party], blow: InjectedFault) -> str:
+def _fault(parties: Sequence[Party], fault: InjectedFault) -> str:
     if {*parties} == {Party.LINK}:
-        return {InjectedFault.KILL: "cut", InjectedFault.PAUSE: "6 s cut", InjectedFault.SLOW: "3.5 s delay"}[blow]
-    if blow is InjectedFault.ABORT:
+        return {InjectedFault.KILL: "cut", InjectedFault.PAUSE: "6 s cut", InjectedFault.SLOW: "3.5 s delay"}[fault]
+    if fault is InjectedFault.ABORT:
         return "killed, then `fieldkit abort`"
     if parties == (Party.FIELDKIT, Party.OPERATOR):
-        return f"suspended, then {_FAULTS[blow]}"
-    return _FAULTS[blow]
+        return f"suspended, then {_FAULTS[fault]}"
+    return _FAULTS[fault]
 
 
 def _times(bound_s: float | None, times: Sequence[tuple[MotionCell, float | None]]) -> list[str]:

@@ -207,10 +207,10 @@ class MotionTrial:
         assert pids, f"no process of the {party} runs on the robot"
         return pids
 
-    def _run_command(self, blow: InjectedFault) -> None:
+    def _run_command(self, fault: InjectedFault) -> None:
         """Run `fieldkit stop` or `fieldkit abort`, as from another terminal."""
         name = self.lab.robot(self.cell.craft).name
-        completed = fieldkit(self.folder, *(("stop", name) if blow is InjectedFault.STOP else ("abort", "--yes")))
+        completed = fieldkit(self.folder, *(("stop", name) if fault is InjectedFault.STOP else ("abort", "--yes")))
         (self.folder / "stop").write_text(completed.out + completed.err, encoding="utf-8")
 
     def _observe(self, sampler: MotionSampler, at_s: float) -> None:

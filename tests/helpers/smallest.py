@@ -23,7 +23,7 @@ Shrink = Callable[[ModuleType, Path], None]
 
 
 @dataclass(frozen=True)
-class Smallest:
+class MinimalRun:
     """Configuration of the minimal run of a benchmark.
 
     Attributes:
@@ -55,7 +55,7 @@ def run_module(*arguments: str) -> "subprocess.CompletedProcess[str]":
     )
 
 
-def run_smallest(name: str, folder: Path) -> None:
+def run_minimally(name: str, folder: Path) -> None:
     """Run a benchmark with its minimal configuration in an empty folder.
 
     Raises:
@@ -277,40 +277,40 @@ def _short_detour(module: ModuleType, folder: Path) -> None:
     replace(module, "SETTLE_S", 2.0)
 
 
-CASES: Final[Mapping[str, Smallest]] = {
-    "aggregate": Smallest("--rounds 1 --tables 1 --rows 80"),
-    "bridge": Smallest(
+CASES: Final[Mapping[str, MinimalRun]] = {
+    "aggregate": MinimalRun("--rounds 1 --tables 1 --rows 80"),
+    "bridge": MinimalRun(
         "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLING_S": 0.5}, shrink=_two_bridge_paths, emulated=True
     ),
-    "studies.combinations": Smallest(
+    "studies.combinations": MinimalRun(
         "run FOLDER/rows.csv --physics builtin --network builtin --policy scheduled --seeds 2 --duration 300ms"
     ),
-    "cosim_discovery": Smallest("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
-    "cosim_exchange": Smallest("", {"COUNTS": (3,), "ROUNDS": 1, "EXCHANGES": 5}),
-    "cosim_speed": Smallest("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy"),
-    "cosim_vs_ns3": Smallest("", shrink=_one_link),
-    "emane": Smallest("--rounds 1", {"ROBOTS": 2, "PINGS": 3}, shrink=_one_radio, emulated=True),
-    "studies.field_shape": Smallest("--out FOLDER/lab --repeats 1", shrink=_one_trial, emulated=True),
-    "layers": Smallest("--rounds 1 --packets 20", {"PINGS": 5, "STATIONS": (2,)}, shrink=_one_layer, emulated=True),
-    "ledger": Smallest("--repeats 3"),
-    "medium": Smallest("--rounds 1 --seconds 1 --probes 20", shrink=_slow_iperf, emulated=True),
-    "studies.mesh": Smallest("--out FOLDER/lab --repeats 1", shrink=_short_row, emulated=True),
-    "studies.mesh_losses": Smallest("--losses 1", shrink=_short_detour, emulated=True),
-    "studies.middleware": Smallest(
+    "cosim_discovery": MinimalRun("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
+    "cosim_exchange": MinimalRun("", {"COUNTS": (3,), "ROUNDS": 1, "EXCHANGES": 5}),
+    "cosim_speed": MinimalRun("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy"),
+    "cosim_vs_ns3": MinimalRun("", shrink=_one_link),
+    "emane": MinimalRun("--rounds 1", {"ROBOTS": 2, "PINGS": 3}, shrink=_one_radio, emulated=True),
+    "studies.field_shape": MinimalRun("--out FOLDER/lab --repeats 1", shrink=_one_trial, emulated=True),
+    "layers": MinimalRun("--rounds 1 --packets 20", {"PINGS": 5, "STATIONS": (2,)}, shrink=_one_layer, emulated=True),
+    "ledger": MinimalRun("--repeats 3"),
+    "medium": MinimalRun("--rounds 1 --seconds 1 --probes 20", shrink=_slow_iperf, emulated=True),
+    "studies.mesh": MinimalRun("--out FOLDER/lab --repeats 1", shrink=_short_row, emulated=True),
+    "studies.mesh_losses": MinimalRun("--losses 1", shrink=_short_detour, emulated=True),
+    "studies.middleware": MinimalRun(
         "--out FOLDER/lab --only dds --repeats 1 --table FOLDER/table.csv", shrink=_one_stream, emulated=True
     ),
-    "moves": Smallest("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
-    "pcap": Smallest("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 400}),
-    "radio_vs_ns3": Smallest("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}, shrink=_without_ns3),
-    "startup": Smallest("--rounds 1", shrink=_two_commands),
-    "stop": Smallest("--rounds 1", emulated=True),
-    "swarm": Smallest("--sizes 2 --seconds 1", {"PINGS": 5}, shrink=_small_swarm, emulated=True),
-    "tcp_vs_kernel": Smallest("--runs 2 --seconds 1 --together 1 --loss 1% --delay 5ms", emulated=True),
-    "tcp_vs_ns3": Smallest("", {"SECONDS": 1.0, "SEEDS": 2}, shrink=_few_losses),
-    "telemetry": Smallest("--seconds 0.5", {"SLOWER": (1,)}, shrink=_stand_in_iw),
-    "topics": Smallest("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "STREAM_S": 1.0, "BURST_S": 0.1}),
-    "trial_overhead": Smallest("--rounds 1 --record 1s --round-trips 0s", emulated=True),
-    "studies.zenoh_images": Smallest(
+    "moves": MinimalRun("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
+    "pcap": MinimalRun("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 400}),
+    "radio_vs_ns3": MinimalRun("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}, shrink=_without_ns3),
+    "startup": MinimalRun("--rounds 1", shrink=_two_commands),
+    "stop": MinimalRun("--rounds 1", emulated=True),
+    "swarm": MinimalRun("--sizes 2 --seconds 1", {"PINGS": 5}, shrink=_small_swarm, emulated=True),
+    "tcp_vs_kernel": MinimalRun("--runs 2 --seconds 1 --together 1 --loss 1% --delay 5ms", emulated=True),
+    "tcp_vs_ns3": MinimalRun("", {"SECONDS": 1.0, "SEEDS": 2}, shrink=_few_losses),
+    "telemetry": MinimalRun("--seconds 0.5", {"SLOWER": (1,)}, shrink=_stand_in_iw),
+    "topics": MinimalRun("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "STREAM_S": 1.0, "BURST_S": 0.1}),
+    "trial_overhead": MinimalRun("--rounds 1 --record 1s --round-trips 0s", emulated=True),
+    "studies.zenoh_images": MinimalRun(
         "--rounds 1", {"SAMPLES": 2, "BYTES": 10_000}, shrink=_one_setting, emulated=True
     ),
 }

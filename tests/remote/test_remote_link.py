@@ -40,19 +40,19 @@ def soon() -> Deadline:
 
 
 class Clock:
-    """A clock of deadlines that stands still until a test makes something hang: earlier steps have no timeout."""
+    """A clock of deadlines that does not advance before a test causes a hang: earlier steps have no timeout."""
 
     def __init__(self) -> None:
         self._made_s = time.monotonic()
-        self._hangs_s: float | None = None
+        self._started_s: float | None = None
 
-    def something_hangs(self) -> None:
-        self._hangs_s = time.monotonic()
+    def start(self) -> None:
+        self._started_s = time.monotonic()
 
     def monotonic(self) -> float:
         now_s = time.monotonic()
-        stood_until_s = self._made_s + SOON if self._hangs_s is None else self._hangs_s
-        return self._made_s + max(0.0, now_s - stood_until_s)
+        stopped_until_s = self._made_s + SOON if self._started_s is None else self._started_s
+        return self._made_s + max(0.0, now_s - stopped_until_s)
 
 
 @pytest.fixture
@@ -161,9 +161,9 @@ def test_any_hang_of_a_server_is_reported(
         if at in {"banner", "keys"}:
             if at == "keys":
                 stream.sendall(b"SSH-2.0-halting\r\n")
-            clock.something_hangs()
+            clock.start()
             return None
-        return ssh_server(stream, rsa, at, clock.something_hangs)
+        return ssh_server(stream, rsa, at, clock.start)
 
     shell = server.shell(connect=fakes(serve).connect, host_key=pinned(rsa), timing=QUICK)
     with pytest.raises(LinkError, match=output_text) as caught:
@@ -290,11 +290,11 @@ def test_hanging_ssh_agent_has_a_timeout(
         agent.bind(str(tmp_path / "agent"))
         agent.listen()
 
-        def take_a_question() -> None:
+        def accept_request() -> None:
             asked.enter_context(agent.accept()[0])
-            clock.something_hangs()
+            clock.start()
 
-        threading.Thread(target=take_a_question, daemon=True).start()
+        threading.Thread(target=accept_request, daemon=True).start()
         monkeypatch.setenv("SSH_AUTH_SOCK", str(tmp_path / "agent"))
         with pytest.raises(LinkLostError, match="did not answer the login in time"):
             server.shell(private_key=None, timing=QUICK).run(("true",), deadline=Deadline.after(HANGS_S))
@@ -361,7 +361,7 @@ def test_too_many_keys_are_a_refused_login(server: Server, tmp_path: Path, monke
             agent.terminate()
 
 
-def test_key_file_with_a_passphrase_is_for_the_agent(tmp_path: Path) -> None:
+def test_key_file_with_a_passphrase_requires_the_agent(tmp_path: Path) -> None:
     path = tmp_path / "my key"
     subprocess.run(("ssh-keygen", "-q", "-t", "ed25519", "-N", "secret", "-f", str(path)), check=True)
     with pytest.raises(ConfigurationError, match="its private key has a passphrase") as caught:
@@ -598,7 +598,7 @@ def test_link_over_the_radio_is_not_reopened_during_a_measurement(
         assert re.match("robot: the link is lost; for .* at most its radio is being measured", notices[0])
         assert line.tries == 1
         if ends_by == "its time":
-            clock.something_hangs()
+            clock.start()
             waiting.wait_for_starts(2)
         else:
             with pytest.raises(TimeoutError):
@@ -616,15 +616,15 @@ def test_timeout_of_a_link_over_the_radio_is_extended(server: Server, *, on_air:
     shell = server.shell(timing=QUICK, on_air=on_air)
     shell.run(("true",), deadline=soon())
 
-    def given_up_after_ms() -> int:
+    def user_timeout_ms() -> int:
         link = shell._connection._link
         assert link is not None
         assert link._stream is not None
         return link._stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
 
     with shell.silence(30.0):
-        assert given_up_after_ms() == (31_000 if on_air else 1_000)
-    assert given_up_after_ms() == 1_000
+        assert user_timeout_ms() == (31_000 if on_air else 1_000)
+    assert user_timeout_ms() == 1_000
     shell.close()
 
 
@@ -638,21 +638,21 @@ def test_silence_lasts_until_the_latest_end(server: Server) -> None:
     stream = link._stream
     assert stream is not None
 
-    def given_up_after_ms() -> int:
+    def user_timeout_ms() -> int:
         return stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
 
     longer, shorter = shell.silence(3000.0), shell.silence(30.0)
     with longer:
         with shorter:
-            assert given_up_after_ms() > 2_900_000
-        assert given_up_after_ms() > 2_900_000
+            assert user_timeout_ms() > 2_900_000
+        assert user_timeout_ms() > 2_900_000
         assert connection._silence_s() > 2_900
-    assert given_up_after_ms() == 1_000
+    assert user_timeout_ms() == 1_000
     assert not connection._silence_s()
     shell.close()
 
 
-def test_patience_ends_and_starts_only_once(shell: SshShell, line: CuttableLine, server: Server) -> None:
+def test_patience_applies_once_per_loss_of_the_link(shell: SshShell, line: CuttableLine, server: Server) -> None:
     impatient = server.shell(connect=line.connect, timing=QUICK, patience_s=2.0)
     assert impatient.run(("echo", "up"), deadline=soon()).stdout == b"up\n"
     line.open = False

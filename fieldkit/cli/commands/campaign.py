@@ -61,7 +61,7 @@ def _report_outcome(outcome: "CampaignOutcome", file: Path, folder: Path) -> int
     if outcome.failed:
         failed = format_count(outcome.failed, "repeat")
         command = shell_command("fieldkit", "campaign", file, "--failed")
-        remedy = f"correct what the reasons name, then add --failed: {command}"
+        remedy = f"remove the causes, then add --failed: {command}"
         show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}\n  remedy: {remedy}")
     if outcome.remaining:
         names = ", ".join(map(str, outcome.remaining))

@@ -126,7 +126,7 @@ def _explain_os_errors(path: Path, option: str) -> Iterator[None]:
 
 
 def _command(arguments: argparse.Namespace) -> list[str]:
-    """Return the words of the command that makes the same page again."""
+    """Return the words of the command that regenerates the page."""
     words = ["fieldkit", "report", *map(str, arguments.paths), "-o", str(arguments.out)]
     words += ["--title", arguments.title] if arguments.title else []
     words += [word for name in arguments.quantity for word in ("--quantity", name)]

@@ -146,7 +146,7 @@ def serve(answer: Callable[[Json], Json]) -> None:
         _apply_limits(*limits)
         try:
             reply = answer(question)
-        except Exception as error:  # noqa: BLE001 (the file caused it, whatever it is)
+        except Exception as error:  # noqa: BLE001 (the file may cause any exception)
             has_memory = not isinstance(error, MemoryError)
             reply = {_ERROR_KEY: _error_text(error)}
         _remove(tempfile.tempdir)  # the parent process may have been killed

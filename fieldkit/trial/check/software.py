@@ -60,7 +60,7 @@ class Probed:
     variants: Variants
 
     def has_program(self, program: str, needs: Sequence[Need]) -> bool:
-        """Return True if the robot has a program of a step, and whatever this program cannot work without.
+        """Return True if the robot has a program of a step, and everything that this program requires.
 
         Args:
             program: The program.

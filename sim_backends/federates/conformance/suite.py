@@ -1,4 +1,4 @@
-"""The suite: all checks of a role, and what came of them."""
+"""The suite: all checks of a role, and their results."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
