@@ -4,6 +4,7 @@ Sources: wiki.ros.org/ROS/Master_API, wiki.ros.org/ROS/Slave_API, wiki.ros.org/R
 """
 
 import http.client
+import os
 import queue
 import select
 import socket
@@ -293,8 +294,9 @@ class Node:
             self._stream_server.close()
             raise
         self._uri = f"http://{self._host}:{self._server.server_address[1]}/"
-        for function in (self._request_topic, self._publisher_update, self._get_pid):
-            self._server.register_function(function, _camel_case(function.__name__))
+        self._server.register_function(self._request_topic, "requestTopic")
+        self._server.register_function(self._publisher_update, "publisherUpdate")
+        self._server.register_function(self._get_pid, "getPid")
         threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
         threading.Thread(target=self._accept, daemon=True).start()
 
@@ -367,7 +369,7 @@ class Node:
         return [_SUCCESS, "", 0]
 
     def _get_pid(self, _caller: str) -> list[Any]:
-        return [_SUCCESS, "", 0]
+        return [_SUCCESS, "", os.getpid()]
 
     def close(self) -> None:
         """Unregister the node and close its connections."""
@@ -381,18 +383,15 @@ class Node:
             for topic in topics:
                 with suppress(OSError):
                     call(self._master, method, self._name, topic, self._uri)
-        for endpoint in (*self._publishers.values(), *self._subscribers.values()):
-            endpoint.close()
+        for publisher in self._publishers.values():
+            publisher.close()
+        for subscriber in self._subscribers.values():
+            subscriber.close()
         self._server.shutdown()
         self._server.server_close()
         with suppress(OSError):
             self._stream_server.shutdown(socket.SHUT_RDWR)  # ends the wait of `accept`
         self._stream_server.close()
-
-
-def _camel_case(name: str) -> str:
-    first, *rest = name.strip("_").split("_")
-    return first + "".join(word.capitalize() for word in rest)
 
 
 def _address_towards(uri: str) -> str:
