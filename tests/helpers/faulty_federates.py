@@ -1,8 +1,8 @@
 """Federates that have a fault after 200 ms of simulated time.
 
 `python -m tests.helpers.faulty_federates ROLE FAULT` serves one over its standard input and output. Without arguments
-it reads lines `ROLE FAULT ADDRESS`, serves one run of each in a process that it forks, and prints the process id: the
-imports are done only once.
+it reads lines `ROLE FAULT ADDRESS RUNS DELAY`, serves each federate in a process that it forks, and prints the
+process id: the imports are done only once.
 """
 
 import os
@@ -67,11 +67,19 @@ class Federates:
     def __init__(self, process: "subprocess.Popen[str]") -> None:
         self._process = process
 
-    def start(self, role: str, fault: str, address: str) -> int:
-        """Start a federate; return its process id."""
+    def start(self, role: str, fault: str, address: str, *, runs: int = 1, delay_s: float = 0.0) -> int:
+        """Start a federate after a delay; return its process id.
+
+        Args:
+            role: `physics` or `network`.
+            fault: Its fault, or `none`.
+            address: Its address.
+            runs: Number of runs that it serves.
+            delay_s: The delay.
+        """
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write(f"{role} {fault} {address}\n")
+        self._process.stdin.write(f"{role} {fault} {address} {runs} {delay_s}\n")
         self._process.stdin.flush()
         return int(self._process.stdout.readline())
 
@@ -101,10 +109,11 @@ def main() -> None:
         return
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel removes children that have exited
     for line in sys.stdin:
-        role, fault, address = line.split()
+        role, fault, address, runs, delay_s = line.split()
         pid = os.fork()
         if pid == 0:
-            serve(faulty(role, fault), name="faulty", address=address, runs=1)
+            time.sleep(float(delay_s))
+            serve(faulty(role, fault), name="faulty", address=address, runs=int(runs))
             os._exit(0)
         print(pid, flush=True)  # noqa: T201 (read by the test)
 

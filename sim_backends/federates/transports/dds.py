@@ -7,6 +7,7 @@ The topics are `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, their type 
 import queue
 import re
 import struct
+import threading
 import time
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -45,8 +46,41 @@ def frame_topic(name: str, part: str) -> Topic:
     )
 
 
+class _Participants:
+    """The participants of this process, as a process can have only one configuration per domain."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._participants: dict[tuple[int, str], tuple[Middleware, int]] = {}
+
+    def open(self, address: "DdsAddress") -> Middleware:
+        """Return the participant of a domain and interface, which is started if necessary.
+
+        Raises:
+            MiddlewareError: CycloneDDS is missing or does not start.
+        """
+        key = address.domain, address.interface
+        with self._lock:
+            participant, uses = self._participants.get(key) or (adapter("dds")(address.network), 0)
+            self._participants[key] = participant, uses + 1
+        return participant
+
+    def close(self, address: "DdsAddress") -> None:
+        """Close the participant after its last use."""
+        key = address.domain, address.interface
+        with self._lock:
+            participant, uses = self._participants.pop(key)
+            if uses > 1:
+                self._participants[key] = participant, uses - 1
+            else:
+                participant.close()
+
+
+_PARTICIPANTS: Final = _Participants()
+
+
 class DdsBus:
-    """A participant with a reader and a writer.
+    """A reader and a writer.
 
     Args:
         address: The address.
@@ -59,14 +93,15 @@ class DdsBus:
 
     def __init__(self, address: "DdsAddress", reads: str, writes: str) -> None:
         try:
-            self._middleware: Middleware = adapter("dds")(address.network)
+            participant = _PARTICIPANTS.open(address)
         except MiddlewareError as error:
             raise ConfigurationError(
                 f"{address} cannot be used: {error}", remedy="python3 -m pip install 'fieldkit[ros2]'"
             ) from error
+        self._address = address
         self._samples: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._writer = self._middleware.publisher(frame_topic(address.name, writes))
-        self._matched_writers = self._middleware.subscribe(frame_topic(address.name, reads), self._deliver)
+        self._writer = participant.publisher(frame_topic(address.name, writes))
+        self._matched_writers = participant.subscribe(frame_topic(address.name, reads), self._deliver)
 
     def _deliver(self, data: bytes, _at_ns: int) -> None:
         if len(data) >= _CDR.size:
@@ -97,7 +132,7 @@ class DdsBus:
     def close(self) -> None:
         """Implement `SampleBus.close`, after the last samples have been acknowledged, or after half a second."""
         self._writer.drain(0.5)
-        self._middleware.close()
+        _PARTICIPANTS.close(self._address)
 
 
 @dataclass(frozen=True)
