@@ -33,6 +33,8 @@ from sim_backends.world.motion import State
 _TIME: Final = struct.Struct("<q")
 _TWO_TIMES: Final = struct.Struct("<qq")
 _NO_COMMANDS: Final = struct.Struct("<qqI")
+_NO_OUTCOMES: Final = struct.Struct("<qqQ")
+"""An answer of a network in which both counts are 0."""
 _THREE_TIMES: Final = struct.Struct("<qqq")
 _U32: Final = struct.Struct("<I")
 _STATES_HEAD: Final = struct.Struct("<qII")
@@ -169,6 +171,10 @@ class NetworkOutcomes:
         Raises:
             MalformedFrameError: It is malformed.
         """
+        if len(body) == _NO_OUTCOMES.size:
+            at_ns, next_event_ns, arrivals_and_drops = _NO_OUTCOMES.unpack(body)
+            if not arrivals_and_drops:
+                return NetworkOutcomes(at_ns, next_event_ns, (), ())
         reader = FrameReader(body)
         at_ns, next_event_ns = reader.unpack(_TWO_TIMES)
         arrivals, drops = read_arrivals(reader, agents), read_drops(reader)
