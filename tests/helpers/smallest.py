@@ -283,7 +283,7 @@ CASES: Final[Mapping[str, Smallest]] = {
         "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLING_S": 0.5}, shrink=_two_bridge_paths, emulated=True
     ),
     "cosim_discovery": Smallest("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
-    "cosim_exchange": Smallest("", {"COUNTS": (3,), "ROUNDS": 1, "EXCHANGES": 5}),
+    "cosim_exchange": Smallest("", {"COUNTS": (3,), "ROUNDS": 1, "EXCHANGES": 5, "STEPS": 5, "PEER_ROUNDS": 1}),
     "cosim_speed": Smallest("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy"),
     "cosim_vs_ns3": Smallest("", shrink=_one_link),
     "emane": Smallest("--rounds 1", {"ROBOTS": 2, "PINGS": 3}, shrink=_one_radio, emulated=True),
