@@ -2,16 +2,19 @@
 
 An exchange with a physics is a request without commands and an answer with the states of all agents; an exchange with
 a network is a request with these states and an answer without packets. The federate does nothing else. The time is
-that of the coordinator's call, in wall time: the median of several rounds, in which the transports alternate. The
-floor is a plain socket between two Python programs, which sends and receives as many bytes and does nothing with
-them. `pipe to C` is `docs/examples/federates/carts.c` (physics only).
+that of the coordinator's call; the rounds of all transports alternate. The floor is a plain socket between two Python
+programs, which sends and receives as many bytes and does nothing with them. `pipe to C` is
+`docs/examples/federates/carts.c` (physics only). The peers, HELICS and mosaik, exchange as much in each step
+(`cosim_peers`).
 
-Both processes share the machine's processors, so other load changes the result.
+Both processes share the machine's processors, so other load changes the wall time: its minimum over the rounds is the
+time on an idle machine, if one round was not disturbed. The processor time is that of both processes.
 """
 
 import argparse
 import json
 import math
+import os
 import shlex
 import shutil
 import socket
@@ -21,10 +24,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Final
 
+from benchmarks import cosim_peers
+from benchmarks.cosim_peers import PEERS, child_pids, processor_s
 from sim_backends.federates.agent_states import STATE
 from sim_backends.federates.frames import HEADER_BYTES, NETWORK, PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello
@@ -35,7 +41,9 @@ from sim_backends.world.motion import State
 
 COUNTS: Final = (3, 10, 50, 200)
 ROUNDS: Final = 7
-EXCHANGES: Final = 2000
+EXCHANGES: Final = 1000
+STEPS: Final = 1000
+PEER_ROUNDS: Final = 3
 STEP_NS: Final = 1_000_000
 CARTS: Final = Path(__file__).parents[1] / "docs" / "examples" / "federates" / "carts.c"
 _PHYSICS_REQUEST_BYTES: Final = HEADER_BYTES + 8 + 8 + 4
@@ -98,8 +106,21 @@ def echo(request_bytes: int, answer_bytes: int, port: int) -> None:
             connection.sendall(answer)
 
 
+@dataclass(frozen=True)
+class Party:
+    """An exchange, and the process of its other side.
+
+    Attributes:
+        exchange: Makes an exchange.
+        pids: The process, whose processor time is measured too.
+    """
+
+    exchange: Exchange
+    pids: Sequence[int] = ()
+
+
 @contextmanager
-def floor(request_bytes: int, answer_bytes: int) -> Iterator[Exchange]:
+def floor(request_bytes: int, answer_bytes: int) -> Iterator[Party]:
     """Yield an exchange over a plain socket."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         sizes = (str(request_bytes), str(answer_bytes), str(server.getsockname()[1]))
@@ -114,24 +135,22 @@ def floor(request_bytes: int, answer_bytes: int) -> Iterator[Exchange]:
         while left:
             left -= len(connection.recv(left))
 
-    yield exchange
+    yield Party(exchange, [process.pid])
     connection.close()
     process.wait()
 
 
 @contextmanager
-def physics(where: str, count: int) -> Iterator[Exchange]:
-    """Yield an exchange with an external physics."""
-    with closing(open_physics(where, make_hello(PHYSICS, count), 60.0)) as remote:
-        yield lambda to_ns: remote.advance(to_ns, {})
-
-
-@contextmanager
-def network(where: str, count: int) -> Iterator[Exchange]:
-    """Yield an exchange with an external network."""
+def opened(role: str, where: str, count: int, pids: Sequence[int] = ()) -> Iterator[Party]:
+    """Yield an exchange with an external federate: `physics` or `network`."""
+    before = child_pids()
+    if role == "physics":
+        with closing(open_physics(where, make_hello(PHYSICS, count), 60.0)) as physics:
+            yield Party(lambda to_ns: physics.advance(to_ns, {}), pids or sorted(child_pids() - before))
+        return
     states = {agent.name: agent.start for agent in make_hello(NETWORK, count).agents}
-    with closing(open_network(where, make_hello(NETWORK, count), 60.0)) as remote:
-        yield lambda to_ns: remote.advance(to_ns, (), states)
+    with closing(open_network(where, make_hello(NETWORK, count), 60.0)) as network:
+        yield Party(lambda to_ns: network.advance(to_ns, (), states), pids or sorted(child_pids() - before))
 
 
 def served(role: str, address: str = "") -> str:
@@ -142,55 +161,97 @@ def served(role: str, address: str = "") -> str:
 
 
 @contextmanager
-def listening(role: str) -> Iterator[str]:
-    """Yield the address of a federate that listens."""
+def listening(role: str, scheme: str, count: int) -> Iterator[Party]:
+    """Yield an exchange with a federate that listens."""
+    served_at = where = f"{scheme}:benchmark_{os.getpid()}"
+    if scheme in {"tcp", "udp"}:
+        port = free_port()
+        served_at, where = f"{scheme}-listen:127.0.0.1:{port}", f"{scheme}:127.0.0.1:{port}"
+    process = subprocess.Popen(shlex.split(served(role, served_at)))
+    try:
+        with opened(role, where, count, [process.pid]) as party:
+            yield party
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def free_port() -> int:
+    """Return a port that no program uses."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    process = subprocess.Popen(shlex.split(served(role, f"tcp-listen:127.0.0.1:{port}")))
-    yield f"tcp:127.0.0.1:{port}"
+        return int(server.getsockname()[1])
+
+
+@contextmanager
+def ros_master() -> Iterator[bool]:
+    """Run a ROS master; yield False if it is not installed."""
+    if shutil.which("rosmaster") is None:
+        yield False
+        return
+    port = free_port()
+    os.environ |= {"ROS_MASTER_URI": f"http://127.0.0.1:{port}", "ROS_IP": "127.0.0.1"}
+    process = subprocess.Popen(
+        ("rosmaster", "--core", "-p", str(port)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    yield True
     process.terminate()
     process.wait()
 
 
-def measure(exchanges: Mapping[str, Exchange]) -> dict[str, float]:
-    """Return the time of each exchange in microseconds."""
-    times_us: dict[str, list[float]] = {name: [] for name in exchanges}
+@dataclass(frozen=True)
+class Times:
+    """Times of an exchange in microseconds.
+
+    Attributes:
+        wall: Median of the rounds.
+        wall_min: Minimum of the rounds.
+        cpu: Median of the processor time.
+    """
+
+    wall: float
+    wall_min: float
+    cpu: float
+
+    @staticmethod
+    def of(rounds: Sequence[tuple[float, float]]) -> "Times":
+        """Return the times of rounds, each with wall time and processor time."""
+        walls, cpus = zip(*rounds, strict=True)
+        return Times(statistics.median(walls), min(walls), statistics.median(cpus))
+
+
+def measure(parties: Mapping[str, Party]) -> dict[str, Times]:
+    """Return the times of each exchange."""
+    rounds: dict[str, list[tuple[float, float]]] = {name: [] for name in parties}
     to_ns = 0
     for _ in range(ROUNDS):
-        for name, exchange in exchanges.items():
-            started_s = time.perf_counter()
+        for name, party in parties.items():
+            cpu_s, started_s = processor_s(party.pids), time.perf_counter()
             for _ in range(EXCHANGES):
                 to_ns += STEP_NS
-                exchange(to_ns)
-            times_us[name].append((time.perf_counter() - started_s) / EXCHANGES * 1e6)
-    return {name: statistics.median(values) for name, values in times_us.items()}
+                party.exchange(to_ns)
+            wall_s = time.perf_counter() - started_s
+            spent_s = wall_s, processor_s(party.pids) - cpu_s
+            rounds[name].append((spent_s[0] / EXCHANGES * 1e6, spent_s[1] / EXCHANGES * 1e6))
+    return {name: Times.of(values) for name, values in rounds.items()}
 
 
-def results(count: int, program: Path | None) -> dict[str, float]:
-    """Return the times with a number of agents, by role and transport."""
-    states_bytes = count * STATE.size
+def results(count: int, program: Path | None, *, has_ros: bool) -> dict[str, Times]:
+    """Return the times with a number of agents, by role and transport, and those of the peers."""
     inproc = Still(make_hello(PHYSICS, count))
-    with (
-        floor(_PHYSICS_REQUEST_BYTES, _PHYSICS_ANSWER_BYTES + states_bytes) as plain,
-        physics(served("physics"), count) as pipe,
-        network(served("network"), count) as network_pipe,
-        listening("physics") as address,
-        physics(address, count) as tcp,
-        listening("network") as network_address,
-        network(network_address, count) as network_tcp,
-    ):
-        exchanges: dict[str, Exchange] = {
-            "physics inproc": lambda to_ns: inproc.advance(to_ns, {}),
-            "plain socket": plain,
-            "physics pipe": pipe,
-            "physics tcp": tcp,
-            "network pipe": network_pipe,
-            "network tcp": network_tcp,
-        }
-        if program is None:
-            return measure(exchanges)
-        with physics(str(program), count) as pipe_to_c:
-            return measure(exchanges | {"physics pipe to C": pipe_to_c})
+    with ExitStack() as stack:
+        parties = {"physics inproc": Party(lambda to_ns: inproc.advance(to_ns, {}))}
+        answer_bytes = _PHYSICS_ANSWER_BYTES + count * STATE.size
+        parties["plain socket"] = stack.enter_context(floor(_PHYSICS_REQUEST_BYTES, answer_bytes))
+        if program is not None:
+            parties["physics pipe to C"] = stack.enter_context(opened("physics", str(program), count))
+        parties["physics pipe"] = stack.enter_context(opened("physics", served("physics"), count))
+        for scheme in ("tcp", "udp", "dds", *(("ros1",) if has_ros else ())):
+            parties[f"physics {scheme}"] = stack.enter_context(listening("physics", scheme, count))
+        parties["network pipe"] = stack.enter_context(opened("network", served("network"), count))
+        parties["network tcp"] = stack.enter_context(listening("network", "tcp", count))
+        times = measure(parties)
+    rounds = {peer: [cosim_peers.measure(peer, count, STEPS) for _ in range(PEER_ROUNDS)] for peer in PEERS}
+    return times | {peer: Times.of(values) for peer, values in rounds.items()}
 
 
 def compiled(folder: Path) -> Path | None:
@@ -216,15 +277,20 @@ def main() -> None:
         role, *address = arguments.serve
         serve(Still if role == "physics" else Silent, address=address[0] if address else None)
         return
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, ros_master() as has_ros:
         program = compiled(Path(folder))
-        by_count = {count: results(count, program) for count in COUNTS}
+        by_count = {count: results(count, program, has_ros=has_ros) for count in COUNTS}
     if arguments.json:
-        print(json.dumps(by_count, indent=2))
+        by_name = {
+            count: {name: asdict(times) for name, times in by_party.items()} for count, by_party in by_count.items()
+        }
+        print(json.dumps(by_name, indent=2))
         return
-    print(f"{'microseconds per exchange':26}" + "".join(f"{count:>8}" for count in COUNTS) + "  agents")
-    for name in next(iter(by_count.values())):
-        print(f"{name:26}" + "".join(f"{times_us[name]:8.1f}" for times_us in by_count.values()))
+    for field in fields(Times):
+        print(f"{field.name + ' (us)':26}" + "".join(f"{count:>9}" for count in COUNTS) + "  agents")
+        for name in next(iter(by_count.values())):
+            row = (getattr(times_by_name[name], field.name) for times_by_name in by_count.values())
+            print(f"{name:26}" + "".join(f"{value_us:9.1f}" for value_us in row))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import math
 import struct
 from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from typing_extensions import override
 
@@ -19,13 +19,33 @@ _INDEX: Final = struct.Struct("<I")
 _NEW_AGENT_BYTES: Final = _INDEX.size + 2
 _STATE_FORMAT: Final = "II8d"
 STATE: Final = struct.Struct("<" + _STATE_FORMAT)
-_FIELDS: Final = 10
+_MOTION: Final = struct.Struct("<7d")
+_MOTION_OFFSET: Final = 8
 _NO_NEW_AGENTS: Final = count_bytes(0)
 
 
+class _Layouts(NamedTuple):
+    """Layouts of parts of many states; each skips the other parts.
+
+    Attributes:
+        whole: All fields.
+        indices: The index and the reserved field, as one number, which is the index if the reserved field is 0.
+        positions: Positions and velocities.
+        headings: The headings.
+        limits: The limits.
+    """
+
+    whole: struct.Struct
+    indices: struct.Struct
+    positions: struct.Struct
+    headings: struct.Struct
+    limits: struct.Struct
+
+
 @lru_cache(maxsize=32)
-def _layout(count: int) -> struct.Struct:
-    return struct.Struct("<" + _STATE_FORMAT * count)
+def _layouts(count: int) -> _Layouts:
+    formats = (_STATE_FORMAT, "Q64x", "8x6d16x", "56xd8x", "64xd")
+    return _Layouts(*(struct.Struct("<" + text * count) for text in formats))
 
 
 class AgentTable:
@@ -38,12 +58,14 @@ class AgentTable:
         names: Their names, in order.
         indices: Their indices by name. After an addition it is another mapping, so that received states can keep it.
         order: All indices.
+        valid_limits: The limits of the last states that were received, which seldom change and need no second check.
     """
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self.names: list[str] = []
         self.indices: dict[str, int] = {}
         self.order: tuple[int, ...] = ()
+        self.valid_limits: tuple[float, ...] = ()
         self.add(list(names))
 
     def copy(self) -> "AgentTable":
@@ -117,13 +139,13 @@ class ReceivedStates(Mapping[str, State]):
 
     Args:
         rows: Number of each agent's state.
-        values: The fields of all states.
         data: Their bytes.
+        limits: The limits of the agents, in the order of the rows.
     """
 
-    def __init__(self, rows: Mapping[str, int], values: tuple[Any, ...], data: bytes) -> None:
+    def __init__(self, rows: Mapping[str, int], data: bytes, limits: tuple[float, ...]) -> None:
         self._rows = rows
-        self._values = values
+        self._limits = limits
         self._cache: dict[str, State] = {}
         self.data = data
 
@@ -133,8 +155,8 @@ class ReceivedStates(Mapping[str, State]):
     def __getitem__(self, name: str) -> State:
         state = self._cache.get(name)
         if state is None:
-            begin = self._rows[name] * _FIELDS + 2
-            e, n, u, v_e, v_n, v_u, heading_rad = self._values[begin : begin + 7]
+            at = self._rows[name] * STATE.size + _MOTION_OFFSET
+            e, n, u, v_e, v_n, v_u, heading_rad = _MOTION.unpack_from(self.data, at)
             # NaN, which means no heading, is the only number that is not equal to itself.
             heading = heading_rad if heading_rad == heading_rad else None  # noqa: PLR0124 (see above)
             state = self._cache[name] = State((e, n, u), (v_e, v_n, v_u), heading)
@@ -152,12 +174,16 @@ class ReceivedStates(Mapping[str, State]):
 
     def has_indices(self, agents: AgentTable) -> bool:
         """Return True if the indices in its bytes are those of a table, for all of the table's agents."""
-        return self._rows == agents.indices
+        return self._rows is agents.indices or self._rows == agents.indices
+
+    def has_limits_of(self, other: Mapping[str, State]) -> bool:
+        """Return True if other states have the same agents with the same limits; it may be False if unsure."""
+        return isinstance(other, ReceivedStates) and self._rows is other._rows and self._limits == other._limits  # noqa: SLF001 (of the same class)
 
     @property
     def limits_m_s2(self) -> dict[str, float]:
         """The limits of the agents."""
-        return dict(zip(self._rows, self._values[9::_FIELDS], strict=True))
+        return dict(zip(self._rows, self._limits, strict=True))
 
 
 def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: Mapping[str, float] | None) -> bytes:
@@ -177,7 +203,7 @@ def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: M
         limit_m_s2 = math.inf if limits_m_s2 is None else limits_m_s2.get(name, math.inf)
         heading = math.nan if heading_rad is None else heading_rad
         values += (indices[name], 0, *position_m, *velocity_m_s, heading, limit_m_s2)
-    return count_bytes(count) + _layout(count).pack(*values)
+    return count_bytes(count) + _layouts(count).whole.pack(*values)
 
 
 def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
@@ -188,44 +214,47 @@ def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
     """
     count = reader.count(STATE.size)
     begin = reader.position
-    data = reader.take(count * STATE.size)
-    values = _layout(count).unpack(data)
-    indices = values[0::_FIELDS]
-    if not _seem_valid(values):
-        _check_each(values, begin)
+    return unpack_states(reader.take(count * STATE.size), begin, agents)
+
+
+def unpack_states(data: bytes, begin: int, agents: AgentTable) -> ReceivedStates:
+    """Return states of agents; arguments and errors as for `read_states`.
+
+    Args:
+        data: The bytes of the states.
+        begin: Position of the first one in the frame.
+        agents: The agents.
+    """
+    layouts = _layouts(len(data) // STATE.size)
+    indices, limits = layouts.indices.unpack(data), layouts.limits.unpack(data)
+    headings = layouts.headings.unpack(data)
+    # The sum of finite numbers may be too large, then each is checked.
+    if not (
+        math.isfinite(sum(layouts.positions.unpack(data)))
+        and math.inf not in headings
+        and -math.inf not in headings
+        and (limits == agents.valid_limits or (min(limits, default=0.0) >= 0 and not math.isnan(sum(limits))))
+    ):
+        _check_each(data, begin)
+    agents.valid_limits = limits
     if indices == agents.order:
-        return ReceivedStates(agents.indices, values, data)
+        return ReceivedStates(agents.indices, data, limits)
+    _check_each(data, begin)
     rows: dict[str, int] = {}
     for row, index in enumerate(indices):
         name = agents.name(index, begin + row * STATE.size)
         if name in rows:
             raise MalformedFrameError(begin + row * STATE.size, f"agent {name} has two states")
         rows[name] = row
-    return ReceivedStates(rows, values, data)
+    return ReceivedStates(rows, data, limits)
 
 
-def _seem_valid(values: tuple[Any, ...]) -> bool:
-    """Return True if all states are valid; False if one may not be, as sums may be too large for finite numbers."""
-    headings, limits = values[8::_FIELDS], values[9::_FIELDS]
-    position = sum(values[2::_FIELDS]) + sum(values[3::_FIELDS]) + sum(values[4::_FIELDS])
-    velocity = sum(values[5::_FIELDS]) + sum(values[6::_FIELDS]) + sum(values[7::_FIELDS])
-    return not (
-        any(values[1::_FIELDS])
-        or not math.isfinite(position + velocity)
-        or math.inf in headings
-        or -math.inf in headings
-        or not min(limits, default=0.0) >= 0
-        or math.isnan(sum(limits))
-    )
-
-
-def _check_each(values: tuple[Any, ...], begin: int) -> None:
+def _check_each(data: bytes, begin: int) -> None:
     """Check each state.
 
     Raises:
         MalformedFrameError: One is invalid; the error has its position.
     """
-    for row in range(len(values) // _FIELDS):
-        index, reserved, *numbers, heading_rad, limit_m_s2 = values[row * _FIELDS : (row + 1) * _FIELDS]
+    for row, (index, reserved, *numbers, heading_rad, limit_m_s2) in enumerate(STATE.iter_unpack(data)):
         if reserved or not math.isfinite(sum(numbers)) or math.isinf(heading_rad) or not limit_m_s2 >= 0:
             raise MalformedFrameError(begin + row * STATE.size, f"the state of agent {index} is invalid")

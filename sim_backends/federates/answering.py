@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from sim_backends.federates import tcp
 from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
 from sim_backends.federates.exchanges import (
@@ -36,6 +35,7 @@ from sim_backends.federates.frames import (
 )
 from sim_backends.federates.handshake import NO_EVENT, FederateCapability, Hello, Welcome
 from sim_backends.federates.records import COMMAND_TYPES, command_type
+from sim_backends.federates.transports.contract import is_same_token
 from sim_backends.world.motion import DeadReckoned
 
 _MAX_COPIES: Final = 1000
@@ -237,7 +237,7 @@ class _Run:
         raise MalformedFrameError(4, f"the request {header.kind.name.lower()} is not supported")
 
     def _begin(self, hello: Hello, request: int) -> bytes:
-        if not tcp.is_same_token(hello.token, self.token):
+        if not is_same_token(hello.token, self.token):
             raise PermissionError("the token is wrong")
         self.heartbeat = _Heartbeat(self.channel, max(hello.heartbeat_ms / 1e3, 0.01))
         self.heartbeat.begin(request, 0, 0)

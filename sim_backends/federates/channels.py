@@ -73,31 +73,44 @@ class StreamChannel:
         self._readable.register(read_fd, select.POLLIN)
         self._writable = select.poll()
         self._writable.register(write_fd, select.POLLOUT)
-        self._data = bytearray()
+        self._data = b""
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
         """Implement `FrameChannel.send`."""
-        rest = memoryview(frame)
-        while rest:
+        rest: bytes | memoryview = frame
+        while True:
             try:
-                rest = rest[os.write(self._write_fd, rest) :]
+                written = os.write(self._write_fd, rest)
             except BlockingIOError:
                 _wait(self._writable, deadline_s)
+                continue
             except OSError as error:
                 raise ClosedError("the connection was closed") from error
+            if written == len(rest):
+                return
+            rest = memoryview(rest)[written:]
 
     def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> ProtocolFrame:
         """Implement `FrameChannel.receive`."""
-        data = self._data
+        data = self._data or self._read(deadline_s)
         while len(data) < HEADER_BYTES:
-            self._read(deadline_s)
+            data = self._data = data + self._read(deadline_s, len(data))
         header = read_header(data, max_bytes)
         end = HEADER_BYTES + header.size
-        while len(data) < end:
-            self._read(deadline_s)
-        body = bytes(memoryview(data)[HEADER_BYTES:end])
-        del data[:end]
-        return ProtocolFrame(header, body)
+        if len(data) < end:
+            data = self._read_rest(data, end, deadline_s)
+        self._data = data[end:]
+        return ProtocolFrame(header, data[HEADER_BYTES:end])
+
+    def _read_rest(self, begin: bytes, end: int, deadline_s: float | None) -> bytes:
+        """Return data that begins with some bytes and has at least a number of bytes."""
+        data = bytearray(begin)
+        try:
+            while len(data) < end:
+                data += self._read(deadline_s, len(data))
+        finally:
+            self._data = bytes(data)
+        return self._data
 
     def close(self) -> None:
         """Implement `FrameChannel.close`."""
@@ -105,20 +118,27 @@ class StreamChannel:
             os.close(fd)
         self._fds = set()
 
-    def _read(self, deadline_s: float | None) -> None:
+    def _read(self, deadline_s: float | None, pending: int = 0) -> bytes:
+        """Return the next bytes, at least one.
+
+        Args:
+            deadline_s: As for `receive`.
+            pending: Number of bytes of the same frame that were read before, for the error.
+        """
         if not self._fds:
             raise ClosedError("the connection was closed")
-        _wait(self._readable, deadline_s)
-        try:
-            received = os.read(self._read_fd, _CHUNK_BYTES)
-        except BlockingIOError:
-            return
-        except OSError as error:
-            raise ClosedError("the connection was closed") from error
-        if not received:
-            rest = f" after {len(self._data)} bytes of a frame" if self._data else ""
-            raise ClosedError(f"the connection was closed{rest}")
-        self._data += received
+        while True:
+            _wait(self._readable, deadline_s)
+            try:
+                received = os.read(self._read_fd, _CHUNK_BYTES)
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise ClosedError("the connection was closed") from error
+            if not received:
+                rest = f" after {pending} bytes of a frame" if pending else ""
+                raise ClosedError(f"the connection was closed{rest}")
+            return received
 
 
 def _wait(poll: select.poll, deadline_s: float | None) -> None:

@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from sim_backends.federates.agent_states import (
+    STATE,
     AgentTable,
     ReceivedStates,
     announcements_bytes,
     read_announcements,
     read_states,
     states_bytes,
+    unpack_states,
 )
-from sim_backends.federates.frames import FrameReader, MalformedFrameError
+from sim_backends.federates.frames import HEADER_BYTES, FrameReader, MalformedFrameError
 from sim_backends.federates.records import (
     arrivals_bytes,
     commands_bytes,
@@ -30,8 +32,13 @@ from sim_backends.world.motion import State
 
 _TIME: Final = struct.Struct("<q")
 _TWO_TIMES: Final = struct.Struct("<qq")
+_NO_COMMANDS: Final = struct.Struct("<qqI")
+_NO_OUTCOMES: Final = struct.Struct("<qqQ")
+"""An answer of a network in which both counts are 0."""
 _THREE_TIMES: Final = struct.Struct("<qqq")
 _U32: Final = struct.Struct("<I")
+_STATES_HEAD: Final = struct.Struct("<qII")
+"""An answer of a physics without new agents: time, 0, number of states."""
 
 
 def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any], agents: AgentTable) -> bytes:
@@ -43,6 +50,8 @@ def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any]
         commands: Commands by agent.
         agents: The agents.
     """
+    if not commands:
+        return _NO_COMMANDS.pack(to_ns, from_ns, 0)
     return _TWO_TIMES.pack(to_ns, from_ns) + commands_bytes(commands, agents)
 
 
@@ -72,6 +81,10 @@ def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]
     Raises:
         MalformedFrameError: It is malformed.
     """
+    if len(body) >= _STATES_HEAD.size:
+        at_ns, new, count = _STATES_HEAD.unpack_from(body)
+        if not new and len(body) == _STATES_HEAD.size + count * STATE.size:
+            return at_ns, unpack_states(body[_STATES_HEAD.size :], HEADER_BYTES + _STATES_HEAD.size, agents)
     reader = FrameReader(body)
     (at_ns,) = reader.unpack(_TIME)
     read_announcements(reader, agents)
@@ -158,6 +171,10 @@ class NetworkOutcomes:
         Raises:
             MalformedFrameError: It is malformed.
         """
+        if len(body) == _NO_OUTCOMES.size:
+            at_ns, next_event_ns, arrivals_and_drops = _NO_OUTCOMES.unpack(body)
+            if not arrivals_and_drops:
+                return NetworkOutcomes(at_ns, next_event_ns, (), ())
         reader = FrameReader(body)
         at_ns, next_event_ns = reader.unpack(_TWO_TIMES)
         arrivals, drops = read_arrivals(reader, agents), read_drops(reader)

@@ -116,8 +116,9 @@ class RemotePhysics(_RemoteFederate):
                 f"{self.session.name}, requested to advance to {seconds_text(to_ns)}, returned the states at "
                 f"{seconds_text(states_ns)} instead of {seconds_text(at_ns)}, its last step until then"
             )
+        if not states.has_limits_of(self._states):
+            self._limits_m_s2.update(states.limits_m_s2)
         self._states, self._states_ns = states, at_ns
-        self._limits_m_s2.update(states.limits_m_s2)
         self.session.reached_ns = to_ns
         return states
 

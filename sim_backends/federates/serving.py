@@ -5,9 +5,11 @@ import time
 from contextlib import closing
 from typing import Any, Final
 
-from sim_backends.federates import tcp
 from sim_backends.federates.answering import FederateService, Make, serve_channel
 from sim_backends.federates.channels import DeadlineError, StreamChannel
+from sim_backends.federates.transports.contract import Address, read_token
+from sim_backends.federates.transports.joining import join
+from sim_backends.federates.transports.table import FORMS, parse_address
 
 _CONNECT_S: Final = 60.0
 _HELLO_S: Final = 10.0
@@ -20,7 +22,7 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
     Args:
         make: Called with the `Hello` of each run; returns the federate, for example its class.
         address: None for standard input and output, which then belong to the protocol: what the federate prints goes
-            to standard error. `tcp-listen:HOST:PORT` listens, `tcp:HOST:PORT` connects to a listening coordinator.
+            to standard error. Otherwise an address of a transport (`transports.table`).
         runs: Number of runs after which to return; None for one run if this side does not listen, else no limit.
         **properties: Other attributes of `FederateService`.
 
@@ -33,13 +35,13 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
 
 def serve_service(service: FederateService, *, address: str | None = None, runs: int | None = None) -> None:
     """Serve a federate and its properties; otherwise as `serve`."""
-    parsed = None if address is None else tcp.parse_address(address)
+    parsed = None if address is None else parse_address(address)
     if address is not None and parsed is None:
-        raise ValueError(f"{address!r} is neither tcp:HOST:PORT nor tcp-listen:HOST:PORT")
+        raise ValueError(f"{address!r} is not one of {', '.join(FORMS)}")
     if parsed is None:
         with closing(_standard_channel()) as channel:
             succeeded = serve_channel(channel, service)
-    elif parsed.listens:
+    elif parsed.listens is not False:
         succeeded = _listen(parsed, service, runs)
     else:
         succeeded = _connect(parsed, service, 1 if runs is None else runs)
@@ -47,28 +49,28 @@ def serve_service(service: FederateService, *, address: str | None = None, runs:
         raise SystemExit(1)
 
 
-def _listen(address: tcp.TcpAddress, service: FederateService, runs: int | None) -> bool:
-    token = tcp.token(address)
+def _listen(address: Address, service: FederateService, runs: int | None) -> bool:
+    token = read_token(address)
     succeeded, served = True, 0
-    with tcp.listening(address) as server:
+    with address.listen() as listener:
         while runs is None or served < runs:
-            with closing(tcp.accept(server, None)) as channel:
+            with closing(listener.accept(None)) as channel:
                 succeeded = serve_channel(channel, service, token, _HELLO_S)
             served += 1
     return succeeded
 
 
-def _connect(address: tcp.TcpAddress, service: FederateService, runs: int) -> bool:
-    token = tcp.token(address)
+def _connect(address: Address, service: FederateService, runs: int) -> bool:
+    token = read_token(address)
     succeeded = True
     for _ in range(runs):
         deadline_s = time.monotonic() + _CONNECT_S
         try:
-            channel = tcp.connect(address, deadline_s)
+            channel = address.connect(deadline_s)
         except DeadlineError as error:
             raise SystemExit(str(error)) from error
         with closing(channel):
-            tcp.join(channel, token, deadline_s)
+            join(channel, token, deadline_s)
             succeeded = serve_channel(channel, service, token)
     return succeeded
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Final, NoReturn, TypeVar
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.federates import tcp
 from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
 from sim_backends.federates.children import Child
 from sim_backends.federates.exchanges import decode_number, decode_text
@@ -15,6 +14,9 @@ from sim_backends.federates.frames import ROLES, Header, MalformedFrameError, Me
 from sim_backends.federates.handshake import Hello, Welcome
 from sim_backends.federates.named import command_line
 from sim_backends.federates.protocols import FederateError, UnansweredError, seconds_text
+from sim_backends.federates.transports.contract import read_token
+from sim_backends.federates.transports.joining import accept_federate
+from sim_backends.federates.transports.table import parse_address
 
 PATIENCE: Final = 20
 """A federate that reports that it computes may take this multiple of the deadline for an answer."""
@@ -250,7 +252,7 @@ def open_session(
         ConfigurationError: The name, the command or the address cannot be used.
         FederateError: The federate failed, or has not connected or answered in time.
     """
-    address = tcp.parse_address(where)
+    address = parse_address(where)
     if deadline_s is not None:
         # Several heartbeats per deadline, as the federate's machine may be busy.
         hello = replace(hello, heartbeat_ms=max(min(hello.heartbeat_ms, round(deadline_s * 250)), 1))
@@ -258,13 +260,11 @@ def open_session(
         child = Child(command_line(where, role))
         session = FederateSession(role, printable(where), child.channel, deadline_s=deadline_s, child=child)
     else:
-        token = tcp.token(address)
+        token = read_token(address)
         hello = replace(hello, token=token)
         limit_s = time.monotonic() + (_FOREVER_S if deadline_s is None else deadline_s)
         try:
-            channel = (
-                tcp.accept_federate(address, token, limit_s) if address.listens else tcp.connect(address, limit_s)
-            )
+            channel = accept_federate(address, token, limit_s) if address.listens else address.connect(limit_s)
         except DeadlineError as error:
             raise UnansweredError(
                 f"{ROLES[role]} ({address}): {error} within {deadline_s:g} s",

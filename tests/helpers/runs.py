@@ -1,15 +1,19 @@
 """Runs fieldkit like its users: as a command in a separate folder."""
 
 import csv
+import io
 import json
 import os
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from fieldkit.cli import main
 
 LIMIT_S = 600.0
 
@@ -31,6 +35,14 @@ class Run:
     def events(self, name: str) -> list[dict[str, Any]]:
         """The JSON events of one kind."""
         return [event for event in map(json.loads, self.out.splitlines()) if event["event"] == name]
+
+
+def cosim(lab: Path, *words: str) -> Run:
+    """Run `fieldkit cosim` in this process, in the folder `lab`."""
+    out, err = io.StringIO(), io.StringIO()
+    with chdir(lab), redirect_stdout(out), redirect_stderr(err):
+        code = main(("cosim", *words))
+    return Run(code, out.getvalue(), err.getvalue())
 
 
 def start(lab: Path, *arguments: str) -> "subprocess.Popen[str]":

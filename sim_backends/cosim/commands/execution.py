@@ -17,6 +17,7 @@ from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder, StateSamples
 from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.external import has_addresses
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
 from sim_backends.cosim.studies.seeds import Task, as_completed_tasks
@@ -100,9 +101,10 @@ def simulate_all(
     sink: Sink,
     deadline_s: float | None = DEADLINE_S,
 ) -> tuple[list[SeedResult], bool]:
-    """Return the result of a scenario for each seed, run in parallel, and True if Ctrl-C interrupted them.
+    """Return the result of a scenario for each seed, and True if Ctrl-C interrupted them.
 
-    Seeds that had not finished when they were interrupted are missing.
+    Seeds that had not finished when they were interrupted are missing. The runs are parallel unless a federate serves
+    one run at a time.
 
     Args:
         scenario: The scenario.
@@ -130,7 +132,10 @@ def simulate_all(
     tasks = [Task(policy, seed) for seed in seeds]
     interrupted = False
     try:
-        for number, result in as_completed_tasks(partial(_simulate, scenario, folder, deadline_s), tasks):
+        # A federate with an address serves one run at a time.
+        workers = 1 if has_addresses(scenario) else None
+        work = partial(_simulate, scenario, folder, deadline_s)
+        for number, result in as_completed_tasks(work, tasks, workers=workers):
             results[number] = result
             report(len(results))
             if result.is_interrupted:  # with a single worker, the run itself catches Ctrl-C

@@ -13,6 +13,7 @@ from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, Hello
 from sim_backends.federates.named import PythonFederate, named
 from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
+from sim_backends.federates.transports.table import parse_address
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Body
 from sim_backends.world.world import World
@@ -26,6 +27,12 @@ def without_federates(scenario: CosimScenario) -> CosimScenario:
             "network": scenario.network.model_copy(update={"federate": None, "options": None}),
         }
     )
+
+
+def has_addresses(scenario: CosimScenario) -> bool:
+    """Return True if a federate of the scenario has the address of a transport instead of a command."""
+    federates = (scenario.physics.federate, scenario.network.federate)
+    return any(where is not None and parse_address(where) is not None for where in federates)
 
 
 def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, role: int) -> Hello:

@@ -21,6 +21,7 @@ import rospy
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.robot import base_process, services
 from sim_backends.emulated.ros import tcpros
+from sim_backends.ros1 import framing
 
 _MASTER_S: Final = 20.0
 _CONNECT_S: Final = 5.0
@@ -44,7 +45,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
         self._lock = threading.Lock()
         stream, packets = _subscribe(topic)
         with stream:
-            header = tcpros.unpack_header(_next_packet(stream, packets))
+            header = framing.unpack_header(_next_packet(stream, packets))
         self._message = _message_class(header)
         self._latched = header["latching"] == "1"
         with self._lock:
@@ -74,7 +75,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
                     self._stream.shutdown(socket.SHUT_RDWR)
                 self._stream = None
 
-    def _relay_until_unsubscribed(self, stream: socket.socket, packets: tcpros.PacketSplitter) -> None:
+    def _relay_until_unsubscribed(self, stream: socket.socket, packets: framing.PacketSplitter) -> None:
         """Relay messages until the last subscriber leaves; reconnect if the sensors process restarts."""
         while True:
             self._relay(stream, packets)
@@ -84,7 +85,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
                 stream, packets = _subscribe(self._topic)
                 self._stream = stream
 
-    def _relay(self, stream: socket.socket, packets: tcpros.PacketSplitter) -> None:
+    def _relay(self, stream: socket.socket, packets: framing.PacketSplitter) -> None:
         with stream:
             _next_packet(stream, packets)  # the connection header
             while payload := _next_packet(stream, packets):
@@ -106,10 +107,10 @@ def _relay_velocities(topic: str) -> None:
     rospy.Subscriber(topic, roslib.message.get_message_class("geometry_msgs/Twist"), send, queue_size=1)
 
 
-def _subscribe(topic: str) -> tuple[socket.socket, tcpros.PacketSplitter]:
+def _subscribe(topic: str) -> tuple[socket.socket, framing.PacketSplitter]:
     stream = _connect(str(tcpros.socket_path(topic)))
     stream.sendall(tcpros.request("/ros_relay", topic))
-    return stream, tcpros.PacketSplitter()
+    return stream, framing.PacketSplitter()
 
 
 def _connect(path: str) -> socket.socket:
@@ -128,7 +129,7 @@ def _connect(path: str) -> socket.socket:
             return stream
 
 
-def _next_packet(stream: socket.socket, packets: tcpros.PacketSplitter) -> bytes:
+def _next_packet(stream: socket.socket, packets: framing.PacketSplitter) -> bytes:
     """Return the next packet, or b"" at the end of the stream."""
     while True:
         for payload in packets:

@@ -17,6 +17,7 @@ from sim_backends.emulated.ros import static_frames, tcpros
 from sim_backends.emulated.ros.laser import LaserTarget
 from sim_backends.emulated.ros.messages import Definition, Sensor, Source
 from sim_backends.emulated.ros.own_motion import Odometer
+from sim_backends.ros1 import framing
 
 QUEUE_BYTES: Final = 4 << 20
 """Maximum unsent data of a slow subscriber; further messages are dropped for it, as by a ROS publisher's queue."""
@@ -43,7 +44,7 @@ class Subscriber:
         self._stream = stream
         self._greeting = greeting
         self._selector = selector
-        self._packets = tcpros.PacketSplitter()
+        self._packets = framing.PacketSplitter()
         self._unsent = bytearray()
         stream.setblocking(False)
         selector.register(stream, selectors.EVENT_READ, self.serve)
@@ -88,7 +89,7 @@ class Subscriber:
     def _send_greeting(self) -> None:
         """Answer the connection header once it is complete; anything after it is ignored."""
         for packet in self._packets:
-            tcpros.unpack_header(packet)
+            framing.unpack_header(packet)
             self.is_subscribed = True
             self.send(self._greeting)
             return
@@ -115,7 +116,7 @@ class TopicSocket:
     def __init__(
         self, topic: str, header: Mapping[str, str], selector: selectors.BaseSelector, latched: bytes = b""
     ) -> None:
-        self._greeting = tcpros.pack(tcpros.pack_header(header)) + (tcpros.pack(latched) if latched else b"")
+        self._greeting = framing.pack(framing.pack_header(header)) + (framing.pack(latched) if latched else b"")
         self._selector = selector
         self._subscribers: list[Subscriber] = []
         path = tcpros.socket_path(topic)
@@ -178,7 +179,7 @@ class Publication:
             self._number = math.ceil(elapsed_s * rate_hz)
         elif self._number <= elapsed_s * rate_hz:
             now = self._odometer.at(time.monotonic_ns())
-            packet = tcpros.pack(self._source.message(self._number, time.time_ns(), now))
+            packet = framing.pack(self._source.message(self._number, time.time_ns(), now))
             for subscriber in subscribers:
                 subscriber.send(packet)
             self._number += 1

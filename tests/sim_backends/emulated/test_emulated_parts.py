@@ -30,6 +30,7 @@ from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.ros import messages, tcpros
 from sim_backends.emulated.ros.laser import LaserTarget
 from sim_backends.emulated.ros.messages import Sensor
+from sim_backends.ros1 import framing
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
 from tests.helpers.labs import replace_text
@@ -281,22 +282,22 @@ class TestMessages:
 class TestTcpros:
     @given(fields=st.dictionaries(st.from_regex(r"[a-z_]{1,9}", fullmatch=True), st.text()), cut=st.integers(1, 50))
     def test_a_header_is_read_from_chunks_of_any_size(self, fields: dict[str, str], cut: int) -> None:
-        stream = tcpros.pack(tcpros.pack_header(fields)) + tcpros.pack(b"message")
-        packets = tcpros.PacketSplitter()
+        stream = framing.pack(framing.pack_header(fields)) + framing.pack(b"message")
+        packets = framing.PacketSplitter()
         received: list[bytes] = []
         for start in range(0, len(stream), cut):
             packets.feed(stream[start : start + cut])
             received += packets
-        assert tcpros.unpack_header(received[0]) == fields
+        assert framing.unpack_header(received[0]) == fields
         assert received[1:] == [b"message"]
         assert packets.pending == 0
 
     def test_a_truncated_header_is_rejected(self) -> None:
         with pytest.raises(ValueError, match="within a field"):
-            tcpros.unpack_header(tcpros.pack_header({"topic": "/scan"})[:-1])
+            framing.unpack_header(framing.pack_header({"topic": "/scan"})[:-1])
 
     def test_an_excessive_length_is_rejected(self) -> None:
-        packets = tcpros.PacketSplitter()
+        packets = framing.PacketSplitter()
         packets.feed(b"\xff\xff\xff\xff")
         with pytest.raises(ValueError, match="longer than"):
             list(packets)

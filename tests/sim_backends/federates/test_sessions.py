@@ -19,7 +19,6 @@ from types import MappingProxyType
 import pytest
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.federates import tcp
 from sim_backends.federates.answering import FederateService, serve_channel
 from sim_backends.federates.channels import ClosedError, DeadlineError, StreamChannel
 from sim_backends.federates.frames import HEADER_BYTES, NETWORK, PHYSICS, MessageKind, encode
@@ -28,6 +27,9 @@ from sim_backends.federates.protocols import FederateError, UnansweredError
 from sim_backends.federates.remote import RemotePhysics, open_network, open_physics
 from sim_backends.federates.serving import serve
 from sim_backends.federates.session import FederateSession
+from sim_backends.federates.transports.contract import TOKEN_VARIABLE
+from sim_backends.federates.transports.joining import join
+from sim_backends.federates.transports.tcp import TcpAddress
 from sim_backends.physics.body import Twist
 from sim_backends.world.motion import State
 from tests.helpers.federate_examples import EXAMPLES, carts
@@ -256,7 +258,7 @@ def test_heartbeats_are_shorter_than_the_deadline() -> None:
 
 
 def test_a_token_is_needed_beyond_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(tcp.TOKEN_VARIABLE, raising=False)
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
     for where in ("tcp:192.0.2.1:7000", "tcp-listen:0.0.0.0:7000"):
         with pytest.raises(ConfigurationError, match="there is no token"):
             open_physics(where, HELLO, 1.0)
@@ -266,11 +268,11 @@ def test_a_token_is_needed_beyond_loopback(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_federate_refuses_a_wrong_token(monkeypatch: pytest.MonkeyPatch) -> None:
     port = free_port()
-    monkeypatch.setenv(tcp.TOKEN_VARIABLE, "right")
+    monkeypatch.setenv(TOKEN_VARIABLE, "right")
     thread = threading.Thread(target=_serve_once, args=(port,), daemon=True)
-    with tcp.listening(tcp.TcpAddress("127.0.0.1", port)) as server:
+    with TcpAddress("tcp", "127.0.0.1", port).listen() as listener:
         thread.start()
-        with closing(tcp.accept(server, time.monotonic() + 20)) as channel:
+        with closing(listener.accept(time.monotonic() + 20)) as channel:
             channel.receive(time.monotonic() + 20)  # join
             session = FederateSession(PHYSICS, "test", channel, deadline_s=20.0)
             with pytest.raises(FederateError, match="PermissionError: the token is wrong"):
@@ -284,9 +286,9 @@ def _serve_once(port: int) -> None:
 
 
 def test_other_programs_are_rejected_and_the_wait_continues(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(tcp.TOKEN_VARIABLE, "right")
+    monkeypatch.setenv(TOKEN_VARIABLE, "right")
     port = free_port()
-    address = tcp.TcpAddress("127.0.0.1", port, listens=True)
+    address = TcpAddress("tcp", "127.0.0.1", port, listens=True)
 
     def connect_all() -> None:
         for data in (
@@ -297,8 +299,8 @@ def test_other_programs_are_rejected_and_the_wait_continues(monkeypatch: pytest.
             with socket.create_connection(("127.0.0.1", port)) as connection:
                 connection.sendall(data)
                 assert connection.recv(1) == b""  # nothing is sent to it, not even the token
-        channel = tcp.connect(tcp.TcpAddress("127.0.0.1", port), time.monotonic() + 20)
-        tcp.join(channel, "right", time.monotonic() + 20)
+        channel = TcpAddress("tcp", "127.0.0.1", port).connect(time.monotonic() + 20)
+        join(channel, "right", time.monotonic() + 20)
         serve_channel(channel, FederateService(carts()), "right")
 
     threading.Timer(0.1, connect_all).start()

@@ -1,6 +1,5 @@
 """Scenarios with external federates: equal results with the built-in ones, recordings and processes after faults."""
 
-import io
 import json
 import os
 import shlex
@@ -10,12 +9,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from fieldkit.cli import main
 from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.scenario.external import without_federates
@@ -23,7 +21,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.protocols import FederateError
 from tests.helpers.federate_examples import EXAMPLES
 from tests.helpers.federate_pairs import children, now_s
-from tests.helpers.runs import Run, finish, start, wait_during
+from tests.helpers.runs import cosim, finish, start, wait_during
 
 SERVED = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served"))
 DURATION = {"duration": "400ms"}
@@ -76,83 +74,12 @@ def test_a_simulation_with_external_federates_can_be_copied(served: dict[str, st
     assert len(digests) == 1
 
 
-def cosim(lab: Path, *words: str) -> Run:
-    out, err = io.StringIO(), io.StringIO()
-    with chdir(lab), redirect_stdout(out), redirect_stderr(err):
-        code = main(("cosim", *words))
-    return Run(code, out.getvalue(), err.getvalue())
-
-
-def faulty(folder: Path, role: str, fault: str) -> str:
-    """Return the command of a federate that has a fault after 200 ms of simulated time."""
-    program = folder / f"{role}.py"
-    program.write_text(
-        f"""\
-import os, runpy, signal, time
-from sim_backends.federates import channels, serving
-from sim_backends.network.disc import Disc
-
-Carts = runpy.run_path({str(EXAMPLES / "carts.py")!r})["Carts"]
-
-class Net(Disc):
-    def __init__(self, hello):
-        super().__init__(1e5, 1_000_000)
-
-class Faulty({"Carts" if role == "physics" else "Net"}):
-    def advance(self, to_ns, *rest):
-        if to_ns > 200_000_000:
-            {fault}
-        return super().advance(to_ns, *rest)
-
-serving.serve(Faulty, name="faulty")
-""",
-        encoding="utf-8",
-    )
-    return shlex.join((sys.executable, str(program)))
-
-
-@pytest.mark.parametrize(
-    ("fault", "role", "code", "message"),
-    [
-        ("os.kill(os.getpid(), signal.SIGKILL)", "physics", 1, "it was ended by SIGKILL"),
-        (
-            "os.kill(os.getpid(), signal.SIGSTOP)",
-            "network",
-            3,
-            "has not answered for 6 s: request to advance from 0.2",
-        ),
-        (
-            "channels.StreamChannel.send = lambda self, *_: os.write(self._write_fd, b'garbage' * 9)",
-            "network",
-            1,
-            "with a malformed frame: byte 4: there is no kind of message",
-        ),
-        ("raise ValueError('no wheels')", "physics", 1, "ValueError: no wheels"),
-    ],
-)
-def test_a_fault_ends_the_run_and_its_recording_is_readable(
-    fault: str, role: str, code: int, message: str, tmp_path: Path
-) -> None:
-    began_s = now_s()
-    federate = (f"--{role}", faulty(tmp_path, role, fault))
-    options = (
-        "--duration",
-        "1s",
-        "--policy",
-        "sliding_window",
-        "--window",
-        "10ms",
-        "--deadline",
-        "6s" if code == 3 else "60s",
-    )
-    run = cosim(tmp_path, "run", "convoy", *federate, *options, "--out", "faulty")
-    assert run.code == code, run.err
-    assert f"error: {role} faulty (" in run.err
-    assert message in run.err
-    assert children(began_s) == set()
-    replayed = cosim(tmp_path, "replay", "faulty", "--format", "json")
-    assert replayed.code == 0, replayed.err
-    assert json.loads(replayed.out)["flows"]
+def test_a_federate_that_listens_serves_one_seed_after_another(served: dict[str, str], tmp_path: Path) -> None:
+    options = ("--seeds", "2", "--duration", "200ms", "--format", "json")
+    federates = [word for role, where in served.items() for word in (f"--{role}", where)]
+    external, built_in = (cosim(tmp_path, "run", "convoy", *words, *options) for words in (federates, ()))
+    assert (external.code, built_in.code) == (0, 0), external.err
+    assert json.loads(external.out) == json.loads(built_in.out)
 
 
 def test_a_network_without_next_events_suits_policies_with_windows(tmp_path: Path) -> None:
@@ -188,8 +115,9 @@ def processes_of(program: Path) -> list[int]:
 def test_no_federate_is_left_if_the_run_is_interrupted_or_killed(
     number: signal.Signals, code: int, tmp_path: Path
 ) -> None:
-    command = faulty(tmp_path, "physics", "pass")
-    program = tmp_path / "physics.py"
+    program = tmp_path / "carts.py"
+    program.write_bytes((EXAMPLES / "carts.py").read_bytes())
+    command = shlex.join((sys.executable, str(program)))
     words = ("cosim", "run", "convoy", "--physics", command, "--duration", "10000s", "--out", "run")
     process = start(tmp_path, *words)
     wait_during(process, lambda: any((tmp_path / "run").rglob("*.parquet")))

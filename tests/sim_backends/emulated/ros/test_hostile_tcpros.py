@@ -23,6 +23,7 @@ from sim_backends.emulated.ros import tcpros
 from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.emulated.ros.own_motion import Odometer
 from sim_backends.emulated.ros.sensors import Publication
+from sim_backends.ros1 import framing
 from tests.fuzz.mutate import mutated
 
 GOOD: Final = "/good"
@@ -51,7 +52,7 @@ def stream_of(topic: str, count: int) -> bytes:
         "type": "std_msgs/Float64",
     }
     packets = (struct.pack("<d", number) for number in range(count))
-    return tcpros.pack(tcpros.pack_header(header)) + b"".join(map(tcpros.pack, packets))
+    return framing.pack(framing.pack_header(header)) + b"".join(map(framing.pack, packets))
 
 
 class Publishers:
@@ -157,7 +158,7 @@ def test_a_publisher_survives_hostile_subscribers(tmp_path: Path, monkeypatch: p
         for key, events in selector.select(0):
             key.data(events)
         publication.publish()
-    header = tcpros.PacketSplitter()
+    header = framing.PacketSplitter()
     header.feed(streams[HOSTILE].recv(1 << 16))
     first, *_ = header
-    assert tcpros.unpack_header(first)["topic"] == SENSOR.topic
+    assert framing.unpack_header(first)["topic"] == SENSOR.topic

@@ -18,8 +18,9 @@ from sim_backends.emulated.ros import messages, sensors, tcpros
 from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.emulated.ros.own_motion import Odometer
 from sim_backends.emulated.ros.sensors import Publication, Subscriber
+from sim_backends.ros1 import framing
 
-HEADER: Final = tcpros.pack(b"the header")
+HEADER: Final = framing.pack(b"the header")
 REQUEST: Final = tcpros.request("/test", "/imu")
 IMU: Final = Sensor("/imu", "sensor_msgs/Imu", rate_hz=5.0, frame="imu", points=None)
 
@@ -65,7 +66,7 @@ class Peer:
 
     def output(self) -> list[bytes]:
         """Return all packets that it has sent."""
-        packets = tcpros.PacketSplitter()
+        packets = framing.PacketSplitter()
         self.stream.setblocking(False)
         while True:
             self.serve_all()
@@ -103,7 +104,7 @@ def test_a_subscriber_is_answered_once_its_request_is_complete(peer: Peer) -> No
     assert peer.output() == [b"the header"]
 
 
-@pytest.mark.parametrize("data", [b"\xff\xff\xff\xff", tcpros.pack(tcpros.pack(b"no field")), tcpros.pack(b"x")])
+@pytest.mark.parametrize("data", [b"\xff\xff\xff\xff", framing.pack(framing.pack(b"no field")), framing.pack(b"x")])
 def test_a_subscriber_with_another_protocol_is_disconnected(peer: Peer, data: bytes) -> None:
     peer.stream.send(data)
     peer.serve_all()
@@ -130,11 +131,11 @@ def test_a_slow_subscriber_loses_whole_messages_without_blocking(peer: Peer, mon
     monkeypatch.setattr(sensors, "QUEUE_BYTES", 1 << 16)
     sent = [bytes([number]) * 50_000 for number in range(100)]
     for message in sent:
-        peer.subscriber.send(tcpros.pack(message))
+        peer.subscriber.send(framing.pack(message))
     received = peer.output()
     assert 2 <= len(received) < len(sent)
     assert received == sent[: len(received)]
-    peer.subscriber.send(tcpros.pack(b"again"))
+    peer.subscriber.send(framing.pack(b"again"))
     assert peer.output() == [b"again"]
 
 
@@ -170,10 +171,10 @@ class Topic:
 
 def received(stream: socket.socket) -> list[Any]:
     """Return the connection header, if it is new, and the numbers of the messages received."""
-    packets = tcpros.PacketSplitter()
+    packets = framing.PacketSplitter()
     packets.feed(stream.recv(1 << 20, socket.MSG_DONTWAIT))
     return [
-        tcpros.unpack_header(packet) if b"callerid=" in packet else int.from_bytes(packet[:4], "little")
+        framing.unpack_header(packet) if b"callerid=" in packet else int.from_bytes(packet[:4], "little")
         for packet in packets
     ]
 

@@ -1,0 +1,1 @@
+"""Transports that carry the frames between coordinator and federate; `table` lists them."""

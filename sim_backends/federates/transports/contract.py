@@ -1,0 +1,148 @@
+"""What a transport provides: an address that can connect or listen, and a listener that accepts with a deadline."""
+
+import hmac
+import ipaddress
+import os
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.federates.channels import FrameChannel
+
+TOKEN_VARIABLE: Final = "FIELDKIT_FEDERATE_TOKEN"  # noqa: S105 (the variable's name)
+
+
+class Listener(Protocol):
+    """Accepts one channel after another."""
+
+    def accept(self, deadline_s: float | None) -> FrameChannel:
+        """Return the next channel.
+
+        Args:
+            deadline_s: Time of `time.monotonic` until which to wait; None for no deadline.
+
+        Raises:
+            DeadlineError: No program has connected in time.
+        """
+        ...
+
+
+class Address(Protocol):
+    """An address of a transport. Its text is that of the user.
+
+    Attributes:
+        listens: True if the side that has this address listens, False if it connects; None if the federate listens
+            and the coordinator connects, with the same address on both sides.
+        is_loopback: True if only programs on this machine can use it.
+    """
+
+    @property
+    def listens(self) -> bool | None: ...  # noqa: D102 (see above)
+
+    @property
+    def is_loopback(self) -> bool: ...  # noqa: D102 (see above)
+
+    def connect(self, deadline_s: float) -> FrameChannel:
+        """Return a channel to the program that listens, which may start later.
+
+        Args:
+            deadline_s: Time of `time.monotonic` until which to try.
+
+        Raises:
+            ConfigurationError: The transport cannot be used.
+            DeadlineError: No program listened in time.
+        """
+        ...
+
+    def listen(self) -> AbstractContextManager[Listener]:
+        """Return a listener.
+
+        Raises:
+            ConfigurationError: The address cannot be used.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Transport:
+    """A transport.
+
+    Attributes:
+        forms: Forms of its addresses, which begin with its schemes: `tcp:HOST:PORT`.
+        example: An address.
+        parse: Returns the address of a text that begins with one of its schemes; `ValueError` if it is invalid.
+    """
+
+    forms: Sequence[str]
+    example: str
+    parse: Callable[[str], Address]
+
+
+def read_token(address: Address) -> str:
+    """Return the token of a connection: the value of `TOKEN_VARIABLE`.
+
+    Raises:
+        ConfigurationError: There is none, and other machines can use the address.
+    """
+    value = os.environ.get(TOKEN_VARIABLE, "")
+    if not value and not address.is_loopback:
+        raise ConfigurationError(
+            f"{address} is not on this machine, and there is no token",
+            remedy=f"set {TOKEN_VARIABLE} to the same secret text on both sides",
+        )
+    return value
+
+
+def is_same_token(one: str, other: str) -> bool:
+    """Return True if two tokens are equal, in constant time."""
+    return hmac.compare_digest(one.encode(), other.encode())
+
+
+def is_loopback(host: str) -> bool:
+    """Return True if a host is this machine's loopback address."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+@dataclass(frozen=True)
+class HostAndPort:
+    """An address with a port; `SCHEME-listen` is that of the side that listens.
+
+    Attributes:
+        scheme: Its scheme, without `-listen`.
+        host: Host name or IP address.
+        port: Port.
+        listens: See `Address`.
+    """
+
+    scheme: str
+    host: str
+    port: int
+    listens: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.scheme}{'-listen' if self.listens else ''}:{self.host}:{self.port}"
+
+    @property
+    def is_loopback(self) -> bool:
+        """See `Address`."""
+        return is_loopback(self.host)
+
+
+def split_host_and_port(text: str) -> tuple[str, str, int, bool]:
+    """Return scheme, host, port and `listens` of `SCHEME:HOST:PORT` or `SCHEME-listen:HOST:PORT`.
+
+    Raises:
+        ValueError: Host or port is missing, or the port is not a number.
+    """
+    scheme, _, rest = text.partition(":")
+    host, _, port = rest.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ValueError("host or port is missing")
+    return scheme.removesuffix("-listen"), host.strip("[]"), int(port), scheme.endswith("-listen")

@@ -1,0 +1,147 @@
+"""ROS 1: messages `std_msgs/UInt8MultiArray` on two topics, whose nodes find each other through a ROS master.
+
+The topics are `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`. The environment variables of ROS apply:
+`ROS_MASTER_URI` (http://localhost:11311) and `ROS_IP` or `ROS_HOSTNAME`, the address of this machine for other nodes.
+"""
+
+import os
+import re
+import secrets
+import struct
+import time
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Final
+from urllib.parse import urlsplit
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.federates.channels import ClosedError, DeadlineError
+from sim_backends.federates.transports import samples
+from sim_backends.federates.transports.contract import Listener, Transport, is_loopback
+from sim_backends.ros1.node import MasterError, MessageType, Node
+
+_DEFAULT_MASTER: Final = "http://localhost:11311"
+_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_PATIENCE_S: Final = 60.0
+MESSAGE: Final = MessageType(
+    "std_msgs/UInt8MultiArray",
+    "82373f1612381bb6ee473b5cd6f5d89c",
+    "MultiArrayLayout layout\nuint8[] data\n"
+    "================================================================================\n"
+    "MSG: std_msgs/MultiArrayLayout\nMultiArrayDimension[] dim\nuint32 data_offset\n"
+    "================================================================================\n"
+    "MSG: std_msgs/MultiArrayDimension\nstring label\nuint32 size\nuint32 stride\n",
+)
+_MESSAGE_HEAD: Final = struct.Struct("<III")
+"""No dimensions, no offset, and the number of bytes."""
+
+
+class Ros1Bus:
+    """A node with a publisher and a subscriber.
+
+    Args:
+        address: The address.
+        reads: Topic to subscribe to, `requests` or `answers`.
+        writes: Topic to publish.
+        deadline_s: Time of `time.monotonic` until which to wait for the master.
+
+    Raises:
+        ConfigurationError: No port can be opened, or the master refuses the node.
+        DeadlineError: No master answers.
+    """
+
+    def __init__(self, address: "Ros1Address", reads: str, writes: str, deadline_s: float) -> None:
+        name = f"/fieldkit/{address.name}_{writes}_{secrets.token_hex(4)}"
+        prefix = f"/fieldkit/{address.name}"
+        try:
+            self._node = Node(name, address.master, address.host)
+        except OSError as error:
+            raise ConfigurationError(f"{address} cannot be used: {error}", remedy="check ROS_IP") from error
+        try:
+            self._publisher = self._node.publish(f"{prefix}/{writes}", MESSAGE, deadline_s)
+            self._subscriber = self._node.subscribe(f"{prefix}/{reads}", MESSAGE, deadline_s)
+        except TimeoutError as error:
+            self._node.close()
+            raise DeadlineError(str(error)) from error
+        except MasterError as error:
+            self._node.close()
+            raise ConfigurationError(f"{address} cannot be used: {error}", remedy="check the ROS master") from error
+
+    def write(self, sample: bytes, deadline_s: float | None) -> None:
+        """Implement `SampleBus.write`."""
+        try:
+            count = self._publisher.publish(_MESSAGE_HEAD.pack(0, 0, len(sample)) + sample, deadline_s)
+        except TimeoutError as error:
+            raise DeadlineError("the wait reached its deadline") from error
+        if not count:
+            raise ClosedError("the connection was closed")
+
+    def take(self, deadline_s: float | None) -> bytes:
+        """Implement `SampleBus.take`; messages with another layout are ignored."""
+        while True:
+            try:
+                message = self._subscriber.take(deadline_s)
+            except TimeoutError as error:
+                raise DeadlineError("the wait reached its deadline") from error
+            if len(message) >= _MESSAGE_HEAD.size:
+                dimensions, offset, size = _MESSAGE_HEAD.unpack_from(message)
+                if (dimensions, offset, size) == (0, 0, len(message) - _MESSAGE_HEAD.size):
+                    return message[_MESSAGE_HEAD.size :]
+
+    def has_peer(self) -> bool:
+        """Implement `SampleBus.has_peer`."""
+        return self._publisher.connections > 0 and self._subscriber.connections > 0
+
+    def close(self) -> None:
+        """Implement `SampleBus.close`."""
+        self._node.close()
+
+
+@dataclass(frozen=True)
+class Ros1Address:
+    """Name of a federate, master and own address.
+
+    Attributes:
+        name: Its name.
+        master: URI of the master.
+        host: Address of this machine for other nodes; empty for the one from which the master is reached.
+        listens: See `Address`.
+    """
+
+    name: str
+    master: str = field(default_factory=lambda: os.environ.get("ROS_MASTER_URI", _DEFAULT_MASTER))
+    host: str = field(default_factory=lambda: os.environ.get("ROS_IP") or os.environ.get("ROS_HOSTNAME", ""))
+    listens: None = None
+
+    def __str__(self) -> str:
+        return f"ros1:{self.name} ({self.master})"
+
+    @property
+    def is_loopback(self) -> bool:
+        """See `Address`."""
+        return is_loopback(urlsplit(self.master).hostname or "") and (not self.host or is_loopback(self.host))
+
+    def connect(self, deadline_s: float) -> samples.SampleChannel:
+        """Implement `Address.connect`."""
+        bus = Ros1Bus(self, reads="answers", writes="requests", deadline_s=deadline_s)
+        return samples.connected_channel(bus, self, deadline_s)
+
+    def listen(self) -> AbstractContextManager[Listener]:
+        """Implement `Address.listen`; the master may start later."""
+        deadline_s = time.monotonic() + _PATIENCE_S
+        return samples.listening(lambda: Ros1Bus(self, reads="requests", writes="answers", deadline_s=deadline_s))
+
+
+def parse(text: str) -> Ros1Address:
+    """Return the address of `ros1:NAME`.
+
+    Raises:
+        ValueError: The name is invalid.
+    """
+    name = text.partition(":")[2]
+    if not _NAME.fullmatch(name):
+        raise ValueError(f"{name!r} is not a name of letters, digits and underscores")
+    return Ros1Address(name)
+
+
+TRANSPORT: Final = Transport(("ros1:NAME",), "ros1:carts", parse)

@@ -1,0 +1,183 @@
+"""Channels over a bus of samples, such as a pair of topics: each sample has a run's number and one frame.
+
+The federate reads one topic and writes the other, the coordinator the reverse. The coordinator draws the number of
+the run, and begins with `hello`. A sample without a frame ends the run.
+"""
+
+import secrets
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from typing import Final, Protocol
+
+from sim_backends.federates.channels import ClosedError, DeadlineError
+from sim_backends.federates.frames import (
+    HEADER_BYTES,
+    MAX_FRAME_BYTES,
+    MalformedFrameError,
+    MessageKind,
+    ProtocolFrame,
+    read_header,
+)
+from sim_backends.federates.transports.contract import Listener
+
+_RUN: Final = struct.Struct("<Q")
+_KIND_OFFSET: Final = _RUN.size + 4
+_CHECK_S: Final = 0.5
+"""Interval at which a channel that waits checks that the other side exists."""
+_MAX_WAITING: Final = 16
+_POLL_S: Final = 0.01
+
+
+class SampleBus(Protocol):
+    """Reads samples from one topic and writes samples to another."""
+
+    def write(self, sample: bytes, deadline_s: float | None) -> None:
+        """Write a sample.
+
+        Raises:
+            ClosedError: There is no reader.
+            DeadlineError: It was not accepted in time.
+        """
+        ...
+
+    def take(self, deadline_s: float | None) -> bytes:
+        """Return the next sample.
+
+        Raises:
+            DeadlineError: There was none in time.
+        """
+        ...
+
+    def has_peer(self) -> bool:
+        """Return True if the other side reads and writes now."""
+        ...
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+class SampleChannel:
+    """A channel over a bus.
+
+    Args:
+        bus: The bus.
+        run: Number of the run.
+        first: The first sample, if it was received already.
+        owns_bus: True if `close` must close the bus.
+    """
+
+    def __init__(self, bus: SampleBus, run: int, *, first: bytes = b"", owns_bus: bool = False) -> None:
+        self._bus = bus
+        self._run = _RUN.pack(run)
+        self._first = first
+        self._owns_bus = owns_bus
+        self._is_closed = self._is_closed_by_peer = False
+        self.other_hellos: deque[bytes] = deque(maxlen=_MAX_WAITING)
+
+    def send(self, frame: bytes, deadline_s: float | None) -> None:
+        """Implement `FrameChannel.send`."""
+        if self._is_closed_by_peer:
+            raise ClosedError("the connection was closed")
+        self._bus.write(self._run + frame, deadline_s)
+
+    def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> ProtocolFrame:
+        """Implement `FrameChannel.receive`."""
+        sample = self._next_sample(deadline_s)
+        body_at = _RUN.size + HEADER_BYTES
+        if len(sample) < body_at:
+            raise MalformedFrameError(len(sample) - _RUN.size, "the sample ends within a header")
+        header = read_header(sample[_RUN.size : body_at], max_bytes)
+        if len(sample) != body_at + header.size:
+            raise MalformedFrameError(0, f"a sample with {len(sample) - body_at} bytes, not {header.size}")
+        return ProtocolFrame(header, sample[body_at:])
+
+    def _next_sample(self, deadline_s: float | None) -> bytes:
+        if self._first:
+            first, self._first = self._first, b""
+            return first
+        while not self._is_closed and not self._is_closed_by_peer:
+            check_s = time.monotonic() + _CHECK_S
+            try:
+                sample = self._bus.take(check_s if deadline_s is None else min(check_s, deadline_s))
+            except DeadlineError:
+                if deadline_s is not None and time.monotonic() >= deadline_s:
+                    raise
+                if not self._bus.has_peer():
+                    break
+                continue
+            if sample.startswith(self._run):
+                if len(sample) > _RUN.size:
+                    return sample
+                self._is_closed_by_peer = True
+            elif _is_hello(sample):
+                self.other_hellos.append(sample)
+        raise ClosedError("the connection was closed")
+
+    def close(self) -> None:
+        """Implement `FrameChannel.close`."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        with suppress(ClosedError, DeadlineError):
+            self._bus.write(self._run, time.monotonic() + _CHECK_S)
+        if self._owns_bus:
+            self._bus.close()
+
+
+def _is_hello(sample: bytes) -> bool:
+    return sample[_KIND_OFFSET : _KIND_OFFSET + 2] == int(MessageKind.HELLO).to_bytes(2, "little")
+
+
+class SampleListener:
+    """Accepts runs in the order of their `hello`; one that comes during another run waits.
+
+    Args:
+        bus: The bus.
+    """
+
+    def __init__(self, bus: SampleBus) -> None:
+        self._bus = bus
+        self._waiting: deque[bytes] = deque(maxlen=_MAX_WAITING)
+
+    def accept(self, deadline_s: float | None) -> SampleChannel:
+        """Implement `Listener.accept`."""
+        while not self._waiting:
+            sample = self._bus.take(deadline_s)
+            if _is_hello(sample):
+                self._waiting.append(sample)
+        first = self._waiting.popleft()
+        channel = SampleChannel(self._bus, _RUN.unpack_from(first)[0], first=first)
+        channel.other_hellos = self._waiting
+        return channel
+
+
+def connected_channel(bus: SampleBus, address: object, deadline_s: float) -> SampleChannel:
+    """Return the channel of a new run, as soon as a federate reads and writes.
+
+    Raises:
+        DeadlineError: There was none in time.
+    """
+    while not bus.has_peer():
+        if time.monotonic() >= deadline_s:
+            bus.close()
+            raise DeadlineError(f"no federate has been discovered at {address}")
+        time.sleep(_POLL_S)
+    return SampleChannel(bus, secrets.randbits(64), owns_bus=True)
+
+
+def listening(make_bus: Callable[[], SampleBus]) -> AbstractContextManager[Listener]:
+    """Return a listener on a bus, which is closed afterwards."""
+
+    @contextmanager
+    def listen() -> Iterator[SampleListener]:
+        bus = make_bus()
+        try:
+            yield SampleListener(bus)
+        finally:
+            bus.close()
+
+    return listen()

@@ -1,0 +1,406 @@
+"""A ROS 1 node that publishes and subscribes to serialized messages, without ROS's libraries.
+
+Sources: wiki.ros.org/ROS/Master_API, wiki.ros.org/ROS/Slave_API, wiki.ros.org/ROS/TCPROS.
+"""
+
+import http.client
+import os
+import queue
+import select
+import socket
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final
+from urllib.parse import urlsplit
+from xmlrpc.client import Error as XmlRpcError
+from xmlrpc.client import ServerProxy, Transport
+from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
+
+from sim_backends.ros1.framing import PacketSplitter, pack, pack_header, unpack_header
+
+_SUCCESS: Final = 1
+_CALL_S: Final = 5.0
+_RETRY_S: Final = 0.1
+_CHUNK: Final = 1 << 16
+
+
+class MasterError(ConnectionError):
+    """A master or node refused a call."""
+
+
+@dataclass(frozen=True)
+class MessageType:
+    """A message type.
+
+    Attributes:
+        name: Its name, `package/Name`.
+        md5: MD5 sum of its definition.
+        definition: Its definition with those of all nested types.
+    """
+
+    name: str
+    md5: str
+    definition: str
+
+
+class _TimedTransport(Transport):
+    """Calls of XML-RPC with a time limit."""
+
+    def make_connection(self, host: Any) -> http.client.HTTPConnection:  # noqa: ANN401 (of the base class)
+        connection = super().make_connection(host)
+        connection.timeout = _CALL_S
+        return connection
+
+
+class _Requests(SimpleXMLRPCRequestHandler):
+    rpc_paths = ("/", "/RPC2")
+    timeout = _CALL_S
+
+
+class _Server(SimpleXMLRPCServer):
+    """The XML-RPC server of a node; each call has a thread, so that one that is slow delays no other."""
+
+    def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 (of the base class)
+        threading.Thread(target=self._process, args=(request, client_address), daemon=True).start()
+
+    def _process(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 (of the base class)
+        with suppress(OSError, ValueError):
+            self.finish_request(request, client_address)
+        self.shutdown_request(request)
+
+
+def call(uri: str, method: str, *arguments: object) -> Any:  # noqa: ANN401 (a value of XML-RPC)
+    """Return the value of a call of a master or node.
+
+    Raises:
+        OSError: It cannot be reached.
+        MasterError: It refused the call, or its answer is not one of ROS.
+    """
+    try:
+        answer = getattr(ServerProxy(uri, transport=_TimedTransport()), method)(*arguments)
+        status, message, value = answer
+    except (XmlRpcError, http.client.HTTPException, TypeError, ValueError) as error:
+        raise MasterError(f"{uri} gave no valid answer to {method}: {error}") from error
+    if status != _SUCCESS:
+        raise MasterError(f"{uri} refused {method}: {message}")
+    return value
+
+
+class Publisher:
+    """A publisher of a topic.
+
+    Args:
+        topic: The topic.
+        kind: Its type.
+        caller: Name of the node.
+    """
+
+    def __init__(self, topic: str, kind: MessageType, caller: str) -> None:
+        self._kind = kind
+        self._header = {
+            "callerid": caller,
+            "latching": "0",
+            "md5sum": kind.md5,
+            "message_definition": kind.definition,
+            "topic": topic,
+            "type": kind.name,
+        }
+        self._lock = threading.Lock()
+        self._streams: list[socket.socket] = []
+
+    @property
+    def connections(self) -> int:
+        """Number of connected subscribers."""
+        return len(self._streams)
+
+    def accept(self, stream: socket.socket, header: Mapping[str, str]) -> None:
+        """Answer the connection header of a subscriber, and send it the messages from now on.
+
+        Raises:
+            ValueError: The subscriber expects another type.
+        """
+        if header.get("md5sum") not in {"*", self._kind.md5}:
+            raise ValueError(f"the type of {header.get('topic')} is {self._kind.name}, not {header.get('type')}")
+        stream.sendall(pack(pack_header(self._header)))
+        with self._lock:
+            self._streams.append(stream)
+        # Subscribers send nothing more, so that the end of the stream is all that can be read.
+        ended = select.poll()
+        ended.register(stream, select.POLLIN)
+        ended.poll()
+        self._disconnect(stream)
+
+    def publish(self, message: bytes, deadline_s: float | None) -> int:
+        """Send a message to all subscribers, and return their number; one that does not read in time is disconnected.
+
+        Raises:
+            TimeoutError: All of them were disconnected for this reason.
+        """
+        packet = pack(message)
+        sent, was_late = 0, False
+        for stream in tuple(self._streams):
+            try:
+                stream.settimeout(None if deadline_s is None else max(deadline_s - time.monotonic(), 0.001))
+                stream.sendall(packet)
+                sent += 1
+            except OSError as error:
+                was_late |= isinstance(error, TimeoutError)
+                self._disconnect(stream)
+        if was_late and not sent:
+            raise TimeoutError("the subscriber does not read")
+        return sent
+
+    def _disconnect(self, stream: socket.socket) -> None:
+        """Stop sending to a subscriber; the thread of `accept` closes its socket."""
+        with self._lock, suppress(ValueError):
+            self._streams.remove(stream)
+        with suppress(OSError):
+            stream.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Disconnect all subscribers."""
+        for stream in tuple(self._streams):
+            self._disconnect(stream)
+
+
+class Subscriber:
+    """A subscriber to a topic, which connects to each of its publishers.
+
+    Args:
+        topic: The topic.
+        kind: Its type.
+        caller: Name of the node.
+    """
+
+    def __init__(self, topic: str, kind: MessageType, caller: str) -> None:
+        self._topic = topic
+        self._kind = kind
+        self._caller = caller
+        self._messages: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._publishers: set[str] = set()
+        self._streams: list[socket.socket] = []
+        self._is_closed = False
+
+    @property
+    def connections(self) -> int:
+        """Number of connected publishers."""
+        return len(self._streams)
+
+    def update(self, publishers: Sequence[str]) -> None:
+        """Connect to the publishers, given by their URIs, that are new."""
+        with self._lock:
+            new, self._publishers = set(publishers) - self._publishers, set(publishers)
+        for uri in new:
+            threading.Thread(target=self._receive, args=(uri,), daemon=True).start()
+
+    def take(self, deadline_s: float | None) -> bytes:
+        """Return the next message.
+
+        Raises:
+            TimeoutError: There was none in time.
+        """
+        try:
+            return self._messages.get(timeout=None if deadline_s is None else max(deadline_s - time.monotonic(), 0))
+        except queue.Empty:
+            raise TimeoutError(f"no message on {self._topic}") from None
+
+    def _receive(self, uri: str) -> None:
+        """Receive the messages of a publisher until it ends; nothing happens if it does not exist any more."""
+        with suppress(OSError, ValueError):
+            protocol = call(uri, "requestTopic", self._caller, self._topic, [["TCPROS"]])
+            _, host, port = protocol
+            with socket.create_connection((host, port), timeout=_CALL_S) as stream:
+                self._read(stream)
+        with self._lock:
+            self._publishers.discard(uri)
+
+    def _read(self, stream: socket.socket) -> None:
+        """Exchange headers, then store each message.
+
+        Raises:
+            OSError: The connection failed.
+            ValueError: The publisher violates TCPROS, or has another type.
+        """
+        stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        fields = {
+            "callerid": self._caller,
+            "md5sum": self._kind.md5,
+            "message_definition": self._kind.definition,
+            "tcp_nodelay": "1",
+            "topic": self._topic,
+            "type": self._kind.name,
+        }
+        stream.sendall(pack(pack_header(fields)))
+        packets, has_header = PacketSplitter(), False
+        try:
+            while data := stream.recv(_CHUNK):
+                packets.feed(data)
+                for packet in packets:
+                    if has_header:
+                        self._messages.put(packet)
+                    elif unpack_header(packet).get("md5sum") != self._kind.md5:
+                        return
+                    else:
+                        has_header = True
+                        stream.settimeout(None)
+                        self._add(stream)
+        finally:
+            with self._lock, suppress(ValueError):
+                self._streams.remove(stream)
+
+    def _add(self, stream: socket.socket) -> None:
+        with self._lock:
+            self._streams.append(stream)
+        if self._is_closed:
+            stream.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Disconnect from all publishers."""
+        self._is_closed = True
+        with self._lock:
+            streams = tuple(self._streams)
+        for stream in streams:
+            with suppress(OSError):
+                stream.shutdown(socket.SHUT_RDWR)
+
+
+class Node:
+    """A node.
+
+    Args:
+        name: Its name.
+        master: URI of the master.
+        host: Address or name of this machine for other nodes; empty for the address from which the master is reached.
+
+    Raises:
+        OSError: The address cannot be used.
+    """
+
+    def __init__(self, name: str, master: str, host: str = "") -> None:
+        self._name = name
+        self._master = master
+        self._host = host or _address_towards(master)
+        self._publishers: dict[str, Publisher] = {}
+        self._subscribers: dict[str, Subscriber] = {}
+        self._is_closed = False
+        self._stream_server = socket.create_server((self._host, 0))
+        try:
+            self._server = _Server((self._host, 0), _Requests, logRequests=False, allow_none=True)
+        except OSError:
+            self._stream_server.close()
+            raise
+        self._uri = f"http://{self._host}:{self._server.server_address[1]}/"
+        self._server.register_function(self._request_topic, "requestTopic")
+        self._server.register_function(self._publisher_update, "publisherUpdate")
+        self._server.register_function(self._get_pid, "getPid")
+        threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def publish(self, topic: str, kind: MessageType, deadline_s: float) -> Publisher:
+        """Return a publisher of a topic.
+
+        Args:
+            topic: The topic.
+            kind: Its type.
+            deadline_s: Time of `time.monotonic` until which to wait for the master.
+
+        Raises:
+            TimeoutError: No master answers.
+            MasterError: The master refuses the publisher.
+        """
+        publisher = self._publishers[topic] = Publisher(topic, kind, self._name)
+        self._register("registerPublisher", topic, kind, deadline_s)
+        return publisher
+
+    def subscribe(self, topic: str, kind: MessageType, deadline_s: float) -> Subscriber:
+        """Return a subscriber to a topic; arguments and errors as for `publish`."""
+        subscriber = self._subscribers[topic] = Subscriber(topic, kind, self._name)
+        subscriber.update(self._register("registerSubscriber", topic, kind, deadline_s))
+        return subscriber
+
+    def _register(self, method: str, topic: str, kind: MessageType, deadline_s: float) -> list[str]:
+        while True:
+            try:
+                uris = call(self._master, method, self._name, topic, kind.name, self._uri)
+            except MasterError:
+                raise
+            except OSError as error:
+                if time.monotonic() + _RETRY_S >= deadline_s:
+                    raise TimeoutError(f"no ROS master answers at {self._master}: {error}") from error
+                time.sleep(_RETRY_S)
+                continue
+            return [str(uri) for uri in uris]
+
+    def _accept(self) -> None:
+        while not self._is_closed:
+            try:
+                stream, _ = self._stream_server.accept()
+            except OSError:
+                return
+            threading.Thread(target=self._serve, args=(stream,), daemon=True).start()
+
+    def _serve(self, stream: socket.socket) -> None:
+        """Send messages to a subscriber; one that violates TCPROS is disconnected."""
+        with stream, suppress(OSError, ValueError):
+            stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            stream.settimeout(_CALL_S)
+            packets = PacketSplitter()
+            while data := stream.recv(_CHUNK):
+                packets.feed(data)
+                for packet in packets:
+                    header = unpack_header(packet)
+                    publisher = self._publishers.get(header.get("topic", ""))
+                    if publisher is not None:
+                        publisher.accept(stream, header)
+                    return
+
+    def _request_topic(self, _caller: str, topic: str, protocols: Sequence[Any]) -> list[Any]:
+        if topic not in self._publishers or not any(protocol[:1] == ["TCPROS"] for protocol in protocols):
+            return [0, f"{topic} is not published here by TCPROS", 0]
+        return [_SUCCESS, "", ["TCPROS", self._host, self._stream_server.getsockname()[1]]]
+
+    def _publisher_update(self, _caller: str, topic: str, publishers: Sequence[str]) -> list[Any]:
+        if topic in self._subscribers:
+            self._subscribers[topic].update(publishers)
+        return [_SUCCESS, "", 0]
+
+    def _get_pid(self, _caller: str) -> list[Any]:
+        return [_SUCCESS, "", os.getpid()]
+
+    def close(self) -> None:
+        """Unregister the node and close its connections."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        for method, topics in (
+            ("unregisterPublisher", tuple(self._publishers)),
+            ("unregisterSubscriber", tuple(self._subscribers)),
+        ):
+            for topic in topics:
+                with suppress(OSError):
+                    call(self._master, method, self._name, topic, self._uri)
+        for publisher in self._publishers.values():
+            publisher.close()
+        for subscriber in self._subscribers.values():
+            subscriber.close()
+        self._server.shutdown()
+        self._server.server_close()
+        with suppress(OSError):
+            self._stream_server.shutdown(socket.SHUT_RDWR)  # ends the wait of `accept`
+        self._stream_server.close()
+
+
+def _address_towards(uri: str) -> str:
+    """Return the address of this machine from which a URI is reached.
+
+    Raises:
+        OSError: It cannot be reached.
+    """
+    parts = urlsplit(uri)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect((parts.hostname, parts.port or 80))
+        return str(probe.getsockname()[0])

@@ -1,0 +1,60 @@
+"""Addresses of all transports on this machine, and the ROS master that one of them needs."""
+
+import os
+import secrets
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Final
+
+import pytest
+
+SCHEMES: Final = ("tcp", "udp", "dds", "ros1")
+
+
+def free_port() -> int:
+    """Return a port that no program uses."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def new_addresses(scheme: str) -> tuple[str, str]:
+    """Return an unused address of a transport, as of the federate that listens and as of the coordinator."""
+    if scheme in {"dds", "ros1"}:
+        address = f"{scheme}:test_{secrets.token_hex(4)}"
+        return address, address
+    port = free_port()
+    return f"{scheme}-listen:127.0.0.1:{port}", f"{scheme}:127.0.0.1:{port}"
+
+
+@contextmanager
+def ros_master() -> Iterator[None]:
+    """Run a ROS master, and let `ROS_MASTER_URI` name it."""
+    port = free_port()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{port}")
+        patch.setenv("ROS_IP", "127.0.0.1")
+        environment = os.environ | {"ROS_LOG_DIR": "/tmp"}
+        process = subprocess.Popen(
+            ("rosmaster", "--core", "-p", str(port)),
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        try:
+            _wait_for_port(process, port)
+            yield
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def _wait_for_port(process: "subprocess.Popen[bytes]", port: int) -> None:
+    deadline_s = time.monotonic() + 60
+    while time.monotonic() < deadline_s and process.poll() is None:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
+            return
+        time.sleep(0.01)
+    raise AssertionError("rosmaster does not listen")

@@ -1,0 +1,241 @@
+"""The UDP transport: lost, repeated and reordered datagrams, and those of programs without a cookie."""
+
+import random
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from typing import Any
+
+import pytest
+
+from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
+from sim_backends.federates.frames import MessageKind, encode
+from sim_backends.federates.transports import datagrams
+from sim_backends.federates.transports.datagrams import (
+    DATAGRAM_HEADER_BYTES,
+    MAX_DATAGRAM_BYTES,
+    DatagramHeader,
+    DatagramKind,
+    RetransmissionTimer,
+    pack_datagram,
+    unpack_datagram,
+)
+from sim_backends.federates.transports.udp import UdpAddress
+from tests.helpers.federate_transports import free_port
+
+Forward = Callable[[bytes, bool], list[bytes]]
+"""Returns the datagrams that the network delivers when it receives one; the flag is the direction."""
+
+
+def after_s(duration_s: float) -> float:
+    return time.monotonic() + duration_s
+
+
+class Network:
+    """A UDP relay between the two sides of a connection.
+
+    Args:
+        server: Port of the side that listens.
+        forward: Changes the stream of datagrams.
+    """
+
+    def __init__(self, server: int, forward: Forward) -> None:
+        self.forward = forward
+        self.count = 0
+        self._near, self._far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        self._near.bind(("127.0.0.1", 0))
+        self._far.connect(("127.0.0.1", server))
+        self.port = self._near.getsockname()[1]
+        self._client: Any = None
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stopped.is_set():
+            for side in select.select([self._near, self._far], [], [], 0.05)[0]:
+                with suppress(OSError):
+                    datagram, peer = side.recvfrom(65536)
+                    self.count += 1
+                    if side is self._near:
+                        self._client = peer
+                    for forwarded in self.forward(datagram, side is self._near):
+                        if side is self._near:
+                            self._far.send(forwarded)
+                        else:
+                            self._near.sendto(forwarded, self._client)
+
+    def stop(self) -> None:
+        self._stopped.set()
+        self._thread.join()
+        self._near.close()
+        self._far.close()
+
+
+def unchanged(datagram: bytes, _: bool) -> list[bytes]:
+    return [datagram]
+
+
+def lossy(seed: int) -> Forward:
+    """Return a network that loses 20 % of the datagrams, repeats 10 %, and delays 10 % until after the next one."""
+    draws = random.Random(seed)
+    delayed_by_direction: dict[bool, list[bytes]] = {True: [], False: []}
+
+    def forward(datagram: bytes, is_to_server: bool) -> list[bytes]:
+        draw, delayed = draws.random(), delayed_by_direction[is_to_server]
+        if draw < 0.2:
+            return []
+        if draw < 0.3:
+            delayed.append(datagram)
+            return []
+        late = tuple(delayed)
+        delayed.clear()
+        return [datagram] * (2 if draw < 0.4 else 1) + list(late)
+
+    return forward
+
+
+@contextmanager
+def connected(forward: Forward) -> Iterator[tuple[FrameChannel, FrameChannel, Network]]:
+    """Yield both channels of a connection: of the side that connected, of the side that listened; and the network."""
+    port = free_port()
+    network = Network(port, forward)
+    hello = encode(MessageKind.PING, 0, 0, b"8 bytes.")
+    try:
+        with UdpAddress("udp", "127.0.0.1", port, listens=True).listen() as listener:
+            accepted: list[FrameChannel] = []
+            thread = threading.Thread(target=lambda: accepted.append(listener.accept(after_s(30))), daemon=True)
+            thread.start()
+            near = UdpAddress("udp", "127.0.0.1", network.port).connect(after_s(30))
+            near.send(hello, after_s(30))
+            while thread.is_alive():
+                with suppress(DeadlineError):
+                    near.receive(after_s(0.05))
+            with closing(near), closing(accepted[0]) as far:
+                assert far.receive(after_s(30)).body == b"8 bytes."
+                yield near, far, network
+    finally:
+        network.stop()
+
+
+def exchange(near: FrameChannel, far: FrameChannel, bodies: list[bytes]) -> None:
+    """Send each body from both sides, as request and answer."""
+
+    def answer() -> None:
+        for body in bodies:
+            assert far.receive(after_s(60)).body == body
+            far.send(encode(MessageKind.STATES, 1, 0, body), after_s(60))
+        with suppress(ClosedError):
+            far.receive(after_s(60))  # the last answer is resent until it is acknowledged
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    for body in bodies:
+        near.send(encode(MessageKind.PING, 1, 0, body), after_s(60))
+        assert near.receive(after_s(60)).body == body
+    near.close()
+    thread.join(60)
+    assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_lost_repeated_and_reordered_datagrams_change_nothing(seed: int) -> None:
+    draws = random.Random(seed)
+    bodies = [draws.randbytes(draws.choice((0, 8, 700, 1160, 5000))) for _ in range(40)]
+    bodies += [draws.randbytes(100_000)]  # more than the window
+    with connected(lossy(seed)) as (near, far, network):
+        exchange(near, far, bodies)
+        assert network.count > 2 * len(bodies)
+
+
+def test_an_answer_acknowledges_the_request_so_that_an_exchange_has_two_datagrams() -> None:
+    with connected(unchanged) as (near, far, network):
+        near._timer.interval_s = far._timer.interval_s = 10.0  # type: ignore[attr-defined]
+        before = network.count
+        exchange(near, far, [bytes(700)] * 20)
+        assert network.count - before <= 40 + 6
+
+
+def test_datagrams_of_other_programs_are_ignored() -> None:
+    with connected(unchanged) as (near, far, network):
+        header = DatagramHeader(DatagramKind.DATA, near._identity[0], 12345, near._number)  # type: ignore[attr-defined]
+        forged = [pack_datagram(header, b"forged"), b"", b"garbage" * 20, pack_datagram(header)[:30]]
+        close = DatagramHeader(DatagramKind.CLOSE, near._identity[0], 0, near._number)  # type: ignore[attr-defined]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            for datagram in (*forged, pack_datagram(close)):
+                other.sendto(datagram, ("127.0.0.1", network.port))
+                other.sendto(datagram, far._socket.getsockname())  # type: ignore[attr-defined]
+        network._client = near._socket.getsockname()  # type: ignore[attr-defined]
+        exchange(near, far, [b"8 bytes."])
+
+
+def test_only_a_program_that_returns_the_cookie_of_its_address_is_accepted() -> None:
+    port = free_port()
+    with (
+        UdpAddress("udp", "127.0.0.1", port, listens=True).listen() as listener,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as forger,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
+        for endpoint in (forger, other):
+            endpoint.connect(("127.0.0.1", port))
+            endpoint.settimeout(20)
+        forger.send(pack_datagram(DatagramHeader(DatagramKind.OPEN, 7)))
+        with pytest.raises(DeadlineError, match="no program has connected"):
+            listener.accept(after_s(0.05))
+        cookie = unpack_datagram(forger.recv(2000))
+        assert cookie is not None
+        assert (cookie.kind, cookie.connection) == (DatagramKind.COOKIE, 7)
+        data = pack_datagram(DatagramHeader(DatagramKind.DATA, 7, cookie.cookie))
+        other.send(data)  # the cookie of another address
+        forger.send(pack_datagram(DatagramHeader(DatagramKind.DATA, 7, cookie.cookie ^ 1)))
+        with pytest.raises(DeadlineError):
+            listener.accept(after_s(0.05))
+        forger.send(data)
+        listener.accept(after_s(20)).close()
+
+
+def test_the_other_process_has_exited_or_closed() -> None:
+    with connected(unchanged) as (near, far, _):
+        far.close()
+        with pytest.raises(ClosedError):
+            near.receive(after_s(20))
+
+
+def test_a_process_that_exits_is_noticed_by_the_refusal_of_its_machine() -> None:
+    own, peer = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    peer.bind(("127.0.0.1", 0))
+    own.connect(peer.getsockname())
+    peer.close()
+    channel = datagrams.DatagramChannel(own, 1, 2)
+    with pytest.raises(ClosedError, match="the connection was closed"):
+        channel.receive(after_s(20))
+    channel.close()
+
+
+def test_the_timer_follows_rfc_6298() -> None:
+    timer = RetransmissionTimer()
+    timer.add_round_trip(0.1)
+    assert timer.interval_s == pytest.approx(0.1 + 4 * 0.05)
+    timer.add_round_trip(0.2)
+    variation_s = 0.05 * 3 / 4 + 0.1 / 4
+    assert timer.interval_s == pytest.approx(0.1 * 7 / 8 + 0.2 / 8 + 4 * variation_s)
+    for _ in range(10):
+        timer.back_off()
+    assert timer.interval_s == 2.0
+    for _ in range(100):
+        timer.add_round_trip(1e-5)
+    assert timer.interval_s == 0.02
+
+
+def test_the_layout_by_hand() -> None:
+    frame = encode(MessageKind.BYE, 0, 0)
+    datagram = pack_datagram(DatagramHeader(DatagramKind.DATA, 1, 2, 3, 4), frame)
+    assert datagram == b"FKUD" + struct.pack("<BBHQQQQ", 1, 3, 0, 1, 2, 3, 4) + frame
+    assert unpack_datagram(datagram) == (3, 1, 2, 3, 4)
+    assert datagrams._DATA_BYTES + DATAGRAM_HEADER_BYTES == MAX_DATAGRAM_BYTES == 1200
+    assert unpack_datagram(datagram[:39]) is None
+    assert unpack_datagram(b"FKUD" + struct.pack("<BBHQQQQ", 2, 3, 0, 1, 2, 3, 4)) is None
