@@ -12,13 +12,13 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Field, Int, Number, Strict
 from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
-from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.steps.capabilities import DescribesActions, HasRefusals, Moves, Pings, SendsFile
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Pinging, Planned, PutProgram, Refusal, Scene
 from fieldkit.steps.variants import Variants
+from fieldkit.trial import step_errors
 from fieldkit.trial.columns import of_steps, trial_columns
 from fieldkit.trial.frozen import Columns
 from fieldkit.trial.procedure import Procedure, Repeats
@@ -109,15 +109,9 @@ class Plan(Strict):
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         """Yield every job of one attempt in the order of their starts."""
         for entry in self.procedure.steps:
-            try:
-                yield from entry.step.jobs(scene)
-            except FieldkitError:
-                raise
-            except Exception as error:
-                raise ConfigurationError(
-                    f"the commands of the step {entry.kind} cannot be derived: {describe_exception(error)}",
-                    remedy="report it to the author of the step",
-                ) from error
+            with step_errors.before_trial(f"the commands of the step {entry.kind} cannot be derived"):
+                planned_jobs = tuple(entry.step.jobs(scene))
+            yield from planned_jobs
 
     def program_copies(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""

@@ -27,11 +27,11 @@ from fieldkit.measure.evidence import link_samples, oracle_delays, track
 from fieldkit.remote import evidence, fetching, jobs, programs
 from fieldkit.remote.fetching import FetchProgress, LateJobError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
-from fieldkit.trial import hosts, size
+from fieldkit.trial import hosts, size, step_errors
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.owners import FileOwners
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import locks, step_errors
+from fieldkit.trial.running import locks
 
 T = TypeVar("T")
 
@@ -124,7 +124,7 @@ class Robots:
             for section in self._plan.procedure.sections.values():
                 stack.enter_context(section.around_steps(self._plan, scene, self.shells))
             for entry in self._plan.procedure.steps:
-                with step_errors.reported(entry.kind, scene.laptop_folder):
+                with step_errors.during_attempt(entry.kind):
                     entry.step.run(scene, self._testbed, announce)
 
     @contextmanager
