@@ -85,7 +85,7 @@ class FlightGuard:
             self._exchange()
         self._first_mode = self._drone.mode if self._drone.armed else None
         for kind in (HEARTBEAT, LOCAL_POSITION_NED):
-            self._drone.request_stream(kind, RATE_HZ)
+            self._drone.commands.request_stream(kind, RATE_HZ)
         self._orders = Orders(self._plan.orders, (STAY, LEAVE), self._plan.lease_s)
         self._iteration_s = None
 

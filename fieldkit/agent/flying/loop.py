@@ -6,7 +6,7 @@ import threading
 import time
 from typing import Callable, Iterator
 
-from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.autopilot import AutopilotState, status_text
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying.liveness import FLYING, IDLE, LANDING, PILOT, LivenessFile
 from fieldkit.agent.flying.origin import FlightFence, FlightOrigin, Position
@@ -96,8 +96,8 @@ class FlightLoop:
             self.update()
             self.session.exchange(1 / RATE_HZ)
         for kind in _STREAMS:
-            self.drone.request_stream(kind, RATE_HZ)
-        self.drone.request_stream(GLOBAL_POSITION_INT, 2.0)
+            self.drone.commands.request_stream(kind, RATE_HZ)
+        self.drone.commands.request_stream(GLOBAL_POSITION_INT, 2.0)
         self.orders = Orders(self._plan.orders, (STAY, CLIMB, GO, HOME, LEAVE), self._plan.lease_s)
 
     def update(self) -> None:
@@ -133,7 +133,9 @@ class FlightLoop:
             self._require_control()
             if set_point is not None:
                 position_m = set_point()
-                self.drone.send_set_point(self.fence.clamped(position_m) if self.fence else position_m, self.yaw_rad)
+                self.drone.commands.send_set_point(
+                    self.fence.clamped(position_m) if self.fence else position_m, self.yaw_rad
+                )
             self.update()
             self.session.exchange(1 / RATE_HZ)
             yield
@@ -167,7 +169,7 @@ class FlightLoop:
             if is_done():
                 return
             if time.monotonic() > start_s + COMMAND_TIMEOUT_S:
-                raise FlightError(REFUSED, f"the autopilot refuses {what} ({self.drone.status_text})")
+                raise FlightError(REFUSED, f"the autopilot refuses {what} ({status_text(self.drone)})")
             if time.monotonic() > retry_s:
                 retry_s = time.monotonic() + RETRY_S
                 send_command()
@@ -196,11 +198,11 @@ class FlightLoop:
         if not drone.guided:
             if self._liveness is not None and self._liveness.other_state == LANDING:
                 raise FlightError(PEER_STOPPED, "the guard lands it")
-            raise FlightError(TAKEN_OVER, f"another party flies it ({drone.status_text})")
+            raise FlightError(TAKEN_OVER, f"another party flies it ({status_text(drone)})")
         if not self.has_armed:
             return
         if not drone.armed:
-            raise FlightError(TAKEN_OVER, f"its motors have stopped ({drone.status_text})")
+            raise FlightError(TAKEN_OVER, f"its motors have stopped ({status_text(drone)})")
         if drone.position_age_s > _POSITION_TIMEOUT_S:
             raise FlightError(REFUSED, f"it has not reported its position for {_POSITION_TIMEOUT_S:g} s")
         if (
