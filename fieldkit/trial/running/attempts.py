@@ -178,7 +178,7 @@ class Attempts:
                 raise  # the attempt is intact: resume fetches the rest of it
             reason = STOPPED if self._motions.is_ordered else _interruption_reason(error)
             if self._reached:
-                self._robots.mark_unfetched(started.remote(self._plan.trial), partial, reason)
+                self._robots.unfetched.mark_all(started.remote(self._plan.trial), partial, reason)
             ended = replace(started, status=Status.VOID, reason=reason, excused=True)
             self._ledger.commit(partial, ended, self._judge(started, partial).measured)
             if isinstance(error, LockLostError) and self._last_remote:
