@@ -9,7 +9,8 @@ from fieldkit.analysis.compare import Comparison, Difference, Pair
 from fieldkit.analysis.quantities import DIFFERENCE_UNITS, Tally
 from fieldkit.analysis.result_tables import rounded
 from fieldkit.analysis.statistics import CONFIDENCE
-from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, Kind, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, Kind, csv_text
+from fieldkit.core.result_rows import DifferenceRow, declared
 from fieldkit.core.text import json_text
 from fieldkit.core.units import format_count
 

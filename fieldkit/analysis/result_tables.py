@@ -10,7 +10,8 @@ from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.table_lines import TableLine, lines
-from fieldkit.core.columns import SCHEMA_VERSION, EstimateRow, Kind, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, Kind, csv_text
+from fieldkit.core.result_rows import EstimateRow, declared
 from fieldkit.core.text import json_text, one_line
 
 MORE: Final = "more_wanted"

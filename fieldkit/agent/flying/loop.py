@@ -86,15 +86,7 @@ class FlightLoop:
         Raises:
             FlightError: No heartbeat arrived, or the job was cancelled.
         """
-        start_s = time.monotonic()
-        while not self.drone.alive:
-            if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was cancelled")
-            if time.monotonic() > start_s + HEARTBEAT_S:
-                connection = self._plan.connection
-                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
-            self.update()
-            self.session.exchange(1 / RATE_HZ)
+        wait_for_heartbeat(self.session, self._plan.connection, self._stop_event, self.update)
         for kind in _STREAMS:
             self.drone.commands.request_stream(kind, RATE_HZ)
         self.drone.commands.request_stream(GLOBAL_POSITION_INT, 2.0)
@@ -211,3 +203,21 @@ class FlightLoop:
             and (breach := self.fence.breach(drone.position_m))
         ):
             raise FlightError(FENCE_BREACHED, breach)
+
+
+def wait_for_heartbeat(
+    session: AutopilotSession, connection: str, stop_event: threading.Event, each_iteration: Callable[[], None]
+) -> None:
+    """Wait for the first heartbeat of the autopilot at a connection.
+
+    Raises:
+        FlightError: No heartbeat arrived, or the job was cancelled.
+    """
+    start_s = time.monotonic()
+    while not session.drone.alive:
+        if stop_event.is_set():
+            raise FlightError(CANCELLED, "the job was cancelled")
+        if time.monotonic() > start_s + HEARTBEAT_S:
+            raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
+        each_iteration()
+        session.exchange(1 / RATE_HZ)
