@@ -179,7 +179,7 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
 
     def leave_first(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
         if remote.endswith("tcp-01-1"):
-            self._mark_unfetched(Role.SENDER, remote, into, "the link broke \udcff")
+            self.unfetched.mark(Role.SENDER, remote, into, "the link broke \udcff")
             return ["the link broke"]
         raise LockLostError("aborted")
 
