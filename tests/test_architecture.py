@@ -84,6 +84,7 @@ LEAVES = {
         "core.units",
         "core.errors",
         "core.columns",
+        "core.result_rows",
         "core.text",
         "core.crosschecks",
         "core.laptop_files",

@@ -17,7 +17,8 @@ from fieldkit.config.documentation import attribute_meanings, class_description
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import Site
 from fieldkit.core import errors, events
-from fieldkit.core.columns import Column, DifferenceRow, EstimateRow, declared
+from fieldkit.core.columns import Column
+from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
 from fieldkit.steps.base import Step, step_types
 from fieldkit.trial.columns import installed
 from fieldkit.trial.procedure import Procedure

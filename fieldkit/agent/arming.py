@@ -101,15 +101,15 @@ class ArmingCheck:
         self._retry_s = now_s + _RETRY_S
         for kind, value in ((SYS_STATUS, drone.status), (LOCAL_POSITION_NED, drone.position_m)):
             if value is None:
-                drone.request_stream(kind, _RATE_HZ)
+                drone.commands.request_stream(kind, _RATE_HZ)
         if drone.estimate is None:
-            drone.request_stream(drone.dialect.estimate_message, _RATE_HZ)
+            drone.commands.request_stream(drone.dialect.estimate_message, _RATE_HZ)
         if self._checked_s is None:
-            drone.command(PREARM_CHECKS)
+            drone.commands.send(PREARM_CHECKS)
         if self._needs.returns and not drone.has_home:
-            drone.request_once(HOME_POSITION)
+            drone.commands.request_once(HOME_POSITION)
         for name in self._missing_parameters():
-            drone.request_parameter(name)
+            drone.commands.request_parameter(name)
 
     def _missing_parameters(self) -> list[str]:
         """Return the names of the requested parameters that the autopilot has not reported."""

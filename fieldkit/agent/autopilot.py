@@ -78,20 +78,75 @@ class SystemStatus:
     received_s: float
 
 
+class AutopilotCommands:
+    """Sends commands and requests to an autopilot; nothing but heartbeats is sent before its first heartbeat.
+
+    Args:
+        link: The connection.
+        component: Component id of this program.
+
+    Attributes:
+        target: System id and component id of the autopilot; None before its first heartbeat.
+    """
+
+    def __init__(self, link: FlightLink, component: int) -> None:
+        self.target: tuple[int, int] | None = None
+        self._link = link
+        self._writer = FrameWriter(_OWN_SYSTEM, component)
+
+    def send_heartbeat(self) -> None:
+        """Send a heartbeat."""
+        self._link.send(self._writer.heartbeat(_TYPE_ONBOARD))
+
+    def request_stream(self, kind: int, rate_hz: float) -> None:
+        """Request a message at a rate while the link is open; 0 Hz ends the request."""
+        self.send(SET_MESSAGE_INTERVAL, kind, 1e6 / rate_hz if rate_hz else 0)
+
+    def request_once(self, kind: int) -> None:
+        """Request a message once."""
+        self.send(REQUEST, kind)
+
+    def request_parameter(self, name: str) -> None:
+        """Request a parameter; its value is added to `AutopilotState.parameters` if it exists."""
+        if self.target is not None:
+            padded_name = name.encode("ascii").ljust(_NAME_BYTES, b"\0")
+            self._send_frame(PARAM_REQUEST_READ, struct.pack("<hBB16s", -1, *self.target, padded_name))
+
+    def send(self, command: float, *parameters: float) -> None:
+        """Send a command; its result is stored in `AutopilotState.command_results`."""
+        if self.target is not None:
+            self._link.send(self._writer.command(self.target, int(command), *parameters))
+
+    def send_set_point(self, position_m: tuple[float, float, float], yaw_rad: float) -> None:
+        """Send a set-point: a position in LOCAL_POSITION_NED, and a heading clockwise from north."""
+        if self.target is not None:
+            now_ms = int(time.monotonic() * 1e3) & 0xFFFFFFFF
+            values = (now_ms, *position_m, *(0.0,) * 6, yaw_rad, 0.0)
+            self._send_frame(
+                SET_POINT, struct.pack("<I11fHBBB", *values, _POSITION_AND_YAW, *self.target, _LOCAL_NED)
+            )
+
+    def _send_frame(self, kind: int, payload: bytes) -> None:
+        self._link.send(self._writer.frame(kind, payload))
+
+
 class AutopilotState:
-    """The reported state of an autopilot, and commands to it.
+    """The reported state of an autopilot.
 
     Args:
         link: The connection; the first autopilot whose heartbeat arrives there is used.
         component: Component id of this program.
 
     Attributes:
+        link: The connection.
+        commands: Sends commands to the autopilot.
         armed: Whether its motors may turn.
         failsafe: Whether one of its failsafes is active.
         mode: Its custom mode, from its heartbeat.
         dialect: The dialect of its family; None for an unknown family, or before its first heartbeat.
         family: Its MAV_AUTOPILOT and MAV_TYPE.
         speed_m_s: Its speed.
+        booted_s: Its boot time by CLOCK_BOOTTIME of this computer, from its last position report.
         status: Its health and battery; None before its first report.
         estimate: Flags of its position estimate (ESTIMATOR_STATUS_FLAGS); None before its first report.
         has_home: Whether it has reported its home position.
@@ -102,13 +157,12 @@ class AutopilotState:
 
     def __init__(self, link: FlightLink, component: int = PILOT) -> None:
         self.link = link
-        self._own_address = _OWN_SYSTEM, component
-        self._source: tuple[int, int] | None = None
-        self._writer = FrameWriter(*self._own_address)
+        self._component = component
+        self.commands = AutopilotCommands(link, component)
         self._heartbeat_s = self._position_s = self._attitude_s = self._latitude_longitude_s = -math.inf
         self._position_m = (0.0, 0.0, 0.0)
         self._latitude_longitude = (0.0, 0.0)
-        self._yaw_rad = self.speed_m_s = self._boot_s = 0.0
+        self._yaw_rad = self.speed_m_s = self.booted_s = 0.0
         self.mode = 0
         self.armed = self.failsafe = self.has_home = False
         self.dialect: FlightDialect | None = None
@@ -139,7 +193,7 @@ class AutopilotState:
     @property
     def system(self) -> int:
         """Its system id; 0 before its first heartbeat."""
-        return self._source[0] if self._source else 0
+        return self.commands.target[0] if self.commands.target else 0
 
     @property
     def heartbeat_age_s(self) -> float:
@@ -177,11 +231,6 @@ class AutopilotState:
         return self._position_m if math.isfinite(self._position_s) else None
 
     @property
-    def booted_s(self) -> float:
-        """Its boot time by CLOCK_BOOTTIME of this computer, from its last position report."""
-        return self._boot_s
-
-    @property
     def latitude_longitude(self) -> tuple[float, float] | None:
         """Latitude and longitude in degrees; None without a fresh report, or if they are unknown."""
         return self._latitude_longitude if time.monotonic() - self._latitude_longitude_s < FRESH_S else None
@@ -190,11 +239,6 @@ class AutopilotState:
     def yaw_rad(self) -> float | None:
         """Its heading, clockwise from north; None without a fresh report."""
         return self._yaw_rad if time.monotonic() - self._attitude_s < FRESH_S else None
-
-    @property
-    def status_text(self) -> str:
-        """A text with its mode and its last text message."""
-        return f"mode {self.mode_name}" + (f", its last text: {self.texts.last}" if self.texts.last else "")
 
     def receive(self) -> None:
         """Process the frames that have arrived. Damaged frames and those of other systems are ignored."""
@@ -205,14 +249,14 @@ class AutopilotState:
             source, payload = (message.system, message.component), message.payload.ljust(_MAX_PAYLOAD_BYTES, b"\0")
             if message.kind == HEARTBEAT:
                 self._on_heartbeat(source, payload)
-            elif source == self._source and message.kind in self._handlers:
+            elif source == self.commands.target and message.kind in self._handlers:
                 self._handlers[message.kind](payload)
 
     def _on_heartbeat(self, source: tuple[int, int], payload: bytes) -> None:
         mode, vehicle, autopilot, base, status = struct.unpack_from("<IBBBB", payload)
-        if autopilot == NO_AUTOPILOT or self._source not in (None, source):
+        if autopilot == NO_AUTOPILOT or self.commands.target not in (None, source):
             return
-        self._source, self._heartbeat_s, self.mode = source, time.monotonic(), mode
+        self.commands.target, self._heartbeat_s, self.mode = source, time.monotonic(), mode
         self.armed, self.failsafe, self.family = bool(base & _ARMED), status == _CRITICAL, (autopilot, vehicle)
         self.dialect = next((dialect for dialect in _DIALECTS if dialect.matches(autopilot, vehicle)), None)
 
@@ -220,7 +264,7 @@ class AutopilotState:
         boot_ms, *values = _TIME_AND_FLOATS.unpack_from(payload)
         if all(map(math.isfinite, values)):
             self._position_m, self._position_s = (values[0], values[1], values[2]), time.monotonic()
-            self._boot_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_ms / 1e3
+            self.booted_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_ms / 1e3
             self.speed_m_s = math.hypot(*values[3:])
 
     def _on_global_position(self, payload: bytes) -> None:
@@ -237,7 +281,9 @@ class AutopilotState:
     def _on_command_ack(self, payload: bytes) -> None:
         """Store a final result for this program or for all programs (COMMAND_ACK of MAVLink 1 has no target)."""
         command, result, _, _, *target = _COMMAND_ACK.unpack_from(payload)
-        is_for_this_program = all(number in (0, own_number) for number, own_number in zip(target, self._own_address))
+        is_for_this_program = all(
+            number in (0, own_number) for number, own_number in zip(target, (_OWN_SYSTEM, self._component))
+        )
         if is_for_this_program and result != IN_PROGRESS:
             self.command_results[command] = result
 
@@ -255,40 +301,7 @@ class AutopilotState:
         if math.isfinite(value):
             self.parameters[name] = value
 
-    def send_heartbeat(self) -> None:
-        """Send a heartbeat."""
-        self.link.send(self._writer.heartbeat(_TYPE_ONBOARD))
 
-    def request_stream(self, kind: int, rate_hz: float) -> None:
-        """Request a message at a rate while the link is open; 0 Hz ends the request."""
-        self.command(SET_MESSAGE_INTERVAL, kind, 1e6 / rate_hz if rate_hz else 0)
-
-    def stream_hz(self, kind: int) -> float:
-        """Return the recent rate of a requested message, in messages per second; 0 if unknown."""
-        rate = self.link.messages.get(kind)
-        return rate.hz if rate else 0.0
-
-    def request_once(self, kind: int) -> None:
-        """Request a message once."""
-        self.command(REQUEST, kind)
-
-    def request_parameter(self, name: str) -> None:
-        """Request a parameter; its value is added to `parameters` if it exists."""
-        if self._source is not None:
-            padded_name = name.encode("ascii").ljust(_NAME_BYTES, b"\0")
-            self._send(PARAM_REQUEST_READ, struct.pack("<hBB16s", -1, *self._source, padded_name))
-
-    def command(self, command: float, *parameters: float) -> None:
-        """Send a command; its result is stored in `command_results`."""
-        if self._source is not None:
-            self.link.send(self._writer.command(self._source, int(command), *parameters))
-
-    def send_set_point(self, position_m: tuple[float, float, float], yaw_rad: float) -> None:
-        """Send a set-point: a position in LOCAL_POSITION_NED, and a heading clockwise from north."""
-        if self._source is not None:
-            now_ms = int(time.monotonic() * 1e3) & 0xFFFFFFFF
-            values = (now_ms, *position_m, *(0.0,) * 6, yaw_rad, 0.0)
-            self._send(SET_POINT, struct.pack("<I11fHBBB", *values, _POSITION_AND_YAW, *self._source, _LOCAL_NED))
-
-    def _send(self, kind: int, payload: bytes) -> None:
-        self.link.send(self._writer.frame(kind, payload))
+def status_text(drone: AutopilotState) -> str:
+    """Return a text with the mode of an autopilot and its last text message."""
+    return f"mode {drone.mode_name}" + (f", its last text: {drone.texts.last}" if drone.texts.last else "")

@@ -160,14 +160,14 @@ class OffboardPilot:
         if hold_start is not None:
             loop.run_until(lambda: time.monotonic() - start_s > _SET_POINTS_S, set_point=hold_start)
         loop.command_until(
-            lambda: drone.command(*dialect.guided_command()),
+            lambda: drone.commands.send(*dialect.guided_command()),
             lambda: drone.guided,
             f"the mode {dialect.guided_mode}",
             hold_start,
         )
         loop.state = FLYING
         self._require_armable(hold_start)
-        loop.command_until(lambda: drone.command(ARM, 1), lambda: drone.armed, "to arm", hold_start)
+        loop.command_until(lambda: drone.commands.send(ARM, 1), lambda: drone.armed, "to arm", hold_start)
         loop.has_armed = True
         self._start_phase("climbing")
         if commands:
@@ -213,11 +213,11 @@ class OffboardPilot:
             drone.command_results.pop(int(command[0]), None)
         for command in preceding:
             self._loop.command_until(
-                partial(drone.command, *command), partial(self._has_result, command[0]), "a climb speed"
+                partial(drone.commands.send, *command), partial(self._has_result, command[0]), "a climb speed"
             )
         # The acknowledgement may be lost, and a second command to take off is refused in the air.
         is_accepted = lambda: drone.command_results.get(int(last[0])) == ACCEPTED or risen_m() > _LIFTED_M  # noqa: E731
-        self._loop.command_until(partial(drone.command, *last), is_accepted, "to take off")
+        self._loop.command_until(partial(drone.commands.send, *last), is_accepted, "to take off")
         self._loop.run_until(lambda: has_risen() or self._loop.orders.order == HOME)
 
     def _has_result(self, command: float) -> bool:

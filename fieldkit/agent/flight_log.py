@@ -45,6 +45,7 @@ class FlightLog:
         """Write position, speed and mode of the drone, and the rate of its reports; does nothing before `begin`."""
         if self._lines is None or self._origin is None or drone.position_m is None or not self.phase:
             return
+        rate = drone.link.messages.get(LOCAL_POSITION_NED)
         ahead_m, left_m = self._origin.relative_m(drone.position_m)
         self._write(
             {
@@ -56,7 +57,7 @@ class FlightLog:
                 "up_m": round(self._ground_m - drone.position_m[2], 3),
                 "speed_m_s": round(drone.speed_m_s, 3),
                 "mode": drone.mode_name,
-                "rate_hz": round(drone.stream_hz(LOCAL_POSITION_NED), 3),
+                "rate_hz": round(rate.hz if rate else 0.0, 3),
             }
         )
 

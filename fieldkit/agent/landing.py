@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Callable, Iterator
 
-from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.autopilot import AutopilotState, status_text
 from fieldkit.agent.dialect import ARM
 from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.mavlink_frames import ACCEPTED
@@ -87,18 +87,18 @@ def bring_down(
         warned = not drone.alive
         if may_command():
             if how == "return" and drone.alive and now_s > start_s + COMMAND_TIMEOUT_S:
-                log_line(f"land: it does not return ({drone.status_text})")
+                log_line(f"land: it does not return ({status_text(drone)})")
                 bring_down(session, "land", may_command, each_iteration)
                 return
             if now_s > retry_s:
                 retry_s = now_s + RETRY_S
-                drone.command(*command)
+                drone.commands.send(*command)
                 if drone.command_results.get(number, ACCEPTED) != ACCEPTED:
-                    drone.command(ARM, 0)  # refused in the air; on the ground it may refuse to land
+                    drone.commands.send(ARM, 0)  # refused in the air; on the ground it may refuse to land
         elif not drone.lands_or_returns and (
             drone.dialect is not None or drone.command_results.get(number) != ACCEPTED
         ):
-            raise FlightError(TAKEN_OVER, f"another party flies it, nothing more is sent ({drone.status_text})")
+            raise FlightError(TAKEN_OVER, f"another party flies it, nothing more is sent ({status_text(drone)})")
         each_iteration()
         session.exchange(_POLL_S)
 

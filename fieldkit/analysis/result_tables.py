@@ -1,4 +1,4 @@
-"""Cells and comparisons as tables in CSV, JSON, Markdown and LaTeX."""
+"""Cells as tables in CSV, JSON, Markdown and LaTeX."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -8,10 +8,10 @@ from typing import Any, Final
 
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.compare import Comparison, Difference, Pair
-from fieldkit.analysis.quantities import Quantity, Tally
+from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.table_lines import TableLine, lines
-from fieldkit.core.columns import SCHEMA_VERSION, DifferenceRow, EstimateRow, Kind, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, Kind, csv_text
+from fieldkit.core.result_rows import EstimateRow, declared
 from fieldkit.core.text import json_text, one_line
 
 MORE: Final = "more_wanted"
@@ -89,7 +89,7 @@ def _cell_object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
     estimates = {}
     for row in estimate_rows(cell):
         if row.quantity is not None:
-            values = {name: _round(value) for name, value in asdict(row).items()}
+            values = {name: rounded(value) for name, value in asdict(row).items()}
             additional = {} if more is None else {MORE: more.get(row.quantity)}
             estimates[values.pop("quantity")] = {
                 name: value for name, value in (values | additional).items() if name not in counts
@@ -97,86 +97,9 @@ def _cell_object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
     return {"key": dict(cell.key), **{name: getattr(cell, name) for name in counts}, "estimates": estimates}
 
 
-def _round(value: object) -> Any:  # noqa: ANN401 (any JSON value)
+def rounded(value: object) -> Any:  # noqa: ANN401 (any JSON value)
     """Return a number rounded to the digits of a CSV."""
     return float(f"{value:.9g}") if isinstance(value, float) else value
-
-
-def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRow]]:
-    """Yield each condition with each of its rows: one per quantity, or a single row if neither run measured one."""
-    for pair in comparison.pairs:
-        missing_in = pair.missing_in or None
-        rows = [_difference_row(difference, missing_in, comparison.n_compared) for difference in pair.differences]
-        rows += [row for a, b in pair.words for row in _word_rows(a, b, missing_in)]
-        yield from ((pair, row) for row in rows or [DifferenceRow(missing_in=missing_in)])
-
-
-def comparison_csv(comparison: Comparison) -> str:
-    """Return a comparison as CSV: the columns that identify conditions, then those of `DifferenceRow`."""
-    names = [column.name for column in declared(DifferenceRow)]
-    rows = (
-        [*pair.key.values(), *(getattr(row, name) for name in names)] for pair, row in difference_rows(comparison)
-    )
-    return csv_text([*comparison.by, *names], rows)
-
-
-def comparison_json(comparison: Comparison) -> str:
-    """Return a comparison as one JSON object: conclusions, concerns, and differences as in the CSV."""
-    text = json_text(
-        {
-            "schema_version": SCHEMA_VERSION,
-            "by": list(comparison.by),
-            "conclusions": list(wording.conclusions(comparison)),
-            "concerns": [asdict(concern) for concern in comparison.concerns],
-            "missed": comparison.exceeds_threshold,
-            "differences": [
-                {**pair.key, **{name: _round(value) for name, value in asdict(row).items()}}
-                for pair, row in difference_rows(comparison)
-            ],
-        },
-        indent=1,
-        allow_nan=False,
-    )
-    return f"{text}\n"
-
-
-def _difference_row(difference: Difference, missing_in: str | None, comparisons: int) -> DifferenceRow:
-    return DifferenceRow(
-        missing_in=missing_in,
-        quantity=difference.quantity.name,
-        unit=difference.quantity.unit,
-        estimate=difference.quantity.kind,
-        n_a=difference.a.n if difference.a else None,
-        n_b=difference.b.n if difference.b else None,
-        a=difference.a.value if difference.a else None,
-        b=difference.b.value if difference.b else None,
-        difference=difference.value,
-        low=difference.interval.low if difference.interval else None,
-        high=difference.interval.high if difference.interval else None,
-        cliffs_delta=difference.cliffs_delta,
-        p_holm=difference.p_holm,
-        threshold=difference.threshold,
-        within=difference.within,
-        verdict=wording.verdict(difference, comparisons),
-    )
-
-
-def _word_rows(a: Tally, b: Tally, missing_in: str | None) -> Iterator[DifferenceRow]:
-    """Yield a row per word that either run has in a column."""
-    for word in dict.fromkeys((*a.counts, *b.counts)):
-        of_a, of_b = a.share(word), b.share(word)
-        yield DifferenceRow(
-            missing_in=missing_in,
-            quantity=a.quantity(word),
-            unit="share",
-            estimate=Kind.WORDS,
-            n_a=a.n or None,
-            n_b=b.n or None,
-            a=of_a,
-            b=of_b,
-            difference=None if of_a is None or of_b is None else of_b - of_a,
-            verdict=wording.NOT_JUDGED,
-        )
 
 
 def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:

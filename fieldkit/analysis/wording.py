@@ -1,4 +1,4 @@
-"""Texts about estimates, judgements and comparisons: numbers with units, intervals, verdicts, cautions."""
+"""Texts about estimates and judgements: numbers with units, intervals, verdicts, cautions."""
 
 import math
 import re
@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
-from fieldkit.analysis.compare import Comparison, Difference
 from fieldkit.analysis.expectations import Scope
 from fieldkit.analysis.judgements import Judgement
-from fieldkit.analysis.quantities import DIFFERENCE_UNITS, Quantity, Tally, in_order
+from fieldkit.analysis.quantities import Quantity, Tally, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, assured
 from fieldkit.core import columns
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import ENDED, Status
-from fieldkit.core.units import format_count
 
 _MIN_IN_SECONDS_S: Final = 10.0
 _MIN_IN_MBIT_BIT_S: Final = 1e6
@@ -26,9 +24,6 @@ _MAX_LISTED: Final = 3
 _MAX_WORDS: Final = 5
 _MAX_WORD_LENGTH: Final = 30
 _PLAIN_WORD: Final = re.compile(r"[A-Za-z](?:[\w -]*[A-Za-z])?")
-
-NOT_JUDGED: Final = "words are counted, not judged"
-"""Verdict of a comparison of word counts, which has no interval."""
 
 
 @dataclass(frozen=True)
@@ -286,86 +281,3 @@ def _word_counts(words: Tally) -> Iterator[str]:
 def status_counts(numbers: Mapping[str, int]) -> str:
     """Return the numbers of attempts by final status: `20 valid, 1 void`."""
     return ", ".join(f"{numbers[status]} {status}" for status in ENDED if numbers.get(status)) or "none"
-
-
-def verdict(difference: Difference, comparisons: int) -> str:
-    """Return the verdict on a difference: `B 3.10 points more [1.20, 5.00]`.
-
-    Args:
-        difference: The difference.
-        comparisons: Number of all comparisons.
-    """
-    if difference.value is None:
-        text = f"only {'B' if difference.a is None else 'A'} has it"
-    elif difference.interval is None:
-        text = "no interval, so no verdict"
-    elif difference.excludes_zero:
-        low, high = sorted((abs(difference.interval.low), abs(difference.interval.high)))
-        more = "more" if difference.value > 0 else "less"
-        interval_text = comparison_scale(difference).interval(low, high)
-        text = f"B {_amount(abs(difference.value), difference)} {more} {interval_text}"
-        if not is_significant(difference):
-            text += f"; may be chance among {comparisons}"
-    else:
-        most = max(abs(difference.interval.low), abs(difference.interval.high))
-        text = f"no difference seen; up to {_amount(most, difference)} possible"
-    return text + _threshold(difference)
-
-
-def is_significant(difference: Difference) -> bool:
-    """Return True if a difference is significant after correction for the number of comparisons."""
-    return difference.p_holm is not None and difference.p_holm < 1 - CONFIDENCE
-
-
-def conclusions(comparison: Comparison) -> Iterator[str]:
-    """Yield the conclusions of a comparison, and the conditions that could not be compared."""
-    comparisons, differences = comparison.n_compared, comparison.differences
-    excludes_zero = sum(difference.excludes_zero for difference in differences)
-    significant = sum(is_significant(difference) for difference in differences)
-    yield (
-        f"{format_count(comparisons, 'comparison')}: {format_count(excludes_zero, 'difference')} seen, {significant} "
-        f"after correction for their number; without real differences about {(1 - CONFIDENCE) * comparisons:.1f} "
-        "would be seen by chance"
-    )
-    for pair in comparison.pairs:
-        if pair.missing_in:
-            yield f"not compared, because {pair.missing_in} has no such condition: {pair.name}"
-    limited = [
-        (pair.name, difference)
-        for pair in comparison.pairs
-        for difference in pair.differences
-        if difference.within is not None
-    ]
-    missed = [(name, difference) for name, difference in limited if not difference.within]
-    if limited:
-        yield f"shown to be within its threshold: {len(limited) - len(missed)} of {len(limited)}"
-    for name, difference in missed:
-        yield f"not shown to be within {_limit(difference)}: {difference.quantity.name} in {name}"
-    sides = (("A", [pair.a for pair in comparison.pairs]), ("B", [pair.b for pair in comparison.pairs]))
-    for side, cells in sides:
-        yield from (f"{side}: {caution[2:]}" for caution in cautions([cell for cell in cells if cell is not None]))
-
-
-def _threshold(difference: Difference) -> str:
-    if difference.within is None:
-        return ""
-    return f"; {'within' if difference.within else 'may exceed'} {_limit(difference)}"
-
-
-def comparison_scale(difference: Difference) -> Scale:
-    """Return the scale for the values of A and B."""
-    return scale_of(difference.quantity, [side.value for side in (difference.a, difference.b) if side])
-
-
-def _limit(difference: Difference) -> str:
-    limit = comparison_scale(difference).factor * (difference.threshold or 0)
-    return f"{limit:.6g} {_unit(difference)}".rstrip()
-
-
-def _amount(amount: float, difference: Difference) -> str:
-    return f"{comparison_scale(difference).number(amount)} {_unit(difference)}".rstrip()
-
-
-def _unit(difference: Difference) -> str:
-    """Return the unit of a difference, such as percentage points for shares."""
-    return DIFFERENCE_UNITS.get(difference.quantity.unit, comparison_scale(difference).unit)

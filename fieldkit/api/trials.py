@@ -21,7 +21,7 @@ from fieldkit.export import table
 from fieldkit.export.table import Table
 from fieldkit.measure.transfers import fates
 from fieldkit.report.trial_folders import Evidence, load_evidence
-from fieldkit.trial import sources
+from fieldkit.trial import planned_evidence, sources
 from fieldkit.trial.sources import Sources
 
 
@@ -192,7 +192,8 @@ class Trials:
                 remedy=remedy,
             )
         transfers = {
-            transfer.name: transfer for transfer in plan.transfers(Protocol(self._attempts.texts["protocol"][row]))
+            transfer.name: transfer
+            for transfer in planned_evidence.transfers(plan, Protocol(self._attempts.texts["protocol"][row]))
         }
         if step is not None and step not in transfers:
             named = ", ".join(map(repr, transfers)) or "none"

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.analysis import result_tables, wording
+from fieldkit.analysis import comparison_results, result_tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.comparable import VARIED, Concern
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
@@ -138,7 +138,7 @@ def _table(comparison: Comparison) -> None:
         if not pair.missing_in:
             table(_HEAD, _lines(comparison, pair), title=f"{pair.name}: {_repeats(pair)}", right=(1, 2, 3))
     print_text(_DELTA)
-    print_text("\n".join(wording.conclusions(comparison)))
+    print_text("\n".join(comparison_results.conclusions(comparison)))
 
 
 def _markdown(comparison: Comparison) -> str:
@@ -155,7 +155,7 @@ def _markdown(comparison: Comparison) -> str:
     differing = (*comparison.refusals, *comparison.varied)
     notes = [
         _DELTA,
-        *wording.conclusions(comparison),
+        *comparison_results.conclusions(comparison),
         *(f"{_concern_text(comparison, concern)}: {concern}" for concern in differing),
     ]
     return (
@@ -166,7 +166,7 @@ def _markdown(comparison: Comparison) -> str:
 
 
 _FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
-    {"csv": result_tables.comparison_csv, "json": result_tables.comparison_json, "markdown": _markdown}
+    {"csv": comparison_results.to_csv, "json": comparison_results.to_json, "markdown": _markdown}
 )
 
 
@@ -177,11 +177,14 @@ def _lines(comparison: Comparison, pair: Pair) -> list[tuple[str, ...]]:
             _value(difference, difference.a),
             _value(difference, difference.b),
             _delta(difference),
-            wording.verdict(difference, comparison.n_compared),
+            comparison_results.verdict(difference, comparison.n_compared),
         )
         for difference in pair.differences
     ]
-    words = [(a.label, wording.tally_text(a), wording.tally_text(b), "", wording.NOT_JUDGED) for a, b in pair.words]
+    words = [
+        (a.label, wording.tally_text(a), wording.tally_text(b), "", comparison_results.NOT_JUDGED)
+        for a, b in pair.words
+    ]
     return figures + words or [("nothing measured", "", "", "", "")]
 
 
@@ -189,7 +192,7 @@ def _value(difference: Difference, side: Estimate | None) -> str:
     if side is None:
         return ""
     part = wording.incomplete(side)
-    return wording.amount(wording.comparison_scale(difference), side) + (f" ({part})" if part else "")
+    return wording.amount(comparison_results.comparison_scale(difference), side) + (f" ({part})" if part else "")
 
 
 def _delta(difference: Difference) -> str:

@@ -16,7 +16,6 @@ from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
 from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
-from fieldkit.export import junit
 from fieldkit.trial import store
 from fieldkit.trial.running.runner import Outcome
 
@@ -124,6 +123,8 @@ def write_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
     """
     if arguments.junit is None:
         return
+    from fieldkit.export import junit  # noqa: PLC0415 (few trials write this file)
+
     try:
         junit.write(arguments.junit, folders)
     except OSError as error:

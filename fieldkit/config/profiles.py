@@ -235,7 +235,7 @@ class Radio(Strict):
     Attributes:
         interface: Name of the network interface under test, `wlan0`.
         standard: For example `802.11n 2.4 GHz`, for information only.
-        access_point: True if the robot runs an access point, for information only.
+        access_point: True if the robot runs an access point; `check` reports if its radio is a station.
         tx_power_dbm: Transmit power in dBm; used by the emulated radio.
         sensitivity_dbm: Weakest signal that it can receive, in dBm; used by the emulated radio, and by `check` to
             report a weak signal.
@@ -259,7 +259,7 @@ class Limits(Strict):
             drone.
         fence_m: Maximum horizontal distance from the robot's start, in metres; required by steps that fly or drive
             it.
-        battery_min: Approximate running time on one charge, in minutes, for information only.
+        battery_min: Approximate running time on one charge, in minutes; a trial that takes longer reports it.
     """
 
     max_speed_m_s: Number | Int

@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Generic, Self, TypeVar
+from typing import Annotated, Any, Generic, NamedTuple, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -64,6 +64,7 @@ __all__ = [
     "Names",
     "Number",
     "RootModel",
+    "SectionValue",
     "SerializerFunctionWrapHandler",
     "Span",
     "Speed",
@@ -164,6 +165,21 @@ Span = Annotated[
 """A distance that keeps the operator's label."""
 
 
+class _UnvalidatedSection(NamedTuple):
+    """The value of a section of an installed package, which is validated together with the other keys."""
+
+    model: type[BaseModel]
+    value: object
+
+
+def _validated_section(section: object) -> object:
+    return section.model.model_validate(section.value) if isinstance(section, _UnvalidatedSection) else section
+
+
+SectionValue = Annotated[Any, BeforeValidator(_validated_section)]
+"""Type of the values of further keys in a mapping with sections."""
+
+
 class Strict(BaseModel):
     """Base of everything read from YAML: frozen, no unknown keys.
 
@@ -209,7 +225,7 @@ class Strict(BaseModel):
         if not sections:
             return data
         return {
-            key: value if key in names else _validated_under(key, sections[key], value)
+            key: value if key in names else _UnvalidatedSection(sections[key], value)
             for key, value in data.items()
             if key in names or value is not None
         }

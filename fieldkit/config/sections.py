@@ -7,7 +7,7 @@ from typing import ClassVar, TypeVar
 
 from typing_extensions import override
 
-from fieldkit.config.schema import BaseModel, ConfigDict, Strict
+from fieldkit.config.schema import BaseModel, ConfigDict, SectionValue, Strict
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.lazy_mapping import LazyMapping
@@ -26,6 +26,8 @@ class Sectioned(Strict):
     """
 
     model_config = ConfigDict(extra="allow")
+
+    __pydantic_extra__: dict[str, SectionValue]
 
     section_group: ClassVar[str]
     section_base: ClassVar[type]

@@ -29,6 +29,7 @@ from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.transfers import altered_packets
 from fieldkit.measure.transfers.match import Match, match
 from fieldkit.measure.transfers.transfer_spec import Transfer
+from fieldkit.trial import planned_evidence
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
@@ -172,14 +173,16 @@ class AttemptRecord:
     @property
     def transfers(self) -> tuple[Transfer, ...]:
         """The packet filter of each of its transfers."""
-        return self.plan.transfers(self.attempt.repeat.protocol)
+        return planned_evidence.transfers(self.plan, self.attempt.repeat.protocol)
 
 
 def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptRecord:
     """Return the readable recordings of an attempt."""
-    captures = {name: evidence.read_or_none(pcap.read, name) for name in plan.captures()}
-    pings = {pinging.file: evidence.read_or_none(ping.read, pinging.file) for pinging in plan.pingings()}
-    bags = {role: evidence.read_or_none(recordings.read, name) for role, name in plan.bags().items()}
+    captures = {name: evidence.read_or_none(pcap.read, name) for name in planned_evidence.captures(plan)}
+    pings = {
+        pinging.file: evidence.read_or_none(ping.read, pinging.file) for pinging in planned_evidence.pingings(plan)
+    }
+    bags = {role: evidence.read_or_none(recordings.read, name) for role, name in planned_evidence.bags(plan).items()}
     return AttemptRecord(
         plan=plan,
         attempt=attempt,
@@ -209,7 +212,7 @@ def messages(record: AttemptRecord) -> Iterator[Message]:
     """Return the messages of the robots' recordings, in the order of their times as far as their clocks agree."""
     streams = []
     marked = packet_fates(record.captures, record.transfers)
-    for file, role in record.plan.captures().items():
+    for file, role in planned_evidence.captures(record.plan).items():
         if file in record.captures:
             topic, meaning = (
                 _named("packets", _step(file)),
@@ -239,7 +242,7 @@ def _step(file: str) -> str:
 
 def _rtts(record: AttemptRecord, role: Role) -> Iterator[Message]:
     """Yield the replies to ping that a robot printed, and ICMP errors, at the times of their output."""
-    for pinging in record.plan.pingings():
+    for pinging in planned_evidence.pingings(record.plan):
         if pinging.role == role and pinging.file in record.pings:
             yield from _replies(record, role, pinging.name, pinging.file)
 
@@ -290,7 +293,7 @@ def _spans(record: AttemptRecord, role: Role) -> Iterator[tuple[str, str, int, i
                 times_ns = (forward.where(forward.dport == transfer.port) if transfer.name else forward).time_ns
                 if len(times_ns) and times_ns.min() != NO_TIME:
                     yield transfer.name, "transfer", int(times_ns.min()), int(times_ns.max())
-    for pinging in record.plan.pingings():
+    for pinging in planned_evidence.pingings(record.plan):
         if pinging.role == role and pinging.file in record.pings:
             replies = record.pings[pinging.file].replies
             stamps_ns = [reply.at_utc_ns for reply in replies if reply.at_utc_ns is not None]

@@ -13,7 +13,8 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.result_tables import estimate_rows
-from fieldkit.core.columns import SCHEMA_VERSION, Column, EstimateRow, cell, csv_text, declared
+from fieldkit.core.columns import SCHEMA_VERSION, Column, cell, csv_text
+from fieldkit.core.result_rows import EstimateRow, declared
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import SentPackets
 

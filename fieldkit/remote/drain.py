@@ -60,7 +60,7 @@ def drain(
     while not deadline.expired:
         if isinstance(channel, Channel):
             pending = _feed(channel, pending)
-        ended = channel.eof_received or channel.closed  # before the buffers are read, so that no output is missed
+        ended = _is_at_end(channel)  # before the buffers are read, so that no output is missed
         # One chunk of each stream per iteration, so that limit and deadline apply to a sender that never pauses.
         if channel.recv_ready():
             received += out.write(channel.recv(_CHUNK))
@@ -79,6 +79,10 @@ def drain(
         select.select([channel.fileno()], [], [], wait_s)
         deadline = deadline.extended_by_suspension(start_s, wait_s)
     raise ExpiredError("end")
+
+
+def _is_at_end(channel: Execution) -> bool:
+    return bool(channel.eof_received or (isinstance(channel, Channel) and channel.closed))
 
 
 def _feed(channel: Channel, pending: memoryview | None) -> memoryview | None:

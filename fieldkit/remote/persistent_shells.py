@@ -131,11 +131,34 @@ class PersistentShell:
             SSHException: The connection broke.
         """
         nonce = secrets.token_hex(_NONCE_BYTES).encode()
-        command = RunningCommand(self._channel, nonce, self._reservation)
-        command.settimeout(None)
-        with suppress(OSError):  # the shell has ended; a lost connection is reported by the next session
-            self._channel.sendall(nonce + b" " + command_line.encode() + b"\n")
-        return command if command.wait_for_start() else None
+        command = None
+        try:
+            self._channel.settimeout(None)
+            with suppress(OSError):  # the shell has ended; a lost connection is reported by the next session
+                self._channel.sendall(nonce + b" " + command_line.encode() + b"\n")
+            command = wait_for_start(self._channel, nonce, self._reservation)
+        finally:
+            if command is None:
+                self._channel.close()
+        return command
+
+
+def wait_for_start(channel: Channel, nonce: bytes, reservation: threading.Lock) -> "RunningCommand | None":
+    """Return a command when the shell has started it, or None if the shell has ended.
+
+    Args:
+        channel: The channel of the shell, to which the command was sent.
+        nonce: The nonce of the command.
+        reservation: The lock that reserves the shell.
+
+    Raises:
+        SSHException: The connection broke.
+        UnfitServerError: The end mark has no exit code.
+    """
+    output = _Stream(nonce)
+    while not output.has_started and (chunk := channel.recv(_CHUNK)):
+        output.feed(chunk)
+    return RunningCommand(channel, output, _Stream(nonce), reservation) if output.has_started else None
 
 
 class RunningCommand:
@@ -143,25 +166,20 @@ class RunningCommand:
 
     Args:
         channel: The channel of the shell.
-        nonce: The nonce of the command.
+        out: Its standard output, whose start mark has arrived.
+        err: Its standard error.
         reservation: The lock that reserves the shell; it is released by `close`.
     """
 
-    def __init__(self, channel: Channel, nonce: bytes, reservation: threading.Lock) -> None:
+    def __init__(self, channel: Channel, out: "_Stream", err: "_Stream", reservation: threading.Lock) -> None:
         self._channel = channel
         self._reservation: threading.Lock | None = reservation
         self._end_event = threading.Event()
-        self._out, self._err = _Stream(nonce), _Stream(nonce)
+        self._out, self._err = out, err
 
     def __del__(self) -> None:
         """Close the command if it was not closed, as a channel does."""
         self.close()
-
-    def wait_for_start(self) -> bool:
-        """Wait until the shell has started the command; return False if the shell has ended."""
-        while not self._out.has_started and (chunk := self._channel.recv(_CHUNK)):
-            self._out.feed(chunk)
-        return self._out.has_started
 
     def request_end(self) -> None:
         """Request the end of a command that was started with `held`.
@@ -173,17 +191,12 @@ class RunningCommand:
 
     @property
     def eof_received(self) -> bool:
-        """Whether all output of the command has arrived; reads the available data of both streams."""
+        """Whether no more output of the command can arrive; reads the available data of both streams."""
         if self._channel.recv_ready():
             self._out.feed(self._channel.recv(_CHUNK))
         if self._channel.recv_stderr_ready():
             self._err.feed(self._channel.recv_stderr(_CHUNK))
         return self._ended or self._is_cut_off
-
-    @property
-    def closed(self) -> bool:
-        """Whether no more output can arrive because the channel has ended."""
-        return self._is_cut_off
 
     @property
     def status_event(self) -> threading.Event:

@@ -26,6 +26,7 @@ from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report.charts import Panel, Series
 from fieldkit.report.theme import Colour, Style
+from fieldkit.trial import planned_evidence
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
 
@@ -84,7 +85,7 @@ class AttemptTimes:
 
 def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> AttemptTimes:
     """Return the times from the evidence of the attempt in a row."""
-    transfers = plan.transfers(model.Protocol(repeats.texts["protocol"][row]))
+    transfers = planned_evidence.transfers(plan, model.Protocol(repeats.texts["protocol"][row]))
     first = next(iter(transfers), None)
     ends = (first.source, first.destination) if first else (Role.SENDER, Role.RECEIVER)
     packets = [
@@ -94,7 +95,8 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> A
     ]
     bags = {transfer.sent_file: evidence.read_or_none(recordings.read, transfer.sent_file) for transfer in transfers}
     outputs = [
-        (pinging.name, pinging.role, evidence.read_or_none(ping.read, pinging.file)) for pinging in plan.pingings()
+        (pinging.name, pinging.role, evidence.read_or_none(ping.read, pinging.file))
+        for pinging in planned_evidence.pingings(plan)
     ]
     offset_ns, clocks = _clock_offset(
         transfers, packets, ends, {transfer.name: _offset_s(repeats, row, transfer) for transfer in transfers}

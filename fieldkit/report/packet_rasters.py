@@ -13,6 +13,7 @@ from fieldkit.measure.transfers import fates
 from fieldkit.report import wording
 from fieldkit.report.series import panels
 from fieldkit.report.trial_folders import Evidence
+from fieldkit.trial import planned_evidence
 
 MAX_REPEATS: Final = 400
 """Maximum number of repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""
@@ -87,7 +88,7 @@ def _marked_packets(cell: Cell, evidence: Evidence, max_lines: int) -> dict[tupl
         attempt, plan = evidence.attempt(row), evidence.plan(row)
         if attempt is None or plan is None or evidence.repeats.texts["status"][row] != Status.VALID:
             continue
-        for transfer in plan.transfers(Protocol(evidence.repeats.texts["protocol"][row])):
+        for transfer in planned_evidence.transfers(plan, Protocol(evidence.repeats.texts["protocol"][row])):
             if (packets := fates.read(attempt, transfer)) is not None:
                 masks.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
         if max(map(len, masks.values()), default=0) == max_lines:

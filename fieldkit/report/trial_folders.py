@@ -17,7 +17,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
-from fieldkit.trial import manifest, store
+from fieldkit.trial import manifest, planned_evidence, store
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
 
@@ -116,7 +116,11 @@ class Evidence:
     def pings(self, row: int, step: str = "") -> ping.Ping | None:
         """Return the output of ping in a row's attempt, optionally of a named step, or None if unavailable."""
         evidence, plan = self.attempt(row), self.plan(row)
-        pinging = next((candidate for candidate in plan.pingings() if candidate.name == step), None) if plan else None
+        pinging = (
+            next((candidate for candidate in planned_evidence.pingings(plan) if candidate.name == step), None)
+            if plan
+            else None
+        )
         return evidence.read_or_none(ping.read, pinging.file) if evidence and pinging else None
 
 

@@ -1,11 +1,11 @@
 """Estimates of the duration of repeats: from the procedure for a good link, then from finished repeats."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
-from fieldkit.core.units import TimeEstimate
+from fieldkit.core.units import TimeEstimate, format_duration
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
@@ -56,6 +56,18 @@ def finished_repeats(plan: Plan, entries: Iterable[JournalEntry]) -> list[Finish
 def of_trial(plan: Plan, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
     """Return the estimated duration of all repeats of a trial; see `of_repeats`."""
     return total(of_repeats(plan, protocol, plan.repeats, finished) for protocol in plan.protocols)
+
+
+def battery_notes(plans: Sequence[Plan]) -> Iterator[str]:
+    """Yield a sentence for each robot whose battery does not last for trials in sequence, by its profile."""
+    duration = total(of_trial(plan, []) for plan in plans)
+    for robot in plans[0].cast.values():
+        battery_min = robot.profile.limits.battery_min
+        if battery_min is not None and duration.likely_s > 60 * battery_min:
+            yield (
+                f"{robot.name} runs for about {battery_min:g} min on one charge (battery_min of its profile), "
+                f"the trial takes {format_duration(duration.likely_s)}"
+            )
 
 
 def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[FinishedRepeat]) -> TimeEstimate:

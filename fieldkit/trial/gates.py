@@ -1,13 +1,12 @@
 """Evidence checks and measures of an attempt; each evidence file is read once."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from traceback import format_exception
 from typing import Final
 
-from fieldkit.core.columns import Measured, cell, step_prefixed
-from fieldkit.core.errors import EvidenceError, describe_exception
+from fieldkit.core.columns import Column, Measured, cell, step_prefixed
+from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
@@ -15,6 +14,7 @@ from fieldkit.steps.view import View
 from fieldkit.trial import hosts, placements
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
+from fieldkit.trial.step_errors import StepErrors
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,11 @@ class EvidenceVerdict:
     measured: Measured
     step_errors: tuple[str, ...] = ()
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether exceptions of steps are the only problems, so that another attempt would not help."""
+        return 0 < len(self.problems) <= len(self.step_errors)
+
 
 def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVerdict:
     """Measure an attempt and check that its evidence is complete.
@@ -45,23 +50,25 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         MemoryError: This machine has too little memory; this is not a problem of the evidence.
     """
     scene = plan.scene(repeat, "")
+    step_errors = StepErrors()
     # The robots' states are judged first, because their problems cause many of the others.
-    problems = list(hosts.problems(plan.procedure, scene, evidence))
+    problems = list(hosts.problems(plan.procedure, scene, evidence, step_errors))
     measured = oracle_delays.measure_lateness(
         evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
     )
     for role in link.ROLES:
         measured |= link.measure(role, evidence.links(role))
-    step_errors: list[str] = []
     placement_problem = placements.contradiction(scene, evidence)
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
+        columns: tuple[Column, ...] = ()
         try:
+            columns = placed.step.output_columns()
             result = placed.step.measure(view)
-            impossible = dict(_impossible_values(placed, result))
+            impossible = dict(_impossible_values(placed, columns, result))
             if not placed.disturbed:
                 problems += (_step_problem(placed, reason) for reason in placed.step.check(view))
-                problems += _unexplained_columns(placed, result)
+                problems += _unexplained_columns(placed, columns, result)
                 problems += impossible.values()
             result = result.without(impossible)
             if placement_problem:
@@ -70,13 +77,12 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see the docstring)
-            reason = f"the evidence of {placed.label} cannot be measured: {describe_exception(error)}"
-            step_errors.append("".join(format_exception(error)))
+            reason = step_errors.add(f"the evidence of {placed.label} cannot be measured", error)
             problems.append(reason)
-            result = Measured.all_missing(placed.step.output_columns(), reason)
+            result = Measured.all_missing(columns, reason)
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
-    return EvidenceVerdict(tuple(problems), measured, tuple(step_errors))
+    return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks))
 
 
 def _step_problem(placed: PlacedStep, reason: str) -> str:
@@ -84,18 +90,20 @@ def _step_problem(placed: PlacedStep, reason: str) -> str:
     return f"{placed.step.prefix}: {reason}" if placed.step.prefix else reason
 
 
-def _unexplained_columns(placed: PlacedStep, measured: Measured) -> Iterator[str]:
-    for column in placed.step.output_columns():
+def _unexplained_columns(placed: PlacedStep, columns: Iterable[Column], measured: Measured) -> Iterator[str]:
+    for column in columns:
         if column.name not in measured.values and column.name not in measured.missing:
             yield f"{placed.label} gives neither a value nor a reason for {column.name}"
 
 
-def _impossible_values(placed: PlacedStep, measured: Measured) -> Iterator[tuple[str, str]]:
+def _impossible_values(
+    placed: PlacedStep, columns: Iterable[Column], measured: Measured
+) -> Iterator[tuple[str, str]]:
     """Yield each column whose measured value is outside its declared range, and the reason.
 
     Such values are removed, because a table that contains one could not be read again.
     """
-    for column in placed.step.output_columns():
+    for column in columns:
         text = "" if column.type is str else cell(measured.values.get(column.name))
         if text and (problem := "not a number" if text == "nan" else column.invalid_value_reason(text)):
             yield (

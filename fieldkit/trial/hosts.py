@@ -1,28 +1,35 @@
 """Judge each robot's state before and after an attempt: reboots, clock changes, and how its jobs ended."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
-from fieldkit.core.errors import describe_exception
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import clock, endings, host
 from fieldkit.measure.evidence.host import HostState
 from fieldkit.steps.capabilities import Restarts
 from fieldkit.steps.nest import own_jobs
-from fieldkit.steps.scene import Scene
+from fieldkit.steps.scene import Planned, Scene
 from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.step_errors import StepErrors
 
 _LOST: Final = "the section {} is missing in its state before or after the attempt"
 REBOOTED: Final = "the robot rebooted during the repeat"
 
 
-def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
+def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step_errors: StepErrors) -> Iterator[str]:
     """Yield the robots' problems that make an attempt void, and the sections that are missing in their state files.
 
     A section that a robot cannot provide is missing before and after; if it is missing in one of them only, it was
-    lost. If a step restarts a robot, only its jobs are judged, because its clock starts again.
+    lost. If a step restarts a robot, only its jobs are judged, because its clock starts again. Exceptions of steps
+    are added to `step_errors`.
     """
+    planned_jobs: list[Planned] = []
+    for placed in procedure.walk():
+        try:
+            planned_jobs += () if placed.disturbed else own_jobs(placed.step, scene)
+        except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
+            yield step_errors.add(f"the commands of {placed.label} cannot be derived", error)
     restarted_roles = restarted(procedure)
     for role in sorted(procedure.roles()):
         name = scene.robot(role).name
@@ -40,7 +47,9 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence) -> I
                 continue  # a reboot also ends its jobs and restarts its clock
             yield from (f"{name}: {reason}" for reason in _clock_problems(before, after))
         if after is not None and after.endings is not None:
-            yield from (f"{name}: {reason}" for reason in _job_problems(procedure, scene, role, after, evidence))
+            yield from (
+                f"{name}: {reason}" for reason in _job_problems(procedure, planned_jobs, role, after, evidence)
+            )
 
 
 def restarted(procedure: Procedure) -> frozenset[Role]:
@@ -73,24 +82,18 @@ def _clock_problems(before: HostState, after: HostState) -> Iterator[str]:
 
 
 def _job_problems(
-    procedure: Procedure, scene: Scene, role: Role, after: HostState, evidence: AttemptEvidence
+    procedure: Procedure, planned_jobs: Iterable[Planned], role: Role, after: HostState, evidence: AttemptEvidence
 ) -> Iterator[str]:
-    """Yield the jobs of undisturbed steps that did not end as required."""
-    for placed in procedure.walk():
-        try:
-            planned_jobs = () if placed.disturbed else tuple(own_jobs(placed.step, scene))
-        except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
-            yield f"the commands of {placed.label} cannot be derived: {describe_exception(error)}"
+    """Yield the jobs on a robot that did not end as required."""
+    for planned in planned_jobs:
+        if planned.role is not role:
             continue
-        for planned in planned_jobs:
-            if planned.role is not role:
-                continue
-            ending = (after.endings or {}).get(planned.job.name)
-            if (
-                ending is None
-                and role not in restarted(procedure)
-                and any(evidence.has(file) for file in (planned.job.log, planned.job.stdout) if file)
-            ):
-                yield f"its job {planned.job.name} ran, but its exit was not recorded"
-            if ending and (reason := endings.termination_error(ending, planned.permitted_causes, planned.least_s)):
-                yield f"its job {planned.job.name} {reason}"
+        ending = (after.endings or {}).get(planned.job.name)
+        if (
+            ending is None
+            and role not in restarted(procedure)
+            and any(evidence.has(file) for file in (planned.job.log, planned.job.stdout) if file)
+        ):
+            yield f"its job {planned.job.name} ran, but its exit was not recorded"
+        if ending and (reason := endings.termination_error(ending, planned.permitted_causes, planned.least_s)):
+            yield f"its job {planned.job.name} {reason}"

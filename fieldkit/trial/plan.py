@@ -12,13 +12,11 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Field, Int, Number, Strict
 from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
-from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
 from fieldkit.core.model import Distance, Placement, Protocol, RepeatId, Role, Topology
-from fieldkit.measure.transfers.transfer_spec import Transfer
-from fieldkit.steps.capabilities import DescribesActions, HasRefusals, Moves, Pings, SendsFile
-from fieldkit.steps.nest import Nest
-from fieldkit.steps.scene import Pinging, Planned, PutProgram, Refusal, Scene
+from fieldkit.steps.capabilities import DescribesActions, HasRefusals, Moves
+from fieldkit.steps.scene import Planned, PutProgram, Refusal, Scene
 from fieldkit.steps.variants import Variants
+from fieldkit.trial import step_errors
 from fieldkit.trial.columns import of_steps, trial_columns
 from fieldkit.trial.frozen import Columns
 from fieldkit.trial.procedure import Procedure, Repeats
@@ -109,15 +107,9 @@ class Plan(Strict):
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         """Yield every job of one attempt in the order of their starts."""
         for entry in self.procedure.steps:
-            try:
-                yield from entry.step.jobs(scene)
-            except FieldkitError:
-                raise
-            except Exception as error:
-                raise ConfigurationError(
-                    f"the commands of the step {entry.kind} cannot be derived: {describe_exception(error)}",
-                    remedy="report it to the author of the step",
-                ) from error
+            with step_errors.before_trial(f"the commands of the step {entry.kind} cannot be derived"):
+                planned_jobs = tuple(entry.step.jobs(scene))
+            yield from planned_jobs
 
     def program_copies(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""
@@ -151,29 +143,3 @@ class Plan(Strict):
         section_notes = (line for section in self._sections() for line in section.abort_notes(self))
         steps = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, Moves))
         return (*section_notes, *(line for step in steps for line in step.abort_notes(scene)))
-
-    def transfers(self, protocol: Protocol) -> tuple[Transfer, ...]:
-        """Return the packet filter of each transfer, in the order of their starts."""
-        scene = self.procedure.scene(protocol, self.cast, "")
-        transfers = (
-            placed.step.transfer(scene, placed.within)
-            for placed in self.procedure.walk()
-            if isinstance(placed.step, SendsFile)
-        )
-        return tuple(transfer for transfer in transfers if transfer is not None)
-
-    def pingings(self) -> tuple[Pinging, ...]:
-        """Return all round-trip time measurements of a repeat, in the order of their starts."""
-        pingings = (placed.step.pinging() for placed in self.procedure.walk() if isinstance(placed.step, Pings))
-        return tuple(pinging for pinging in pingings if pinging is not None)
-
-    def captures(self) -> Mapping[str, Role]:
-        """Return the role of the robot that makes each capture, by capture file."""
-        nests = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, Nest))
-        roles_by_file = [(file, role) for nest in nests for role, file in nest.captures().items()]
-        return {file: role for role in self.cast for file, owner in roles_by_file if owner == role}
-
-    def bags(self) -> Mapping[Role, str]:
-        """Return the first file that is recorded on each robot, by name below an attempt's folder."""
-        scene = self.procedure.scene(self.protocols[0], self.cast, "")
-        return {role: recordings[0].name for role, recordings in scene.recorded.items()}

@@ -43,7 +43,7 @@ from fieldkit.steps.legs import PathLeg
 from fieldkit.steps.nest import Nest, resolved, with_record
 from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
-from fieldkit.trial import columns
+from fieldkit.trial import columns, step_errors
 from fieldkit.trial.procedure_section import ProcedureSection
 
 Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
@@ -118,7 +118,9 @@ class Procedure(catalog.Named, Sectioned):
         """Reject a role without a place, which is most likely misspelled."""
         known_roles = (*FIXED_ROLES, *self.places)
         for placed in self.walk():
-            for role in sort_roles(placed.step.roles() - set(known_roles)):
+            with step_errors.before_trial(f"{placed.label} cannot be planned"):
+                roles = placed.step.roles()
+            for role in sort_roles(roles - set(known_roles)):
                 remedy = f"give its place: places: {{{role}: {{near: sender, left: 5m}}}}"
                 raise schema.validation_error(
                     f"there is no role {role}; {did_you_mean(role, known_roles, remedy)}", *placed.at
@@ -144,19 +146,21 @@ class Procedure(catalog.Named, Sectioned):
         for placed in self.walk():
             step = placed.step
             before = [other.step for other in earlier if not placed.runs_beside(other)]
+            with step_errors.before_trial(f"{placed.label} cannot be planned"):
+                resources, file_names, step_columns = step.exclusive_resources(), step.files(), columns.of_step(step)
             if isinstance(step, ChecksPlacement) and (reason := step.placement_error(before, placed.within)):
                 raise schema.validation_error(reason, *placed.at)
-            for resource in step.exclusive_resources():
+            for resource in resources:
                 if (step.prefix, resource) in used_resources:
                     raise schema.validation_error(_duplicate_resource_message(step, resource), *placed.at)
                 used_resources.add((step.prefix, resource))
-            for name in step.files():
+            for name in file_names:
                 if reason := _file_conflict(step, name, files):
                     raise schema.validation_error(reason, *placed.at)
                 files.add(name)
             if reason := next(filter(None, map(placed.port_conflict, earlier)), None):
                 raise schema.validation_error(reason, *placed.at, "port")
-            for column in columns.of_step(step):
+            for column in step_columns:
                 if reason := columns.column_conflict(column, filled):
                     raise schema.validation_error(reason, *placed.at)
                 filled.add(column.name)

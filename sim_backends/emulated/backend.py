@@ -25,8 +25,8 @@ from sim_backends.emulated.provisioning import (
     drives_by_topic,
     sensors_of,
 )
-from sim_backends.emulated.robot import rootfs
-from sim_backends.emulated.ros import messages
+from sim_backends.emulated.robot.spec import unsupported_paths
+from sim_backends.emulated.ros import sensor_specs
 from sim_backends.world.world import load_world
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ class EmulatedBackend:
         for robot in robots.values():
             _check_ros(robot, self._options)
             for sensor in sensors_of(robot):
-                messages.check(sensor)
+                sensor_specs.check(sensor)
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""
@@ -220,7 +220,7 @@ def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
             where=robot.name,
             remedy="remove the topics that have a definition from a copy of the profile",
         )
-    if unsupported := rootfs.unsupported_paths(ros.command.setup):
+    if unsupported := unsupported_paths(ros.command.setup):
         raise ConfigurationError(
             f"a robot cannot have the setup file {unsupported[0]}: it is in the root directory or in a kernel folder",
             where=robot.name,

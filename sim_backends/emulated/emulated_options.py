@@ -6,8 +6,7 @@ from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Document, Duration, Field, Strict
-from sim_backends.emulated.robot.rootfs import NETCATS
-from sim_backends.emulated.robot.spec import HELLO_S, Netcat, Ping, SshServer, Userland
+from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
 from sim_backends.radio.radio_options import RadioOptions
 
 BOOT_S: Final = 2.0

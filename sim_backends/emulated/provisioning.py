@@ -17,8 +17,14 @@ from sim_backends.emulated.emulated_options import HOST_TOOLS, EmulatedOptions, 
 from sim_backends.emulated.motion_sections import drive_of, mavlink_of
 from sim_backends.emulated.robot.spec import ANTENNA_M, LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros import static_frames
-from sim_backends.emulated.ros.laser import LaserTarget, Neighbour
-from sim_backends.emulated.ros.messages import GENERATORS, LASER_SCAN, Definition, Sensor
+from sim_backends.emulated.ros.sensor_specs import (
+    GENERATED_TYPES,
+    LASER_SCAN,
+    Definition,
+    LaserTarget,
+    Neighbour,
+    Sensor,
+)
 from sim_backends.world.shapes import Cylinder, Shape
 from sim_backends.world.world import World
 
@@ -96,7 +102,7 @@ def _topics(robot: "Robot | LabRobot") -> tuple[PublishedTopic, ...]:
 
 def _sensor(topic: PublishedTopic) -> Sensor:
     sensor = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points, child_frame=topic.child_frame)
-    if topic.type in GENERATORS:
+    if topic.type in GENERATED_TYPES:
         return sensor
     from sim_backends.emulated.ros import templates  # noqa: PLC0415 (as above)
 

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common as d
 
 from fieldkit.agent import dialect, mavlink_frames
 from fieldkit.agent.arming import ArmingCheck
-from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.autopilot import AutopilotState, status_text
 from fieldkit.agent.flight_plan import FlightNeeds, FlightPlan, point_on_path
 from fieldkit.agent.flying.origin import FlightOrigin
 from fieldkit.agent.links.client import MessageRate
@@ -70,7 +70,7 @@ def test_state_from_messages_of_an_autopilot() -> None:
     assert state.speed_m_s == pytest.approx(0.5)
     assert state.yaw_rad == pytest.approx(1.5)
     assert state.command_results == {400: 4}
-    assert state.status_text == "mode OFFBOARD, its last text: Arming denied: it falls"
+    assert status_text(state) == "mode OFFBOARD, its last text: Arming denied: it falls"
     assert state.texts.unread() == ["Arming denied: it falls"]
     assert state.texts.unread() == []
 
@@ -107,13 +107,13 @@ def test_any_payload_is_tolerated(payloads: list[tuple[int, bytes]]) -> None:
 
 def test_sent_messages_are_those_of_pymavlink() -> None:
     state, link = state_from()
-    state.send_heartbeat()
+    state.commands.send_heartbeat()
     assert state.dialect is not None
-    state.command(*state.dialect.guided_command())
-    state.command(dialect.ARM, 1)
-    state.command(*state.dialect.bring_down_command("land"))
-    state.send_set_point((1.5, -2.5, -3.0), -2.0)
-    state.request_stream(mavlink_frames.ATTITUDE, 10.0)
+    state.commands.send(*state.dialect.guided_command())
+    state.commands.send(dialect.ARM, 1)
+    state.commands.send(*state.dialect.bring_down_command("land"))
+    state.commands.send_set_point((1.5, -2.5, -3.0), -2.0)
+    state.commands.request_stream(mavlink_frames.ATTITUDE, 10.0)
     reader = d.MAVLink(None)
     messages = [message for frame in link.sent for message in reader.parse_buffer(frame)]
     beat, mode, arm, land, lead, ask = messages

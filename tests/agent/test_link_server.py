@@ -107,7 +107,7 @@ def test_each_connection_is_shared_by_four_programs(kind: str) -> None:
                 sessions, lambda: all(session.drone.alive and session.drone.position_m for session in sessions)
             )
             assert len(servers(connection)) == 1
-            sessions[3].drone.command(512, 148)
+            sessions[3].drone.commands.send(512, 148)
             exchange_until(sessions, lambda: 512 in sessions[3].drone.command_results)
         assert_nothing_remains(connection)
 
@@ -137,7 +137,7 @@ def test_killed_or_suspended_server_is_replaced(fault: signal.Signals) -> None:
     with drone_at("tcp of one client") as connection:
         with connected_sessions(connection, 3) as sessions:
             exchange_until(sessions, lambda: all(session.drone.alive for session in sessions))
-            sessions[0].drone.request_stream(ATTITUDE, 20)
+            sessions[0].drone.commands.request_stream(ATTITUDE, 20)
             links = links_of(sessions)
             (pid,) = servers(connection)
             os.kill(pid, fault)
@@ -178,7 +178,7 @@ def test_reconnected_serial_device_stops_no_program(tmp_path: Path) -> None:
         connection = f"{usb.path}:115200"
         with connected_sessions(connection, 2) as sessions:
             exchange_until(sessions, lambda: all(session.drone.alive for session in sessions))
-            sessions[0].drone.request_stream(ATTITUDE, 20)
+            sessions[0].drone.commands.request_stream(ATTITUDE, 20)
             links = links_of(sessions)
             (pid,) = servers(connection)
             exchange_until(sessions, lambda: ATTITUDE in links[0].messages and links[0].messages[ATTITUDE].hz > 14)
@@ -198,12 +198,12 @@ def test_exit_of_a_client_keeps_the_rates_of_others() -> None:
     with drone_at("udpout") as connection, connected_sessions(connection, 2) as sessions:
         exchange_until(sessions, lambda: all(session.drone.alive for session in sessions))
         links = links_of(sessions)
-        sessions[0].drone.request_stream(LOCAL_POSITION_NED, 10)
-        sessions[1].drone.request_stream(LOCAL_POSITION_NED, 40)
+        sessions[0].drone.commands.request_stream(LOCAL_POSITION_NED, 10)
+        sessions[1].drone.commands.request_stream(LOCAL_POSITION_NED, 40)
         exchange_until(
             sessions, lambda: links[0].messages[LOCAL_POSITION_NED].hz > 28 if links[0].messages else False
         )
-        sessions[1].drone.request_stream(LOCAL_POSITION_NED, 0)
+        sessions[1].drone.commands.request_stream(LOCAL_POSITION_NED, 0)
         exchange_until(sessions, lambda: links[0].messages[LOCAL_POSITION_NED].hz < 14)
         exchange_until(sessions, lambda: not links[1].messages)
         assert links[0].messages[LOCAL_POSITION_NED].interval_us == 100_000
@@ -215,7 +215,7 @@ def test_rate_that_another_station_changed_is_requested_again() -> None:
         with connected_sessions(connection) as sessions:
             exchange_until(sessions, lambda: sessions[0].drone.alive)
             (link,) = links_of(sessions)
-            sessions[0].drone.request_stream(ATTITUDE, 20)
+            sessions[0].drone.commands.request_stream(ATTITUDE, 20)
             exchange_until(sessions, lambda: ATTITUDE in link.messages and link.messages[ATTITUDE].hz > 17)
             # REQUEST_DATA_STREAM as sent by MAVProxy: all streams at 4 Hz.
             station = drones.Sender(255, 230)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldkit.analysis import comparison_results
 from fieldkit.analysis.compare import Comparison, Difference, compare
-from fieldkit.analysis.result_tables import comparison_csv
 from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, parsed, replace
 
 UDP = bursty(COMPARABLE, 20, seed=1)
@@ -239,7 +239,7 @@ def test_swapping_the_runs_changes_all_signs(seed: int, n: int, m: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_the_order_of_rows_changes_nothing(seed: int) -> None:
     a, b = list(UDP), bursty(COMPARABLE, 15, seed=2)
-    before = comparison_csv(compared(a, b))
+    before = comparison_results.to_csv(compared(a, b))
     for rows in (a, b):
         random.Random(seed).shuffle(rows)
-    assert comparison_csv(compared(a, b)) == before
+    assert comparison_results.to_csv(compared(a, b)) == before

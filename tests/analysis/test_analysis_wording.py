@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from fieldkit.analysis import wording
+from fieldkit.analysis import comparison_results
 from fieldkit.analysis.compare import Difference, compare
 from fieldkit.core.model import Interval
 from tests.helpers.tables import COMPARABLE, bursty, parsed
@@ -49,4 +49,4 @@ def between(
     ],
 )
 def test_the_verdict_on_a_difference(change: Difference, expected: str) -> None:
-    assert wording.verdict(change, 20) == expected
+    assert comparison_results.verdict(change, 20) == expected

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.analysis import repeats, result_tables, wording
+from fieldkit.analysis import comparison_results, repeats, result_tables, wording
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.compare import compare
 from fieldkit.analysis.repeats import Repeats
@@ -100,7 +100,7 @@ def test_words_of_two_runs_are_listed_but_not_compared() -> None:
     result = compare(a, b)
     without = compare(table(["", "", ""]), table(["", "", ""]))
     assert result.n_compared == without.n_compared, "words are not in the number of comparisons"
-    rows = {row.quantity: row for _, row in result_tables.difference_rows(result) if row.estimate == Kind.WORDS}
+    rows = {row.quantity: row for _, row in comparison_results.difference_rows(result) if row.estimate == Kind.WORDS}
     assert set(rows) == {"grass=wet", "grass=dry"}
     wet = rows["grass=wet"]
     assert (wet.n_a, wet.n_b) == (3, 2)
@@ -109,6 +109,6 @@ def test_words_of_two_runs_are_listed_but_not_compared() -> None:
 
 
 def test_words_of_only_one_run_are_listed() -> None:
-    rows = [row for _, row in result_tables.difference_rows(compare(table(["", ""]), table(["wet", ""])))]
+    rows = [row for _, row in comparison_results.difference_rows(compare(table(["", ""]), table(["wet", ""])))]
     (wet,) = (row for row in rows if row.quantity == "grass=wet")
     assert (wet.n_a, wet.n_b, wet.a, wet.b, wet.difference) == (None, 1, None, 1, None)

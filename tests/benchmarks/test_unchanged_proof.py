@@ -96,6 +96,7 @@ def test_structure_is_counted(tmp_path: Path) -> None:
         "fieldkit/b/options.py": '"""Whoever tells; told."""\n',
         "sim_backends/options.py": "class Large:\n" + "".join(f"    def m{n}(self): ...\n" for n in range(13)),
         "sim_backends/__init__.py": "class Small:\n" + "".join(f"    def _m{n}(self): ...\n" for n in range(13)),
+        "fieldkit/__init__.py": '"""A package."""\n',
         "docs/a.md": "nobody mends it\n" + "x" * 20_000,
     }
     for name, text in files.items():
@@ -105,8 +106,10 @@ def test_structure_is_counted(tmp_path: Path) -> None:
     assert structure.namesakes(tmp_path) == {"options.py": 3}
     assert structure.large_classes(tmp_path) == {"sim_backends/options.py: Large": 13}
     assert numbers == numbers | {
-        "lines of code": "32",
-        "files per 1,000 lines": "125.00",
+        "lines of code": "33",
+        "files per 1,000 lines, without empty `__init__`": "121.21",
+        "empty `__init__` files": "1",
+        "files over 400 lines": "0",
         "file names used more than twice": "1",
         "classes with over 12 public methods": "1",
         "pages over 20 kB": "1",

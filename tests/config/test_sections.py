@@ -78,6 +78,14 @@ def test_an_error_in_a_section_names_its_place(winch: object, message: str) -> N
     assert caught.value.where.startswith("robots/iris.yaml:")
 
 
+def test_an_error_in_a_section_hides_no_other_error() -> None:
+    broken = {**PROFILE, "winch": {"metres": "3"}, "limits": {"max_speed_m_s": "fast"}}
+    with pytest.raises(ConfigurationError) as caught:
+        schema.validate(schema.parse(documents.to_text(broken), source="robots/iris.yaml"), BenchProfile)
+    assert caught.value.what.startswith("in limits.max_speed_m_s: "), "the first error in the file"
+    assert caught.value.what.endswith(" (1 more after this one)")
+
+
 def test_a_key_of_no_package_is_unknown() -> None:
     document = schema.parse(documents.to_text({**PROFILE, "winch": {"metres": 3}}), source="robots/iris.yaml")
     with pytest.raises(ConfigurationError, match="unknown key winch"):

@@ -12,7 +12,7 @@ from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.headers import TCP, UDP
 from fieldkit.measure.transfers.transfer_spec import Transfer
-from fieldkit.trial import gates, store
+from fieldkit.trial import gates, planned_evidence, store
 from fieldkit.trial.plan import Plan
 from tests.helpers.dissected import Row, dissected
 from tests.helpers.labs import write_procedure
@@ -103,7 +103,7 @@ def test_the_losses_of_each_udp_transfer_equal_those_counted_by_scapy(trial: Pat
     lost = 0
     for plan, folder, values in attempts(trial, Protocol.UDP):
         captures = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
-        for transfer in plan.transfers(Protocol.UDP):
+        for transfer in planned_evidence.transfers(plan, Protocol.UDP):
             sent_keys = list(packet_keys(captures[transfer.source], transfer, UDP))
             ids = {key[0] for is_first, key in sent_keys if is_first}
             sent_packets = Counter(key for _, key in sent_keys if key[0] in ids)
@@ -122,7 +122,7 @@ def test_the_losses_of_each_udp_transfer_equal_those_counted_by_scapy(trial: Pat
 def test_each_tcp_transfer_is_complete_and_counts_only_its_frames(trial: Path) -> None:
     for plan, folder, values in attempts(trial, Protocol.TCP):
         captures = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
-        for transfer in plan.transfers(Protocol.TCP):
+        for transfer in planned_evidence.transfers(plan, Protocol.TCP):
             name = transfer.name
             frames = sum(is_own for is_own, _ in packet_keys(captures[transfer.source], transfer, TCP))
             assert values[f"{name}.ip_packets_sent"] == frames

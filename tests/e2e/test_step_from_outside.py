@@ -46,7 +46,7 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
     (installed / f"{target.partition(':')[0]}.py").write_text(source, encoding="utf-8")
     (tmp_path / "procedures").mkdir()
     (tmp_path / "procedures" / "busy.yaml").write_text(PROCEDURE, encoding="utf-8")
-    environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}"}
+    environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}", "TMPDIR": str(tmp_path)}
 
     def run(*words: str) -> subprocess.CompletedProcess[str]:
         command = (sys.executable, "-m", "fieldkit", *words)
@@ -90,53 +90,81 @@ def test_the_step_runs_and_is_judged_measured_and_reported(fieldkit: Fieldkit, t
     assert rows(folder)[0]["route_device"] == "", "a figure that is not there is empty, and never guessed"
 
 
-@pytest.mark.emulated
-def test_a_step_that_raises_fails_its_attempt_with_one_line(fieldkit: Fieldkit, tmp_path: Path) -> None:
-    built_in_ros(tmp_path)
-    with (tmp_path / "installed" / "route_step.py").open("a", encoding="utf-8") as module:
-        module.write("\n    def run(self, *_: object) -> None:\n        raise KeyError('wlan0')\n")
-    done = fieldkit("trial", "busy", "5m")
-    assert (done.returncode, "Traceback" in done.stdout + done.stderr) == (4, False)
-    assert "the step route raised KeyError: 'wlan0'" in done.stdout
-    assert "report it to the author of the step, with step-error.log of this repeat" in done.stdout
-    folder = only_trial(tmp_path)
-    assert [row["status"] for row in rows(folder)] == ["void", "void", "failed"]
-    logs = list(folder.glob("**/step-error.log"))
-    assert len(logs) == 3
-    assert all("route_step.py" in log.read_text(encoding="utf-8") for log in logs)
-    assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
+RAISING = """
+    def run(self, scene: Scene, *others: object) -> None:
+        if scene.repeat == 1:
+            raise KeyError('wlan0')
+        super().run(scene, *others)
+
+    def argv(self, scene: Scene) -> tuple[str, ...]:
+        if scene.repeat == 2:
+            raise RuntimeError('no address')
+        return ("true",)
+
+    def measure(self, view: object) -> None:
+        if view.scene.repeat == 3:
+            raise RuntimeError('no route\\nat all')
+        return super().measure(view)
+
+    def check(self, view: object) -> None:
+        if view.scene.repeat == 4:
+            raise OSError('no device')
+        return super().check(view)
+
+    def parse(self, output: str) -> None:
+        return {"route_device": "wlan0"}
+"""
 
 
 @pytest.mark.emulated
-def test_an_exception_on_its_output_is_one_line_with_its_place_and_a_traceback(
+def test_a_step_that_raises_ends_its_attempt_as_failed_with_one_line_and_a_traceback(
     fieldkit: Fieldkit, tmp_path: Path
 ) -> None:
     built_in_ros(tmp_path)
     with (tmp_path / "installed" / "route_step.py").open("a", encoding="utf-8") as module:
-        module.write("\n    def parse(self, output: str) -> None:\n        raise RuntimeError('no route\\nat all')\n")
-    done = fieldkit("trial", "busy", "5m")
-    reason = (
-        "the evidence of the step route cannot be measured: RuntimeError: no route \\(route_step.py, line [0-9]+\\);"
-    )
-    assert len(re.findall(reason, done.stdout)) == 3, done.stdout
+        module.write(RAISING)
+    done = fieldkit("trial", "busy", "5m", "--repeats", "5")
+    assert (done.returncode, "Traceback" in done.stdout + done.stderr) == (4, False), done.stderr
     folder = only_trial(tmp_path)
-    logs = list(folder.glob("**/step-error.log"))
-    assert len(logs) == 3
-    assert all("in parse" in log.read_text(encoding="utf-8") for log in logs)
+    table = rows(folder)
+    assert [(row["attempt"], row["status"]) for row in table] == [("1", "failed")] * 4 + [("1", "valid")]
+    unmeasured = "the evidence of the step route cannot be measured: "
+    lines = [
+        "the step route raised KeyError: 'wlan0' ",
+        "the step route raised RuntimeError: no address ",
+        f"{unmeasured}RuntimeError: no route ",
+        f"{unmeasured}OSError: no device ",
+    ]
+    for number, (line, row) in enumerate(zip(lines, table, strict=False), start=1):
+        assert re.fullmatch(
+            re.escape(line) + r"\(route_step.py, line [0-9]+\); traceback in step-error.log", row["reason"]
+        ), row["reason"]
+        assert row["reason"] in done.stdout
+        log = folder / "repeats" / f"tcp-0{number}.failed1" / "step-error.log"
+        assert f"report it to the author of the step, with {log.relative_to(tmp_path)}" in done.stdout
+        assert "route_step.py" in log.read_text(encoding="utf-8")
     assert fieldkit("verify", str(folder)).returncode == 0
     assert fieldkit("rebuild", str(folder)).stdout.endswith("the same bytes as before\n")
 
 
-def test_a_step_without_a_command_is_an_error_before_the_trial(fieldkit: Fieldkit, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("signature", "line"),
+    [
+        ("argv(self, scene: Scene)", "the commands of the step route cannot be derived: KeyError: 'wlan0'"),
+        ("output_columns(self)", "the step route cannot be planned: KeyError: 'wlan0'"),
+    ],
+)
+def test_a_step_that_raises_in_every_call_is_an_error_before_the_trial(
+    fieldkit: Fieldkit, tmp_path: Path, signature: str, line: str
+) -> None:
     with (tmp_path / "installed" / "route_step.py").open("a", encoding="utf-8") as module:
-        module.write("\n    def argv(self, scene: Scene) -> None:\n        raise KeyError('wlan0')\n")
+        module.write(f"\n    def {signature} -> None:\n        raise KeyError('wlan0')\n")
     for options in ((), ("--dry-run",)):
         refused = fieldkit("trial", "busy", "5m", *options)
-        assert refused.returncode == 2
-        assert (
-            "the commands of the step route cannot be derived: KeyError: 'wlan0' (route_step.py, line"
-            in refused.stderr
-        )
+        assert (refused.returncode, "Traceback" in refused.stderr) == (2, False)
+        assert f"{line} (route_step.py, line" in refused.stderr
+    (log,) = re.findall(r"report it to the author of the step, with its traceback in (\S+\.log)", refused.stderr)
+    assert "KeyError: 'wlan0'" in Path(log).read_text(encoding="utf-8")
     assert not (tmp_path / "trials").exists()
 
 

@@ -22,7 +22,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.remote.drain import drain, wait_for_output
 from fieldkit.remote.link import SPARES, Channel, Link, UnfitServerError
-from fieldkit.remote.persistent_shells import PersistentShell, RunningCommand
+from fieldkit.remote.persistent_shells import PersistentShell, wait_for_start
 from fieldkit.remote.script import CALL, SCRIPT, SCRIPT_PATH
 from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshSession, SshShell
@@ -400,9 +400,9 @@ def test_output_and_exit_code_are_separated_for_any_pieces(
     taken = threading.Lock()
     taken.acquire()
     try:
-        running_command = RunningCommand(cast("Channel", channel), NONCE, taken)
+        running_command = wait_for_start(cast("Channel", channel), NONCE, taken)
         into = BytesIO()
-        assert running_command.wait_for_start()
+        assert running_command is not None
         assert wait_for_output(running_command, out[0][:3], deadline=soon(), robot="robot")
         done = drain(running_command, into, stdin=None, deadline=soon(), limit_bytes=1 << 20, robot="robot")
         running_command.close()
@@ -417,4 +417,4 @@ def test_output_and_exit_code_are_separated_for_any_pieces(
 def test_end_without_an_exit_code_is_an_error(end: bytes) -> None:
     channel = ReceivedChannel([NONCE + b"\n" + NONCE + end + b"...."], [])
     with pytest.raises(UnfitServerError, match="exit code"):
-        RunningCommand(cast("Channel", channel), NONCE, threading.Lock()).wait_for_start()
+        wait_for_start(cast("Channel", channel), NONCE, threading.Lock())

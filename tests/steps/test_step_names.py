@@ -14,7 +14,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.base import Step
 from fieldkit.steps.nest import own_jobs
 from fieldkit.steps.view import View, capture_around
-from fieldkit.trial import gates, rows
+from fieldkit.trial import gates, planned_evidence, rows
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
@@ -95,20 +95,20 @@ def test_plan_lists_transfers_pings_and_captures() -> None:
     plan = plan_of()
     transfers = [
         (transfer.name, transfer.sent_file, transfer.received_file, transfer.captures)
-        for transfer in plan.transfers(Protocol.UDP)
+        for transfer in planned_evidence.transfers(plan, Protocol.UDP)
     ]
     assert transfers == [
         ("up", "imu.bag", "up.recv.bag", ("sender.pcap", "receiver.pcap")),
         ("bare", "scan.bag", "bare.recv.bag", (None, None)),
     ]
-    pings = [(ping.name, ping.role, ping.file) for ping in plan.pingings()]
+    pings = [(ping.name, ping.role, ping.file) for ping in planned_evidence.pingings(plan)]
     assert pings == [("up", Role.SENDER, "up.ping.txt"), ("", Role.RECEIVER, "ping.txt")]
-    assert plan.captures() == {
+    assert planned_evidence.captures(plan) == {
         "sender.pcap": Role.SENDER,
         "inner.sender.pcap": Role.SENDER,
         "receiver.pcap": Role.RECEIVER,
     }
-    assert plan.bags() == {Role.SENDER: "scan.bag"}
+    assert planned_evidence.bags(plan) == {Role.SENDER: "scan.bag"}
     assert [file.name for file in plan.scenes()[0].recorded[Role.SENDER]] == ["scan.bag", "imu.bag"]
 
 
@@ -190,7 +190,7 @@ def test_ambiguous_steps_are_refused(old: str, new: str, what: str) -> None:
 @pytest.mark.parametrize("file", ["imu", "imu.bag"])
 def test_transfer_names_bag_or_file(file: str) -> None:
     plan = plan_of(STEPS.replace("file: imu", f"file: {file}"))
-    assert plan.transfers(Protocol.UDP)[0].sent_file == "imu.bag"
+    assert planned_evidence.transfers(plan, Protocol.UDP)[0].sent_file == "imu.bag"
     assert plan.refusals({}) == ()
 
 

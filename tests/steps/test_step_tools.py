@@ -12,6 +12,7 @@ from fieldkit.steps import variants
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.scene import Refusal
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool, Variants
+from fieldkit.trial import planned_evidence
 from fieldkit.trial.check import tools
 from fieldkit.trial.plan import Plan
 from tests.helpers.casts import TURTLEBOT, los_plan, ros_of
@@ -104,7 +105,7 @@ def ros2_plan(text: str) -> Plan:
 def test_file_of_ros2_recorder_is_sent_and_measured(suffix: str) -> None:
     plan = ros2_plan(f"--no-discovery > {{name}}/{{name}}_0.{suffix}")
     assert lines(Protocol.TCP, {}, plan)["send"].endswith(f"< scan/scan_0.{suffix} 2> sender-send.log")
-    (transfer,) = plan.transfers(Protocol.TCP)
+    (transfer,) = planned_evidence.transfers(plan, Protocol.TCP)
     assert transfer.sent_file == f"scan/scan_0.{suffix}"
 
 

@@ -44,6 +44,15 @@ def test_finished_repeats_of_the_same_trial_are_preferred() -> None:
     assert of_repeats(here, UDP, 3, known) == TimeEstimate(24.0, 24.0), "each protocol by its own repeats"
 
 
+def test_a_trial_reports_batteries_that_do_not_last_for_it() -> None:
+    short = LOS.model_copy(update={"repeats": 1})
+    assert not list(estimates.battery_notes([short]))
+    (note,) = estimates.battery_notes([LOS.model_copy(update={"repeats": 20})])
+    assert note.startswith(
+        "duckiedrone-1 runs for about 7 min on one charge (battery_min of its profile), the trial "
+    )
+
+
 def test_a_larger_distance_than_any_before_may_have_a_dead_link() -> None:
     known = [FinishedRepeat(at("10m"), TCP, 9.0), FinishedRepeat(at("20m"), TCP, 12.0)]
     farther = of_repeats(at("30m"), TCP, 1, known)

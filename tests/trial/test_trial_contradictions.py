@@ -14,6 +14,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import hosts, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import load_procedure
+from fieldkit.trial.step_errors import StepErrors
 from tests.helpers.paths import DATA
 from tests.helpers.plans import problems
 
@@ -221,7 +222,7 @@ def test_a_robot_that_a_step_reboots_may_reboot(tcp: Attempt) -> None:
     procedure, scene = load_procedure("selfheal"), PLAN.scene(RepeatId(Protocol.TCP, 1), "")
     for role in ("sender", "receiver"):
         tcp.text(f"{role}-after.txt", BOOT, BOOT.replace("a", "b"))
-    problems = hosts.problems(procedure, scene, AttemptEvidence(tcp.folder))
+    problems = hosts.problems(procedure, scene, AttemptEvidence(tcp.folder), StepErrors())
     assert list(problems) == ["turtlebot-1: the robot rebooted during the repeat"], (
         "of the robot that only loses its link"
     )

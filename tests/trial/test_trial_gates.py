@@ -145,7 +145,7 @@ def test_one_damaged_file_gives_one_reason(folder: Path, damage: Callable[[Path]
     assert not [other for other in reasons if "cannot be measured" in other], "the damage is handled"
 
 
-def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exception_while_measuring_makes_the_attempt_failed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def measure(step: PingStep, view: View) -> Measured:
         raise OverflowError("int too large to convert to float")
 
@@ -157,7 +157,25 @@ def test_an_exception_while_measuring_makes_the_attempt_void(folder: Path, monke
     assert judged.measured.missing["rtt_loss"] == output_text
     (traceback,) = judged.step_errors
     assert "in measure" in traceback
+    assert judged.has_failed
     assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
+
+
+@pytest.mark.parametrize("method", ["check", "output_columns", "jobs"])
+def test_an_exception_of_any_method_makes_the_attempt_failed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    def raise_error(*_: object) -> None:
+        raise KeyError("wlan0")
+
+    monkeypatch.setattr(PingStep, method, raise_error)
+    judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    *_, reason = judged.problems  # the jobs of the capture around it raise too
+    assert "the step ping cannot be " in reason
+    assert "KeyError: 'wlan0' (test_trial_gates.py, line" in reason
+    assert judged.has_failed
+    (folder / "scan.bag").unlink()
+    assert not gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder)).has_failed, "another attempt may help"
 
 
 def test_an_impossible_value_makes_the_attempt_void_and_is_missing(

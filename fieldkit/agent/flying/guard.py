@@ -15,13 +15,12 @@ from fieldkit.agent.autopilot import GUARD
 from fieldkit.agent.flight_plan import LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING, LivenessFile
-from fieldkit.agent.flying.loop import GAP_S, HEARTBEAT_S, RATE_HZ
+from fieldkit.agent.flying.loop import GAP_S, RATE_HZ, wait_for_heartbeat
 from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.landing import (
     CANCELLED,
     LEASE_EXPIRED,
     PEER_STOPPED,
-    REFUSED,
     FlightError,
     alarm,
     bring_down,
@@ -75,17 +74,10 @@ class FlightGuard:
             self._session.close()
 
     def _wait_for_autopilot(self) -> None:
-        start_s = time.monotonic()
-        while not self._drone.alive:
-            if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was cancelled")
-            if time.monotonic() > start_s + HEARTBEAT_S:
-                connection = self._plan.connection
-                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
-            self._exchange()
+        wait_for_heartbeat(self._session, self._plan.connection, self._stop_event, self._update)
         self._first_mode = self._drone.mode if self._drone.armed else None
         for kind in (HEARTBEAT, LOCAL_POSITION_NED):
-            self._drone.request_stream(kind, RATE_HZ)
+            self._drone.commands.request_stream(kind, RATE_HZ)
         self._orders = Orders(self._plan.orders, (STAY, LEAVE), self._plan.lease_s)
         self._iteration_s = None
 

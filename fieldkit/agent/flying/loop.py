@@ -6,7 +6,7 @@ import threading
 import time
 from typing import Callable, Iterator
 
-from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.autopilot import AutopilotState, status_text
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying.liveness import FLYING, IDLE, LANDING, PILOT, LivenessFile
 from fieldkit.agent.flying.origin import FlightFence, FlightOrigin, Position
@@ -86,18 +86,10 @@ class FlightLoop:
         Raises:
             FlightError: No heartbeat arrived, or the job was cancelled.
         """
-        start_s = time.monotonic()
-        while not self.drone.alive:
-            if self._stop_event.is_set():
-                raise FlightError(CANCELLED, "the job was cancelled")
-            if time.monotonic() > start_s + HEARTBEAT_S:
-                connection = self._plan.connection
-                raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
-            self.update()
-            self.session.exchange(1 / RATE_HZ)
+        wait_for_heartbeat(self.session, self._plan.connection, self._stop_event, self.update)
         for kind in _STREAMS:
-            self.drone.request_stream(kind, RATE_HZ)
-        self.drone.request_stream(GLOBAL_POSITION_INT, 2.0)
+            self.drone.commands.request_stream(kind, RATE_HZ)
+        self.drone.commands.request_stream(GLOBAL_POSITION_INT, 2.0)
         self.orders = Orders(self._plan.orders, (STAY, CLIMB, GO, HOME, LEAVE), self._plan.lease_s)
 
     def update(self) -> None:
@@ -133,7 +125,9 @@ class FlightLoop:
             self._require_control()
             if set_point is not None:
                 position_m = set_point()
-                self.drone.send_set_point(self.fence.clamped(position_m) if self.fence else position_m, self.yaw_rad)
+                self.drone.commands.send_set_point(
+                    self.fence.clamped(position_m) if self.fence else position_m, self.yaw_rad
+                )
             self.update()
             self.session.exchange(1 / RATE_HZ)
             yield
@@ -167,7 +161,7 @@ class FlightLoop:
             if is_done():
                 return
             if time.monotonic() > start_s + COMMAND_TIMEOUT_S:
-                raise FlightError(REFUSED, f"the autopilot refuses {what} ({self.drone.status_text})")
+                raise FlightError(REFUSED, f"the autopilot refuses {what} ({status_text(self.drone)})")
             if time.monotonic() > retry_s:
                 retry_s = time.monotonic() + RETRY_S
                 send_command()
@@ -196,11 +190,11 @@ class FlightLoop:
         if not drone.guided:
             if self._liveness is not None and self._liveness.other_state == LANDING:
                 raise FlightError(PEER_STOPPED, "the guard lands it")
-            raise FlightError(TAKEN_OVER, f"another party flies it ({drone.status_text})")
+            raise FlightError(TAKEN_OVER, f"another party flies it ({status_text(drone)})")
         if not self.has_armed:
             return
         if not drone.armed:
-            raise FlightError(TAKEN_OVER, f"its motors have stopped ({drone.status_text})")
+            raise FlightError(TAKEN_OVER, f"its motors have stopped ({status_text(drone)})")
         if drone.position_age_s > _POSITION_TIMEOUT_S:
             raise FlightError(REFUSED, f"it has not reported its position for {_POSITION_TIMEOUT_S:g} s")
         if (
@@ -209,3 +203,21 @@ class FlightLoop:
             and (breach := self.fence.breach(drone.position_m))
         ):
             raise FlightError(FENCE_BREACHED, breach)
+
+
+def wait_for_heartbeat(
+    session: AutopilotSession, connection: str, stop_event: threading.Event, each_iteration: Callable[[], None]
+) -> None:
+    """Wait for the first heartbeat of the autopilot at a connection.
+
+    Raises:
+        FlightError: No heartbeat arrived, or the job was cancelled.
+    """
+    start_s = time.monotonic()
+    while not session.drone.alive:
+        if stop_event.is_set():
+            raise FlightError(CANCELLED, "the job was cancelled")
+        if time.monotonic() > start_s + HEARTBEAT_S:
+            raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
+        each_iteration()
+        session.exchange(1 / RATE_HZ)

@@ -44,7 +44,7 @@ class AutopilotSession:
         end_s = time.monotonic() + duration_s
         if time.monotonic() > self._next_heartbeat_s:
             self._next_heartbeat_s = time.monotonic() + _HEARTBEAT_INTERVAL_S
-            self.drone.send_heartbeat()
+            self.drone.commands.send_heartbeat()
         while (remaining_s := end_s - time.monotonic()) > 0:
             if self._selector.select(remaining_s):
                 self.drone.receive()

@@ -9,8 +9,9 @@ from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import table
 from fieldkit.cli.parser import Parser
 from fieldkit.config import locations
-from fieldkit.core.columns import DifferenceRow, EstimateRow, declared, plain_name
+from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
 from fieldkit.core.text import print_text
 
 

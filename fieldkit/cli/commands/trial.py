@@ -79,9 +79,12 @@ def run(arguments: argparse.Namespace) -> int:
             return 0
         # These modules import pyarrow, which a dry run does not need.
         from fieldkit.cli import results
+        from fieldkit.trial import estimates
         from fieldkit.trial.running import opening
 
         sink(Note(_announcement(plans)))
+        for line in estimates.battery_notes(plans) if backend.by_hand else ():
+            sink(Note(line))
         with cli_options.operator(arguments, sink) as operator:
             outcomes = opening.run(
                 plans, backend, plans[0].cast, arguments.out, sink=sink, operator=operator, stop=stop

@@ -143,6 +143,12 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
             f"{', '.join(words)}: weaker than {weak_dbm:g} dBm",
             f"iw dev {interface} link   # is the robot too far away?",
         )
+    elif robot.profile.radio.access_point and wifi_facts.get("type") == "managed":
+        report.warn(
+            "Wi-Fi",
+            f"{', '.join(words)}: a station, but by its profile the robot runs an access point",
+            f"start its access point, or correct it: {locations.copy_profile_command(robot.profile.name)}",
+        )
     else:
         report.ok("Wi-Fi", ", ".join(words))
     if not is_access_point:

@@ -19,13 +19,13 @@ from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.motions import STOPPED, Motions
 from fieldkit.steps.variants import Variants
-from fieldkit.trial import gates, hosts, size, store
+from fieldkit.trial import gates, hosts, size, step_errors, store
 from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import step_errors
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.robots import Robots
+from fieldkit.trial.step_errors import StepError
 
 
 class Attempts:
@@ -95,19 +95,22 @@ class Attempts:
             self._sink(PhaseStarted("collect evidence", str(repeat)))
             reasons += self._robots.fetch(remote, partial, clean=not reasons)
             verdict = self._judge(started, partial)
-            step_errors.store(verdict.step_errors, partial)
+            raised = [failure.traceback_text] if isinstance(failure, StepError) else []
+            step_errors.store([*raised, *verdict.step_errors], partial)
+            has_failed = bool(raised) or (not reasons and verdict.has_failed)
+            notes = [step_errors.SEE_LOG] if raised or (not reasons and verdict.step_errors) else []
             reasons = reasons or list(verdict.problems)
             self._last_remote = remote
             if reasons:
                 self._robots.check_alive()
                 self._robots.require_locks()  # an attempt aborted by another user is not counted
-        invalid = Status.FAILED if self._ledger.is_last(repeat) else Status.VOID
-        reason_text = "; ".join(hosts.without_effects(reasons))
-        self._ledger.commit(
-            partial,
-            replace(started, status=invalid if reasons else Status.VALID, reason=reason_text),
-            verdict.measured,
-        )
+        invalid = Status.FAILED if has_failed or self._ledger.is_last(repeat) else Status.VOID
+        reasons = [*hosts.without_effects(reasons), *notes]
+        ended = replace(started, status=invalid if reasons else Status.VALID, reason="; ".join(reasons))
+        self._ledger.commit(partial, ended, verdict.measured)
+        if has_failed:
+            log = step_errors.log_file(store.attempt_folder(self._folder, ended.folder))
+            return f"{step_errors.REPORT}, with {log}"
         return failure.remedy if failure else ""
 
     def recover(self, interrupted_attempt: Attempt) -> None:
@@ -122,12 +125,17 @@ class Attempts:
         # Partial evidence of an interrupted attempt is stored like that of any void attempt.
         missing = [] if committed else self._robots.fetch(remote, evidence_folder, clean=was_measured)
         verdict = self._judge(interrupted_attempt, evidence_folder)
+        if not committed:
+            step_errors.store(verdict.step_errors, evidence_folder)
         if was_measured and missing:
             reasons = ["fieldkit was killed before it had the evidence, which could not be fetched later", *missing]
         else:
             reasons = list(verdict.problems) if was_measured else ["fieldkit was killed during it"]
-        status = Status.VOID if reasons else Status.VALID
-        ended = replace(interrupted_attempt, status=status, reason="; ".join(reasons), excused=bool(reasons))
+            reasons += [step_errors.SEE_LOG] if was_measured and verdict.step_errors else []
+        has_failed = was_measured and not missing and verdict.has_failed
+        status = Status.FAILED if has_failed else Status.VOID if reasons else Status.VALID
+        is_excused = bool(reasons) and not has_failed
+        ended = replace(interrupted_attempt, status=status, reason="; ".join(reasons), excused=is_excused)
         self._ledger.commit(evidence_folder, ended, verdict.measured)
         self._last_remote = remote
 
@@ -170,7 +178,7 @@ class Attempts:
                 raise  # the attempt is intact: resume fetches the rest of it
             reason = STOPPED if self._motions.is_ordered else _interruption_reason(error)
             if self._reached:
-                self._robots.mark_unfetched(started.remote(self._plan.trial), partial, reason)
+                self._robots.unfetched.mark_all(started.remote(self._plan.trial), partial, reason)
             ended = replace(started, status=Status.VOID, reason=reason, excused=True)
             self._ledger.commit(partial, ended, self._judge(started, partial).measured)
             if isinstance(error, LockLostError) and self._last_remote:

@@ -1,7 +1,7 @@
 """The robots of a trial during one attempt: create folders, run the steps, fetch the evidence, clean up."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -9,7 +9,6 @@ from threading import Event, Thread
 from typing import Final, TypeVar
 
 from fieldkit.backends.protocols import Testbed, Transient
-from fieldkit.core import laptop_files
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import (
     EvidenceError,
@@ -20,27 +19,21 @@ from fieldkit.core.errors import (
     TestbedLostError,
 )
 from fieldkit.core.events import PhaseStarted, Sink
-from fieldkit.core.model import RepeatId, Role, Status
-from fieldkit.core.text import encodable
+from fieldkit.core.model import RepeatId, Role
 from fieldkit.core.threads import run_parallel
 from fieldkit.measure.evidence import link_samples, oracle_delays, track
 from fieldkit.remote import evidence, fetching, jobs, programs
 from fieldkit.remote.fetching import FetchProgress, LateJobError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
-from fieldkit.trial import hosts, size
-from fieldkit.trial.journal import Attempt
+from fieldkit.trial import hosts, size, step_errors
 from fieldkit.trial.owners import FileOwners
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import locks, step_errors
+from fieldkit.trial.running import locks
+from fieldkit.trial.running.unfetched import UnfetchedEvidence
 
 T = TypeVar("T")
 
 _WATCH_S: Final = 0.5
-
-
-def unfetched_file(role: Role) -> str:
-    """Return the name of the file that records why evidence was left on the robot in `role`."""
-    return f"{role}-{laptop_files.UNFETCHED}"
 
 
 class Robots:
@@ -62,7 +55,8 @@ class Robots:
         protocol = plan.procedure.protocols[0]
         self._owners = FileOwners.of(plan.procedure, plan.scene(RepeatId(protocol, 1), ""))
         self._is_fetch_cancelled = False
-        self._unfetched: dict[Role, list[str]] = {role: [] for role in self._roles}
+        self.unfetched = UnfetchedEvidence(plan, self._roles, transient=self.transient)
+        """Evidence that was not fetched and stays on the robots."""
         self._boots: dict[Role, str] = {}
 
     @property
@@ -87,7 +81,7 @@ class Robots:
                 remote,
                 role,
                 self._interface(role),
-                old=None if old in self._unfetched[role] else old,
+                old=None if old in self.unfetched.folders[role] else old,
                 token=plan.session,
                 need_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
             )
@@ -124,7 +118,7 @@ class Robots:
             for section in self._plan.procedure.sections.values():
                 stack.enter_context(section.around_steps(self._plan, scene, self.shells))
             for entry in self._plan.procedure.steps:
-                with step_errors.reported(entry.kind, scene.laptop_folder):
+                with step_errors.during_attempt(entry.kind):
                     entry.step.run(scene, self._testbed, announce)
 
     @contextmanager
@@ -167,7 +161,7 @@ class Robots:
         failed = [(role, *problem) for role, problem in zip(self._roles, problems, strict=True) if problem]
         for role, reason, is_there in failed:
             if is_there:
-                self._mark_unfetched(role, remote, into, reason)
+                self.unfetched.mark(role, remote, into, reason)
         return [reason for _, reason, _ in failed]
 
     def _collect(self, role: Role, remote: str, into: Path, *, clean: bool) -> tuple[str, bool] | None:
@@ -199,32 +193,6 @@ class Robots:
             return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateJobError))
         rebooted = None if clean else self._reboot_message(role)
         return (rebooted, False) if rebooted else None
-
-    def mark_unfetched(self, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on every robot, and record its path and the reason in its local folder."""
-        for role in self._roles:
-            self._mark_unfetched(role, remote, into, reason)
-
-    def _mark_unfetched(self, role: Role, remote: str, into: Path, reason: str) -> None:
-        if remote not in self._unfetched[role]:
-            self._unfetched[role].append(remote)
-        verb = "had" if self.transient else "has"
-        end = "; its files ended with it" if self.transient else ""
-        text = f"{reason}\n{self._plan.cast[role].name} {verb} it in ~/{remote}{end}\n"
-        (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
-
-    def restore_unfetched(self, ended: Attempt, kept: Path) -> None:
-        """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder is marked so."""
-        if ended.status is not Status.VALID and not self.transient:
-            for role in self._roles:
-                if (kept / unfetched_file(role)).is_file():
-                    self._unfetched[role].append(ended.remote(self._plan.trial))
-
-    def unfetched(self) -> Mapping[str, Sequence[str]]:
-        """Return the remote folders with evidence that was not fetched, by the robot's name."""
-        if self.transient:
-            return {}
-        return {self._plan.cast[role].name: folders for role, folders in self._unfetched.items() if folders}
 
     def _reboot_message(self, role: Role) -> str | None:
         """Return a message if a robot rebooted unexpectedly during the attempt; None if it did not, or is unknown."""
@@ -283,7 +251,7 @@ class Robots:
         """
 
         def remove(role: Role) -> None:
-            unfetched = self._unfetched[role]
+            unfetched = self.unfetched.folders[role]
             if remote is None:
                 evidence.discard(self.shells[role], self._plan.trial, kept_folders=unfetched)
             elif remote not in unfetched:

@@ -155,7 +155,7 @@ def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, 
     ledger = Ledger(plan, folder, stop)
     robots = Robots(plan, testbed, sink)
     for ended in ledger.ended:
-        robots.restore_unfetched(ended, store.attempt_folder(folder, ended.folder))
+        robots.unfetched.restore(ended, store.attempt_folder(folder, ended.folder))
     repeats = list(plan.order())
     finished = estimates.finished_repeats(plan, journal.read(folder))
     if ledger.differences:
@@ -234,7 +234,7 @@ def _judgement_event(judgement: Judgement) -> ExpectationJudged:
 
 def _report_unfetched(robots: Robots, sink: Sink) -> None:
     """Report evidence that was not fetched and is still on the robots."""
-    for robot, folders in robots.unfetched().items():
+    for robot, folders in robots.unfetched.by_robot().items():
         folder_names = ", ".join(f"~/{folder}" for folder in folders)
         sink(
             Note(

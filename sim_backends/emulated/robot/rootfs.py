@@ -5,7 +5,7 @@ import shlex
 import stat
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatch
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Final
 
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.robot import mounts, ssh_server
-from sim_backends.emulated.robot.spec import HOME, STATE, Netcat, RobotSpec
+from sim_backends.emulated.robot.spec import HOME, NETCATS, STATE, RobotSpec
 
 SSHD_FOLDER: Final = "/run/sshd"
 BOOT_ID: Final = f"{STATE}/boot_id"
@@ -38,14 +38,6 @@ _PASSWORDS: Final = "root:*:20000:0:99999:7:::\n"
 OWN_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
 """System files that each robot has separately."""
 
-NETCATS: Final[dict[Netcat, str]] = {
-    "traditional": "nc.traditional",
-    "openbsd": "nc.openbsd",
-    "ncat": "ncat",
-    "busybox": "busybox",
-}
-"""Debian's program for each netcat."""
-
 # On a real robot `python3` is Debian's, which searches this folder after PYTHONPATH. It is appended, so that the
 # packages of the Python that runs fieldkit come first.
 _SITE_CUSTOMIZE: Final = """\
@@ -59,7 +51,6 @@ BUSYBOX: Final = "/usr/bin/busybox"
 SFTP_FOLDER: Final = "/usr/lib/openssh"
 
 _BIN: Final = "/usr/bin"
-_KERNEL_FOLDERS: Final = ("/proc/", "/sys/", "/dev/")
 _PROGRAM_FOLDERS: Final = (_BIN, "/usr/sbin")
 
 _ANY_NETCAT: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
@@ -201,11 +192,6 @@ def _write(path: Path, content: str, *, mode: int = 0o644) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch(mode=mode)
     path.write_text(content, encoding="utf-8")
-
-
-def unsupported_paths(paths: Iterable[str]) -> list[str]:
-    """Return the paths at which a robot cannot have a file: in kernel folders or in the root directory."""
-    return [path for path in paths if path.startswith(_KERNEL_FOLDERS) or path.count("/") == 1]
 
 
 def mount_programs(spec: RobotSpec) -> None:

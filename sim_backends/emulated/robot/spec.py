@@ -1,16 +1,24 @@
 """Specification of an emulated robot: plain data that the lab sends to the robot's init process as JSON."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
 from fieldkit.core.model import ROS_MASTER_PORT
-from sim_backends.emulated.ros.laser import LaserTarget, Neighbour
-from sim_backends.emulated.ros.messages import Definition, Sensor, Template
+from sim_backends.emulated.ros.sensor_specs import Definition, LaserTarget, Neighbour, Sensor, Template
 
 SshServer = Literal["openssh", "dropbear"]
 Userland = Literal["gnu", "busybox"]
 Netcat = Literal["traditional", "openbsd", "ncat", "busybox"]
 Ping = Literal["iputils", "busybox"]
+
+NETCATS: Final[dict[Netcat, str]] = {
+    "traditional": "nc.traditional",
+    "openbsd": "nc.openbsd",
+    "ncat": "ncat",
+    "busybox": "busybox",
+}
+"""Debian's program for each netcat."""
 
 USER: Final = "root"
 HOME: Final = "/root"
@@ -24,6 +32,8 @@ ANTENNA_M: Final = 0.2
 
 HELLO_S: Final = 4.0
 """Default hello interval of babeld on wireless interfaces."""
+
+_KERNEL_FOLDERS: Final = ("/proc/", "/sys/", "/dev/")
 
 
 @dataclass(frozen=True)
@@ -190,6 +200,11 @@ class RobotSpec:
         neighbours = tuple(Neighbour(*body) for body in data["neighbours"])
         parts = {"laser_targets": targets, "sensors": sensors, "definitions": definitions, "base": base, "ros2": ros2}
         return cls(**{**data, **words, **parts, "neighbours": neighbours})
+
+
+def unsupported_paths(paths: Iterable[str]) -> list[str]:
+    """Return the paths at which a robot cannot have a file: in kernel folders or in the root directory."""
+    return [path for path in paths if path.startswith(_KERNEL_FOLDERS) or path.count("/") == 1]
 
 
 def _laser_target(data: dict[str, Any]) -> LaserTarget:

@@ -14,35 +14,13 @@ import os
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final
 
 from fieldkit.core.model import Vector
+from sim_backends.emulated.ros.sensor_specs import LaserTarget, Neighbour
 
 _SLACK_BEAMS: Final = 1e-9
 """Tolerance in beams, so that rounding does not lose a beam that hits a corner."""
-
-
-@dataclass(frozen=True)
-class LaserTarget:
-    """An upright solid that reflects beams.
-
-    Attributes:
-        outline_m: Corners of the outline from above, in order, metres east and north; the centre of a cylinder.
-        radius_m: Radius of a cylinder, 0 for other solids.
-        base_m: Height of the bottom.
-        top_m: Height of the top.
-    """
-
-    outline_m: tuple[tuple[float, float], ...]
-    radius_m: float
-    base_m: float
-    top_m: float
-
-    def edges_m(self) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
-        """Yield the two ends of each edge of the outline."""
-        yield from pairwise((*self.outline_m, self.outline_m[0]))
 
 
 def ranges_m(
@@ -127,22 +105,6 @@ _NUMBER: Final = struct.Struct("<Q")
 _CRC: Final = struct.Struct("<I")
 _AXES: Final = 3
 _ABSENT: Final = (math.nan, math.nan, math.nan)
-
-
-class Neighbour(NamedTuple):
-    """Body of another robot: an upright cylinder around its antenna.
-
-    Attributes:
-        number: Its position among the robots of the lab, from 0.
-        radius_m: Radius of the cylinder.
-        below_m: Height of the antenna above the bottom of the cylinder.
-        above_m: Height of the top above the antenna.
-    """
-
-    number: int
-    radius_m: float
-    below_m: float
-    above_m: float
 
 
 class _Slots:

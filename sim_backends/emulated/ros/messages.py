@@ -13,18 +13,16 @@ vary in a real sensor contain noise, so that they compress no better than real o
 import math
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from random import Random
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, did_you_mean
-from sim_backends.emulated.ros.laser import LaserTarget, ranges_m
+from sim_backends.emulated.ros.laser import ranges_m
 from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
+from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Sensor, Template, check, packed_string
 
 GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
-LASER_SCAN: Final = "sensor_msgs/LaserScan"
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
 # Variances of x, y, z (m^2) and of rotations about them (rad^2), for pose and, per second, twist: those of a Husky's
@@ -50,61 +48,6 @@ NORTH_RADIUS_M: Final = 6_335_439.327
 
 _FLOATS_BYTES: Final = 16  # the size of a point, so that the fields of points stay aligned
 _ONE_TRANSFORM: Final = struct.pack("<I", 1)
-
-
-@dataclass(frozen=True)
-class Template:
-    """Serialized parts of messages of a type without a generator.
-
-    Attributes:
-        stamped: True if the message starts with a header.
-        head: Content between the header and the list that is filled, serialized, in hexadecimal digits.
-        tail: Content after the list, in the same form.
-        size_bytes: Size of the list.
-        floats: True if the list holds 4-byte floats; otherwise any bytes.
-    """
-
-    stamped: bool
-    head: str
-    tail: str
-    size_bytes: int
-    floats: bool
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """One topic that a robot publishes.
-
-    Attributes:
-        topic: For example `/scan`.
-        type: ROS message type, `package/Name`.
-        rate_hz: Messages per second.
-        frame: `frame_id` of the header.
-        points: For a laser scan, beams per turn.
-        template: Parts of the messages of a type without a generator.
-        child_frame: Frame of the robot, for odometry and transforms; REP 105 calls it `base_link`.
-    """
-
-    topic: str
-    type: str
-    rate_hz: float
-    frame: str
-    points: int | None
-    template: Template | None = None
-    child_frame: str = ""
-
-
-@dataclass(frozen=True)
-class Definition:
-    """Message definition that a publisher announces.
-
-    Attributes:
-        text: Fields of the type and of all types in it.
-        md5: MD5 sum of the definition, by which ROS compares types.
-    """
-
-    text: str
-    md5: str
 
 
 Generator = Callable[[Sensor, Random, OwnMotion], bytes]
@@ -149,29 +92,6 @@ class Source:
         )
 
 
-def check(sensor: Sensor) -> None:
-    """Check that an emulated robot can publish `sensor`.
-
-    Raises:
-        ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
-    """
-    if sensor.type not in GENERATORS and sensor.template is None:
-        hint = did_you_mean(sensor.type, GENERATORS, f"known types: {', '.join(GENERATORS)}")
-        raise ConfigurationError(
-            f"an emulated robot cannot publish {sensor.type}",
-            where=f"topic {sensor.topic}",
-            remedy=f"{hint} Or add a generator to sim_backends/emulated/ros/messages.py",
-        )
-    if sensor.rate_hz <= 0:
-        raise ConfigurationError(
-            "a topic with rate 0Hz publishes nothing", where=f"topic {sensor.topic}", remedy="write 5Hz"
-        )
-    if sensor.type == LASER_SCAN and sensor.points is None:
-        raise ConfigurationError(
-            "a laser scan needs `points`, beams per turn", where=f"topic {sensor.topic}", remedy="write points: 360"
-        )
-
-
 def _template_generator(template: Template) -> Generator:
     """Return a generator that fills the list with incompressible noise, or with normally distributed floats."""
     head, tail, size_bytes = bytes.fromhex(template.head), bytes.fromhex(template.tail), template.size_bytes
@@ -187,12 +107,6 @@ def _template_generator(template: Template) -> Generator:
         return head + pool[start : start + size_bytes] + tail
 
     return generate
-
-
-def packed_string(text: str) -> bytes:
-    """Return a string in ROS 1 serialization: its length, then its bytes."""
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
 
 
 def _float32s(values: Sequence[float]) -> bytes:
@@ -337,4 +251,4 @@ GENERATORS: Final[dict[str, Generator]] = {
     "sensor_msgs/Temperature": _temperature,
     "geometry_msgs/PoseStamped": _pose_stamped,
 }
-"""Generator per message type."""
+"""Generator per message type; its keys are `sensor_specs.GENERATED_TYPES`."""

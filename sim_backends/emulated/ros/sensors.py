@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Final
 
 from sim_backends.emulated.ros import static_frames, tcpros
-from sim_backends.emulated.ros.laser import LaserTarget
-from sim_backends.emulated.ros.messages import Definition, Sensor, Source
+from sim_backends.emulated.ros.messages import Source
 from sim_backends.emulated.ros.own_motion import Odometer
+from sim_backends.emulated.ros.sensor_specs import Definition, LaserTarget, Sensor
 from sim_backends.ros1 import framing
 
 QUEUE_BYTES: Final = 4 << 20

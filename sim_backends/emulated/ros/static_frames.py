@@ -7,7 +7,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from sim_backends.emulated.ros.messages import Sensor, packed_string
+from sim_backends.emulated.ros.sensor_specs import Sensor, packed_string
 
 TOPIC: Final = "/tf_static"
 TYPE: Final = "tf2_msgs/TFMessage"

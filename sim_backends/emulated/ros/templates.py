@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.errors import ConfigurationError, did_you_mean
-from sim_backends.emulated.ros.messages import GENERATORS, Definition, Template, packed_string
+from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, Definition, Template, packed_string
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -109,7 +109,7 @@ def _unknown(topic: PublishedTopic) -> ConfigurationError:
     return ConfigurationError(
         f"an emulated robot cannot publish {topic.type}: ROS 1 itself has no definition of it, or of a type in it",
         where=f"topic {topic.name}",
-        remedy=f"{did_you_mean(topic.type, GENERATORS, remedy)}",
+        remedy=f"{did_you_mean(topic.type, GENERATED_TYPES, remedy)}",
     )
 
 

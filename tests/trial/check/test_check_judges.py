@@ -119,6 +119,15 @@ def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
     assert "power save" not in {finding.check for finding in findings}
 
 
+def test_a_station_whose_profile_has_an_access_point_is_a_warning() -> None:
+    findings = heard(
+        RELAY, wifi_info=output_text("iw/info-station.txt"), wifi_link=output_text("iw/link-station.txt")
+    )
+    finding = only(findings, "Wi-Fi")
+    assert finding.status is WARN
+    assert finding.detail.endswith(": a station, but by its profile the robot runs an access point")
+
+
 def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
     ibss = CommandResult(output_text("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
     findings = heard(SENDER, wifi_info=ibss, wifi_link=output_text("iw/link-ibss.txt"))

@@ -87,7 +87,7 @@ def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
         "receiver-after.txt",
         "sender-unfetched.txt",
     }
-    assert robots.unfetched() == {"turtlebot-1": [attempts["udp-01-1"]]}
+    assert robots.unfetched.by_robot() == {"turtlebot-1": [attempts["udp-01-1"]]}
     robots.delete_remote(attempts["udp-01-1"])
     robots.delete_remote()
     kept = {role: sorted(path.name for path in (tmp_path / role / ".fieldkit").glob("*/*")) for role in shells}
@@ -177,4 +177,4 @@ def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: P
     (output_text,) = robots.fetch(remote, into, clean=True)
     assert output_text.endswith("job capture ended with exit code 3")
     assert "exit code 1" not in output_text, "the message is from the robot"
-    assert robots.unfetched() == {}
+    assert robots.unfetched.by_robot() == {}

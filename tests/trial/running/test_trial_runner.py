@@ -19,9 +19,10 @@ from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.running.resumption import resumable
-from fieldkit.trial.running.robots import Robots, unfetched_file
+from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.runner import resume_trial, run_trial
 from fieldkit.trial.running.stop import Stop
+from fieldkit.trial.running.unfetched import unfetched_file
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.plans import write_states
 from tests.trial.test_trial_crash import PING, plan, robots_with_evidence
@@ -178,7 +179,7 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
 
     def leave_first(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
         if remote.endswith("tcp-01-1"):
-            self._mark_unfetched(Role.SENDER, remote, into, "the link broke \udcff")
+            self.unfetched.mark(Role.SENDER, remote, into, "the link broke \udcff")
             return ["the link broke"]
         raise LockLostError("aborted")
 

@@ -16,9 +16,10 @@ from fieldkit.core.model import Vector
 from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated.provisioning import laser_targets, neighbour
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.laser import LaserTarget, Neighbour, Neighbourhood, PlacesWriter, ranges_m
-from sim_backends.emulated.ros.messages import LASER_NOISE_M, LASER_SCAN, Sensor, Source
+from sim_backends.emulated.ros.laser import Neighbourhood, PlacesWriter, ranges_m
+from sim_backends.emulated.ros.messages import LASER_NOISE_M, Source
 from sim_backends.emulated.ros.own_motion import OwnMotion
+from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Neighbour, Sensor
 from sim_backends.world.shapes import Box, Cylinder, Solids
 from sim_backends.world.world import World, load_world
 

@@ -20,9 +20,9 @@ from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import own_motion
-from sim_backends.emulated.ros.laser import LaserTarget
-from sim_backends.emulated.ros.messages import GENERATORS, GRAVITY_M_S2, Sensor, Source
+from sim_backends.emulated.ros.messages import GENERATORS, GRAVITY_M_S2, Source
 from sim_backends.emulated.ros.own_motion import AT_REST, Odometer, OwnMotion
+from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, LaserTarget, Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST, ros_of
 
@@ -80,6 +80,10 @@ def yaw_rad(quaternion: Any) -> float:  # noqa: ANN401 (as above)
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_topic_of_a_shipped_robot_has_a_generator(profile: str) -> None:
     assert {topic.type for topic in ros_of(load_profile(profile)).topics} <= GENERATORS.keys()
+
+
+def test_the_generated_types_are_those_with_a_generator() -> None:
+    assert tuple(GENERATORS) == GENERATED_TYPES
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -14,8 +14,9 @@ from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.ros import own_motion
-from sim_backends.emulated.ros.messages import FIX_NOISE_M, Sensor, Source
+from sim_backends.emulated.ros.messages import FIX_NOISE_M, Source
 from sim_backends.emulated.ros.own_motion import AT_REST, AssignedPath, Odometer, OwnMotion
+from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 

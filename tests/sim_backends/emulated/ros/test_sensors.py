@@ -15,8 +15,8 @@ import pytest
 
 from sim_backends.emulated.provisioning import definition
 from sim_backends.emulated.ros import messages, sensors, tcpros
-from sim_backends.emulated.ros.messages import Sensor
 from sim_backends.emulated.ros.own_motion import Odometer
+from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.emulated.ros.sensors import Publication, Subscriber
 from sim_backends.ros1 import framing
 
@@ -221,8 +221,8 @@ def test_a_socket_left_by_a_killed_process_is_replaced(monkeypatch: pytest.Monke
 def test_the_noise_does_not_depend_on_the_process() -> None:
     """A robot's sensors restart after a reboot, and Python's hashes differ from process to process."""
     program = (
-        "from sim_backends.emulated.ros import messages; "
-        f"print(messages.Source(messages.{IMU!r}).message(1, 2).hex())"
+        "from sim_backends.emulated.ros import messages, sensor_specs; "
+        f"print(messages.Source(sensor_specs.{IMU!r}).message(1, 2).hex())"
     )
     result = subprocess.run((sys.executable, "-c", program), capture_output=True, text=True, check=True)
     assert result.stdout.strip() == messages.Source(IMU).message(1, 2).hex()

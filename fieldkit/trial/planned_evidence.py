@@ -1,0 +1,40 @@
+"""Evidence that a repeat of a trial leaves, by its plan: transfers, pings, captures and recordings."""
+
+from collections.abc import Mapping
+
+from fieldkit.core.model import Protocol, Role
+from fieldkit.measure.transfers.transfer_spec import Transfer
+from fieldkit.steps.capabilities import Pings, SendsFile
+from fieldkit.steps.nest import Nest
+from fieldkit.steps.scene import Pinging
+from fieldkit.trial.plan import Plan
+
+
+def transfers(plan: Plan, protocol: Protocol) -> tuple[Transfer, ...]:
+    """Return the packet filter of each transfer, in the order of their starts."""
+    scene = plan.procedure.scene(protocol, plan.cast, "")
+    specs = (
+        placed.step.transfer(scene, placed.within)
+        for placed in plan.procedure.walk()
+        if isinstance(placed.step, SendsFile)
+    )
+    return tuple(transfer for transfer in specs if transfer is not None)
+
+
+def pingings(plan: Plan) -> tuple[Pinging, ...]:
+    """Return all round-trip time measurements of a repeat, in the order of their starts."""
+    specs = (placed.step.pinging() for placed in plan.procedure.walk() if isinstance(placed.step, Pings))
+    return tuple(pinging for pinging in specs if pinging is not None)
+
+
+def captures(plan: Plan) -> Mapping[str, Role]:
+    """Return the role of the robot that makes each capture, by capture file."""
+    nests = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, Nest))
+    roles_by_file = [(file, role) for nest in nests for role, file in nest.captures().items()]
+    return {file: role for role in plan.cast for file, owner in roles_by_file if owner == role}
+
+
+def bags(plan: Plan) -> Mapping[Role, str]:
+    """Return the first file that is recorded on each robot, by name below an attempt's folder."""
+    scene = plan.procedure.scene(plan.protocols[0], plan.cast, "")
+    return {role: recordings[0].name for role, recordings in scene.recorded.items()}

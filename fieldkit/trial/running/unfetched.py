@@ -1,0 +1,67 @@
+"""Evidence that was not fetched: it stays on its robot, and a file in the attempt's local folder records it."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from fieldkit.core import laptop_files
+from fieldkit.core.model import Role, Status
+from fieldkit.core.text import encodable
+from fieldkit.trial.journal import Attempt
+from fieldkit.trial.plan import Plan
+
+
+def unfetched_file(role: Role) -> str:
+    """Return the name of the file that records why evidence was left on the robot in `role`."""
+    return f"{role}-{laptop_files.UNFETCHED}"
+
+
+class UnfetchedEvidence:
+    """The unfetched evidence of a trial.
+
+    Args:
+        plan: The trial.
+        roles: Its roles.
+        transient: Whether the robots and their files are removed at the end of this run of fieldkit.
+
+    Attributes:
+        folders: The folders of attempts on the robot in each role.
+    """
+
+    def __init__(self, plan: Plan, roles: Iterable[Role], *, transient: bool) -> None:
+        self._plan = plan
+        self._transient = transient
+        self.folders: dict[Role, list[str]] = {role: [] for role in roles}
+
+    def mark(self, role: Role, remote: str, into: Path, reason: str) -> None:
+        """Leave an attempt's folder on a robot, and record its path and the reason in its local folder.
+
+        Args:
+            role: Role of the robot.
+            remote: The attempt's folder on the robot.
+            into: The local folder.
+            reason: Why it was not fetched.
+        """
+        if remote not in self.folders[role]:
+            self.folders[role].append(remote)
+        verb = "had" if self._transient else "has"
+        end = "; its files ended with it" if self._transient else ""
+        text = f"{reason}\n{self._plan.cast[role].name} {verb} it in ~/{remote}{end}\n"
+        (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
+
+    def mark_all(self, remote: str, into: Path, reason: str) -> None:
+        """Leave an attempt's folder on every robot; arguments as for `mark`."""
+        for role in self.folders:
+            self.mark(role, remote, into, reason)
+
+    def restore(self, ended: Attempt, kept: Path) -> None:
+        """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder is marked so."""
+        if ended.status is not Status.VALID and not self._transient:
+            for role, folders in self.folders.items():
+                if (kept / unfetched_file(role)).is_file():
+                    folders.append(ended.remote(self._plan.trial))
+
+    def by_robot(self) -> Mapping[str, Sequence[str]]:
+        """Return the remote folders with evidence that was not fetched, by the robot's name."""
+        if self._transient:
+            return {}
+        return {self._plan.cast[role].name: folders for role, folders in self.folders.items() if folders}
