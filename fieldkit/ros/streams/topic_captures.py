@@ -145,6 +145,8 @@ def withheld(
     latency_s = _Arrivals.of(arrived, captured.subscriber, complete=captured.complete, reliable=reliable).latency_s
     if latency_s is None or not len(latency_s):
         return {}
+    # Samples whose latency is unknown count as late as the latest known one: they determine the columns as well.
+    latency_s = np.append(latency_s, np.full(len(arrived) - len(latency_s), latency_s.max()))
     figures_s = {
         "median": float(np.median(latency_s)),
         "mean": float(latency_s.mean()),

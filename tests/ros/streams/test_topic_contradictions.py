@@ -262,6 +262,7 @@ def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     ),
 )
 @example(kind="over TCP", end="received", field=4, some=(0, 5), by=35 * MS)
+@example(kind="reliable with samples given up", end="received", field=4, some=(15, 24), by=SECOND)
 def test_a_change_in_any_range_of_a_field_is_noticed(
     kind: str, end: str, field: int, some: tuple[int, int], by: int, *, folder: Path
 ) -> None:
