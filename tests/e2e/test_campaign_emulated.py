@@ -13,7 +13,7 @@ from fieldkit.core.model import Topology
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.labs import built_in_ros
 from tests.helpers.outside import robots_outside
-from tests.helpers.runs import Run, fieldkit, finish, rows, start, wait_for_line
+from tests.helpers.runs import Run, fieldkit, finish, rows, run_here, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
 
@@ -76,7 +76,7 @@ def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path
     ) + Counter({(turn, "placed"): 2 if turn == planned["trials"][0] else 1 for turn in order})
     for trial in trials(folder):
         assert [row["status"] for row in rows(trial) if row["status"] != "void"] == ["valid"]
-    assert fieldkit(tmp_path, "verify", str(before[1])).code == 0
+    assert run_here(tmp_path, "verify", str(before[1])).code == 0
     left = [event["left_s"] for event in run.events("campaign_went")]
     assert left == sorted(left, reverse=True)
     assert left[-1] == 0

@@ -1,6 +1,7 @@
 """Packets lost by tcpdump: values of a topic that depend on its captures are withheld, and a transfer is void."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,8 @@ steps:
       during:
         - transfer: {from: sender, to: receiver, into: recv.bag, port: 1234}
 """
-NEEDS_NO_CAPTURE = {"topic_sent", "topic_received", "topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
+TIMES = {"topic_jitter_s", "topic_delay_variation_p95_s"}
+NEEDS_NO_CAPTURE = {"topic_sent", "topic_received", "topic_loss", *TIMES}
 NEEDS_CAPTURES = {"topic_delay_median_s", "topic_delay_error_s", "topic_age_mean_s", "topic_packet_loss"}
 
 
@@ -67,11 +69,16 @@ def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tup
     return judged.problems, judged.measured
 
 
+def delayed(measured: Measured) -> Iterator[str]:
+    """Yield the columns of time that the subscriber's program distorts too much, because this machine is busy."""
+    yield from (name for name in TIMES if "its program was delayed" in measured.missing.get(name, ""))
+
+
 @pytest.mark.parametrize("role", ["sender", "receiver"])
 def test_a_topic_keeps_the_values_from_its_logs(attempt: tuple[Plan, Path, journal.Attempt], role: str) -> None:
     problems, measured = with_drops(attempt, f"topic.{role}")
     assert problems == ()
-    assert measured.values.keys() >= NEEDS_NO_CAPTURE, measured.missing
+    assert measured.values.keys() >= NEEDS_NO_CAPTURE - {*delayed(measured)}, measured.missing
     reason = f"the capture of {role} lacks 12 packets that its kernel dropped"
     assert {measured.missing[name] for name in NEEDS_CAPTURES} == {reason}
     assert measured.values["topic_capture_withheld"] == reason

@@ -14,7 +14,7 @@ from sim_backends.radio.modes import N_MODES
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
+from tests.helpers.runs import fieldkit, finish, only_trial, rows, run_here, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
 
@@ -114,9 +114,9 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     assert int(row["rtt_received"]) > 0
 
     before = (trial / "trial.csv").read_bytes()
-    assert fieldkit(lab, "rebuild", str(trial)).code == 0
+    assert run_here(lab, "rebuild", str(trial)).code == 0
     assert (trial / "trial.csv").read_bytes() == before
-    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0
 
 
 def test_a_trial_that_is_stopped_during_the_move_saves_its_state(lab: Path) -> None:

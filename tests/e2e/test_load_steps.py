@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.labs import BOX, write_procedure
-from tests.helpers.runs import Run, fieldkit, only_trial, rows
+from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -155,7 +155,7 @@ def test_errors_are_reported_and_no_repeat_is_valid(wrong: dict[str, tuple[Run, 
     (row,) = rows(only_trial(folder))
     assert row["status"] == "failed"
     assert REASONS[name] in row["reason"], row["reason"]
-    left = fieldkit(folder, "rebuild", str(only_trial(folder)))
+    left = run_here(folder, "rebuild", str(only_trial(folder)))
     assert left.code == 0, left.err
 
 

@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.host import Untouched
 from tests.helpers.labs import copy_shipped
-from tests.helpers.runs import Run, fieldkit, only_trial, rows
+from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -81,7 +81,7 @@ def test_after_the_loss_of_drone_and_master_nothing_is_discovered(tmp_path: Path
     gap_s = max(later - sooner for sooner, later in pairwise(came_ns)) / 1e9
     assert float(row["through.bag_gap_s"]) >= gap_s - 1e-6
     assert len(came_ns) >= 10, "6 s at 5 Hz, the drone lost after 3 s: a connected subscriber needs no master"
-    assert "the same bytes as before" in fieldkit(tmp_path, "rebuild", str(only_trial(tmp_path))).out
+    assert "the same bytes as before" in run_here(tmp_path, "rebuild", str(only_trial(tmp_path))).out
 
 
 def test_without_a_shared_master_the_loss_of_the_drone_has_no_effect(tmp_path: Path) -> None:

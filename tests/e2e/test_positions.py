@@ -16,7 +16,7 @@ from fieldkit.measure.evidence import ping, track
 from fieldkit.measure.evidence.track import Separation
 from fieldkit.ros.bags import bag
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import fieldkit, only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -133,9 +133,9 @@ def test_odometry_equals_the_true_positions_and_the_motion_of_the_robot(lab: Pat
     assert (last_m - first_m) / ((last_ns - first_ns) / 1e9) == pytest.approx(SPEED_M_S, rel=0.1)
 
     before = (trial / "trial.csv").read_bytes()
-    assert fieldkit(lab, "rebuild", str(trial)).out.endswith("the same bytes as before\n")
+    assert run_here(lab, "rebuild", str(trial)).out.endswith("the same bytes as before\n")
     assert (trial / "trial.csv").read_bytes() == before
-    listed = fieldkit(lab, "positions", str(trial)).out
+    listed = run_here(lab, "positions", str(trial)).out
     assert listed.startswith("udp-01  rtt: 10.")
     assert listed.endswith(" m, sender as placed, receiver /odom\n")
 
@@ -182,13 +182,13 @@ def test_gpx_of_an_accompanying_person_can_be_added_and_removed_later(lab: Path)
     sender = f"sender={6 / EARTH_M[1]:.9f},{3 / EARTH_M[0]:.9f}"
     gpx(lab / "walk.gpx", where, late_s=2.5)
 
-    run = fieldkit(lab, "positions", str(trial), "receiver=walk.gpx", sender, "--offset", "2.5s")
+    run = run_here(lab, "positions", str(trial), "receiver=walk.gpx", sender, "--offset", "2.5s")
     assert run.code == 0, run.err
     assert run.out.startswith("changed: trial.csv")
     assert "receiver positions-receiver.gpx" in run.out
     assert_similar(separation_by_columns(trial), expected, within_m=max_update_distance_m(trial))
-    assert fieldkit(lab, "verify", str(trial)).code == 0
-    assert fieldkit(lab, "positions", str(trial), "--clear").code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "positions", str(trial), "--clear").code == 0
     assert tables(trial) == before
     assert not list(trial.glob("positions*"))
-    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0

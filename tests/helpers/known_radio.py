@@ -9,7 +9,7 @@ from tests.helpers.labs import write_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 
 LOSSES_PERCENT = (0, 1, 10, 30)
-IN_CI, AT_NIGHT = 8, 20
+IN_CI, AT_NIGHT = 5, 20
 """Number of repeats of each trial."""
 REPEATS = [IN_CI, pytest.param(AT_NIGHT, marks=pytest.mark.nightly)]
 """Parameters of a module fixture, so that each test that uses it runs with both numbers."""

@@ -7,9 +7,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
+
+from fieldkit.cli import main
 
 LIMIT_S = 600.0
 
@@ -80,6 +84,17 @@ def finish(process: "subprocess.Popen[str]") -> Run:
 def fieldkit(lab: Path, *arguments: str) -> Run:
     """Run `fieldkit` with `arguments` in the folder `lab`."""
     return finish(start(lab, *arguments))
+
+
+def run_here(folder: Path, *arguments: str) -> Run:
+    """Run `fieldkit` with `arguments` in a folder, in this process, which saves half a second of processor time.
+
+    For commands that start no robots, in tests of something else than the start of the command.
+    """
+    out, err = StringIO(), StringIO()
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
+        code = main(arguments)
+    return Run(code, out.getvalue(), err.getvalue())
 
 
 def only_trial(lab: Path) -> Path:
