@@ -27,7 +27,7 @@ from tests.helpers.paths import ROOT
 PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 COMMAND_S = 600.0
 DEBIAN_ROS = {"README.md", "tutorial.md"}
-"""Pages whose trials use Debian's ROS, the default where it is installed; others use the built-in one to save time."""
+"""Pages whose trials use Debian's ROS if it is installed; the others use the built-in one to save time."""
 OWN_SITE = re.compile(r"fieldkit\.yaml|^ls|fieldkit (init|lab)|fieldkit --?")
 """Commands that need a folder without a site file."""
 

@@ -28,8 +28,8 @@ def replace_text(text: str, *changes: str) -> str:
 def built_in_ros(folder: Path, name: str = SITE_FILE, *, radio: str = "{}") -> Path:
     """Write a site file with the default robots but with the built-in ROS instead of Debian's; return its path.
 
-    For tests that do not depend on ROS: a short trial takes two thirds of the CPU time. `radio` has the options of the
-    emulated radio.
+    For tests that do not depend on ROS: a short trial takes two thirds of the CPU time. `radio` has the options of
+    the emulated radio.
     """
     site = folder / name
     site.write_text(

@@ -64,7 +64,10 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
     jobs.install(made, Deadline.after(30))
     evidence.begin(made, FOLDER, "receiver", "lo")
     yield made
-    wait_until(lambda: jobs.list_running(made, Deadline.after(30)) == (), Deadline.after(60))
+    deadline = Deadline.after(120)
+    while running := jobs.list_running(made, Deadline.after(60)):
+        assert not deadline.expired, (running, log(made))
+        time.sleep(0.1)
 
 
 def fly(
