@@ -19,9 +19,11 @@ pytest_plugins = ("pytester", "tests.helpers.leaks", "tests.helpers.reruns")
 # Tests started in the background of a shell ignore SIGINT, and so would all programs that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# A busy machine makes any example slow. `make test` adds `--hypothesis-profile ci`, which uses the same examples each
-# time.
+# A busy machine makes any example slow. `make test` uses `ci`, which is the profile of hypothesis with fewer
+# examples, the same ones each time. `make nightly` uses `nightly`, with other examples each time.
 settings.register_profile("fieldkit", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("ci", settings.get_profile("ci"), max_examples=50)
+settings.register_profile("nightly", settings.get_profile("fieldkit"), print_blob=True)
 settings.load_profile("fieldkit")
 
 # Files that take long, the longest first, because a long file that starts late would run alone at the end. Three of

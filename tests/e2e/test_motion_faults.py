@@ -72,6 +72,7 @@ def test_a_robot_stops_within_the_bounds_and_stays_at_rest(name: str, outcomes: 
 
 
 @pytest.mark.emulated
+@pytest.mark.quiet
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", AT_NIGHT)
 def test_a_robot_of_the_nightly_sample_stops_within_the_bounds(

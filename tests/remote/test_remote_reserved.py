@@ -45,11 +45,13 @@ def test_files_of_the_robot_are_accepted(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", OF_THE_LAPTOP)
 def test_files_of_the_laptop_are_rejected(name: str, tmp_path: Path) -> None:
-    for form, spelling in product(("{}", "up.{}", "scan/{}", "scan/up.{}"), (name, name.upper(), name.title())):
-        wrong = form.format(spelling)
+    forms = product(("{}", "up.{}", "scan/{}", "scan/up.{}"), (name, name.upper(), name.title()))
+    for number, (form, spelling) in enumerate(forms):
+        folder, wrong = tmp_path / str(number), form.format(spelling)
+        folder.mkdir()
         with pytest.raises(EvidenceError, match="only the laptop writes a file of this name"):
-            fetch(archive("ping.txt", wrong), tmp_path)
-        assert not (tmp_path / wrong).exists()
+            fetch(archive("ping.txt", wrong), folder)
+        assert not (folder / wrong).exists()
 
 
 def test_large_file_of_the_laptop_is_rejected(tmp_path: Path) -> None:

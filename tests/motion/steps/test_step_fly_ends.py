@@ -125,8 +125,15 @@ def log_lines(shell: Shell, job: str) -> list[tuple[float, str]]:
 
 
 @pytest.mark.quiet
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-@pytest.mark.parametrize(("target", "watcher"), [("fly", "guard"), ("guard", "fly")])
+@pytest.mark.parametrize(
+    ("target", "watcher", "number"),
+    [
+        ("fly", "guard", signal.SIGSTOP),
+        ("guard", "fly", signal.SIGKILL),
+        pytest.param("fly", "guard", signal.SIGKILL, marks=pytest.mark.nightly),
+        pytest.param("guard", "fly", signal.SIGSTOP, marks=pytest.mark.nightly),
+    ],
+)
 def test_pilot_and_guard_notice_within_a_second_that_the_other_does_not_run(
     shell: Shell, target: str, watcher: str, number: signal.Signals
 ) -> None:
