@@ -16,6 +16,7 @@ from fieldkit.config import schema
 from tests.helpers.casts import PLAIN, los_plan
 from tests.helpers.outside_packages import write_package
 from tests.helpers.paths import ROOT
+from tests.helpers.texts import procedure
 
 PACKAGES: Final = ("fieldkit.motion", "fieldkit.ros")
 LIMIT_S: Final = 300.0
@@ -56,16 +57,14 @@ STEPS_OF_PRODUCTS: Final = {
     "fly": "{robot: sender, height: 2m, during: [ping: {from: sender, to: receiver}]}",
     "record": "{robot: sender, topics: [/scan], duration: 2s}",
 }
-PROCEDURE: Final = """\
-name: KIND
-summary: A procedure with a kind of step of a product
-scenario: los
-topology: masterless
-protocols: [udp]
-repeats: 1
-steps:
-  - KIND: STEP
-"""
+PROCEDURE: Final = procedure(
+    "KIND",
+    """\
+- KIND: STEP
+""",
+    protocols="udp",
+    attempts=None,
+)
 
 
 def entry_points() -> Iterator[str]:

@@ -11,31 +11,28 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
 from fieldkit.trial.plan import Plan
 from tests.helpers.runs import fieldkit, only_trial
+from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
 
-STREAM = """\
-name: stream
-summary: "A topic with a ping in one capture, a transfer in another"
-scenario: los
-topology: masterless
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - capture:
-      name: topic
-      during:
-        - together:
-            during:
-              - topics: {from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 2s}
-              - ping: {from: sender, to: receiver, count: 10, interval: 200ms, payload_bytes: 56}
-  - record: {robot: sender, topics: [/scan], duration: 1s, name: scan}
-  - capture:
-      name: transfer
-      during:
-        - transfer: {from: sender, to: receiver, into: recv.bag, port: 1234}
-"""
+STREAM = procedure(
+    "stream",
+    """\
+- capture:
+    name: topic
+    during:
+      - together:
+          during:
+            - topics: {from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 2s}
+            - ping: {from: sender, to: receiver, count: 10, interval: 200ms, payload_bytes: 56}
+- record: {robot: sender, topics: [/scan], duration: 1s, name: scan}
+- capture:
+    name: transfer
+    during:
+      - transfer: {from: sender, to: receiver, into: recv.bag, port: 1234}
+""",
+    protocols="udp",
+)
 TIMES = {"topic_jitter_s", "topic_delay_variation_p95_s"}
 NEEDS_NO_CAPTURE = {"topic_sent", "topic_received", "topic_loss", *TIMES}
 NEEDS_CAPTURES = {"topic_delay_median_s", "topic_delay_error_s", "topic_age_mean_s", "topic_packet_loss"}

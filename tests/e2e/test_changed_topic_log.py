@@ -10,25 +10,22 @@ from fieldkit.agent import records
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
 from tests.helpers.runs import fieldkit, only_trial
+from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
 
-STREAM = """\
-name: stream
-summary: "A topic over DDS and one over Zenoh, side by side"
-scenario: los
-topology: masterless
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - capture:
-      during:
-        - together:
-            during:
-              - topics: {name: dds, from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 3s}
-              - topics: {name: zenoh, from: sender, to: receiver, over: zenoh, rate: 20Hz, bytes: 500B, duration: 3s}
-"""
+STREAM = procedure(
+    "stream",
+    """\
+- capture:
+    during:
+      - together:
+          during:
+            - topics: {name: dds, from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 3s}
+            - topics: {name: zenoh, from: sender, to: receiver, over: zenoh, rate: 20Hz, bytes: 500B, duration: 3s}
+""",
+    protocols="udp",
+)
 
 
 def shifted(content: bytes, by_ns: int) -> bytes:

@@ -27,6 +27,7 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.ros.steered import Steered
+from tests.helpers import texts
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.rovers import rover_profile
@@ -55,22 +56,19 @@ PLACEMENT = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 SPEED_M_S = 0.6
 LEASE_S = 2.0
 SETUP = ("/opt/ros/noetic/setup.bash",)
-DRIVE = """\
-name: drive
-summary: The receiver drives away
-scenario: los
-topology: master
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - move:
-      robot: receiver
-      path: [{away: 20m}]
-      speed: 0.6m/s
-      during:
-        - ping: {from: sender, to: receiver, count: 150, interval: 200ms, payload_bytes: 500}
-"""
+DRIVE = texts.procedure(
+    "drive",
+    """\
+- move:
+    robot: receiver
+    path: [{away: 20m}]
+    speed: 0.6m/s
+    during:
+      - ping: {from: sender, to: receiver, count: 150, interval: 200ms, payload_bytes: 500}
+""",
+    topology="master",
+    protocols="udp",
+)
 BOTH = (
     DRIVE[: DRIVE.index("  - move:")]
     + """\

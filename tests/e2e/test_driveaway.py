@@ -15,21 +15,15 @@ from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, finish, only_trial, rows, run_here, start, wait_for_line
+from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  duckiedrone-1: {profile: quick}
-roles:
-  masterless: {sender: turtlebot-1, receiver: duckiedrone-1}
-emulated:
-  ros: builtin
-  record_air: true
-  radio: {fading: false, shadowing_db: 0.0}  # a link that ends in one place
-"""
+# A link that ends in one place.
+SITE = site(
+    {"turtlebot-1": "turtlebot3_burger", "duckiedrone-1": "quick"},
+    emulated="ros: builtin, record_air: true, radio: {fading: false, shadowing_db: 0.0}",
+)
 WAY_M = 60.0
 SPEED_M_S = 4.0
 RATES = {mode.name: mode.rate_bit_s for mode in N_MODES}

@@ -19,40 +19,29 @@ from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
 from tests.helpers.sshd import wait_until
+from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
 # The drone is in range where it hovers, and out of range 20 m farther.
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  duckiedrone-1: {profile: duckiedrone}
-roles:
-  masterless: {sender: turtlebot-1, receiver: duckiedrone-1}
-emulated:
-  ros: builtin
-  radio: {fading: false, shadowing_db: 0.0, noise_floor_dbm: -59, mode: n0}
-"""
-PROCEDURE = """\
-name: flyaway
-summary: a drone flies away while bytes are sent to it
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-on_abort: {receiver: land}
-steps:
-  - fly:
-      robot: receiver
-      height: 1m
-      path: [{away: 20m}]
-      speed: 3m/s
-      then: land
-      lease: 3s
-      during: DURING
-"""
+SITE = site(
+    {"turtlebot-1": "turtlebot3_burger", "duckiedrone-1": "duckiedrone"},
+    emulated="ros: builtin, radio: {fading: false, shadowing_db: 0.0, noise_floor_dbm: -59, mode: n0}",
+)
+PROCEDURE = procedure(
+    "flyaway",
+    """\
+- fly:
+    robot: receiver
+    height: 1m
+    path: [{away: 20m}]
+    speed: 3m/s
+    then: land
+    lease: 3s
+    during: DURING
+""",
+    more="on_abort: {receiver: land}\n",
+)
 TRANSFER = """
         - capture:
             robots: [sender, receiver]
@@ -99,34 +88,20 @@ def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
 
 
 # A drone of each family; both are real robots for fieldkit. Landings by their programs start soon.
-DRONES = """\
-backend: emulated
-robots:
-  copter-1: {profile: copter}
-  duckiedrone-1: {profile: duckiedrone}
-roles:
-  masterless: {sender: copter-1, receiver: duckiedrone-1}
-emulated:
-  ros: builtin
-"""
-GIVEN_UP = """\
-name: givenup
-summary: a drone flies 2 m away and waits there
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-on_abort: {ROLE: HOW}
-steps:
-  - fly:
-      robot: ROLE
-      height: 60cm
-      path: [{away: 2m}]
-      speed: 3m/s
-      lease: LEASE
-      during: [{wait: {duration: 90s}}]
-"""
+DRONES = site({"copter-1": "copter", "duckiedrone-1": "duckiedrone"}, emulated="ros: builtin")
+GIVEN_UP = procedure(
+    "givenup",
+    """\
+- fly:
+    robot: ROLE
+    height: 60cm
+    path: [{away: 2m}]
+    speed: 3m/s
+    lease: LEASE
+    during: [{wait: {duration: 90s}}]
+""",
+    more="on_abort: {ROLE: HOW}\n",
+)
 SET_PARAMETER = """\
 from pymavlink import mavutil
 drone = mavutil.mavlink_connection("udpout:127.0.0.1:14550", source_system=250)

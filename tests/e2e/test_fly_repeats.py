@@ -14,22 +14,14 @@ from fieldkit.core.model import Role, Vector
 from tests.helpers.outside import robots_outside
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
 WAY_M = 1.0
 HEIGHT_M = 0.4
 AIRBORNE_M = 0.1
-LAB = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  copter-1: {profile: copter}
-roles:
-  masterless: {sender: turtlebot-1, receiver: copter-1}
-emulated:
-  ros: builtin
-"""
+LAB = site({"turtlebot-1": "turtlebot3_burger", "copter-1": "copter"}, emulated="ros: builtin")
 PROCEDURE = """\
 name: again
 summary: an ArduCopter flies away and returns, again and again

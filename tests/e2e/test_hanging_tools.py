@@ -10,24 +10,20 @@ from fieldkit.remote import jobs
 from tests.helpers.labs import copy_shipped, write_procedure
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
 
-PROCEDURE = """\
-name: short
-summary: One attempt with short limits
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-steps:
-  - record: {robot: sender, topics: [/scan], duration: 1s}
-  - capture:
-      during:
-        - transfer: {from: sender, to: receiver, file: scan.bag, into: recv.bag, limit: 3s}
-  - ping: {from: sender, to: receiver, count: 2, interval: 200ms}
-"""
+PROCEDURE = procedure(
+    "short",
+    """\
+- record: {robot: sender, topics: [/scan], duration: 1s}
+- capture:
+    during:
+      - transfer: {from: sender, to: receiver, file: scan.bag, into: recv.bag, limit: 3s}
+- ping: {from: sender, to: receiver, count: 2, interval: 200ms}
+""",
+)
 
 # Responds to version queries like the real tool, and hangs during its work.
 HANGS_AT_WORK = """\

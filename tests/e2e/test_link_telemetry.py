@@ -7,24 +7,13 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  turtlebot-2: {profile: turtlebot3_burger}
-roles:
-  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
-emulated:
-  ros: builtin
-  record_air: true
-  # Without fading the SNR is always 23.1 dB, too little for n7: half of the frames of 1,500 bytes are lost, and a
-  # fifth of those of 500 bytes. The probability that repeats of 11 and 20 frames need no retry is at most one in
-  # 10,000.
-  radio: {mode: n7, fading: false, noise_floor_dbm: -84.2}
-"""
+# Without fading the SNR is always 23.1 dB, too little for n7: half of the frames of 1,500 bytes are lost, and a fifth
+# of those of 500 bytes. The probability that repeats of 11 and 20 frames need no retry is at most one in 10,000.
+SITE = site(emulated="ros: builtin, record_air: true, radio: {mode: n7, fading: false, noise_floor_dbm: -84.2}")
 
 
 def kernel_packets(folder: Path, role: str) -> dict[str, int]:

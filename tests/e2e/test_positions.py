@@ -17,39 +17,29 @@ from fieldkit.measure.evidence.track import Separation
 from fieldkit.ros.bags import bag
 from tests.helpers.paths import ROOT
 from tests.helpers.runs import fieldkit, only_trial, rows, run_here
+from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  rover-1: {profile: rover}
-roles:
-  masterless: {sender: turtlebot-1, receiver: rover-1}
-emulated:
-  ros: builtin
-  radio: {fading: false, shadowing_db: 0.0}
-"""
-WALK = """\
-name: walk
-summary: "The receiver drives away, round a corner"
-scenario: los
-topology: masterless
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - track:
-      robots: {receiver: {topic: /odom, facing: away}}
-      during:
-        - move:
-            robot: receiver
-            path: [{away: 4m}, {left: 2m}]
-            speed: 2m/s
-            during:
-              - ping: {from: sender, to: receiver, count: 16, interval: 200ms, payload_bytes: 500}
-"""
+SITE = site(
+    {"turtlebot-1": "turtlebot3_burger", "rover-1": "rover"},
+    emulated="ros: builtin, radio: {fading: false, shadowing_db: 0.0}",
+)
+WALK = procedure(
+    "walk",
+    """\
+- track:
+    robots: {receiver: {topic: /odom, facing: away}}
+    during:
+      - move:
+          robot: receiver
+          path: [{away: 4m}, {left: 2m}]
+          speed: 2m/s
+          during:
+            - ping: {from: sender, to: receiver, count: 16, interval: 200ms, payload_bytes: 500}
+""",
+    protocols="udp",
+)
 SPEED_M_S = 2.0
 EARTH_M = 111_319.49, 110_574.28
 """Metres per degree east and north at the world's origin, on the equator."""

@@ -10,6 +10,7 @@ from fieldkit.core.deadline import Deadline
 from tests.helpers.host import Untouched
 from tests.helpers.labs import built_in_ros, write_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here
+from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
 
@@ -17,106 +18,86 @@ LONG_S = 300.0
 """Upper bound of recovery times on a busy machine."""
 
 # The killed ping never recovers; the sensors restart; the sender is rebooted while it records.
-NEVER = """\
-name: never
-summary: a process that is never restarted, and steps that a fault makes fail
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-steps:
-  - fault:
-      robot: sender
-      kind: kill
-      process: ping
-      after: 0.5s
-      limit: 1.5s
-      during:
-        - ping: {from: sender, to: receiver, count: 100, interval: 100ms}
-  - fault:
-      robot: sender
-      kind: reboot
-      after: 0.5s
-      during:
-        - record: {robot: sender, topics: [/scan], duration: 500s}
-"""
+NEVER = procedure(
+    "never",
+    """\
+- fault:
+    robot: sender
+    kind: kill
+    process: ping
+    after: 0.5s
+    limit: 1.5s
+    during:
+      - ping: {from: sender, to: receiver, count: 100, interval: 100ms}
+- fault:
+    robot: sender
+    kind: reboot
+    after: 0.5s
+    during:
+      - record: {robot: sender, topics: [/scan], duration: 500s}
+""",
+)
 
 CUT_S = 2.0
 # Flows of every kind: three with a rate, of which the topic starts slowly, and a file.
-FLOWS = """\
-name: flows
-summary: the radio is out of range for two seconds while flows of every kind run
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-steps:
-  - capture:
-      during:
-        - soak:
-            from: sender
-            to: receiver
-            protocol: udp
-            rate: 80kbit/s
-            payload_bytes: 500
-            during:
-              - fault:
-                  robot: receiver
-                  kind: out-of-range
-                  for: 2s
-                  after: 5s
-                  during:
-                    - together:
-                        during:
-                          - topics: {from: sender, to: receiver, rate: 20Hz, bytes: 100B, duration: 9s, patience: 60s}
-                          - iperf3:
-                              {name: load, from: sender, to: receiver, protocol: udp, rate: 80kbit/s,
-                               payload_bytes: 500, duration: 9s}
-        - fault:
-            name: again
-            robot: receiver
-            kind: out-of-range
-            for: 2s
-            after: 1s
-            during:
-              - send: {name: up, from: sender, to: receiver, size: 2MB}
-expect: [up.transfer_stall_s < 300 ms]
-"""
+FLOWS = procedure(
+    "flows",
+    """\
+- capture:
+    during:
+      - soak:
+          from: sender
+          to: receiver
+          protocol: udp
+          rate: 80kbit/s
+          payload_bytes: 500
+          during:
+            - fault:
+                robot: receiver
+                kind: out-of-range
+                for: 2s
+                after: 5s
+                during:
+                  - together:
+                      during:
+                        - topics: {from: sender, to: receiver, rate: 20Hz, bytes: 100B, duration: 9s, patience: 60s}
+                        - iperf3:
+                            {name: load, from: sender, to: receiver, protocol: udp, rate: 80kbit/s,
+                             payload_bytes: 500, duration: 9s}
+      - fault:
+          name: again
+          robot: receiver
+          kind: out-of-range
+          for: 2s
+          after: 1s
+          during:
+            - send: {name: up, from: sender, to: receiver, size: 2MB}
+""",
+    more="expect: [up.transfer_stall_s < 300 ms]\n",
+)
 AGREES_S = 0.5
 """Tolerance between the stall of a flow with a rate and the time its radio was out of range: a clock query over SSH,
 the duration of a command to the testbed on a busy machine, and two sending intervals of 50 ms.
 """
 
-HEALS = """\
-name: heals
-summary: a process that its robot starts again
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-steps:
-  - fault: {robot: receiver, kind: kill, process: sensors, after: 0.3s}
-"""
+HEALS = procedure(
+    "heals",
+    """\
+- fault: {robot: receiver, kind: kill, process: sensors, after: 0.3s}
+""",
+)
 
-BROKEN = """\
-name: broken
-summary: what fails before the fault is no work of the fault
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-steps:
-  - fault:
-      robot: receiver
-      kind: reboot
-      after: 60s
-      during:
-        - record: {robot: sender, topics: [/scan], duration: 1s}
-"""
+BROKEN = procedure(
+    "broken",
+    """\
+- fault:
+    robot: receiver
+    kind: reboot
+    after: 60s
+    during:
+      - record: {robot: sender, topics: [/scan], duration: 1s}
+""",
+)
 
 
 def run_procedure(lab: Path, text: str) -> Run:

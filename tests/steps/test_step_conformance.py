@@ -43,6 +43,7 @@ from fieldkit.trial.running.stop import Stop
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
 from tests.helpers.paths import ROOT
+from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
@@ -114,17 +115,7 @@ EXAMPLES: Mapping[str, Example] = {
 KINDS = sorted(EXAMPLES.keys() & kinds.shipped())
 TEXT_BYTES = 10_000
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  turtlebot-2: {profile: turtlebot3_burger}
-roles:
-  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
-emulated:
-  ros: builtin
-  radio: {loss: 0%, rate: 500kbit/s}
-"""
+SITE = site(emulated="ros: builtin, radio: {loss: 0%, rate: 500kbit/s}")
 """The rate is so low that the transfer of a bag takes more than a second and can be interrupted."""
 
 # Kills the program of a job as soon as it runs: the last child of the job's leader; the first one enforces the limit.
