@@ -54,7 +54,8 @@ emulated: {ros: debian}
 """
 PLACEMENT = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 SPEED_M_S = 0.6
-LEASE_S = 2.0
+LEASE_S = 6.0
+"""Longer than the time that a busy machine takes to start the command `stop`."""
 SETUP = ("/opt/ros/noetic/setup.bash",)
 DRIVE = texts.procedure(
     "drive",
@@ -98,7 +99,7 @@ RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
 def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Outside]:
     """Robots that outlive fieldkit; one of them is fast, so that the tests take less time."""
     folder = tmp_path_factory.mktemp("rovers")
-    profile = rover_profile(fence_m=30.0)
+    profile = rover_profile(fence_m=30.0, lease_s=LEASE_S)
     for name in ("robots", "procedures"):
         (folder / name).mkdir()
     (folder / "robots" / "rover.yaml").write_text(profile, encoding="utf-8")

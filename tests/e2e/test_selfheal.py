@@ -69,9 +69,9 @@ FLOWS = procedure(
           robot: receiver
           kind: out-of-range
           for: 2s
-          after: 1s
+          after: 3s
           during:
-            - send: {name: up, from: sender, to: receiver, size: 2MB}
+            - send: {name: up, from: sender, to: receiver, size: 3MB}
 """,
     more="expect: [up.transfer_stall_s < 300 ms]\n",
 )
