@@ -10,7 +10,7 @@ from fieldkit.core.columns import Measured
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
 from fieldkit.trial.plan import Plan
-from tests.helpers.runs import fieldkit, only_trial
+from tests.helpers.runs import only_trial, run_here
 from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
@@ -43,7 +43,7 @@ def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journ
     home = tmp_path_factory.mktemp("drops")
     (home / "procedures").mkdir()
     (home / "procedures" / "stream.yaml").write_text(STREAM, encoding="utf-8")
-    run = fieldkit(home, "trial", "stream", "5m", "--yes")
+    run = run_here(home, "trial", "stream", "5m", "--yes")
     assert run.code == 0, run.out + run.err
     trial = only_trial(home)
     plan = store.read_plan(trial)

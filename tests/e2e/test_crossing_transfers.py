@@ -16,7 +16,7 @@ from fieldkit.trial import gates, store
 from fieldkit.trial.plan import Plan
 from tests.helpers.dissected import Row, dissected
 from tests.helpers.labs import write_procedure
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
 from tests.helpers.texts import TURTLEBOTS_AND_DRONE, procedure, site
 
 pytestmark = pytest.mark.emulated
@@ -54,7 +54,7 @@ Values = Mapping[str, Value]
 def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lab = tmp_path_factory.mktemp("cross")
     (lab / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    run = fieldkit(lab, "trial", write_procedure(lab, PROCEDURE), "5m", "--seed", "4")
+    run = run_here(lab, "trial", write_procedure(lab, PROCEDURE), "5m", "--seed", "4")
     assert run.code == 0, run.err + run.out
     assert "up: " in run.out
     return only_trial(lab)

@@ -31,7 +31,7 @@ from tests.helpers import texts
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.rovers import rover_profile
-from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_during, wait_for_line
+from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_during, wait_for_line
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
@@ -144,7 +144,7 @@ def place_at(track: list[TrackPoint], utc_ns: int) -> Vector:
 def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(outside: Outside) -> None:
     (outside.folder / "procedures" / "drive.yaml").write_text(BOTH, encoding="utf-8")
     starts_m = {role: track_of(outside, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
-    run = fieldkit(outside.folder, *RUN)
+    run = run_here(outside.folder, *RUN)
     assert run.code == 0, run.err
     trial = only_trial(outside.folder)
     (repeat,) = (trial / "repeats").iterdir()
@@ -277,7 +277,7 @@ def assert_held(outside: Outside, reason: str) -> None:
     assert reason in held["reason"]
     assert [(row["status"], row["reason"]) for row in rows(trial)] == [("void", reason)]
     stopped_m = place_m(outside)
-    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    again = run_here(outside.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert f"rover-1: {held['reason']}" in again.err
     assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
@@ -353,7 +353,7 @@ def test_a_robot_outside_its_fence_does_not_start(outside: Outside) -> None:
         wait_until(lambda: stationary(outside), Deadline.after(60))
         moved_m = place_m(outside)
         trial = only_trial(outside.folder)
-        run = fieldkit(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+        run = run_here(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
         assert run.code == 5, run.err
         assert f"outside its fence of {fence_m:g} m" in run.err
         assert place_m(outside) == pytest.approx(moved_m, abs=0.01)
@@ -366,7 +366,7 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(outside: O
     with driving(outside) as process:
         process.send_signal(signal.SIGSTOP)
         sent_ns = time.time_ns()
-        run = fieldkit(outside.folder, "stop", "--all")
+        run = run_here(outside.folder, "stop", "--all")
         took_s = standstill_s(outside, sent_ns)
         assert run.code == 0, run.err + run.out
         assert sorted(run.out.splitlines()) == [
@@ -379,10 +379,10 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(outside: O
     assert ended.code == 3, ended.err
     assert "stopped the robots at" in ended.err
     assert standstill_s(outside, sent_ns + int(1e9 * took_s) + 1) == 0.0, "nothing moved again"
-    again = fieldkit(outside.folder, "stop", "rover-1")
+    again = run_here(outside.folder, "stop", "rover-1")
     assert (again.code, again.out) == (0, "rover-1: no program of fieldkit moves it; nothing was sent to it\n")
     outside.links.cut(Role.SENDER)
-    partly = fieldkit(outside.folder, "stop", "--all")
+    partly = run_here(outside.folder, "stop", "--all")
     assert partly.code == 3
     assert "rover-2: NOT REACHED: stop it by hand" in partly.out
     assert "rover-1: no program of fieldkit moves it" in partly.out
@@ -420,7 +420,7 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(outside: Outside)
         os.kill(agent, signal.SIGSTOP)
         wait_until(lambda: (now := receiver_motion(outside)) is not None and not now.moves, Deadline.after(60))
         stands_ns = time.time_ns()
-        stopped = fieldkit(outside.folder, "stop", "rover-1")
+        stopped = run_here(outside.folder, "stop", "rover-1")
         assert (stopped.code, stopped.out) == (0, "rover-1: stopped (stationary)\n")
         wait_for_end({agent}, within_s=60.0)
         assert standstill_s(outside, stands_ns) == 0.0
@@ -428,7 +428,7 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(outside: Outside)
     assert standstill_s(outside, stands_ns) == 0.0
     trial = only_trial(outside.folder)
     assert motions(trial) == ["origin", "begun", "held"]
-    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    again = run_here(outside.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert "no robot moves before a person confirms: rover-1" in again.err
     assert standstill_s(outside, stands_ns) == 0.0
@@ -484,19 +484,19 @@ def test_after_a_fault_nothing_moves_before_it_is_confirmed(outside: Outside) ->
     trial = only_trial(outside.folder)
     assert motions(trial) == ["origin", "begun", "held"]
     # --yes is no confirmation, in any run.
-    again = fieldkit(outside.folder, "resume", str(trial), *RESUME)
+    again = run_here(outside.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert "no order from the laptop for 2 s" in again.err
     assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
     # Pressing Enter does not confirm either: the default is to stop.
     answers = outside.folder / "answers"
     answers.write_text("\n\n", encoding="utf-8")
-    enter = fieldkit(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    enter = run_here(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
     assert enter.code == 5, enter.err
     assert place_m(outside) == pytest.approx(stopped_m, abs=0.01)
     # With the option the robot first drives back along its path, and then as at the start.
     begun_ns = track_of(outside, Role.RECEIVER)[-1].utc_ns
-    option = fieldkit(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+    option = run_here(outside.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
     assert option.code == 0, option.err
     track = [point for point in track_of(outside, Role.RECEIVER) if point.utc_ns > begun_ns and point.position_m]
     off_m = [math.dist(point.position_m or home_m, home_m) for point in track]
@@ -541,6 +541,6 @@ def test_a_suspended_driver_does_not_continue_until_a_person_confirms(outside: O
     answers = outside.folder / "answers"
     answers.write_text("\nconfirm\n", encoding="utf-8")
     outside.testbed.place(PLACEMENT)
-    confirmed = fieldkit(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    confirmed = run_here(outside.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
     assert confirmed.code == 0, confirmed.err
     assert motions(trial)[2:6] == ["held", "confirmed", "origin", "begun"]

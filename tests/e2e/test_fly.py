@@ -17,7 +17,7 @@ from fieldkit.measure.evidence import track
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
+from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_for_line
 from tests.helpers.sshd import wait_until
 from tests.helpers.texts import procedure, site
 
@@ -60,7 +60,7 @@ def lab(folder: Path, during: str) -> Path:
 
 def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
     (lab(tmp_path, TRANSFER) / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    run = fieldkit(tmp_path, "trial", "flyaway", "3m")
+    run = run_here(tmp_path, "trial", "flyaway", "3m")
     assert run.code == 0, run.err
     trial = only_trial(tmp_path)
     (row,) = rows(trial)
@@ -170,7 +170,7 @@ def test_a_drone_flies_on_without_its_laptop_until_abort(outside: Outside) -> No
     wait_for_end({process.pid}, within_s=60.0)
     assert agents()
     assert height_m(outside, Role.RECEIVER) > 0.2, "it still flies"
-    aborted = fieldkit(outside.folder, "abort", "--yes")
+    aborted = run_here(outside.folder, "abort", "--yes")
     assert aborted.code == 0
     assert "/fly " in aborted.out, aborted.err
     assert_landed(outside, Role.RECEIVER, "land: the job was cancelled")
@@ -194,7 +194,7 @@ def test_stop_lands_a_drone_after_fieldkit_was_killed(outside: Outside) -> None:
     process = flying(outside, Role.RECEIVER, how="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
-    stopped = fieldkit(outside.folder, "stop", "--all")
+    stopped = run_here(outside.folder, "stop", "--all")
     assert stopped.code == 0, stopped.err
     assert sorted(stopped.out.splitlines()) == [
         "copter-1: no program of fieldkit moves it; nothing was sent to it",

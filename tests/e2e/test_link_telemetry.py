@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
 from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
@@ -30,7 +30,7 @@ def kernel_packets(folder: Path, role: str) -> dict[str, int]:
 
 def test_radios_kernels_captures_and_the_air_log_have_equal_counts(tmp_path: Path) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    run = fieldkit(tmp_path, "trial", "los", "60ft", "--topology", "masterless", "--repeats", "1", "--record", "1s")
+    run = run_here(tmp_path, "trial", "los", "60ft", "--topology", "masterless", "--repeats", "1", "--record", "1s")
     assert run.code == 0, run.err + run.out
     trial = only_trial(tmp_path)
     for row in rows(trial):

@@ -16,7 +16,7 @@ from fieldkit.measure.evidence import ping, track
 from fieldkit.measure.evidence.track import Separation
 from fieldkit.ros.bags import bag
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, only_trial, rows, run_here
+from tests.helpers.runs import only_trial, rows, run_here
 from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
@@ -65,7 +65,7 @@ def lab(tmp_path: Path) -> Path:
 
 def run_walk(lab: Path) -> Path:
     """Run the procedure and return the folder of its only trial."""
-    run = fieldkit(lab, "trial", "walk", "10m")
+    run = run_here(lab, "trial", "walk", "10m")
     assert run.code == 0, run.out + run.err
     return only_trial(lab)
 

@@ -9,7 +9,7 @@ from fieldkit.config import locations
 from fieldkit.core.deadline import Deadline
 from tests.helpers.host import Untouched
 from tests.helpers.labs import built_in_ros, write_procedure
-from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here
+from tests.helpers.runs import Run, only_trial, rows, run_here
 from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
@@ -101,11 +101,11 @@ BROKEN = procedure(
 
 
 def run_procedure(lab: Path, text: str) -> Run:
-    return fieldkit(lab, "trial", write_procedure(lab, text), "5m")
+    return run_here(lab, "trial", write_procedure(lab, text), "5m")
 
 
 def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(tmp_path: Path, untouched: Untouched) -> None:
-    run = fieldkit(tmp_path, "trial", "selfheal", "5m", "--repeats", "1")
+    run = run_here(tmp_path, "trial", "selfheal", "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     assert "ping recovery after link-down, median" in run.out
     assert "reboot: gone for " in run.out

@@ -142,7 +142,7 @@ def test_json_events_are_one_object_per_line(tmp_path: Path) -> None:
 
 
 def test_a_masterless_trial_behind_the_wall(tmp_path: Path) -> None:
-    run = fieldkit(tmp_path, "trial", "nlos", "5m", "--topology", "masterless", "--repeats", "1", "--record", "1s")
+    run = run_here(tmp_path, "trial", "nlos", "5m", "--topology", "masterless", "--repeats", "1", "--record", "1s")
     assert run.code == 0, run.err
     assert {
         (row["scenario"], row["topology"], row["relay"], row["receiver"]) for row in rows(only_trial(tmp_path))
@@ -170,7 +170,7 @@ def test_a_silent_topic_makes_every_attempt_void_and_the_trial_invalid(tmp_path:
         "repeats: 20",
         "repeats: 1\nattempts: 2",
     )
-    run = fieldkit(tmp_path, "trial", "los", "30ft", "--record", "1s", "--protocol", "tcp")
+    run = run_here(tmp_path, "trial", "los", "30ft", "--record", "1s", "--protocol", "tcp")
     assert run.code == 4
     trial = only_trial(tmp_path)
     table = rows(trial)
@@ -183,7 +183,7 @@ def test_a_silent_topic_makes_every_attempt_void_and_the_trial_invalid(tmp_path:
 def test_a_missing_tool_stops_the_trial_before_repeat_1(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     copy_shipped(tmp_path, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
-    run = fieldkit(tmp_path, "trial", "los", "30ft")
+    run = run_here(tmp_path, "trial", "los", "30ft")
     assert run.code == 3
     assert "nc.imaginary" in run.err
     assert "turtlebot-1" in run.err

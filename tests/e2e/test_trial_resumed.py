@@ -11,7 +11,7 @@ import pytest
 from fieldkit.trial import journal
 from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.labs import built_in_ros
-from tests.helpers.runs import LIMIT_S, Run, fieldkit, finish, only_trial, rows, run_here, start, wait_for_line
+from tests.helpers.runs import LIMIT_S, Run, finish, only_trial, rows, run_here, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
 
@@ -33,7 +33,7 @@ def begin(lab: Path, *words: str, until: str) -> "subprocess.Popen[str]":
 
 
 def resume(lab: Path) -> Run:
-    return fieldkit(lab, "resume", str(only_trial(lab)), "--json")
+    return run_here(lab, "resume", str(only_trial(lab)), "--json")
 
 
 def check_whole(lab: Path, repeats: int) -> list[dict[str, str]]:
@@ -65,7 +65,7 @@ def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_continues(tmp_path: Pat
     resumed = resume(tmp_path)
     assert resumed.code == 0, resumed.err
     assert [event["repeat"] for event in resumed.events("repeat_ended")] == ["tcp-02"]
-    assert len(check_whole(tmp_path, REPEATS)) == 3
+    assert len(check_whole(tmp_path, REPEATS)) == REPEATS
 
 
 def test_the_second_ctrl_c_stops_the_repeat_immediately(tmp_path: Path, untouched: Untouched) -> None:
@@ -137,7 +137,7 @@ def test_resume_rejects_other_code_a_changed_lab_and_no_trial(tmp_path: Path) ->
     assert other_code.code == 2
     assert "other code" in other_code.err
 
-    nothing = fieldkit(tmp_path, "resume", "nowhere")
+    nothing = run_here(tmp_path, "resume", "nowhere")
     assert nothing.code == 2
     assert "there is no trial.yaml" in nothing.err
     assert json.loads((trial / journal.JOURNAL_FILE).read_text(encoding="utf-8").splitlines()[0])
@@ -149,4 +149,4 @@ def test_a_closed_output_pipe_does_not_end_the_trial(tmp_path: Path) -> None:
     assert process.stdout is not None
     process.stdout.close()
     assert process.wait(LIMIT_S) == 0, process.communicate()[1]
-    assert len(check_whole(tmp_path, REPEATS)) == 3
+    assert len(check_whole(tmp_path, REPEATS)) == REPEATS

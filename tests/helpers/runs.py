@@ -89,7 +89,8 @@ def fieldkit(lab: Path, *arguments: str) -> Run:
 def run_here(folder: Path, *arguments: str) -> Run:
     """Run `fieldkit` with `arguments` in a folder, in this process, which saves half a second of processor time.
 
-    For commands that start no robots, in tests of something else than the start of the command.
+    For tests that need no separate process. Only one thread may run commands, because the working folder and the
+    standard streams belong to the process.
     """
     out, err = StringIO(), StringIO()
     with chdir(folder), redirect_stdout(out), redirect_stderr(err):
