@@ -29,6 +29,7 @@ from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.ros.steered import Steered
 from tests.helpers import texts
 from tests.helpers.host import descendants, wait_for_end
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.outside import Outside, robots_outside
 from tests.helpers.rovers import rover_profile
 from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_during, wait_for_line
@@ -254,7 +255,7 @@ def standstill_s(outside: Outside, since_ns: int) -> float:
     return (max(moving, default=since_ns) - since_ns) / 1e9
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", mark_nightly([signal.SIGINT, signal.SIGTERM]))
 def test_the_first_signal_stops_the_robot_immediately(outside: Outside, number: signal.Signals) -> None:
     with driving(outside) as process:
         sent_ns = time.time_ns()

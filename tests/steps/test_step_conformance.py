@@ -42,6 +42,7 @@ from fieldkit.trial.running.locks import Holder
 from fieldkit.trial.running.stop import Stop
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
 from tests.helpers.texts import site
 
@@ -358,7 +359,7 @@ def kill_tool(kind: str, role: Role, name: str, bench: Bench, monkeypatch: pytes
     assert not bench.left()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", mark_nightly(KINDS, in_ci=("capture", "fly", "record", "together")))
 def test_interrupted_trial_is_resumed(kind: str, bench: Bench) -> None:
     plan, started = bench.plan(kind), threading.Event()
 
