@@ -14,7 +14,7 @@ from fieldkit.remote.jobs import Job
 from tests.e2e.test_bad_inputs import Row, check, table
 from tests.helpers import labs
 from tests.helpers.outside import Outside, robots_outside
-from tests.helpers.runs import run_here
+from tests.helpers.runs import fieldkit
 from tests.helpers.sshd import free_port, make_key
 
 pytestmark = pytest.mark.emulated
@@ -165,5 +165,5 @@ def test_the_page_lists_the_tested_errors() -> None:
 @pytest.mark.parametrize("row", table("On the robots").values(), ids=lambda row: row.situation)
 def test_an_error_of_a_robot_gives_one_message_with_a_remedy(row: Row, outside: Outside, tmp_path: Path) -> None:
     with prepared(tmp_path, outside) as lab:
-        run = run_here(tmp_path, *ON_ROBOTS[row.situation](lab).split())
+        run = fieldkit(tmp_path, *ON_ROBOTS[row.situation](lab).split())
     check(row, run.code, run.err)
