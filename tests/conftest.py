@@ -19,53 +19,70 @@ pytest_plugins = ("pytester", "tests.helpers.leaks", "tests.helpers.reruns")
 # Tests started in the background of a shell ignore SIGINT, and so would all programs that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# A busy machine makes any example slow. `make test` adds `--hypothesis-profile ci`, which uses the same examples each
-# time.
+# A busy machine makes any example slow. `make test` uses `ci`, which is the profile of hypothesis with fewer
+# examples, the same ones each time. `make nightly` uses `nightly`, with other examples each time.
 settings.register_profile("fieldkit", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("ci", settings.get_profile("ci"), max_examples=50)
+settings.register_profile("nightly", settings.get_profile("fieldkit"), print_blob=True)
 settings.load_profile("fieldkit")
 
-# Files that take long, the longest first, because a long file that starts late would run alone at the end. Three of
-# them run several trials in parallel and are separated, so that they do not compete.
+# Files that take long, the longest first, because a long file that starts late would run alone at the end. Those that
+# run several trials in parallel (`known_loss`, `strangers`, `load_steps`) are separated, so that they do not compete.
 _LONG: Final = (
-    "test_known_loss_tcp",
-    "test_chaos",
-    "test_tool_variants",
-    "test_hanging_tools",
-    "test_fly_repeats",
-    "test_trial_resumed",
-    "test_trial_emulated",
     "test_docs",
-    "test_smallest_emulated",
-    "test_known_loss_udp",
-    "test_selfheal",
-    "test_master_loss",
-    "test_fly",
-    "test_step_fly_ends",
     "test_step_conformance",
-    "test_driveaway",
+    "test_smallest_emulated",
+    "test_known_loss_tcp",
+    "test_step_fly_ends",
     "test_drive",
+    "test_lab_command",
+    "test_fly",
+    "test_borders",
+    "test_trial_emulated",
+    "test_trial_resumed",
+    "test_strangers_procedures",
+    "test_selfheal",
+    "test_cosim_shootout",
+    "test_cosim_run",
+    "test_ordinary_user",
+    "test_master_loss",
+    "test_load_steps",
+    "test_trial_crash",
+    "test_check_emulated",
+    "test_conformance",
+    "test_tool_variants",
+    "test_fuzz",
+    "test_cli_varied",
+    "test_known_loss_udp",
+    "test_chaos",
+    "test_smallest_benchmarks",
+    "test_rosbag_behaviour",
+    "test_campaign_emulated",
+    "test_emulated_lab",
+    "test_hanging_tools",
+    "test_drive_campaign",
+    "test_fly_repeats",
+    "test_from_wheel",
+    "test_power_cuts",
+    "test_pytest_fixtures",
+    "test_control_radio",
+    "test_report_page",
+    "test_unchanged_proof",
+    "test_driveaway",
+    "test_measure_stream",
+    "test_flight_ends",
     "test_bridges",
     "test_ros2_on_air",
     "test_ground_stations",
-    "test_power_cuts",
-    "test_campaign_emulated",
-    "test_ordinary_user",
-    "test_control_radio",
-    "test_control_outage",
-    "test_load_steps",
-    "test_known_dead",
-    "test_rosbag_behaviour",
-    "test_check_emulated",
-    "test_conformance",
-    "test_cosim_run",
-    "test_cosim_shootout",
-    "test_emulated_lab",
-    "test_pytest_fixtures",
-    "test_pytest_from_wheel",
+    "test_strict_runs",
+    "test_link_server",
     "test_bad_robots",
-    "test_lab_command",
-    "test_report_page",
-    "test_trial_crash",
+    "test_ros2_bag",
+    "test_reopened_repeats",
+    "test_rescue_program",
+    "test_control_outage",
+    "test_known_dead",
+    "test_stored_trials",
 )
 
 

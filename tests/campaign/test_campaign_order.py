@@ -106,7 +106,8 @@ def test_without_a_limit_each_of_16_trials_is_first_equally_often() -> None:
 
 
 def test_within_three_times_the_shortest_walk_each_trial_is_first_sometimes() -> None:
-    assert len(Counter(every_first(order.DEFAULT_WALK))) == 16
+    firsts: set[PlannedTrial] = set()
+    assert any(len(firsts := {*firsts, first}) == 16 for first in every_first(order.DEFAULT_WALK))
 
 
 def test_the_shortest_walk_allows_only_sweeps() -> None:

@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ COMMAND = re.compile(r"\bfieldkit((?: [a-z][a-z-]*)+)([^;,\n`()]*)")
 OPTION = re.compile(r"--[a-z][a-z-]+")
 
 
+@cache
 def remedies() -> list[tuple[str, str]]:
     """Return each remedy in the source with its location; values are shown as `X`."""
     located = []
@@ -44,12 +46,9 @@ def texts(node: ast.expr) -> list[str]:
     return []
 
 
-REMEDIES = remedies()
-
-
 def test_remedies_are_found() -> None:
-    assert len(REMEDIES) > 200
-    assert sum("fieldkit " in text for _, text in REMEDIES) > 30
+    assert len(remedies()) > 200
+    assert sum("fieldkit " in text for _, text in remedies()) > 30
 
 
 def parser_of(words: str, parsed: Parser) -> tuple[Parser, list[str]]:
@@ -62,7 +61,7 @@ def parser_of(words: str, parsed: Parser) -> tuple[Parser, list[str]]:
 def test_commands_in_remedies_exist_and_accept_their_options() -> None:
     parser = cli.parser()
     wrong = []
-    for place, text in REMEDIES:
+    for place, text in remedies():
         for match in COMMAND.finditer(text):
             command, _ = parser_of(match[1], parser)
             if command is parser and match[1].split()[0] not in {"is", "runs", "itself", "reads", "with"}:

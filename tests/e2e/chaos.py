@@ -23,6 +23,7 @@ from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import write_procedure
 from tests.helpers.runs import LIMIT_S, Run, fieldkit, only_trial, rows, start
+from tests.helpers.texts import procedure
 
 MAX_STARTS: Final = 60
 RECOVERY_NS: Final = 5 * 10**9
@@ -33,21 +34,19 @@ VOIDS_PER_FAULT: Final = 2
 
 POLL_S: Final = 5.0
 
-PROCEDURE: Final = """\
-name: chaos
-summary: A short repeat, for faults to hit
-scenario: los
-topology: masterless
-protocols: [tcp, udp]
-repeats: 10
-attempts: 99
-steps:
-  - record: {robot: sender, topics: [/scan], duration: 1s}
-  - capture:
-      during:
-        - transfer: {from: sender, to: receiver, file: scan.bag, into: recv.bag, limit: 10s, idle: 1s}
-  - ping: {from: sender, to: receiver, count: 5, interval: 200ms}
-"""
+PROCEDURE: Final = procedure(
+    "chaos",
+    """\
+- record: {robot: sender, topics: [/scan], duration: 1s}
+- capture:
+    during:
+      - transfer: {from: sender, to: receiver, file: scan.bag, into: recv.bag, limit: 10s, idle: 1s}
+- ping: {from: sender, to: receiver, count: 5, interval: 200ms}
+""",
+    protocols="tcp, udp",
+    repeats=10,
+    attempts=99,
+)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.running.locks import Holder, locked
 from tests.helpers.field_robots import start_field_robots
-from tests.helpers.runs import fieldkit
+from tests.helpers.runs import run_here
 from tests.helpers.sshd import free_port, make_key
 
 FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
@@ -35,7 +35,7 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
             complete_site = site.read_text(encoding="utf-8")
             port = field_robots.links.port(Role.RECEIVER)
             site.write_text(complete_site.replace(f"port: {port},", f"port: {free_port()},"), encoding="utf-8")
-            run = fieldkit(tmp_path, "abort", "--yes")
+            run = run_here(tmp_path, "abort", "--yes")
             assert run.code == 3
             assert f"{sender}: lock broken, 1 job terminated\n  {FOLDER}/capture " in run.out
             assert re.search(rf"error: {receiver}: .* cannot be reached", run.err)
@@ -43,7 +43,7 @@ def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) ->
             assert len(jobs.list_running(shells[Role.RECEIVER], Deadline.after(30))) == 1
 
             site.write_text(complete_site, encoding="utf-8")
-            run = fieldkit(tmp_path, "abort", "--yes")
+            run = run_here(tmp_path, "abort", "--yes")
             assert run.code == 0
             assert f"{sender}: not locked, 0 jobs terminated\n{receiver}: lock broken, 1 job terminated\n" in run.out
             with pytest.raises(LockLostError, match=r"the trial was aborted by \S+@\S+ at") as caught:
@@ -56,13 +56,13 @@ def test_abort_needs_a_confirmation(tmp_path: Path) -> None:
     robot = f"{{profile: duckiedrone, host: localhost, user: nobody, host_key: {key}}}"
     site = f"backend: field\nrobots:\n  a: {robot}\nroles: {{}}\n"
     (tmp_path / SITE_FILE).write_text(site, encoding="utf-8")
-    run = fieldkit(tmp_path, "abort")
+    run = run_here(tmp_path, "abort")
     assert run.code == 2
     assert "a person must confirm: terminate every job of fieldkit on a" in run.err
     assert "--yes" in run.err
 
 
 def test_emulated_robots_have_nothing_to_abort(tmp_path: Path) -> None:
-    run = fieldkit(tmp_path, "abort")
+    run = run_here(tmp_path, "abort")
     assert run.code == 0
     assert "the robots of this backend run only while their lab runs" in run.out

@@ -13,7 +13,7 @@ from fieldkit.core.model import Topology
 from tests.helpers.field_robots import start_field_robots
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.labs import built_in_ros
-from tests.helpers.runs import Run, fieldkit, finish, rows, start, wait_for_line
+from tests.helpers.runs import Run, finish, rows, run_here, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
 
@@ -63,7 +63,7 @@ def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path
     before = trials(folder)
     assert len(before) == 2
 
-    run = fieldkit(tmp_path, "campaign", "lawn.yaml", "--json")
+    run = run_here(tmp_path, "campaign", "lawn.yaml", "--json")
     assert run.code == 0, run.err
     (planned,) = run.events("campaign_planned")
     assert (len(planned["trials"]), planned["total"]) == (3, 4)
@@ -76,12 +76,12 @@ def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path
     ) + Counter({(turn, "placed"): 2 if turn == planned["trials"][0] else 1 for turn in order})
     for trial in trials(folder):
         assert [row["status"] for row in rows(trial) if row["status"] != "void"] == ["valid"]
-    assert fieldkit(tmp_path, "verify", str(before[1])).code == 0
+    assert run_here(tmp_path, "verify", str(before[1])).code == 0
     left = [event["left_s"] for event in run.events("campaign_went")]
     assert left == sorted(left, reverse=True)
     assert left[-1] == 0
 
-    again = fieldkit(tmp_path, "campaign", "lawn.yaml")
+    again = run_here(tmp_path, "campaign", "lawn.yaml")
     assert again.code == 0, again.err
     assert "4 of 4 trials are done" in again.out
     assert len(trials(folder)) == 4
@@ -89,7 +89,7 @@ def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path
 
 def answered(lab: Path, *answers: str) -> Run:
     (lab / "answers.txt").write_text("".join(f"{answer}\n" for answer in answers), encoding="utf-8")
-    return fieldkit(lab, "campaign", "lawn.yaml", "--answers", "answers.txt", "--json")
+    return run_here(lab, "campaign", "lawn.yaml", "--answers", "answers.txt", "--json")
 
 
 def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Packets lost by tcpdump: values of a topic that depend on its captures are withheld, and a transfer is void."""
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,33 +10,31 @@ from fieldkit.core.columns import Measured
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
 from fieldkit.trial.plan import Plan
-from tests.helpers.runs import fieldkit, only_trial
+from tests.helpers.runs import only_trial, run_here
+from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
 
-STREAM = """\
-name: stream
-summary: "A topic with a ping in one capture, a transfer in another"
-scenario: los
-topology: masterless
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - capture:
-      name: topic
-      during:
-        - together:
-            during:
-              - topics: {from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 2s}
-              - ping: {from: sender, to: receiver, count: 10, interval: 200ms, payload_bytes: 56}
-  - record: {robot: sender, topics: [/scan], duration: 1s, name: scan}
-  - capture:
-      name: transfer
-      during:
-        - transfer: {from: sender, to: receiver, into: recv.bag, port: 1234}
-"""
-NEEDS_NO_CAPTURE = {"topic_sent", "topic_received", "topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
+STREAM = procedure(
+    "stream",
+    """\
+- capture:
+    name: topic
+    during:
+      - together:
+          during:
+            - topics: {from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 2s}
+            - ping: {from: sender, to: receiver, count: 10, interval: 200ms, payload_bytes: 56}
+- record: {robot: sender, topics: [/scan], duration: 1s, name: scan}
+- capture:
+    name: transfer
+    during:
+      - transfer: {from: sender, to: receiver, into: recv.bag, port: 1234}
+""",
+    protocols="udp",
+)
+TIMES = {"topic_jitter_s", "topic_delay_variation_p95_s"}
+NEEDS_NO_CAPTURE = {"topic_sent", "topic_received", "topic_loss", *TIMES}
 NEEDS_CAPTURES = {"topic_delay_median_s", "topic_delay_error_s", "topic_age_mean_s", "topic_packet_loss"}
 
 
@@ -44,7 +43,7 @@ def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journ
     home = tmp_path_factory.mktemp("drops")
     (home / "procedures").mkdir()
     (home / "procedures" / "stream.yaml").write_text(STREAM, encoding="utf-8")
-    run = fieldkit(home, "trial", "stream", "5m", "--yes")
+    run = run_here(home, "trial", "stream", "5m", "--yes")
     assert run.code == 0, run.out + run.err
     trial = only_trial(home)
     plan = store.read_plan(trial)
@@ -67,11 +66,16 @@ def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tup
     return judged.problems, judged.measured
 
 
+def delayed(measured: Measured) -> Iterator[str]:
+    """Yield the columns of time that the subscriber's program distorts too much, because this machine is busy."""
+    yield from (name for name in TIMES if "its program was delayed" in measured.missing.get(name, ""))
+
+
 @pytest.mark.parametrize("role", ["sender", "receiver"])
 def test_a_topic_keeps_the_values_from_its_logs(attempt: tuple[Plan, Path, journal.Attempt], role: str) -> None:
     problems, measured = with_drops(attempt, f"topic.{role}")
     assert problems == ()
-    assert measured.values.keys() >= NEEDS_NO_CAPTURE, measured.missing
+    assert measured.values.keys() >= NEEDS_NO_CAPTURE - {*delayed(measured)}, measured.missing
     reason = f"the capture of {role} lacks 12 packets that its kernel dropped"
     assert {measured.missing[name] for name in NEEDS_CAPTURES} == {reason}
     assert measured.values["topic_capture_withheld"] == reason

@@ -9,26 +9,23 @@ import pytest
 from fieldkit.agent import records
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
-from tests.helpers.runs import fieldkit, only_trial
+from tests.helpers.runs import only_trial, run_here
+from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
 
-STREAM = """\
-name: stream
-summary: "A topic over DDS and one over Zenoh, side by side"
-scenario: los
-topology: masterless
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - capture:
-      during:
-        - together:
-            during:
-              - topics: {name: dds, from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 3s}
-              - topics: {name: zenoh, from: sender, to: receiver, over: zenoh, rate: 20Hz, bytes: 500B, duration: 3s}
-"""
+STREAM = procedure(
+    "stream",
+    """\
+- capture:
+    during:
+      - together:
+          during:
+            - topics: {name: dds, from: sender, to: receiver, over: dds, rate: 20Hz, bytes: 500B, duration: 3s}
+            - topics: {name: zenoh, from: sender, to: receiver, over: zenoh, rate: 20Hz, bytes: 500B, duration: 3s}
+""",
+    protocols="udp",
+)
 
 
 def shifted(content: bytes, by_ns: int) -> bytes:
@@ -45,7 +42,7 @@ def shifted(content: bytes, by_ns: int) -> bytes:
 def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
     (tmp_path / "procedures").mkdir()
     (tmp_path / "procedures" / "stream.yaml").write_text(STREAM, encoding="utf-8")
-    run = fieldkit(tmp_path, "trial", "stream", "5m", "--yes")
+    run = run_here(tmp_path, "trial", "stream", "5m", "--yes")
     assert run.code == 0, run.out + run.err
     trial = only_trial(tmp_path)
     plan = store.read_plan(trial)

@@ -16,7 +16,7 @@ from fieldkit.trial.running.locks import Holder
 from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import copy_shipped
-from tests.helpers.runs import LIMIT_S, Run, fieldkit
+from tests.helpers.runs import LIMIT_S, Run, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -46,7 +46,7 @@ def lab(field_robots: FieldRobots, tmp_path: Path) -> Path:
 
 
 def test_a_ready_lab_is_ok_in_every_line(tmp_path: Path) -> None:
-    run = fieldkit(tmp_path, "check")
+    run = run_here(tmp_path, "check")
     assert run.code == 0, run.out + run.err
     assert list(tmp_path.iterdir()) == []
     lines = run.out.splitlines()
@@ -67,7 +67,7 @@ def test_a_ready_lab_is_ok_in_every_line(tmp_path: Path) -> None:
 
 
 def test_the_field_backend_is_ok_and_leaves_nothing_on_the_robots(field_robots: FieldRobots, lab: Path) -> None:
-    run = fieldkit(lab, *CHECK)
+    run = run_here(lab, *CHECK)
     assert run.code == 0, run.out + run.err
     scan = findings_by_check(run)["turtlebot-1", "topic /scan"]
     assert scan["status"] == "ok"
@@ -87,7 +87,7 @@ def test_each_fault_is_reported_with_its_remedy_and_the_rest_is_checked(field_ro
     leftover = Job(folder, "listen", listen, limit_s=60, log="log", ready=jobs.ready_when_bound(Protocol.TCP, 1234))
     jobs.start(receiver, leftover)
     try:
-        run = fieldkit(lab, *CHECK)
+        run = run_here(lab, *CHECK)
     finally:
         jobs.stop(receiver, leftover)
         receiver.run(("rm", "-r", folder), deadline=Deadline.after(30))
@@ -106,7 +106,7 @@ def test_each_fault_is_reported_with_its_remedy_and_the_rest_is_checked(field_ro
 
 def test_a_silent_topic_is_detected_before_the_trial(lab: Path) -> None:
     copy_shipped(lab, "procedures", "los", "[/scan]", "[/scan, /nothing]")
-    run = fieldkit(lab, *CHECK)
+    run = run_here(lab, *CHECK)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "topic /nothing")}
     assert findings_by_check(run)["turtlebot-1", "topic /scan"]["status"] == "ok"
@@ -118,7 +118,7 @@ def test_an_unreachable_robot_does_not_prevent_checks_of_the_others(field_robots
     address = field_robots.cast[Role.RECEIVER].address
     site = site.replace(f"port: {field_robots.links.port(Role.SENDER)}", "port: 1").replace(address, "192.0.2.1")
     (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
-    run = fieldkit(lab, *CHECK)
+    run = run_here(lab, *CHECK)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "connection"), ("duckiedrone-1", "interface wlan0")}
     assert [check for robot, check in findings_by_check(run) if robot == "turtlebot-1"] == ["connection"]
@@ -132,7 +132,7 @@ def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(field_robo
         )
         evidence.begin(sender[Role.SENDER], job.folder, "sender", "wlan0")
         jobs.start(sender[Role.SENDER], job)
-        run = fieldkit(lab, *CHECK)
+        run = run_here(lab, *CHECK)
         evidence.end_jobs(sender[Role.SENDER], job.folder)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "lock")}, "a process of anna is no leftover"
@@ -147,7 +147,7 @@ def test_a_changed_host_key_names_both_fingerprints(field_robots: FieldRobots, l
     keys = [line.partition("host_key: ")[2].rstrip("}\n") for line in site.splitlines() if "host_key: " in line]
     assert len(keys) == 2
     (lab / "fieldkit.yaml").write_text(site.replace(keys[0], keys[1]), encoding="utf-8")
-    run = fieldkit(lab, *CHECK)
+    run = run_here(lab, *CHECK)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "connection")}
     assert findings_by_check(run)["turtlebot-1", "connection"]["detail"].count("SHA256:") == 2
@@ -159,7 +159,7 @@ def test_a_full_home_directory_fails(field_robots: FieldRobots, lab: Path) -> No
     before = shell.run(("df", "-Pk", "/root"), deadline=Deadline.after(30)).stdout.split()[-5].decode()
     shell.run(("sh", "-c", resize, "sh", "50m"), deadline=Deadline.after(30))
     try:
-        run = fieldkit(lab, *CHECK)
+        run = run_here(lab, *CHECK)
     finally:
         shell.run(("sh", "-c", resize, "sh", f"{before}k"), deadline=Deadline.after(30))
     assert run.code == 3
@@ -177,7 +177,7 @@ def test_a_trial_reports_warnings_and_stops_at_failures(lab: Path) -> None:
         "ping: ping",
         "ping: pong",
     )
-    run = fieldkit(lab, "trial", "los", "5m", "--topology", "masterless", "--yes")
+    run = run_here(lab, "trial", "los", "5m", "--topology", "masterless", "--yes")
     assert run.code == 3
     assert "warning: turtlebot-1: ROS: noetic" in run.out
     assert "turtlebot-1: pong: not found" in run.err

@@ -19,7 +19,7 @@ from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.known_radio import make_lab, measured
-from tests.helpers.runs import fieldkit, only_trial
+from tests.helpers.runs import only_trial, run_here
 from tests.helpers.sshd import wait_until
 
 FETCHED_BYTES = 1_000_000
@@ -95,7 +95,7 @@ def test_a_trial_ends_valid_and_captures_no_ssh_packets(tmp_path: Path, radio: s
     folder = make_lab(tmp_path / "lab", radio)
     site = folder / "fieldkit.yaml"
     site.write_text(site.read_text(encoding="utf-8") + "control: radio\n", encoding="utf-8")
-    run = fieldkit(folder, "trial", "quick", "5m", "--repeats", "2")
+    run = run_here(folder, "trial", "quick", "5m", "--repeats", "2")
     table = measured({folder: run})["lab"]
     assert [row["status"] for row in table] == ["valid"] * 4
     captures = [*only_trial(folder).glob("repeats/*-??/*.pcap")]
@@ -109,7 +109,7 @@ def test_check_reports_the_network_of_ssh(tmp_path: Path, control: str, word: st
     folder = make_lab(tmp_path / "lab", "{}")
     site = folder / "fieldkit.yaml"
     site.write_text(site.read_text(encoding="utf-8") + f"control: {control}\n", encoding="utf-8")
-    run = fieldkit(folder, "check", "quick", "--json")
+    run = run_here(folder, "check", "quick", "--json")
     assert run.code == 0, run.err + run.out
     findings = {finding["robot"]: finding for finding in run.events("finding") if finding["check"] == "control"}
     assert findings.keys() == {"turtlebot-1", "turtlebot-2"}

@@ -8,19 +8,18 @@ import re
 import signal
 import subprocess
 import sys
-from contextlib import ExitStack, chdir, redirect_stderr, redirect_stdout
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 
-from fieldkit.cli import main
 from fieldkit.core.columns import Column
 from fieldkit.trial.columns import trial_columns
 from sim_backends.cosim.recording.manifest import read_manifest, write_manifest
 from tests.helpers.paths import DATA
-from tests.helpers.runs import Run, fieldkit, finish, start
+from tests.helpers.runs import Run, finish, run_here, start
 
 LIMIT_S = 60.0
 TRIAL = DATA / "fieldkit" / "4" / "trials" / "20261122T010946.593049Z_los_30ft_master"
@@ -53,15 +52,7 @@ def lab(tmp_path: Path) -> Path:
 
 def cosim(lab: Path, *words: str) -> Run:
     """Run `fieldkit cosim` in this process, which has already imported most of its modules."""
-    return here(lab, "cosim", *words)
-
-
-def here(lab: Path, *words: str) -> Run:
-    """Run fieldkit in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    with chdir(lab), redirect_stdout(out), redirect_stderr(err):
-        code = main(words)
-    return Run(code, out.getvalue(), err.getvalue())
+    return run_here(lab, "cosim", *words)
 
 
 def rows(text: str) -> list[dict[str, str]]:
@@ -224,7 +215,7 @@ def test_ctrl_c_stops_a_run_of_many_seeds_and_keeps_finished_ones(lab: Path) -> 
     # One more seed may have finished after the last report.
     assert set(printed) <= set(finished_seeds)
     assert f"interrupted: {len(printed)} of 10000 seeds had finished" in run.err
-    aggregated = fieldkit(lab, "aggregate", "sim", "--format", "csv")
+    aggregated = run_here(lab, "aggregate", "sim", "--format", "csv")
     assert aggregated.code == 0, aggregated.err
 
 
@@ -309,22 +300,24 @@ def test_fieldkit_reads_simulations_like_trials(lab: Path) -> None:
     options = ("--set", "agents.bob.along=9.144m", "--duration", "500ms", "--seeds", "2")
     for policy in ("sliding_window", "scheduled"):
         assert cosim(lab, "run", "pass.yaml", *options, "--policy", policy, "--out", policy).code == 0
-    (cell,) = [row for row in rows(here(lab, "aggregate", "scheduled", "--format", "csv").out) if is_loss_row(row)]
+    (cell,) = [
+        row for row in rows(run_here(lab, "aggregate", "scheduled", "--format", "csv").out) if is_loss_row(row)
+    ]
     assert (cell["n_valid"], cell["backend"], cell["distance_m"]) == ("2", "cosim", "9.144")
     assert cell["procedure"] == "pass state/bob (scheduled 10 ms)"
-    both = here(lab, "compare", "scheduled", "sliding_window", "--format", "csv")
+    both = run_here(lab, "compare", "scheduled", "sliding_window", "--format", "csv")
     assert [row["n_b"] for row in rows(both.out) if is_loss_row(row)] == ["2"], both.err
-    trial = here(
+    trial = run_here(
         lab, "compare", str(TRIAL), "scheduled", "--by", "scenario,distance_m,protocol", "--force", "--format", "csv"
     )
     assert [row["n_b"] for row in rows(trial.out) if is_loss_row(row)] == ["2"], trial.err
-    page = here(lab, "report", "scheduled", str(TRIAL), "-o", "page.html")
+    page = run_here(lab, "report", "scheduled", str(TRIAL), "-o", "page.html")
     assert page.code == 0, page.err
     assert "pass state/bob (scheduled 10 ms)" in (lab / "page.html").read_text(encoding="utf-8")
     for form in ("csv", "parquet"):
-        assert here(lab, "export", "scheduled", "--format", form, "-o", f"all.{form}").code == 0
+        assert run_here(lab, "export", "scheduled", "--format", form, "-o", f"all.{form}").code == 0
     assert len(rows((lab / "all.csv").read_text(encoding="utf-8"))) == 2
-    rejected = here(lab, "export", "scheduled/seed-1", "--format", "mcap", "-o", "one.mcap")
+    rejected = run_here(lab, "export", "scheduled/seed-1", "--format", "mcap", "-o", "one.mcap")
     assert rejected.code == 2, "a simulation has no timeline of a trial"
     assert "Traceback" not in rejected.err
 

@@ -16,47 +16,36 @@ from fieldkit.trial import gates, planned_evidence, store
 from fieldkit.trial.plan import Plan
 from tests.helpers.dissected import Row, dissected
 from tests.helpers.labs import write_procedure
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
+from tests.helpers.texts import TURTLEBOTS_AND_DRONE, procedure, site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  turtlebot-2: {profile: turtlebot3_burger}
-  duckiedrone-1: {profile: duckiedrone}
-roles:
-  master: {sender: turtlebot-1, receiver: turtlebot-2, relay: duckiedrone-1}
-emulated:
-  ros: builtin
-  radio: {loss: 5%, rate: 50Mbit/s}
-"""
-PROCEDURE = """\
-name: cross
-summary: both directions at once with a competing flow from a third robot, and pings meanwhile
-scenario: los
-topology: master
-protocols: [tcp, udp]
-repeats: 2
-attempts: 4
-steps:
-  - together:
-      during:
-        - record: {robot: sender, topics: [/imu], duration: 1s}
-        - record: {robot: receiver, topics: [/imu], duration: 1s, name: theirs}
-        - record: {robot: relay, topics: [/pidrone/imu], duration: 1s, name: third}
-  - capture:
-      robots: [sender, receiver, relay]
-      during:
-        - together:
-            during:
-              - transfer: {name: up, from: sender, to: receiver, idle: 1s, port: 1001}
-              - transfer: {name: down, from: receiver, to: sender, idle: 1s, port: 1002, file: theirs}
-              - transfer: {name: rival, from: relay, to: receiver, idle: 1s, port: 1003, file: third}
-              - ping: {name: load, from: sender, to: receiver, count: 20, interval: 50ms, payload_bytes: 4000}
-        - ping: {from: sender, to: receiver, count: 10, interval: 20ms, payload_bytes: 100}
-"""
+SITE = site(TURTLEBOTS_AND_DRONE, emulated="ros: builtin, radio: {loss: 5%, rate: 50Mbit/s}")
+PROCEDURE = procedure(
+    "cross",
+    """\
+- together:
+    during:
+      - record: {robot: sender, topics: [/imu], duration: 1s}
+      - record: {robot: receiver, topics: [/imu], duration: 1s, name: theirs}
+      - record: {robot: relay, topics: [/pidrone/imu], duration: 1s, name: third}
+- capture:
+    robots: [sender, receiver, relay]
+    during:
+      - together:
+          during:
+            - transfer: {name: up, from: sender, to: receiver, idle: 1s, port: 1001}
+            - transfer: {name: down, from: receiver, to: sender, idle: 1s, port: 1002, file: theirs}
+            - transfer: {name: rival, from: relay, to: receiver, idle: 1s, port: 1003, file: third}
+            - ping: {name: load, from: sender, to: receiver, count: 20, interval: 50ms, payload_bytes: 4000}
+      - ping: {from: sender, to: receiver, count: 10, interval: 20ms, payload_bytes: 100}
+""",
+    topology="master",
+    protocols="tcp, udp",
+    repeats=2,
+    attempts=4,
+)
 
 Values = Mapping[str, Value]
 
@@ -65,7 +54,7 @@ Values = Mapping[str, Value]
 def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lab = tmp_path_factory.mktemp("cross")
     (lab / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    run = fieldkit(lab, "trial", write_procedure(lab, PROCEDURE), "5m", "--seed", "4")
+    run = run_here(lab, "trial", write_procedure(lab, PROCEDURE), "5m", "--seed", "4")
     assert run.code == 0, run.err + run.out
     assert "up: " in run.out
     return only_trial(lab)

@@ -27,10 +27,12 @@ from fieldkit.remote.command import with_environment
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.ros.steered import Steered
+from tests.helpers import texts
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import descendants, wait_for_end
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.rovers import rover_profile
-from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_during, wait_for_line
+from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_during, wait_for_line
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
@@ -53,24 +55,22 @@ emulated: {ros: debian}
 """
 PLACEMENT = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 SPEED_M_S = 0.6
-LEASE_S = 2.0
+LEASE_S = 6.0
+"""Longer than the time that a busy machine takes to start the command `stop`."""
 SETUP = ("/opt/ros/noetic/setup.bash",)
-DRIVE = """\
-name: drive
-summary: The receiver drives away
-scenario: los
-topology: master
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - move:
-      robot: receiver
-      path: [{away: 20m}]
-      speed: 0.6m/s
-      during:
-        - ping: {from: sender, to: receiver, count: 150, interval: 200ms, payload_bytes: 500}
-"""
+DRIVE = texts.procedure(
+    "drive",
+    """\
+- move:
+    robot: receiver
+    path: [{away: 20m}]
+    speed: 0.6m/s
+    during:
+      - ping: {from: sender, to: receiver, count: 150, interval: 200ms, payload_bytes: 500}
+""",
+    topology="master",
+    protocols="udp",
+)
 BOTH = (
     DRIVE[: DRIVE.index("  - move:")]
     + """\
@@ -100,7 +100,7 @@ RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
 def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
     """Robots that outlive fieldkit; one of them is fast, so that the tests take less time."""
     folder = tmp_path_factory.mktemp("rovers")
-    profile = rover_profile(fence_m=30.0)
+    profile = rover_profile(fence_m=30.0, lease_s=LEASE_S)
     for name in ("robots", "procedures"):
         (folder / name).mkdir()
     (folder / "robots" / "rover.yaml").write_text(profile, encoding="utf-8")
@@ -147,7 +147,7 @@ def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(fi
     starts_m = {
         role: track_of(field_robots, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)
     }
-    run = fieldkit(field_robots.folder, *RUN)
+    run = run_here(field_robots.folder, *RUN)
     assert run.code == 0, run.err
     trial = only_trial(field_robots.folder)
     (repeat,) = (trial / "repeats").iterdir()
@@ -257,7 +257,7 @@ def standstill_s(field_robots: FieldRobots, since_ns: int) -> float:
     return (max(moving, default=since_ns) - since_ns) / 1e9
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", mark_nightly([signal.SIGINT, signal.SIGTERM]))
 def test_the_first_signal_stops_the_robot_immediately(field_robots: FieldRobots, number: signal.Signals) -> None:
     with driving(field_robots) as process:
         sent_ns = time.time_ns()
@@ -280,7 +280,7 @@ def assert_held(field_robots: FieldRobots, reason: str) -> None:
     assert reason in held["reason"]
     assert [(row["status"], row["reason"]) for row in rows(trial)] == [("void", reason)]
     stopped_m = place_m(field_robots)
-    again = fieldkit(field_robots.folder, "resume", str(trial), *RESUME)
+    again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert f"rover-1: {held['reason']}" in again.err
     assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
@@ -358,7 +358,7 @@ def test_a_robot_outside_its_fence_does_not_start(field_robots: FieldRobots) -> 
         wait_until(lambda: stationary(field_robots), Deadline.after(60))
         moved_m = place_m(field_robots)
         trial = only_trial(field_robots.folder)
-        run = fieldkit(field_robots.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+        run = run_here(field_robots.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
         assert run.code == 5, run.err
         assert f"outside its fence of {fence_m:g} m" in run.err
         assert place_m(field_robots) == pytest.approx(moved_m, abs=0.01)
@@ -371,7 +371,7 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(field_robo
     with driving(field_robots) as process:
         process.send_signal(signal.SIGSTOP)
         sent_ns = time.time_ns()
-        run = fieldkit(field_robots.folder, "stop", "--all")
+        run = run_here(field_robots.folder, "stop", "--all")
         took_s = standstill_s(field_robots, sent_ns)
         assert run.code == 0, run.err + run.out
         assert sorted(run.out.splitlines()) == [
@@ -384,10 +384,10 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(field_robo
     assert ended.code == 3, ended.err
     assert "stopped the robots at" in ended.err
     assert standstill_s(field_robots, sent_ns + int(1e9 * took_s) + 1) == 0.0, "nothing moved again"
-    again = fieldkit(field_robots.folder, "stop", "rover-1")
+    again = run_here(field_robots.folder, "stop", "rover-1")
     assert (again.code, again.out) == (0, "rover-1: no program of fieldkit moves it; nothing was sent to it\n")
     field_robots.links.cut(Role.SENDER)
-    partly = fieldkit(field_robots.folder, "stop", "--all")
+    partly = run_here(field_robots.folder, "stop", "--all")
     assert partly.code == 3
     assert "rover-2: NOT REACHED: stop it by hand" in partly.out
     assert "rover-1: no program of fieldkit moves it" in partly.out
@@ -427,7 +427,7 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(field_robots: Fie
         os.kill(agent, signal.SIGSTOP)
         wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
         stands_ns = time.time_ns()
-        stopped = fieldkit(field_robots.folder, "stop", "rover-1")
+        stopped = run_here(field_robots.folder, "stop", "rover-1")
         assert (stopped.code, stopped.out) == (0, "rover-1: stopped (stationary)\n")
         wait_for_end({agent}, within_s=60.0)
         assert standstill_s(field_robots, stands_ns) == 0.0
@@ -435,7 +435,7 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(field_robots: Fie
     assert standstill_s(field_robots, stands_ns) == 0.0
     trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
-    again = fieldkit(field_robots.folder, "resume", str(trial), *RESUME)
+    again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert "no robot moves before a person confirms: rover-1" in again.err
     assert standstill_s(field_robots, stands_ns) == 0.0
@@ -491,19 +491,19 @@ def test_after_a_fault_nothing_moves_before_it_is_confirmed(field_robots: FieldR
     trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
     # --yes is no confirmation, in any run.
-    again = fieldkit(field_robots.folder, "resume", str(trial), *RESUME)
+    again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert "no order from the laptop for 2 s" in again.err
     assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
     # Pressing Enter does not confirm either: the default is to stop.
     answers = field_robots.folder / "answers"
     answers.write_text("\n\n", encoding="utf-8")
-    enter = fieldkit(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    enter = run_here(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
     assert enter.code == 5, enter.err
     assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
     # With the option the robot first drives back along its path, and then as at the start.
     begun_ns = track_of(field_robots, Role.RECEIVER)[-1].utc_ns
-    option = fieldkit(field_robots.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+    option = run_here(field_robots.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
     assert option.code == 0, option.err
     track = [point for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns > begun_ns and point.position_m]
     off_m = [math.dist(point.position_m or home_m, home_m) for point in track]
@@ -548,6 +548,6 @@ def test_a_suspended_driver_does_not_continue_until_a_person_confirms(field_robo
     answers = field_robots.folder / "answers"
     answers.write_text("\nconfirm\n", encoding="utf-8")
     field_robots.testbed.place(PLACEMENT)
-    confirmed = fieldkit(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    confirmed = run_here(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
     assert confirmed.code == 0, confirmed.err
     assert motions(trial)[2:6] == ["held", "confirmed", "origin", "begun"]

@@ -12,7 +12,7 @@ import pytest
 from fieldkit.core.model import Role
 from tests.helpers.host import wait_for_end
 from tests.helpers.rovers import RECEIVER_SITE, RoverLab, rover_lab
-from tests.helpers.runs import Run, fieldkit, finish, rows, start
+from tests.helpers.runs import Run, finish, rows, run_here, start
 
 pytestmark = pytest.mark.emulated
 
@@ -46,7 +46,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RoverLab]:
 
 
 def campaign(lab: RoverLab, out: str, *words: str) -> Run:
-    return fieldkit(lab.folder, "campaign", "lawn.yaml", "--out", out, *words)
+    return run_here(lab.folder, "campaign", "lawn.yaml", "--out", out, *words)
 
 
 def motions(lab: RoverLab, out: str) -> list[str]:
@@ -136,7 +136,7 @@ def test_with_yes_a_robot_does_not_start_at_an_unconfirmed_position(lab: RoverLa
     lab.write_procedure(Role.SENDER, 0.4)
     lab.place_at("5m")
     since_ns = time.time_ns()
-    several = fieldkit(lab.folder, "trial", "drive", "5m", "10m", "--out", out, *UNASKED)
+    several = run_here(lab.folder, "trial", "drive", "5m", "10m", "--out", out, *UNASKED)
     assert several.code == 2, several.err
     assert "rover-1 moves without a person and must be at another place for 10m" in several.err
     assert set(lab.track_m(since_ns)) <= {lab.place_m}
@@ -171,7 +171,7 @@ def test_stop_stops_a_robot_after_fieldkit_was_killed(lab: RoverLab) -> None:
     (lab.folder / "broken.yaml").write_text(
         (lab.folder / "fieldkit.yaml").read_text(encoding="utf-8") + "no such key: 1\n", encoding="utf-8"
     )
-    stopped = fieldkit(lab.folder, "stop", "--all", "--site", "broken.yaml")
+    stopped = run_here(lab.folder, "stop", "--all", "--site", "broken.yaml")
     assert stopped.code == 0, stopped.out + stopped.err
     assert sorted(stopped.out.splitlines()) == [
         "box-1: no program of fieldkit moves it; nothing was sent to it",

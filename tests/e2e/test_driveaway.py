@@ -14,22 +14,16 @@ from sim_backends.radio.modes import N_MODES
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel, antenna_of
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
+from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_for_line
+from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  duckiedrone-1: {profile: quick}
-roles:
-  masterless: {sender: turtlebot-1, receiver: duckiedrone-1}
-emulated:
-  ros: builtin
-  record_air: true
-  radio: {fading: false, shadowing_db: 0.0}  # a link that ends in one place
-"""
+# A link that ends in one place.
+SITE = site(
+    {"turtlebot-1": "turtlebot3_burger", "duckiedrone-1": "quick"},
+    emulated="ros: builtin, record_air: true, radio: {fading: false, shadowing_db: 0.0}",
+)
 PATH_M = 60.0
 SPEED_M_S = 4.0
 RATES = {mode.name: mode.rate_bit_s for mode in N_MODES}
@@ -79,7 +73,7 @@ def frames(folder: Path, where: tuple[TrackPoint, ...]) -> list[tuple[float, str
 
 
 def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) -> None:
-    run = fieldkit(lab, "trial", "rush", "40m", "--repeats", "1", "--protocol", "udp", "--record", "1s")
+    run = run_here(lab, "trial", "rush", "40m", "--repeats", "1", "--protocol", "udp", "--record", "1s")
     assert run.code == 0, run.err
     trial = only_trial(lab)
     (row,) = [row for row in rows(trial) if row["status"] == "valid"]
@@ -114,9 +108,9 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     assert int(row["rtt_received"]) > 0
 
     before = (trial / "trial.csv").read_bytes()
-    assert fieldkit(lab, "rebuild", str(trial)).code == 0
+    assert run_here(lab, "rebuild", str(trial)).code == 0
     assert (trial / "trial.csv").read_bytes() == before
-    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0
 
 
 def test_a_trial_that_is_stopped_during_the_move_saves_its_state(lab: Path) -> None:
@@ -133,6 +127,6 @@ def test_a_robot_that_is_too_slow_is_rejected_before_anything_moves(lab: Path) -
     (lab / "fieldkit.yaml").write_text(SITE.replace("profile: quick", "profile: turtlebot3_burger"))
     path = lab / "procedures" / "rush.yaml"
     path.write_text(path.read_text().replace("      within_limits: true\n", ""))
-    run = fieldkit(lab, "trial", "rush", "10m", "--repeats", "1")
+    run = run_here(lab, "trial", "rush", "10m", "--repeats", "1")
     assert run.code == 3, run.err
     assert "its top speed is 0.22 m/s, but the move needs 4 m/s" in run.out + run.err

@@ -17,42 +17,31 @@ from fieldkit.measure.evidence import track
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
+from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_for_line
 from tests.helpers.sshd import wait_until
+from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
 # The drone is in range where it hovers, and out of range 20 m farther.
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  duckiedrone-1: {profile: duckiedrone}
-roles:
-  masterless: {sender: turtlebot-1, receiver: duckiedrone-1}
-emulated:
-  ros: builtin
-  radio: {fading: false, shadowing_db: 0.0, noise_floor_dbm: -59, mode: n0}
-"""
-PROCEDURE = """\
-name: flyaway
-summary: a drone flies away while bytes are sent to it
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-on_abort: {receiver: land}
-steps:
-  - fly:
-      robot: receiver
-      height: 1m
-      path: [{away: 20m}]
-      speed: 3m/s
-      then: land
-      lease: 3s
-      during: DURING
-"""
+SITE = site(
+    {"turtlebot-1": "turtlebot3_burger", "duckiedrone-1": "duckiedrone"},
+    emulated="ros: builtin, radio: {fading: false, shadowing_db: 0.0, noise_floor_dbm: -59, mode: n0}",
+)
+PROCEDURE = procedure(
+    "flyaway",
+    """\
+- fly:
+    robot: receiver
+    height: 1m
+    path: [{away: 20m}]
+    speed: 3m/s
+    then: land
+    lease: 3s
+    during: DURING
+""",
+    more="on_abort: {receiver: land}\n",
+)
 TRANSFER = """
         - capture:
             robots: [sender, receiver]
@@ -71,7 +60,7 @@ def lab(folder: Path, during: str) -> Path:
 
 def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
     (lab(tmp_path, TRANSFER) / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    run = fieldkit(tmp_path, "trial", "flyaway", "3m")
+    run = run_here(tmp_path, "trial", "flyaway", "3m")
     assert run.code == 0, run.err
     trial = only_trial(tmp_path)
     (row,) = rows(trial)
@@ -99,34 +88,20 @@ def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
 
 
 # A drone of each family; both are real robots for fieldkit. Landings by their programs start soon.
-DRONES = """\
-backend: emulated
-robots:
-  copter-1: {profile: copter}
-  duckiedrone-1: {profile: duckiedrone}
-roles:
-  masterless: {sender: copter-1, receiver: duckiedrone-1}
-emulated:
-  ros: builtin
-"""
-GIVEN_UP = """\
-name: givenup
-summary: a drone flies 2 m away and waits there
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-on_abort: {ROLE: HOW}
-steps:
-  - fly:
-      robot: ROLE
-      height: 60cm
-      path: [{away: 2m}]
-      speed: 3m/s
-      lease: LEASE
-      during: [{wait: {duration: 90s}}]
-"""
+DRONES = site({"copter-1": "copter", "duckiedrone-1": "duckiedrone"}, emulated="ros: builtin")
+GIVEN_UP = procedure(
+    "givenup",
+    """\
+- fly:
+    robot: ROLE
+    height: 60cm
+    path: [{away: 2m}]
+    speed: 3m/s
+    lease: LEASE
+    during: [{wait: {duration: 90s}}]
+""",
+    more="on_abort: {ROLE: HOW}\n",
+)
 SET_PARAMETER = """\
 from pymavlink import mavutil
 drone = mavutil.mavlink_connection("udpout:127.0.0.1:14550", source_system=250)
@@ -195,7 +170,7 @@ def test_a_drone_continues_without_its_laptop_until_abort(field_robots: FieldRob
     wait_for_end({process.pid}, within_s=60.0)
     assert agents()
     assert height_m(field_robots, Role.RECEIVER) > 0.2, "it still flies"
-    aborted = fieldkit(field_robots.folder, "abort", "--yes")
+    aborted = run_here(field_robots.folder, "abort", "--yes")
     assert aborted.code == 0
     assert "/fly " in aborted.out, aborted.err
     assert_landed(field_robots, Role.RECEIVER, "land: the job was cancelled")
@@ -219,7 +194,7 @@ def test_stop_lands_a_drone_after_fieldkit_was_killed(field_robots: FieldRobots)
     process = flying(field_robots, Role.RECEIVER, how="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
-    stopped = fieldkit(field_robots.folder, "stop", "--all")
+    stopped = run_here(field_robots.folder, "stop", "--all")
     assert stopped.code == 0, stopped.err
     assert sorted(stopped.out.splitlines()) == [
         "copter-1: no program of fieldkit moves it; nothing was sent to it",

@@ -13,23 +13,15 @@ import pytest
 from fieldkit.core.model import Role, Vector
 from tests.helpers.field_robots import start_field_robots
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
+from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
 PATH_M = 1.0
 HEIGHT_M = 0.4
 AIRBORNE_M = 0.1
-LAB = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  copter-1: {profile: copter}
-roles:
-  masterless: {sender: turtlebot-1, receiver: copter-1}
-emulated:
-  ros: builtin
-"""
+LAB = site({"turtlebot-1": "turtlebot3_burger", "copter-1": "copter"}, emulated="ros: builtin")
 PROCEDURE = """\
 name: again
 summary: an ArduCopter flies away and returns, again and again
@@ -70,7 +62,7 @@ def farthest_m(flight: Sequence[Vector], start_m: Vector) -> tuple[float, float]
     return east_m - start_m[0], north_m - start_m[1]
 
 
-@pytest.mark.parametrize("repeats", [4, pytest.param(10, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("repeats", [3, pytest.param(10, marks=pytest.mark.nightly)])
 def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "robots").mkdir()
     (tmp_path / "procedures").mkdir()
@@ -84,7 +76,7 @@ def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, mon
     (tmp_path / "lab.yaml").write_text(LAB, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     with start_field_robots(tmp_path, site=tmp_path / "lab.yaml") as field_robots:
-        run = fieldkit(tmp_path, "trial", "again", "5m", "--yes", "--allow-motion", "--allow-motion-after-fault")
+        run = run_here(tmp_path, "trial", "again", "5m", "--yes", "--allow-motion", "--allow-motion-after-fault")
         assert run.code == 0, run.err
         track = [place for place in field_robots.testbed.oracle.track(0) if place.role is Role.RECEIVER]
     places_m = [place.position_m for place in track if place.position_m is not None]
@@ -96,11 +88,12 @@ def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, mon
             "it is ordered back before the end of its path if the machine is busy"
         )
         assert abs(aside_m) < 0.3
-    results = rows(only_trial(tmp_path))
+    # On a busy machine the pilot may be suspended; it then lands the drone, and the attempt is void.
+    results = [row for row in rows(only_trial(tmp_path)) if row["status"] != "void"]
     assert [row["status"] for row in results] == ["valid"] * repeats
     attempts = sum(int(row["attempt"]) for row in results)
     assert len(flown) <= attempts
-    if attempts == repeats:  # on a busy machine the pilot is suspended, and then lands the drone
+    if attempts == repeats:
         assert len(flown) == repeats
         for row, flight in zip(results, flown, strict=True):
             assert math.dist(flight[-1][:2], home_m[:2]) < 0.5, "it came back"

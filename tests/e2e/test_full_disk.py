@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.labs import built_in_ros
-from tests.helpers.runs import LIMIT_S, fieldkit, only_trial, rows
+from tests.helpers.runs import LIMIT_S, only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -62,5 +62,5 @@ def test_a_full_disk_stops_the_trial_and_resume_continues_after_cleaning_up(tmp_
     table = rows(only_trial(out))
     assert [row["repeat"] for row in table if row["status"] == "valid"] == ["1", "2"]
     assert all(row["reason"] for row in table if row["status"] != "valid")
-    assert fieldkit(out, "verify", str(only_trial(out))).code == 0
-    assert "the same bytes" in fieldkit(out, "rebuild", str(only_trial(out))).out
+    assert run_here(out, "verify", str(only_trial(out))).code == 0
+    assert "the same bytes" in run_here(out, "rebuild", str(only_trial(out))).out

@@ -9,25 +9,21 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.remote import jobs
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import copy_shipped, write_procedure
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
+from tests.helpers.texts import procedure
 
 pytestmark = pytest.mark.emulated
 
-PROCEDURE = """\
-name: short
-summary: One attempt with short limits
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 1
-attempts: 1
-steps:
-  - record: {robot: sender, topics: [/scan], duration: 1s}
-  - capture:
-      during:
-        - transfer: {from: sender, to: receiver, file: scan.bag, into: recv.bag, limit: 3s}
-  - ping: {from: sender, to: receiver, count: 2, interval: 200ms}
-"""
+PROCEDURE = procedure(
+    "short",
+    """\
+- record: {robot: sender, topics: [/scan], duration: 1s}
+- capture:
+    during:
+      - transfer: {from: sender, to: receiver, file: scan.bag, into: recv.bag, limit: 3s}
+- ping: {from: sender, to: receiver, count: 2, interval: 200ms}
+""",
+)
 
 # Responds to version queries like the real tool, and hangs during its work.
 HANGS_AT_WORK = """\
@@ -75,7 +71,7 @@ def test_a_hanging_tool_is_ended_at_its_limit(
     field_robots: FieldRobots, lab: Path, tool: str, program: str, message: str
 ) -> None:
     replace_tool(field_robots, lab, tool, program, HANGS_AT_WORK)
-    run = fieldkit(lab, "trial", "short", "5m", "--yes")
+    run = run_here(lab, "trial", "short", "5m", "--yes")
     assert run.code in {0, 4}, run.err
     (row,) = rows(only_trial(lab))
     if tool == "netcat":  # an incomplete transfer is a measurement
@@ -94,7 +90,7 @@ def test_a_tool_that_hangs_on_version_queries_is_rejected_before_repeat_1(
     field_robots: FieldRobots, lab: Path, tool: str, program: str
 ) -> None:
     replace_tool(field_robots, lab, tool, program, HANGS)
-    run = fieldkit(lab, "trial", "short", "5m", "--yes")
+    run = run_here(lab, "trial", "short", "5m", "--yes")
     assert run.code == 3
     assert f"/root/{tool}" in run.err
     assert "remedy" in run.err
@@ -105,7 +101,7 @@ def test_a_hanging_recorder_is_ended_at_its_limit(field_robots: FieldRobots, lab
         lab, "robots", "turtlebot3_burger", '[rosbag, record, "--duration', '[/root/rosbag, record, "--duration'
     )
     place_program(field_robots, "rosbag", HANGS_AT_WORK.replace("-V |", "*--help* | -V |").format(program="rosbag"))
-    run = fieldkit(lab, "trial", "short", "5m", "--yes")
+    run = run_here(lab, "trial", "short", "5m", "--yes")
     assert run.code == 4, run.err
     (row,) = rows(only_trial(lab))
     assert row["status"] == "failed"

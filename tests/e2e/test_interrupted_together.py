@@ -10,32 +10,24 @@ import pytest
 from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.labs import BOX, write_procedure
 from tests.helpers.runs import finish, only_trial, rows, start
+from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  box-1: {profile: box}
-  box-2: {profile: box}
-roles:
-  masterless: {sender: box-1, receiver: box-2}
-"""
-PROCEDURE = """\
-name: beside
-summary: Four concurrent activities, none of which ends by itself in time
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 2
-steps:
-  - together:
-      during:
-        - run: {name: one, robot: sender, argv: [sleep, "300"], limit: 400s}
-        - run: {name: other, robot: receiver, argv: [sleep, "300"], limit: 400s}
-        - ping: {from: sender, to: receiver, count: 3000, interval: 100ms}
-        - wait: {duration: 300s}
-"""
+SITE = site({"box-1": "box", "box-2": "box"})
+PROCEDURE = procedure(
+    "beside",
+    """\
+- together:
+    during:
+      - run: {name: one, robot: sender, argv: [sleep, "300"], limit: 400s}
+      - run: {name: other, robot: receiver, argv: [sleep, "300"], limit: 400s}
+      - ping: {from: sender, to: receiver, count: 3000, interval: 100ms}
+      - wait: {duration: 300s}
+""",
+    repeats=2,
+    attempts=None,
+)
 
 
 def wait_for_all(process: "subprocess.Popen[str]", names: list[str]) -> None:

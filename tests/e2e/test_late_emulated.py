@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.known_radio import make_lab
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -16,7 +16,7 @@ def test_a_repeat_with_excessive_lateness_does_not_count(tmp_path: Path) -> None
     procedure.write_text(
         procedure.read_text(encoding="utf-8").replace("attempts: 3", "attempts: 1"), encoding="utf-8"
     )
-    run = fieldkit(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
+    run = run_here(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
     assert run.code == 4, run.err
     trial = only_trial(lab)
     (row,) = rows(trial)
@@ -26,5 +26,5 @@ def test_a_repeat_with_excessive_lateness_does_not_count(tmp_path: Path) -> None
     assert int(row["emulator_too_late"]) >= int(row["ip_packets_received"])
     assert 1e-6 < float(row["emulator_late_p99_s"]) <= float(row["emulator_late_max_s"])
     written = (trial / "trial.csv").read_bytes()
-    assert fieldkit(lab, "rebuild", str(trial)).code == 0
+    assert run_here(lab, "rebuild", str(trial)).code == 0
     assert (trial / "trial.csv").read_bytes() == written

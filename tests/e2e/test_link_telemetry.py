@@ -6,25 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
+from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  turtlebot-2: {profile: turtlebot3_burger}
-roles:
-  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
-emulated:
-  ros: builtin
-  record_air: true
-  # Without fading the SNR is always 23.1 dB, too little for n7: half of the frames of 1,500 bytes are lost, and a
-  # fifth of those of 500 bytes. The probability that repeats of 11 and 20 frames need no retry is at most one in
-  # 10,000.
-  radio: {mode: n7, fading: false, noise_floor_dbm: -84.2}
-"""
+# Without fading the SNR is always 23.1 dB, too little for n7: half of the frames of 1,500 bytes are lost, and a fifth
+# of those of 500 bytes. The probability that repeats of 11 and 20 frames need no retry is at most one in 10,000.
+SITE = site(emulated="ros: builtin, record_air: true, radio: {mode: n7, fading: false, noise_floor_dbm: -84.2}")
 
 
 def kernel_packets(folder: Path, role: str) -> dict[str, int]:
@@ -41,7 +30,7 @@ def kernel_packets(folder: Path, role: str) -> dict[str, int]:
 
 def test_radios_kernels_captures_and_the_air_log_have_equal_counts(tmp_path: Path) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    run = fieldkit(tmp_path, "trial", "los", "60ft", "--topology", "masterless", "--repeats", "1", "--record", "1s")
+    run = run_here(tmp_path, "trial", "los", "60ft", "--topology", "masterless", "--repeats", "1", "--record", "1s")
     assert run.code == 0, run.err + run.out
     trial = only_trial(tmp_path)
     for row in rows(trial):

@@ -6,29 +6,18 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.labs import BOX, write_procedure
-from tests.helpers.runs import Run, fieldkit, only_trial, rows
+from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here
+from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  box-1: {profile: box}
-  box-2: {profile: box}
-roles:
-  masterless: {sender: box-1, receiver: box-2}
-emulated: {radio: RADIO}
-"""
-HEAD = """\
-name: own
-summary: Of this test
-scenario: los
-topology: masterless
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-"""
+SITE = site({"box-1": "box", "box-2": "box"}, emulated="radio: RADIO")
+HEAD = procedure(
+    "own",
+    """\
+""",
+    protocols="udp",
+)
 
 # The program leaves the job's process group, which ends with the job.
 KILL_SOON = """  - run:
@@ -155,7 +144,7 @@ def test_errors_are_reported_and_no_repeat_is_valid(wrong: dict[str, tuple[Run, 
     (row,) = rows(only_trial(folder))
     assert row["status"] == "failed"
     assert REASONS[name] in row["reason"], row["reason"]
-    left = fieldkit(folder, "rebuild", str(only_trial(folder)))
+    left = run_here(folder, "rebuild", str(only_trial(folder)))
     assert left.code == 0, left.err
 
 

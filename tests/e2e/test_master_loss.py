@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.host import Untouched
 from tests.helpers.labs import copy_shipped
-from tests.helpers.runs import Run, fieldkit, only_trial, rows
+from tests.helpers.runs import Run, only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -32,7 +32,7 @@ def lab_with_one_master(folder: Path, ros: str = "debian") -> Path:
 def run_procedure(lab: Path, procedure: str, *changes: str) -> dict[str, str]:
     """Run one repeat of a procedure, shorter than the shipped one; return its row."""
     copy_shipped(lab, "procedures", procedure, *SHORTER, *changes)
-    run = fieldkit(lab, "trial", procedure, "5m", "--repeats", "1")
+    run = run_here(lab, "trial", procedure, "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     (row,) = [row for row in rows(only_trial(lab)) if row["status"] == "valid"]
     return row
@@ -51,7 +51,7 @@ def messages_in(bag: Path) -> tuple[set[str], list[int]]:
 
 def test_a_complete_repeat_of_los_with_the_master_and_recorder_of_ros(tmp_path: Path, untouched: Untouched) -> None:
     words = ("trial", "los", "5m", "--repeats", "1", "--record", "2s", "--protocol", "tcp")
-    run = fieldkit(lab_with_one_master(tmp_path), *words)
+    run = run_here(lab_with_one_master(tmp_path), *words)
     assert run.code == 0, run.err + run.out
     assert [row["status"] for row in rows(only_trial(tmp_path))] == ["valid"]
     preflight = (only_trial(tmp_path) / "preflight.txt").read_text(encoding="utf-8")
@@ -81,7 +81,7 @@ def test_after_the_loss_of_drone_and_master_nothing_is_discovered(tmp_path: Path
     gap_s = max(later - sooner for sooner, later in pairwise(came_ns)) / 1e9
     assert float(row["through.bag_gap_s"]) >= gap_s - 1e-6
     assert len(came_ns) >= 10, "6 s at 5 Hz, the drone lost after 3 s: a connected subscriber needs no master"
-    assert "the same bytes as before" in fieldkit(tmp_path, "rebuild", str(only_trial(tmp_path))).out
+    assert "the same bytes as before" in run_here(tmp_path, "rebuild", str(only_trial(tmp_path))).out
 
 
 def test_without_a_shared_master_the_loss_of_the_drone_has_no_effect(tmp_path: Path) -> None:
@@ -93,12 +93,12 @@ def test_without_a_shared_master_the_loss_of_the_drone_has_no_effect(tmp_path: P
 
 def test_a_master_out_of_range_stops_the_trial_before_its_first_repeat(tmp_path: Path) -> None:
     """The master is in range when the robots start, side by side."""
-    run = fieldkit(lab_with_one_master(tmp_path), "trial", "los", "900m", "--repeats", "1", "--protocol", "tcp")
+    run = run_here(lab_with_one_master(tmp_path), "trial", "los", "900m", "--repeats", "1", "--protocol", "tcp")
     assert_refused(run, 3, "turtlebot-1: ROS master: no master answers at duckiedrone-1, 10.42.0.3:11311")
 
 
 def test_robots_with_the_built_in_ros_cannot_share_a_master(tmp_path: Path) -> None:
-    run = fieldkit(lab_with_one_master(tmp_path, "builtin"), "trial", "los", "5m", "--repeats", "1")
+    run = run_here(lab_with_one_master(tmp_path, "builtin"), "trial", "los", "5m", "--repeats", "1")
     assert_refused(run, 2, "needs Debian's ROS")
 
 

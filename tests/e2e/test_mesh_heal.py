@@ -10,7 +10,7 @@ import pytest
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.headers import ICMP
 from tests.helpers.labs import BOX, copy_shipped
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -53,7 +53,7 @@ def test_packets_are_rerouted_within_babels_bound_and_the_row_contains_it(tmp_pa
         "duration: 2s",
     )
     copy_shipped(tmp_path, "procedures", "mesh_heal", *shorter, "count: 750", "count: 80")
-    run = fieldkit(tmp_path, "trial", "mesh_heal", "220m", "--repeats", "1")
+    run = run_here(tmp_path, "trial", "mesh_heal", "220m", "--repeats", "1")
     assert run.code == 0, run.out + run.err
     trial = only_trial(tmp_path)
     row = next(row for row in rows(trial) if row["status"] == "valid")

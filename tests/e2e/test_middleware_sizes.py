@@ -8,7 +8,7 @@ import pytest
 
 from fieldkit.ros.middlewares import tuning
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, only_trial
+from tests.helpers.runs import only_trial, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -32,7 +32,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (home / "procedures").mkdir()
     (home / "procedures" / "sizes_sample.yaml").write_text(text, encoding="utf-8")
     (home / "fieldkit.yaml").write_text((EXAMPLE / "loss-2.yaml").read_text(encoding="utf-8"), encoding="utf-8")
-    run = fieldkit(home, "trial", "sizes_sample", "5m", "--repeats", str(REPEATS), "--yes")
+    run = run_here(home, "trial", "sizes_sample", "5m", "--repeats", str(REPEATS), "--yes")
     assert run.code == 0, run.out + run.err
     return home
 
@@ -40,7 +40,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_recommended_settings_are_written_with_their_evidence(measured: Path) -> None:
     out = measured / "passed"
     words = ("middleware", "recommend", "trials", "-o", str(out), "--repeats", str(REPEATS), "--max-loss", "20%")
-    run = fieldkit(measured, *words)
+    run = run_here(measured, *words)
     assert run.code == 0, run.out + run.err
     assert sorted(path.name for path in out.iterdir()) == ["cyclonedds.xml", "zenoh.json5"]
     assert len(re.findall(r"(?m)^passed: (dds|zenoh)", run.out)) == 2, run.out
@@ -66,7 +66,7 @@ def test_recommended_settings_are_written_with_their_evidence(measured: Path) ->
 )
 def test_without_evidence_nothing_is_written(measured: Path, criterion: tuple[str, ...], why: str) -> None:
     out = measured / "nothing"
-    run = fieldkit(measured, "middleware", "recommend", "trials", "-o", str(out), *criterion)
+    run = run_here(measured, "middleware", "recommend", "trials", "-o", str(out), *criterion)
     assert run.code == 1, run.out + run.err
     assert re.search(why, run.out), run.out
     assert "passed:" not in run.out
@@ -77,7 +77,7 @@ def test_without_evidence_nothing_is_written(measured: Path, criterion: tuple[st
 def test_the_shipped_campaigns_can_run(tmp_path: Path, loss: int) -> None:
     for name in (f"sizes-{loss}.yaml", f"loss-{loss}.yaml"):
         (tmp_path / name).write_text((EXAMPLE / name).read_text(encoding="utf-8"), encoding="utf-8")
-    run = fieldkit(tmp_path, "campaign", f"sizes-{loss}.yaml", "--site", f"loss-{loss}.yaml", "--dry-run")
+    run = run_here(tmp_path, "campaign", f"sizes-{loss}.yaml", "--site", f"loss-{loss}.yaml", "--dry-run")
     assert run.code == 0, run.err
     assert "0 of 1 trials are done" in run.out
 
@@ -86,7 +86,7 @@ def test_the_shipped_collapse_procedure_can_run(tmp_path: Path) -> None:
     (tmp_path / "procedures").mkdir()
     text = (EXAMPLE / "procedures" / "collapse.yaml").read_text(encoding="utf-8")
     (tmp_path / "procedures" / "collapse.yaml").write_text(text, encoding="utf-8")
-    run = fieldkit(tmp_path, "trial", "collapse", "20m", "--dry-run")
+    run = run_here(tmp_path, "trial", "collapse", "20m", "--dry-run")
     assert run.code == 0, run.err
     assert "-B 32768" in run.out
     assert "-s 256" in run.out
@@ -96,7 +96,7 @@ def test_the_shipped_collapse_procedure_can_run(tmp_path: Path) -> None:
     ("option", "value"), [("--max-loss", "101%"), ("--share", "100%"), ("--share", "0%"), ("--repeats", "1")]
 )
 def test_impossible_criteria_are_rejected(tmp_path: Path, option: str, value: str) -> None:
-    run = fieldkit(tmp_path, "middleware", "recommend", ".", "-o", "config", option, value)
+    run = run_here(tmp_path, "middleware", "recommend", ".", "-o", "config", option, value)
     assert run.code == 2, run.out
     assert option in run.err
     assert not (tmp_path / "config").exists()

@@ -8,7 +8,7 @@ import pytest
 
 from fieldkit.core.model import Role
 from fieldkit.measure.evidence import track
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -51,7 +51,7 @@ def lab(tmp_path: Path) -> Path:
 
 
 def test_a_robot_in_a_custom_role_takes_part(lab: Path) -> None:
-    assert fieldkit(lab, "trial", "rivals", "10m").code == 0
+    assert run_here(lab, "trial", "rivals", "10m").code == 0
     trial = only_trial(lab)
     (row,) = rows(trial)
     assert row["status"] == "valid"
@@ -71,7 +71,7 @@ def test_a_robot_in_a_custom_role_takes_part(lab: Path) -> None:
 
 def test_an_unassigned_role_is_reported_before_anything_starts(lab: Path) -> None:
     (lab / "fieldkit.yaml").write_text(SITE.replace("rival: turtlebot-2, ", ""), encoding="utf-8")
-    done = fieldkit(lab, "trial", "rivals", "10m")
+    done = run_here(lab, "trial", "rivals", "10m")
     assert done.code == 2
     assert "no robot has the role rival in topology masterless" in done.err
     assert not (lab / "trials").exists()

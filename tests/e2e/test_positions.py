@@ -16,40 +16,30 @@ from fieldkit.measure.evidence import ping, track
 from fieldkit.measure.evidence.track import Separation
 from fieldkit.ros.bags import bag
 from tests.helpers.paths import ROOT
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
+from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  rover-1: {profile: rover}
-roles:
-  masterless: {sender: turtlebot-1, receiver: rover-1}
-emulated:
-  ros: builtin
-  radio: {fading: false, shadowing_db: 0.0}
-"""
-WALK = """\
-name: walk
-summary: "The receiver drives away, round a corner"
-scenario: los
-topology: masterless
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - track:
-      robots: {receiver: {topic: /odom, facing: away}}
-      during:
-        - move:
-            robot: receiver
-            path: [{away: 4m}, {left: 2m}]
-            speed: 2m/s
-            during:
-              - ping: {from: sender, to: receiver, count: 16, interval: 200ms, payload_bytes: 500}
-"""
+SITE = site(
+    {"turtlebot-1": "turtlebot3_burger", "rover-1": "rover"},
+    emulated="ros: builtin, radio: {fading: false, shadowing_db: 0.0}",
+)
+WALK = procedure(
+    "walk",
+    """\
+- track:
+    robots: {receiver: {topic: /odom, facing: away}}
+    during:
+      - move:
+          robot: receiver
+          path: [{away: 4m}, {left: 2m}]
+          speed: 2m/s
+          during:
+            - ping: {from: sender, to: receiver, count: 16, interval: 200ms, payload_bytes: 500}
+""",
+    protocols="udp",
+)
 SPEED_M_S = 2.0
 EARTH_M = 111_319.49, 110_574.28
 """Metres per degree east and north at the world's origin, on the equator."""
@@ -75,7 +65,7 @@ def lab(tmp_path: Path) -> Path:
 
 def run_walk(lab: Path) -> Path:
     """Run the procedure and return the folder of its only trial."""
-    run = fieldkit(lab, "trial", "walk", "10m")
+    run = run_here(lab, "trial", "walk", "10m")
     assert run.code == 0, run.out + run.err
     return only_trial(lab)
 
@@ -133,9 +123,9 @@ def test_odometry_equals_the_true_positions_and_the_motion_of_the_robot(lab: Pat
     assert (last_m - first_m) / ((last_ns - first_ns) / 1e9) == pytest.approx(SPEED_M_S, rel=0.1)
 
     before = (trial / "trial.csv").read_bytes()
-    assert fieldkit(lab, "rebuild", str(trial)).out.endswith("the same bytes as before\n")
+    assert run_here(lab, "rebuild", str(trial)).out.endswith("the same bytes as before\n")
     assert (trial / "trial.csv").read_bytes() == before
-    listed = fieldkit(lab, "positions", str(trial)).out
+    listed = run_here(lab, "positions", str(trial)).out
     assert listed.startswith("udp-01  rtt: 10.")
     assert listed.endswith(" m, sender as placed, receiver /odom\n")
 
@@ -182,13 +172,13 @@ def test_gpx_of_an_accompanying_person_can_be_added_and_removed_later(lab: Path)
     sender = f"sender={6 / EARTH_M[1]:.9f},{3 / EARTH_M[0]:.9f}"
     gpx(lab / "walk.gpx", where, late_s=2.5)
 
-    run = fieldkit(lab, "positions", str(trial), "receiver=walk.gpx", sender, "--offset", "2.5s")
+    run = run_here(lab, "positions", str(trial), "receiver=walk.gpx", sender, "--offset", "2.5s")
     assert run.code == 0, run.err
     assert run.out.startswith("changed: trial.csv")
     assert "receiver positions-receiver.gpx" in run.out
     assert_similar(separation_by_columns(trial), expected, within_m=max_update_distance_m(trial))
-    assert fieldkit(lab, "verify", str(trial)).code == 0
-    assert fieldkit(lab, "positions", str(trial), "--clear").code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "positions", str(trial), "--clear").code == 0
     assert tables(trial) == before
     assert not list(trial.glob("positions*"))
-    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0

@@ -10,6 +10,7 @@ import pytest
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.backends.registry import load_backend
+from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Protocol, RepeatId, Role, Topology
 from fieldkit.core.prompts import Unattended
@@ -22,18 +23,19 @@ from fieldkit.steps.kinds.transfer import TransferStep
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
+from tests.helpers.labs import built_in_ros
 from tests.helpers.plans import steps_of
 
 # Busy robots respond to the command that starts a program when the program already sends.
 pytestmark = [pytest.mark.emulated, pytest.mark.quiet]
 
-FOLDER = ".fieldkit/quiet/one"
+FOLDER = ".fieldkit/quiet/{}"
 ENDS = (Role.SENDER, Role.RECEIVER)
 
 
-@pytest.fixture
-def lab() -> Iterator[tuple[Testbed, Scene]]:
-    backend = load_backend("emulated", None, None)
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Testbed, Scene]]:
+    backend = load_backend("emulated", *load_site(built_in_ros(tmp_path_factory.mktemp("lab"))))
     cast = backend.cast(Topology.MASTERLESS)
     request = TrialRequest(
         procedure=load_procedure("los"), distance=parse_distance("5m"), topology=Topology.MASTERLESS
@@ -41,13 +43,13 @@ def lab() -> Iterator[tuple[Testbed, Scene]]:
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     with backend.open(cast, seed=1, sink=lambda event: None, operator=Unattended()) as up:
         up.place(plan.placement)
-        yield up, plan.scene(RepeatId(Protocol.UDP, 1), FOLDER)
+        yield up, plan.scene(RepeatId(Protocol.UDP, 1), "")
 
 
-def watch(interface: str, expression: str) -> Job:
+def watch(folder: str, interface: str, expression: str) -> Job:
     options = ("-n", "-U", "--immediate-mode", "-s", "96", "-B", "4096")
     return Job(
-        folder=FOLDER,
+        folder=folder,
         name=f"watch-{interface}",
         argv=("tcpdump", "-i", interface, *options, "-w", f"{interface}.pcap", expression),
         limit_s=120,
@@ -61,15 +63,21 @@ def test_the_control_connection_is_silent_during_measurements(
     lab: tuple[Testbed, Scene], protocol: Protocol, tmp_path: Path
 ) -> None:
     up, scene = lab
-    scene = replace(scene, protocol=protocol)
-    watches = [watch("lo", "tcp port 22"), watch("wlan0", "port 1234 or icmp or ip[6:2] & 0x1fff != 0")]
+    folder = FOLDER.format(protocol)
+    scene = replace(scene, protocol=protocol, folder=folder)
+    watches = [
+        watch(folder, "lo", "tcp port 22"),
+        watch(folder, "wlan0", "port 1234 or icmp or ip[6:2] & 0x1fff != 0"),
+    ]
     for role in ENDS:
         jobs.install(up.shells[role], Deadline.after(30))
-        evidence.begin(up.shells[role], FOLDER, role, "wlan0")
+        evidence.begin(up.shells[role], folder, role, "wlan0")
         for watch_job in watches:
             jobs.start(up.shells[role], watch_job)
+        for _ in range(5):  # its packets show that the capture of the control connection works
+            up.shells[role].run(("true",), deadline=Deadline.after(30))
     up.shells[Role.SENDER].run(
-        ("sh", "-c", f"head -c 200000 /dev/zero >{FOLDER}/scan.bag"), deadline=Deadline.after(30)
+        ("sh", "-c", f"head -c 200000 /dev/zero >{folder}/scan.bag"), deadline=Deadline.after(30)
     )
 
     procedure = load_procedure("los")
@@ -81,7 +89,7 @@ def test_the_control_connection_is_silent_during_measurements(
             jobs.stop(up.shells[role], watch_job, settle=f"{watch_job.name.removeprefix('watch-')}.pcap")
         into = tmp_path / role
         into.mkdir()
-        fetching.fetch(up.shells[role], FOLDER, role, "wlan0", into)
+        fetching.fetch(up.shells[role], folder, role, "wlan0", into)
         control, radio = (pcap.read(into / name).packets for name in ("lo.pcap", "wlan0.pcap"))
         spoken_ns = control.time_ns[control.tcp_payload_bytes > 0]
         assert len(spoken_ns) > 10, "the capture of the control connection works"

@@ -17,6 +17,7 @@ from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running.opening import opened
 from fieldkit.trial.running.runner import run_trial
+from tests.helpers import texts
 
 pytestmark = pytest.mark.emulated
 
@@ -26,22 +27,18 @@ PER_REPEAT: Final = 12
 TO_OPEN: Final = 13
 """Round trips to log in, check for the script, copy it, and lock the robots in order."""
 
-PROCEDURE: Final = """\
-name: trips
-summary: the paper's steps, quicker
-scenario: los
-topology: masterless
-protocols: [tcp]
-repeats: 2
-attempts: 1
-steps:
-  - record: {robot: sender, topics: [/scan], duration: 500ms, name: scan}
-  - capture:
-      robots: [sender, receiver]
-      during:
-        - transfer: {from: sender, to: receiver, idle: 1s}
-  - ping: {from: sender, to: receiver, count: 3, interval: 20ms}
-"""
+PROCEDURE: Final = texts.procedure(
+    "trips",
+    """\
+- record: {robot: sender, topics: [/scan], duration: 500ms, name: scan}
+- capture:
+    robots: [sender, receiver]
+    during:
+      - transfer: {from: sender, to: receiver, idle: 1s}
+- ping: {from: sender, to: receiver, count: 3, interval: 20ms}
+""",
+    repeats=2,
+)
 
 
 def test_connecting_and_each_repeat_take_few_sequential_round_trips(tmp_path: Path) -> None:

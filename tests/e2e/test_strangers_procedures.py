@@ -18,7 +18,7 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.helpers.labs import BOX, write_procedure
-from tests.helpers.runs import fieldkit, rows
+from tests.helpers.runs import fieldkit, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -112,7 +112,8 @@ class LabResults:
         return [row for trial in self.trials for row in rows(trial)]
 
 
-def run_lab(folder: Path, name: str) -> LabResults:
+def run_trial(folder: Path, name: str) -> str:
+    """Run a trial in a new lab; return its output."""
     (folder / "robots").mkdir(parents=True)
     (folder / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
@@ -122,13 +123,18 @@ def run_lab(folder: Path, name: str) -> LabResults:
     (folder / "tools" / "probe.sh").chmod(0o755)
     write_procedure(folder, HEAD.replace("NAME", name) + PROCEDURES[name])
 
-    def run_command(command: str, *words: str) -> str:
-        run = fieldkit(folder, command, *words)
-        missed = command == "trial" and "expect:" in PROCEDURES[name]
-        assert run.code == (1 if missed else 0), run.err + run.out
+    run = fieldkit(folder, "trial", name, *DISTANCES[name], "--answers", "answers.txt")
+    assert run.code == (1 if "expect:" in PROCEDURES[name] else 0), run.err + run.out
+    return run.out
+
+
+def analyse(folder: Path, trial_output: str) -> LabResults:
+    def run_command(*words: str) -> str:
+        run = run_here(folder, *words)
+        assert run.code == 0, run.err + run.out
         return run.out
 
-    outputs = {"trial": run_command("trial", name, *DISTANCES[name], "--answers", "answers.txt")}
+    outputs = {"trial": trial_output}
     trials = tuple(sorted((folder / "trials").iterdir()))
     ends = (str(trials[0]), str(trials[-1]))
     outputs["aggregate"] = run_command("aggregate", "trials", "--format", "csv")
@@ -146,7 +152,8 @@ def run_lab(folder: Path, name: str) -> LabResults:
 def lab_results(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, LabResults]:
     base = tmp_path_factory.mktemp("strangers")
     with ThreadPoolExecutor(3) as pool:
-        return dict(zip(PROCEDURES, pool.map(lambda name: run_lab(base / name, name), PROCEDURES), strict=True))
+        trial_outputs = list(pool.map(lambda name: run_trial(base / name, name), PROCEDURES))
+    return {name: analyse(base / name, out) for name, out in zip(PROCEDURES, trial_outputs, strict=True)}
 
 
 def test_each_procedure_has_about_ten_lines_of_steps() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.labs import built_in_ros
-from tests.helpers.runs import fieldkit, finish, only_trial, rows, start, wait_for_line
+from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
 
@@ -53,8 +53,8 @@ def test_a_part_that_dies_stops_the_trial_and_resume_completes_it(
     wait_for_end(family, within_s=60.0)
     untouched()
     assert [row["status"] for row in rows(only_trial(tmp_path))] == ["void"]
-    resumed = fieldkit(tmp_path, "resume", str(only_trial(tmp_path)), "--json")
+    resumed = run_here(tmp_path, "resume", str(only_trial(tmp_path)), "--json")
     assert resumed.code == 0, resumed.err
     table = rows(only_trial(tmp_path))
     assert [row["status"] for row in table] == ["void", "valid", "valid"]
-    assert fieldkit(tmp_path, "verify", str(only_trial(tmp_path))).code == 0
+    assert run_here(tmp_path, "verify", str(only_trial(tmp_path))).code == 0

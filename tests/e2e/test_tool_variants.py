@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from tests.helpers.labs import copy_shipped
-from tests.helpers.runs import Run, fieldkit, only_trial, rows
+from tests.helpers.runs import Run, only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -57,7 +57,7 @@ def trial(lab: Path, pair: Pair, *words: str) -> Run:
     (lab / "fieldkit.yaml").write_text(
         SITE.format(one=pair.sender, two=pair.receiver, ros=pair.ros), encoding="utf-8"
     )
-    return fieldkit(lab, "trial", "los", "5m", "--repeats", "1", "--record", "1s", *words)
+    return run_here(lab, "trial", "los", "5m", "--repeats", "1", "--record", "1s", *words)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from rosbags.rosbag1 import Reader
 from fieldkit.trial.columns import trial_columns
 from tests.helpers.host import Untouched, descendants, wait_for_end
 from tests.helpers.labs import built_in_ros, copy_shipped
-from tests.helpers.runs import Run, fieldkit, only_trial, rows, start, wait_for_line
+from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
 
@@ -67,11 +67,11 @@ def test_aggregate_of_one_trial_from_raw_evidence_is_its_summary(lab_copy: Path)
     lab = lab_copy
     trial = only_trial(lab)
     (trial / "trial.csv").rename(lab / "trial.csv.away")
-    rebuilt = fieldkit(lab, "aggregate", "trials", "--rebuild", "--format", "csv")
+    rebuilt = run_here(lab, "aggregate", "trials", "--rebuild", "--format", "csv")
     (lab / "trial.csv.away").rename(trial / "trial.csv")
-    for run in (rebuilt, fieldkit(lab, "aggregate", str(trial), "--format", "csv")):
+    for run in (rebuilt, run_here(lab, "aggregate", str(trial), "--format", "csv")):
         assert run.out == (trial / "summary.csv").read_text(encoding="utf-8"), run.err
-    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0
 
 
 def test_the_rows_contain_the_results(finished: tuple[Path, Run]) -> None:
@@ -111,19 +111,19 @@ def test_the_rows_contain_the_results(finished: tuple[Path, Run]) -> None:
 def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy: Path) -> None:
     lab = lab_copy
     trial = only_trial(lab)
-    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0
     before = {name: (trial / name).read_bytes() for name in ("trial.csv", "summary.csv")}
     (trial / "trial.csv").unlink()
     (trial / "summary.csv").write_text("", encoding="utf-8")
-    assert fieldkit(lab, "rebuild", str(trial)).code == 0
+    assert run_here(lab, "rebuild", str(trial)).code == 0
     assert before == {name: (trial / name).read_bytes() for name in before}
-    again = fieldkit(lab, "rebuild", str(trial))
+    again = run_here(lab, "rebuild", str(trial))
     assert "the same bytes as before" in again.out
     pcap = trial / "repeats" / "tcp-02" / "receiver.pcap"
     content = bytearray(pcap.read_bytes())
     content[-1] ^= 0x10
     pcap.write_bytes(content)
-    broken = fieldkit(lab, "verify", str(trial))
+    broken = run_here(lab, "verify", str(trial))
     assert broken.code == 4
     assert "repeats/tcp-02/receiver.pcap: changed" in broken.err
 
@@ -142,7 +142,7 @@ def test_json_events_are_one_object_per_line(tmp_path: Path) -> None:
 
 
 def test_a_masterless_trial_behind_the_wall(tmp_path: Path) -> None:
-    run = fieldkit(tmp_path, "trial", "nlos", "5m", "--topology", "masterless", "--repeats", "1", "--record", "1s")
+    run = run_here(tmp_path, "trial", "nlos", "5m", "--topology", "masterless", "--repeats", "1", "--record", "1s")
     assert run.code == 0, run.err
     assert {
         (row["scenario"], row["topology"], row["relay"], row["receiver"]) for row in rows(only_trial(tmp_path))
@@ -170,20 +170,20 @@ def test_a_silent_topic_makes_every_attempt_void_and_the_trial_invalid(tmp_path:
         "repeats: 20",
         "repeats: 1\nattempts: 2",
     )
-    run = fieldkit(tmp_path, "trial", "los", "30ft", "--record", "1s", "--protocol", "tcp")
+    run = run_here(tmp_path, "trial", "los", "30ft", "--record", "1s", "--protocol", "tcp")
     assert run.code == 4
     trial = only_trial(tmp_path)
     table = rows(trial)
     assert [(row["attempt"], row["status"]) for row in table] == [("1", "void"), ("2", "failed")]
     assert all("scan.bag" in row["reason"] for row in table)
     assert {path.name for path in (trial / "repeats").iterdir()} == {"tcp-01.void1", "tcp-01.failed2"}
-    assert fieldkit(tmp_path, "verify", str(trial)).code == 0
+    assert run_here(tmp_path, "verify", str(trial)).code == 0
 
 
 def test_a_missing_tool_stops_the_trial_before_repeat_1(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
     copy_shipped(tmp_path, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
-    run = fieldkit(tmp_path, "trial", "los", "30ft")
+    run = run_here(tmp_path, "trial", "los", "30ft")
     assert run.code == 3
     assert "nc.imaginary" in run.err
     assert "turtlebot-1" in run.err
@@ -205,8 +205,8 @@ def test_kill_9_leaves_only_finished_repeats(tmp_path: Path, untouched: Untouche
     trial = only_trial(tmp_path)
     (row,) = rows(trial)
     assert row["status"] == "valid"
-    assert fieldkit(tmp_path, "verify", str(trial)).code == 0
-    assert "changed: summary.csv" in fieldkit(tmp_path, "rebuild", str(trial)).out
+    assert run_here(tmp_path, "verify", str(trial)).code == 0
+    assert "changed: summary.csv" in run_here(tmp_path, "rebuild", str(trial)).out
     assert rows(trial, "summary.csv")[0]["n_valid"] == "1"
     assert process.stdout is not None
     process.stdout.close()

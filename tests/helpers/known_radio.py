@@ -7,42 +7,31 @@ import pytest
 
 from tests.helpers.labs import write_procedure
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
+from tests.helpers.texts import procedure, site
 
 LOSSES_PERCENT = (0, 1, 10, 30)
-IN_CI, AT_NIGHT = 8, 20
+IN_CI, AT_NIGHT = 5, 20
 """Number of repeats of each trial."""
 REPEATS = [IN_CI, pytest.param(AT_NIGHT, marks=pytest.mark.nightly)]
 """Parameters of a module fixture, so that each test that uses it runs with both numbers."""
 
-SITE = """\
-backend: emulated
-robots:
-  turtlebot-1: {profile: turtlebot3_burger}
-  turtlebot-2: {profile: turtlebot3_burger}
-roles:
-  masterless: {sender: turtlebot-1, receiver: turtlebot-2}
-emulated:
-  ros: builtin
-  radio: RADIO
-"""
+SITE = site(emulated="ros: builtin, radio: RADIO")
 
 # The steps of the paper, shortened: a bag of about 15 kB per 0.5 s, and few pings.
-PROCEDURE = """\
-name: quick
-summary: the steps of the paper, shortened
-scenario: los
-topology: masterless
-protocols: [tcp, udp]
-repeats: REPEATS
-attempts: 3
-steps:
-  - record: {robot: sender, topics: [TOPIC], duration: 1s, name: scan}
-  - capture:
-      robots: [sender, receiver]
-      during:
-        - transfer: {from: sender, to: receiver, idle: 1s, limit: 600s}
-        - ping: {from: sender, to: receiver, count: PINGS, interval: 20ms}
-"""
+PROCEDURE = procedure(
+    "quick",
+    """\
+- record: {robot: sender, topics: [TOPIC], duration: 1s, name: scan}
+- capture:
+    robots: [sender, receiver]
+    during:
+      - transfer: {from: sender, to: receiver, idle: 1s, limit: 600s}
+      - ping: {from: sender, to: receiver, count: PINGS, interval: 20ms}
+""",
+    protocols="tcp, udp",
+    repeats="REPEATS",
+    attempts=3,
+)
 
 
 def make_lab(lab: Path, radio: str, *, topic: str = "/scan", pings: int = 1, repeats: int = IN_CI) -> Path:

@@ -25,13 +25,16 @@ def replace_text(text: str, *changes: str) -> str:
     return text
 
 
-def built_in_ros(folder: Path, name: str = SITE_FILE) -> Path:
+def built_in_ros(folder: Path, name: str = SITE_FILE, *, radio: str = "{}") -> Path:
     """Write a site file with the default robots but with the built-in ROS instead of Debian's; return its path.
 
-    For tests that do not depend on ROS: a short trial takes two thirds of the CPU time.
+    For tests that do not depend on ROS: a short trial takes two thirds of the CPU time. `radio` has the options of
+    the emulated radio.
     """
     site = folder / name
-    site.write_text(f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n", encoding="utf-8")
+    site.write_text(
+        f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin, radio: {radio}}}\n", encoding="utf-8"
+    )
     return site
 
 

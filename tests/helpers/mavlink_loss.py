@@ -6,6 +6,7 @@ firewall of its namespace.
 """
 
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -22,6 +23,7 @@ from tests.helpers import drones
 from tests.helpers.mavlink_router import MavlinkRouter
 
 RATE_HZ: Final = 20
+STREAMS_WITHIN_S: Final = 60.0
 PERIODIC: Final = (d.MAVLINK_MSG_ID_ATTITUDE, d.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
 _RULES: Final = """\
 table ip lossy {{
@@ -42,6 +44,16 @@ table ip lossy {{
 def message_id_hex(message_id: int) -> str:
     """The id of a message in the byte order in which the kernel compares it."""
     return "0x" + message_id.to_bytes(3, "little").hex()
+
+
+def wait_for_streams(log: Path) -> None:
+    """Wait until the log has a message of each stream; losses before the first one are not visible in it."""
+    deadline_s = time.monotonic() + STREAMS_WITHIN_S
+    # The id of a message is in bytes 7 to 9 of its MAVLink 2 frame, which begins with 0xfd.
+    headers = [re.compile(rb"\xfd.{6}" + re.escape(kind.to_bytes(3, "little")), re.DOTALL) for kind in PERIODIC]
+    while not all(header.search(log.read_bytes()) for header in headers):
+        assert time.monotonic() < deadline_s, "a stream did not begin"
+        time.sleep(0.01)
 
 
 def counters() -> dict[str, int]:
@@ -79,6 +91,7 @@ def main(log: Path, duration_s: float, percent: int) -> dict[str, Any]:
                 while recorder.stderr.readline() != b"up, MAVLink\n":
                     assert recorder.poll() is None
                 station_thread.start()
+                wait_for_streams(log)
                 kinds = ", ".join(map(message_id_hex, PERIODIC))
                 rules = _RULES.format(percent=percent, port=router.udp, kinds=kinds)
                 subprocess.run(("nft", "-f", "-"), input=rules.encode(), check=True)

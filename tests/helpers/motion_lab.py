@@ -37,22 +37,14 @@ from tests.helpers.paths import ROOT
 from tests.helpers.rovers import rover_profile
 from tests.helpers.runs import fieldkit
 from tests.helpers.sshd import wait_until
+from tests.helpers.texts import site
 
 ROUTER_PORT: Final = 5760
 AUTOPILOT_PORT: Final = 14550
 LONG_S: Final = 60.0
 
 _ROLES: Final = {Craft.ROVER: Role.SENDER, Craft.PX4: Role.RECEIVER, Craft.COPTER: Role.RELAY}
-_SITE: Final = """\
-backend: emulated
-robots:
-  rover-1: {profile: rover}
-  px4-1: {profile: px4}
-  copter-1: {profile: copter}
-roles:
-  master: {sender: rover-1, receiver: px4-1, relay: copter-1}
-emulated: {ros: auto}
-"""
+_SITE: Final = site({"rover-1": "rover", "px4-1": "px4", "copter-1": "copter"}, emulated="ros: auto")
 
 _DRIVE: Final = """\
 name: matrix

@@ -13,6 +13,7 @@ from fieldkit.core.model import Placement, Role, Scenario, Topology, Vector
 from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from sim_backends.emulated.ros.steered import Steered
+from tests.helpers import texts
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import BOX, replace_text
 from tests.helpers.paths import ROOT
@@ -20,15 +21,7 @@ from tests.helpers.sshd import wait_until
 
 LONG_S: Final = 90.0
 SPEED_M_S: Final = 0.6
-_SITE: Final = """\
-backend: emulated
-robots:
-  rover-1: {profile: rover}
-  box-1: {profile: box}
-roles:
-  masterless: {sender: rover-1, receiver: box-1}
-emulated: {ros: auto}
-"""
+_SITE: Final = texts.site({"rover-1": "rover", "box-1": "box"}, emulated="ros: auto")
 _ROLES: Final = "roles: {masterless: {sender: rover-1, receiver: box-1}}"
 RECEIVER_SITE: Final = "receiver.yaml"
 """Site file in which the rover is the receiver, whose position is the same for all distances."""

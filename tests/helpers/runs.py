@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,18 @@ def finish(process: "subprocess.Popen[str]") -> Run:
 def fieldkit(lab: Path, *arguments: str) -> Run:
     """Run `fieldkit` with `arguments` in the folder `lab`."""
     return finish(start(lab, *arguments))
+
+
+def run_here(folder: Path, *arguments: str) -> Run:
+    """Run `fieldkit` with `arguments` in a folder, in this process, which saves half a second of processor time.
+
+    For tests that need no separate process. Only one thread may run commands, because the working folder and the
+    standard streams belong to the process.
+    """
+    out, err = StringIO(), StringIO()
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
+        code = main(arguments)
+    return Run(code, out.getvalue(), err.getvalue())
 
 
 def only_trial(lab: Path) -> Path:

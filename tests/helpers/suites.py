@@ -8,17 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.helpers import texts
 from tests.helpers.paths import ROOT
 
-SITE = """\
-backend: emulated
-robots:
-  rover: {profile: turtlebot3_burger}
-  base: {profile: turtlebot3_burger}
-roles:
-  masterless: {sender: rover, receiver: base}
-emulated: {ros: builtin, world: open, radio: {fading: false}}
-"""
+SITE = texts.site(
+    {"rover": "turtlebot3_burger", "base": "turtlebot3_burger"},
+    emulated="ros: builtin, world: open, radio: {fading: false}",
+)
 LIMIT_S = 300.0
 
 

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser
 from tests.helpers import lawns, tables
 from tests.helpers.browser import LAPTOP, PHONE, chromium, opened
 from tests.helpers.labs import built_in_ros
-from tests.helpers.runs import fieldkit, only_trial
+from tests.helpers.runs import only_trial, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -29,7 +29,7 @@ def lawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the report of synthetic trials; return its path."""
     folder = tmp_path_factory.mktemp("lawn")
     tables.write(folder, [*lawns.lawn(), *dead()], "all.csv")
-    run = fieldkit(folder, "report", "all.csv")
+    run = run_here(folder, "report", "all.csv")
     assert run.code == 0, run.err
     return folder / "report.html"
 
@@ -113,9 +113,9 @@ def luminance(colour: list[float]) -> float:
 
 def test_report_of_an_emulated_trial_links_to_its_evidence(browser: Browser, tmp_path: Path) -> None:
     built_in_ros(tmp_path)
-    run = fieldkit(tmp_path, "trial", "los", "30ft", "--repeats", "2", "--record", "1s", "--protocol", "udp")
+    run = run_here(tmp_path, "trial", "los", "30ft", "--repeats", "2", "--record", "1s", "--protocol", "udp")
     assert run.code == 0, run.err
-    run = fieldkit(tmp_path, "report", "trials", "--rebuild")
+    run = run_here(tmp_path, "report", "trials", "--rebuild")
     assert run.code == 0, run.err
     with opened(browser, tmp_path / "report.html") as opened_page:
         assert opened_page.console_messages == opened_page.requests == []

@@ -39,7 +39,11 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
-    rows = [row for row in lawns.lawn(2) if row.topology == "master" and row.distance != "55ft"]
+    rows = [
+        tables.replace(row, transfer_s=None)  # three figures instead of six
+        for row in lawns.lawn(2)
+        if (row.topology, row.backend, row.protocol) == ("master", "field", "udp") and row.distance != "55ft"
+    ]
     path = tables.write(tmp_path, rows)
     runs = []
     for name in ("one", "two"):

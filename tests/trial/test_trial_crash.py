@@ -6,6 +6,7 @@ import signal
 from collections import Counter
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from fieldkit.cli.terminal import interruptible
 from fieldkit.config import schema
 from fieldkit.config.schema import parse, validate
+from fieldkit.core import plugins
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import parse_distance
 from fieldkit.trial import journal, manifest, store
@@ -28,6 +30,7 @@ from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.runner import resume_trial, run_trial
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.plans import problems, write_states
 
 REPEATS = 1
@@ -36,6 +39,7 @@ INTERRUPTED = 130
 CODE_HASH = code_hash()
 WRITE = os.write
 FSYNC = os.fsync
+DUMP = schema.dump
 VOID_FIRST = "tcp-01-1"
 """The only attempt with incomplete evidence."""
 
@@ -53,6 +57,9 @@ PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
 64 bytes from 10.42.0.2: icmp_seq=1 ttl=64 time=2 ms
 1 packets transmitted, 1 received, 0% packet loss, time 0ms
 """
+
+STRIDES = mark_nightly([3, 1])
+"""Distances between the writes at which a test interrupts a trial: CI interrupts at every third one."""
 
 # Calls that write something to disk or remove it.
 WRITES = ("fsync", "write", "rename", "mkdir", "unlink", "truncate")
@@ -81,23 +88,24 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(Robots, verb, nothing)
     monkeypatch.setattr(Robots, "fetch", fetch)
     monkeypatch.setattr(preflight, "preflight", nothing)
-    # A short trial spends most of its time reading the same YAML and the same code.
-    monkeypatch.setattr(schema, "load", once(schema.load))
+    # A short trial spends most of its time with the same YAML, the same code and the same installed packages.
+    # Processes that are forked later have the cached values of this one.
+    text, versions = schema.dump(plan()), plugins.versions()
+    monkeypatch.setattr(schema, "dump", lambda dumped: text if dumped == plan() else DUMP(dumped))
+    monkeypatch.setattr(schema, "read", read_once)
+    monkeypatch.setattr(plugins, "versions", lambda: versions)
     for module in ("request", "running.resumption"):
         monkeypatch.setattr(f"fieldkit.trial.{module}.code_hash", lambda: CODE_HASH)
 
 
-def once(load: Callable[[Path, type[Plan]], Plan]) -> Callable[[Path, type[Plan]], Plan]:
-    """Read files with equal content only once."""
-    known: dict[bytes, Plan] = {}
+@cache
+def parsed_once(text: str, source: str) -> schema.Document:
+    return parse(text, source=source)
 
-    def loaded(path: Path, kind: type[Plan]) -> Plan:
-        content = path.read_bytes()
-        if content not in known:
-            known[content] = load(path, kind)
-        return known[content]
 
-    return loaded
+def read_once(path: Path) -> schema.Document:
+    """Read a file, but parse equal content only once."""
+    return parsed_once(path.read_text(encoding="utf-8"), str(path))
 
 
 def die(call: Callable[..., object], *words: object) -> None:
@@ -156,6 +164,7 @@ def run(out: Path, moment: int = 0, befalls: Callable[..., None] = die) -> bool:
     return code == 0
 
 
+@cache
 def plan() -> Plan:
     request = TrialRequest(validate(parse(PROCEDURE, source="x"), Procedure), parse_distance("30ft"))
     return make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, 12, 0, tzinfo=UTC))
@@ -192,11 +201,12 @@ def demand_whole(out: Path) -> None:
     )
 
 
-def test_a_kill_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("stride", STRIDES)
+def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robots_with_evidence(monkeypatch)
     out = tmp_path / "trials"
-    moments = 0
-    while not run(out, moments := moments + 1):
+    moments = 1 - stride
+    while not run(out, moments := moments + stride):
         assert run(out)
         demand_whole(out)
         shutil.rmtree(out)
@@ -204,11 +214,12 @@ def test_a_kill_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.Mo
     assert moments > 40, "too few writes were interrupted"
 
 
-def test_a_stop_at_any_write_is_recovered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("stride", STRIDES)
+def test_a_stop_at_any_write_is_recovered(stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robots_with_evidence(monkeypatch)
     out = tmp_path / "trials"
-    moments = 0
-    while not run(out, moments := moments + 1, be_told):
+    moments = 1 - stride
+    while not run(out, moments := moments + stride, be_told):
         if any(out.glob(f"*/{store.MANIFEST_FILE}")):
             demand_agreement(trial_of(out))
         assert run(out)

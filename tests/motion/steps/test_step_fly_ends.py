@@ -34,6 +34,7 @@ from tests.helpers.casts import DUCKIEDRONE
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.mavlink_router import MavlinkRouter
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import LocalShell
 
@@ -64,7 +65,10 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
     jobs.install(made, Deadline.after(30))
     evidence.begin(made, FOLDER, "receiver", "lo")
     yield made
-    wait_until(lambda: jobs.list_running(made, Deadline.after(30)) == (), Deadline.after(60))
+    deadline = Deadline.after(120)
+    while running := jobs.list_running(made, Deadline.after(60)):
+        assert not deadline.expired, (running, log(made))
+        time.sleep(0.1)
 
 
 def fly(
@@ -122,8 +126,15 @@ def log_lines(shell: Shell, job: str) -> list[tuple[float, str]]:
 
 
 @pytest.mark.quiet
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-@pytest.mark.parametrize(("target", "watcher"), [("fly", "guard"), ("guard", "fly")])
+@pytest.mark.parametrize(
+    ("target", "watcher", "number"),
+    [
+        ("fly", "guard", signal.SIGSTOP),
+        ("guard", "fly", signal.SIGKILL),
+        pytest.param("fly", "guard", signal.SIGKILL, marks=pytest.mark.nightly),
+        pytest.param("guard", "fly", signal.SIGSTOP, marks=pytest.mark.nightly),
+    ],
+)
 def test_pilot_and_guard_notice_within_a_second_that_the_other_does_not_run(
     shell: Shell, target: str, watcher: str, number: signal.Signals
 ) -> None:
@@ -142,7 +153,7 @@ def test_pilot_and_guard_notice_within_a_second_that_the_other_does_not_run(
     assert seen_s - at_s[0] < 1.0
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", mark_nightly([signal.SIGSTOP, signal.SIGKILL]))
 def test_flight_continues_without_its_link_server(shell: Shell, number: signal.Signals) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         connection, ended = f"udpout:127.0.0.1:{port}", list[int]()
@@ -206,8 +217,15 @@ def test_flight_continues_after_serial_device_was_missing_for_two_seconds(shell:
     assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-@pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])
+@pytest.mark.parametrize(
+    ("firmware", "number"),
+    [
+        (PX4, signal.SIGSTOP),
+        (ARDUCOPTER, signal.SIGKILL),
+        pytest.param(PX4, signal.SIGKILL, marks=pytest.mark.nightly),
+        pytest.param(ARDUCOPTER, signal.SIGSTOP, marks=pytest.mark.nightly),
+    ],
+)
 def test_guard_lands_drone_whose_pilot_does_not_run(shell: Shell, number: signal.Signals, firmware: Firmware) -> None:
     """It kills a suspended pilot first, which could otherwise control the drone again later."""
     target: list[tuple[int, float]] = []
@@ -229,7 +247,7 @@ def test_guard_lands_drone_whose_pilot_does_not_run(shell: Shell, number: signal
     assert seen_s - at_s < NOTICED_S
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", mark_nightly([signal.SIGSTOP, signal.SIGKILL]))
 def test_pilot_lands_drone_whose_guard_does_not_run(shell: Shell, number: signal.Signals) -> None:
     guards: list[int] = []
 

@@ -33,6 +33,8 @@ FOREIGN = 1000
 """First number of the scans from the side without ROS 1."""
 ENDS = Path(__file__).parent
 LIMIT_S = 90
+ALL_TESTS_S = 1800
+"""The master runs during all tests of this file."""
 """Time limit of all nodes: a bridge that forwards nothing fails its test by then."""
 ENOUGH = 30
 OTHER_TYPE = ("rostopic", "pub", "-r", "10", "/scan", "std_msgs/String", "x")
@@ -58,9 +60,9 @@ class Site:
         }
 
     @contextmanager
-    def started(self, host: TestHost, *argv: str) -> Iterator[Process]:
+    def started(self, host: TestHost, *argv: str, limit_s: int = LIMIT_S) -> Iterator[Process]:
         """Run a command on a host while the body runs."""
-        command = ("timeout", "-k", "10", str(LIMIT_S), "nsenter", "-t", str(host.pid), "-n", *argv)
+        command = ("timeout", "-k", "10", str(limit_s), "nsenter", "-t", str(host.pid), "-n", *argv)
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=self.environment) as process:
             try:
@@ -107,7 +109,7 @@ class Site:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     with two_connected_hosts() as hosts:
         samples = Site(hosts, tmp_path_factory.mktemp("bridge"))
-        with samples.started(hosts[0], "rosmaster", "--core", "-p", "11311"):
+        with samples.started(hosts[0], "rosmaster", "--core", "-p", "11311", limit_s=ALL_TESTS_S):
             # A node that starts before its master prints a warning among the received messages.
             master = f"/dev/tcp/{hosts[0].address}/11311"
             assert samples.completed("bash", "-c", f"until : <{master}; do sleep 0.1; done").returncode == 0

@@ -22,6 +22,7 @@ from fieldkit.ros.streams import stream_options
 from fieldkit.steps.kinds.capture import CaptureStep
 from fieldkit.steps.scene import CommandResult, Scene
 from fieldkit.trial.procedure import Procedure
+from tests.helpers import texts
 from tests.helpers.casts import CAST
 from tests.helpers.paths import ROOT
 
@@ -219,19 +220,16 @@ def test_missing_middleware_fails_with_remedy(over: str, remedy: str) -> None:
     assert needs[0].judge(CommandResult("", 0))[0] is Verdict.OK
 
 
-PROCEDURE = """\
-name: lossy
-summary: One topic over a radio that loses packets
-scenario: los
-topology: {topology}
-protocols: [udp]
-repeats: 1
-attempts: 1
-steps:
-  - capture:
-      during:
-        - topics: {topics}
-"""
+PROCEDURE = texts.procedure(
+    "lossy",
+    """\
+- capture:
+    during:
+      - topics: {topics}
+""",
+    topology="{topology}",
+    protocols="udp",
+)
 SITE = """\
 backend: emulated
 robots:

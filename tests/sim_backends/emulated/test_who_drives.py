@@ -7,19 +7,10 @@ import pytest
 from fieldkit.config.site import load_site
 from fieldkit.core.model import Topology
 from sim_backends.emulated.backend import EmulatedBackend
+from tests.helpers import texts
 from tests.helpers.paths import ROOT
 
-SITE = """\
-backend: emulated
-robots:
-  one: {profile: one}
-  two: {profile: two}
-  drone: {profile: duckiedrone}
-roles:
-  master: {sender: one, receiver: two, relay: drone}
-emulated:
-  ros: ROS
-"""
+SITE = texts.site({"one": "one", "two": "two", "drone": "duckiedrone"}, emulated="ros: ROS")
 OWN_TOPICS = {
     "/cmd_vel, odometry: /odom": "/two/cmd_vel, odometry: /two/odom",
     "{name: /odom,": "{name: /two/odom,",

@@ -17,7 +17,16 @@ from fieldkit.trial.running.runner import Outcome, resume_trial, run_trial
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.plans import write_states
 from tests.helpers.runs import rows
-from tests.trial.test_trial_crash import KILLED, PING, at_write, demand_agreement, die, plan, robots_with_evidence
+from tests.trial.test_trial_crash import (
+    KILLED,
+    PING,
+    STRIDES,
+    at_write,
+    demand_agreement,
+    die,
+    plan,
+    robots_with_evidence,
+)
 
 TWO = plan().model_copy(update={"repeats": 2})
 FIRST = RepeatId(Protocol.TCP, 1)
@@ -84,12 +93,12 @@ def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: P
     assert Note("no repeat of this trial failed") in received
 
 
-def moments(folder: Path) -> Iterator[Path]:
-    """Yield the trial's folder after a kill at each of the writes while a repeat is run again."""
-    moment, kept = 0, folder.with_name("kept")
+def moments(folder: Path, stride: int) -> Iterator[Path]:
+    """Yield the trial's folder after a kill at every `stride`-th write while a repeat is run again."""
+    moment, kept = 1 - stride, folder.with_name("kept")
     shutil.copytree(folder, kept)
     while True:
-        moment += 1
+        moment += stride
         pid = os.fork()
         if pid == 0:
             at_write(moment, die)
@@ -104,12 +113,13 @@ def moments(folder: Path) -> Iterator[Path]:
         assert code == KILLED
 
 
-def test_a_kill_at_any_write_is_recovered(tmp_path: Path, broken: set[str]) -> None:
+@pytest.mark.parametrize("stride", STRIDES)
+def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, broken: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, broken)
     broken.clear()
     count = 0
-    for died in moments(folder):
-        count += 1
+    for died in moments(folder, stride):
+        count += stride
         redo(died)
         assert Status.FAILED not in {attempt.status for attempt in journal.ended(journal.read(died))}
         assert [row["repeat"] for row in rows(died) if row["status"] == "valid"].count("1") == 1

@@ -24,6 +24,7 @@ from fieldkit.trial.running.runner import resume_trial, run_trial
 from fieldkit.trial.running.stop import Stop
 from fieldkit.trial.running.unfetched import unfetched_file
 from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.plans import write_states
 from tests.trial.test_trial_crash import PING, plan, robots_with_evidence
 
@@ -293,10 +294,11 @@ def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> lis
     return failed
 
 
-def test_a_disk_may_be_full_at_any_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    full, moment, over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 0, False
+@pytest.mark.parametrize("stride", mark_nightly([3, 1]))
+def test_a_disk_may_be_full_at_any_write(stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full, moment, over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 1 - stride, False
     while not over:
-        out = tmp_path / str(moment := moment + 1)
+        out = tmp_path / str(moment := moment + stride)
         with monkeypatch.context() as patched:
             failed = failing(patched, moment, full)
             try:

@@ -1,6 +1,7 @@
 """The paper's claims: changes computed by hand, and systems that differ only in the claimed property."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -8,24 +9,28 @@ import pytest
 from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.studies.intervals import t_quantile
 from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims, delay_change
-from sim_backends.cosim.studies.paper_setups import FlowSample, only_flow
+from sim_backends.cosim.studies.paper_setups import FlowSample, Setup, only_flow
 from sim_backends.cosim.studies.paper_tables import Agreement
 
 NAN = math.nan
-SETUPS = claim_setups({"duration": "1s"})
+
+
+@cache
+def setups() -> dict[str, Setup]:
+    return claim_setups({"duration": "1s"})
 
 
 def claims_of(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -> dict[tuple[str, str, str], Claim]:
     """Return all claims for the mean delays and the arrivals of each system with each seed, the same in every row."""
     samples = {}
-    for name, setup in SETUPS.items():
+    for name, setup in setups().items():
         system = name.partition(",")[0]
         flow = only_flow(setup)
         samples[name] = [
             {flow: FlowSample(100, count, count * delay_s if count else NAN, {})}
             for delay_s, count in zip(delays_s[system], arrived[system], strict=True)
         ]
-    return {(claim.than, claim.lines, claim.quantity): claim for claim in claims(SETUPS, samples)}
+    return {(claim.than, claim.lines, claim.quantity): claim for claim in claims(setups(), samples)}
 
 
 def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:
@@ -86,7 +91,7 @@ def test_the_papers_own_tables_contradict_its_statements() -> None:
 
 def test_adaptive_and_fixed_window_differ_only_by_their_policy() -> None:
     for line in Sight:
-        adaptive, fixed = SETUPS[f"adaptive, {line} 60 m"], SETUPS[f"fixed window, {line} 60 m"]
+        adaptive, fixed = setups()[f"adaptive, {line} 60 m"], setups()[f"fixed window, {line} 60 m"]
         assert adaptive.scenario == fixed.scenario
         assert (adaptive.policy, fixed.policy) == ("velocity_aware", "sliding_window")
         assert adaptive.scenario.policy.window == 0.001, "the paper's initial window"

@@ -21,7 +21,7 @@ from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.radio_options import RadioOptions
 from tests.helpers.known_radio import make_lab
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
 
 RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
 ADDRESSES = {"a": "10.9.0.1", "b": "10.9.0.2", "r": "10.9.0.3"}
@@ -105,7 +105,7 @@ def test_each_hop_of_a_ping_is_in_both_files(
 @pytest.mark.emulated
 def test_a_site_file_with_record_air_adds_the_files_to_the_evidence(tmp_path: Path) -> None:
     lab = make_lab(tmp_path / "air", "{fading: false}\n  record_air: true")
-    run = fieldkit(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
+    run = run_here(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
     assert run.code == 0, run.err
     trial = only_trial(lab)
     assert f"lab_bytes: {air_log.LIMIT_BYTES}" in (trial / "trial.yaml").read_text(encoding="utf-8")
@@ -114,4 +114,4 @@ def test_a_site_file_with_record_air_adds_the_files_to_the_evidence(tmp_path: Pa
     sent = [line for line in table(folder) if line["transmitter"] == row["sender"] and line["attempt"] == "1"]
     assert len(sent) >= int(row["ip_packets_sent"]) > 0
     assert pcap.read(folder / air_log.PCAP).frames == len(table(folder))
-    assert fieldkit(lab, "verify", str(trial)).code == 0
+    assert run_here(lab, "verify", str(trial)).code == 0

@@ -1,14 +1,19 @@
-"""The documentation installed by a wheel: `fieldkit docs` finds its pages, and needs no network."""
+"""What a wheel installs: pages for `fieldkit docs`, which needs no network, and the plugin for pytest."""
 
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Request, sync_playwright
 
-from tests.helpers import site_links, wheels
+from tests.helpers import site_links, suites, wheels
+from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
+
+EXAMPLE = ROOT / "docs" / "examples" / "teleop"
+"""The example suite of docs/pytest.md."""
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +63,19 @@ def test_search_works_from_files(python: Path) -> None:
         tab.wait_for_selector(".md-search-result__item")
         browser.close()
     assert not [url for url in requested if not url.startswith(("file:", "data:", "about:", "blob:"))]
+
+
+@pytest.fixture
+def example(tmp_path: Path) -> Path:
+    """The example after a user has copied it."""
+    return Path(shutil.copytree(EXAMPLE, tmp_path / "teleop", ignore=shutil.ignore_patterns("__pycache__")))
+
+
+def test_the_example_passes(python: Path, example: Path) -> None:
+    where = subprocess.run(
+        (python, "-c", "import fieldkit; print(fieldkit.__file__)"), cwd=example, capture_output=True, check=True
+    )
+    assert Path(where.stdout.decode().strip()).is_relative_to(python.parents[1])
+    done = suites.run(example, python=str(python), beside=())
+    assert (done.code, set(done.results.values()), len(done.results)) == (0, {"passed"}, 3), done.output
+    assert not (example / "fieldkit-results").exists()

@@ -1,0 +1,54 @@
+"""Texts of site files and procedures for tests."""
+
+from collections.abc import Mapping
+from textwrap import indent
+from types import MappingProxyType
+from typing import Final
+
+TURTLEBOTS: Final[Mapping[str, str]] = MappingProxyType(
+    {"turtlebot-1": "turtlebot3_burger", "turtlebot-2": "turtlebot3_burger"}
+)
+TURTLEBOTS_AND_DRONE: Final[Mapping[str, str]] = MappingProxyType({**TURTLEBOTS, "duckiedrone-1": "duckiedrone"})
+
+
+def site(robots: Mapping[str, str] = TURTLEBOTS, *, emulated: str = "", backend: str = "emulated") -> str:
+    """A site file. Two robots are sender and receiver without a master; a third is the relay of topology `master`.
+
+    Args:
+        robots: Profile by name of the robot, in the order sender, receiver, relay.
+        emulated: Options of emulated robots, in YAML without the outer braces: `ros: builtin, record_air: true`.
+        backend: Name of the backend.
+    """
+    entries = "".join(f"  {name}: {{profile: {profile}}}\n" for name, profile in robots.items())
+    roles = ", ".join(f"{role}: {name}" for role, name in zip(("sender", "receiver", "relay"), robots, strict=False))
+    topology = "master" if len(robots) > 2 else "masterless"
+    text = f"backend: {backend}\nrobots:\n{entries}roles:\n  {topology}: {{{roles}}}\n"
+    return text + (f"emulated: {{{emulated}}}\n" if emulated else "")
+
+
+def procedure(
+    name: str,
+    steps: str,
+    *,
+    topology: str = "masterless",
+    protocols: str = "tcp",
+    repeats: int | str = 1,
+    attempts: int | None = 1,
+    more: str = "",
+) -> str:
+    """A procedure in line of sight.
+
+    Args:
+        name: Its name.
+        steps: The list of steps in YAML, without indentation.
+        topology: Its topology.
+        protocols: Its protocols, separated by commas.
+        repeats: Number of repeats.
+        attempts: Largest number of attempts at a repeat; None for the default.
+        more: Lines with other keys, in YAML.
+    """
+    tries = "" if attempts is None else f"attempts: {attempts}\n"
+    return (
+        f"name: {name}\nsummary: A procedure of a test\nscenario: los\ntopology: {topology}\n"
+        f"protocols: [{protocols}]\nrepeats: {repeats}\n{tries}{more}steps:\n{indent(steps, '  ')}"
+    )
