@@ -294,9 +294,13 @@ class RosNode:
             self._stream_server.close()
             raise
         self._uri = f"http://{self._host}:{self._server.server_address[1]}/"
-        self._server.register_function(self._request_topic, "requestTopic")
-        self._server.register_function(self._publisher_update, "publisherUpdate")
-        self._server.register_function(self._get_pid, "getPid")
+        functions: Mapping[str, Any] = {
+            "requestTopic": self._request_topic,
+            "publisherUpdate": self._publisher_update,
+            "getPid": self._get_pid,
+        }
+        for method, function in functions.items():
+            self._server.register_function(function, method)
         threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
         threading.Thread(target=self._accept, daemon=True).start()
 
