@@ -40,7 +40,7 @@ from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.motion import State
 
 COUNTS: Final = (3, 10, 50, 200)
-ROUNDS: Final = 7
+ROUNDS: Final = 5
 EXCHANGES: Final = 1000
 STEPS: Final = 1000
 PEER_ROUNDS: Final = 3

@@ -17,8 +17,7 @@ from sim_backends.world.motion import State
 
 _INDEX: Final = struct.Struct("<I")
 _NEW_AGENT_BYTES: Final = _INDEX.size + 2
-_STATE_FORMAT: Final = "II8d"
-STATE: Final = struct.Struct("<" + _STATE_FORMAT)
+STATE: Final = struct.Struct("<II8d")
 _MOTION: Final = struct.Struct("<7d")
 _MOTION_OFFSET: Final = 8
 _NO_NEW_AGENTS: Final = count_bytes(0)
@@ -28,14 +27,12 @@ class _Layouts(NamedTuple):
     """Layouts of parts of many states; each skips the other parts.
 
     Attributes:
-        whole: All fields.
         indices: The index and the reserved field, as one number, which is the index if the reserved field is 0.
         positions: Positions and velocities.
         headings: The headings.
         limits: The limits.
     """
 
-    whole: struct.Struct
     indices: struct.Struct
     positions: struct.Struct
     headings: struct.Struct
@@ -44,7 +41,7 @@ class _Layouts(NamedTuple):
 
 @lru_cache(maxsize=32)
 def _layouts(count: int) -> _Layouts:
-    formats = (_STATE_FORMAT, "Q64x", "8x6d16x", "56xd8x", "64xd")
+    formats = ("Q64x", "8x6d16x", "56xd8x", "64xd")
     return _Layouts(*(struct.Struct("<" + text * count) for text in formats))
 
 
@@ -197,13 +194,15 @@ def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: M
     count = len(states)
     if limits_m_s2 is None and isinstance(states, ReceivedStates) and states.has_indices(agents):
         return count_bytes(count) + states.data
-    indices = agents.indices
-    values: list[float] = []
-    for name, (position_m, velocity_m_s, heading_rad) in states.items():
-        limit_m_s2 = math.inf if limits_m_s2 is None else limits_m_s2.get(name, math.inf)
-        heading = math.nan if heading_rad is None else heading_rad
-        values += (indices[name], 0, *position_m, *velocity_m_s, heading, limit_m_s2)
-    return count_bytes(count) + _layouts(count).whole.pack(*values)
+    limits = {} if limits_m_s2 is None else limits_m_s2
+    indices, pack, nan, infinity = agents.indices, STATE.pack, math.nan, math.inf
+    parts = [
+        pack(
+            indices[name], 0, e, n, u, v_e, v_n, v_u, nan if heading is None else heading, limits.get(name, infinity)
+        )
+        for name, ((e, n, u), (v_e, v_n, v_u), heading) in states.items()
+    ]
+    return count_bytes(count) + b"".join(parts)
 
 
 def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:

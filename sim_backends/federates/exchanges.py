@@ -33,6 +33,7 @@ from sim_backends.world.motion import State
 _TIME: Final = struct.Struct("<q")
 _TWO_TIMES: Final = struct.Struct("<qq")
 _NO_COMMANDS: Final = struct.Struct("<qqI")
+"""A request to a physics in which the count of commands is 0."""
 _NO_OUTCOMES: Final = struct.Struct("<qqQ")
 """An answer of a network in which both counts are 0."""
 _THREE_TIMES: Final = struct.Struct("<qqq")
@@ -61,6 +62,10 @@ def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, d
     Raises:
         MalformedFrameError: It is malformed.
     """
+    if len(body) == _NO_COMMANDS.size:
+        to_ns, from_ns, count = _NO_COMMANDS.unpack(body)
+        if not count:
+            return to_ns, from_ns, {}
     reader = FrameReader(body)
     to_ns, from_ns = reader.unpack(_TWO_TIMES)
     commands = read_commands(reader, agents)

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from sim_backends.federates.answering import FederateService, Make, serve_channel
 from sim_backends.federates.channels import DeadlineError, StreamChannel
-from sim_backends.federates.transports.contract import Address, read_token
+from sim_backends.federates.transports.contract import TransportAddress, read_token
 from sim_backends.federates.transports.joining import join
 from sim_backends.federates.transports.table import FORMS, parse_address
 
@@ -49,7 +49,7 @@ def serve_service(service: FederateService, *, address: str | None = None, runs:
         raise SystemExit(1)
 
 
-def _listen(address: Address, service: FederateService, runs: int | None) -> bool:
+def _listen(address: TransportAddress, service: FederateService, runs: int | None) -> bool:
     token = read_token(address)
     succeeded, served = True, 0
     with address.listen() as listener:
@@ -60,7 +60,7 @@ def _listen(address: Address, service: FederateService, runs: int | None) -> boo
     return succeeded
 
 
-def _connect(address: Address, service: FederateService, runs: int) -> bool:
+def _connect(address: TransportAddress, service: FederateService, runs: int) -> bool:
     token = read_token(address)
     succeeded = True
     for _ in range(runs):

@@ -32,7 +32,7 @@ class MasterError(ConnectionError):
 
 
 @dataclass(frozen=True)
-class MessageType:
+class RosMessageType:
     """A message type.
 
     Attributes:
@@ -55,12 +55,12 @@ class _TimedTransport(Transport):
         return connection
 
 
-class _Requests(SimpleXMLRPCRequestHandler):
+class _RosNodeRequests(SimpleXMLRPCRequestHandler):
     rpc_paths = ("/", "/RPC2")
     timeout = _CALL_S
 
 
-class _Server(SimpleXMLRPCServer):
+class _RosNodeServer(SimpleXMLRPCServer):
     """The XML-RPC server of a node; each call has a thread, so that one that is slow delays no other."""
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 (of the base class)
@@ -89,7 +89,7 @@ def call(uri: str, method: str, *arguments: object) -> Any:  # noqa: ANN401 (a v
     return value
 
 
-class Publisher:
+class RosPublisher:
     """A publisher of a topic.
 
     Args:
@@ -98,7 +98,7 @@ class Publisher:
         caller: Name of the node.
     """
 
-    def __init__(self, topic: str, kind: MessageType, caller: str) -> None:
+    def __init__(self, topic: str, kind: RosMessageType, caller: str) -> None:
         self._kind = kind
         self._header = {
             "callerid": caller,
@@ -166,7 +166,7 @@ class Publisher:
             self._disconnect(stream)
 
 
-class Subscriber:
+class RosSubscriber:
     """A subscriber to a topic, which connects to each of its publishers.
 
     Args:
@@ -175,7 +175,7 @@ class Subscriber:
         caller: Name of the node.
     """
 
-    def __init__(self, topic: str, kind: MessageType, caller: str) -> None:
+    def __init__(self, topic: str, kind: RosMessageType, caller: str) -> None:
         self._topic = topic
         self._kind = kind
         self._caller = caller
@@ -268,7 +268,7 @@ class Subscriber:
                 stream.shutdown(socket.SHUT_RDWR)
 
 
-class Node:
+class RosNode:
     """A node.
 
     Args:
@@ -284,23 +284,27 @@ class Node:
         self._name = name
         self._master = master
         self._host = host or _address_towards(master)
-        self._publishers: dict[str, Publisher] = {}
-        self._subscribers: dict[str, Subscriber] = {}
+        self._publishers: dict[str, RosPublisher] = {}
+        self._subscribers: dict[str, RosSubscriber] = {}
         self._is_closed = False
         self._stream_server = socket.create_server((self._host, 0))
         try:
-            self._server = _Server((self._host, 0), _Requests, logRequests=False, allow_none=True)
+            self._server = _RosNodeServer((self._host, 0), _RosNodeRequests, logRequests=False, allow_none=True)
         except OSError:
             self._stream_server.close()
             raise
         self._uri = f"http://{self._host}:{self._server.server_address[1]}/"
-        self._server.register_function(self._request_topic, "requestTopic")
-        self._server.register_function(self._publisher_update, "publisherUpdate")
-        self._server.register_function(self._get_pid, "getPid")
+        functions: Mapping[str, Any] = {
+            "requestTopic": self._request_topic,
+            "publisherUpdate": self._publisher_update,
+            "getPid": self._get_pid,
+        }
+        for method, function in functions.items():
+            self._server.register_function(function, method)
         threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def publish(self, topic: str, kind: MessageType, deadline_s: float) -> Publisher:
+    def publish(self, topic: str, kind: RosMessageType, deadline_s: float) -> RosPublisher:
         """Return a publisher of a topic.
 
         Args:
@@ -312,17 +316,17 @@ class Node:
             TimeoutError: No master answers.
             MasterError: The master refuses the publisher.
         """
-        publisher = self._publishers[topic] = Publisher(topic, kind, self._name)
+        publisher = self._publishers[topic] = RosPublisher(topic, kind, self._name)
         self._register("registerPublisher", topic, kind, deadline_s)
         return publisher
 
-    def subscribe(self, topic: str, kind: MessageType, deadline_s: float) -> Subscriber:
+    def subscribe(self, topic: str, kind: RosMessageType, deadline_s: float) -> RosSubscriber:
         """Return a subscriber to a topic; arguments and errors as for `publish`."""
-        subscriber = self._subscribers[topic] = Subscriber(topic, kind, self._name)
+        subscriber = self._subscribers[topic] = RosSubscriber(topic, kind, self._name)
         subscriber.update(self._register("registerSubscriber", topic, kind, deadline_s))
         return subscriber
 
-    def _register(self, method: str, topic: str, kind: MessageType, deadline_s: float) -> list[str]:
+    def _register(self, method: str, topic: str, kind: RosMessageType, deadline_s: float) -> list[str]:
         while True:
             try:
                 uris = call(self._master, method, self._name, topic, kind.name, self._uri)

@@ -42,7 +42,7 @@ def _fail(fault: str) -> None:
     if fault == "delayed":
         time.sleep(DELAY_S)
     if fault == "garbage":
-        answering._Run._send = _send_garbage  # type: ignore[method-assign]
+        answering._Run._send = _send_garbage  # type: ignore[method-assign, assignment]
     if fault == "raises":
         raise ValueError("no wheels")
 
@@ -57,7 +57,7 @@ def faulty(role: str, fault: str) -> Any:  # noqa: ANN401 (a class that is made 
             return super().advance(to_ns, *rest)
 
     if fault == "delayed":  # as a program that computes for long and has no thread for heartbeats
-        answering._Heartbeat.begin = lambda *_: None  # type: ignore[method-assign, assignment]
+        answering._Heartbeat.begin = lambda *_: None  # type: ignore[method-assign]
     return Faulty
 
 

@@ -14,7 +14,7 @@ from sim_backends.federates.channels import FrameChannel
 TOKEN_VARIABLE: Final = "FIELDKIT_FEDERATE_TOKEN"  # noqa: S105 (the variable's name)
 
 
-class Listener(Protocol):
+class ChannelListener(Protocol):
     """Accepts one channel after another."""
 
     def accept(self, deadline_s: float | None) -> FrameChannel:
@@ -29,7 +29,7 @@ class Listener(Protocol):
         ...
 
 
-class Address(Protocol):
+class TransportAddress(Protocol):
     """An address of a transport. Its text is that of the user.
 
     Attributes:
@@ -56,7 +56,7 @@ class Address(Protocol):
         """
         ...
 
-    def listen(self) -> AbstractContextManager[Listener]:
+    def listen(self) -> AbstractContextManager[ChannelListener]:
         """Return a listener.
 
         Raises:
@@ -66,7 +66,7 @@ class Address(Protocol):
 
 
 @dataclass(frozen=True)
-class Transport:
+class FederateTransport:
     """A transport.
 
     Attributes:
@@ -77,10 +77,10 @@ class Transport:
 
     forms: Sequence[str]
     example: str
-    parse: Callable[[str], Address]
+    parse: Callable[[str], TransportAddress]
 
 
-def read_token(address: Address) -> str:
+def read_token(address: TransportAddress) -> str:
     """Return the token of a connection: the value of `TOKEN_VARIABLE`.
 
     Raises:
@@ -118,7 +118,7 @@ class HostAndPort:
         scheme: Its scheme, without `-listen`.
         host: Host name or IP address.
         port: Port.
-        listens: See `Address`.
+        listens: See `TransportAddress`.
     """
 
     scheme: str
@@ -131,7 +131,7 @@ class HostAndPort:
 
     @property
     def is_loopback(self) -> bool:
-        """See `Address`."""
+        """See `TransportAddress`."""
         return is_loopback(self.host)
 
 

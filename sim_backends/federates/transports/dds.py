@@ -17,7 +17,7 @@ from fieldkit.agent.middleware import Middleware, MiddlewareError, Network, Qual
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.transports import samples
-from sim_backends.federates.transports.contract import Listener, Transport, is_loopback
+from sim_backends.federates.transports.contract import ChannelListener, FederateTransport, is_loopback
 
 _LOOPBACK: Final = "127.0.0.1"
 _MAX_DOMAIN: Final = 232
@@ -143,7 +143,7 @@ class DdsAddress:
         name: Its name.
         domain: DDS domain.
         interface: IPv4 address of this machine on the network to use.
-        listens: See `Address`.
+        listens: See `TransportAddress`.
     """
 
     name: str
@@ -156,7 +156,7 @@ class DdsAddress:
 
     @property
     def is_loopback(self) -> bool:
-        """See `Address`."""
+        """See `TransportAddress`."""
         return is_loopback(self.interface)
 
     @property
@@ -167,11 +167,11 @@ class DdsAddress:
         return Network(self.interface, domain=self.domain)
 
     def connect(self, deadline_s: float) -> samples.SampleChannel:
-        """Implement `Address.connect`."""
+        """Implement `TransportAddress.connect`."""
         return samples.connected_channel(DdsBus(self, reads="answers", writes="requests"), self, deadline_s)
 
-    def listen(self) -> AbstractContextManager[Listener]:
-        """Implement `Address.listen`."""
+    def listen(self) -> AbstractContextManager[ChannelListener]:
+        """Implement `TransportAddress.listen`."""
         return samples.listening(lambda: DdsBus(self, reads="requests", writes="answers"))
 
 
@@ -190,4 +190,6 @@ def parse(text: str) -> DdsAddress:
     return DdsAddress(name, int(domain), rest[1] if len(rest) > 1 else _LOOPBACK)
 
 
-TRANSPORT: Final = Transport(("dds:NAME", "dds:NAME:DOMAIN:INTERFACE"), "dds:carts or dds:carts:7:192.0.2.3", parse)
+TRANSPORT: Final = FederateTransport(
+    ("dds:NAME", "dds:NAME:DOMAIN:INTERFACE"), "dds:carts or dds:carts:7:192.0.2.3", parse
+)

@@ -6,17 +6,17 @@ from typing import Final
 from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
 from sim_backends.federates.frames import MAX_JOIN_BYTES, MalformedFrameError, MessageKind, encode
 from sim_backends.federates.handshake import decode_join, encode_join
-from sim_backends.federates.transports.contract import Address, is_same_token
+from sim_backends.federates.transports.contract import TransportAddress, is_same_token
 
 _JOIN_S: Final = 5.0
 """Longest wait for the first message of a connection, which may come from any program."""
 
 
-def accept_federate(address: Address, expected_token: str, deadline_s: float) -> FrameChannel:
+def accept_federate(address: TransportAddress, expected_token: str, deadline_s: float) -> FrameChannel:
     """Return the channel of a federate, which begins with `join` and the token; others are closed.
 
     Args:
-        address: Address at which to listen.
+        address: TransportAddress at which to listen.
         expected_token: The token.
         deadline_s: Time of `time.monotonic` until which to wait.
 

@@ -17,13 +17,13 @@ from urllib.parse import urlsplit
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.transports import samples
-from sim_backends.federates.transports.contract import Listener, Transport, is_loopback
-from sim_backends.ros1.node import MasterError, MessageType, Node
+from sim_backends.federates.transports.contract import ChannelListener, FederateTransport, is_loopback
+from sim_backends.ros1.node import MasterError, RosMessageType, RosNode
 
 _DEFAULT_MASTER: Final = "http://localhost:11311"
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _PATIENCE_S: Final = 60.0
-MESSAGE: Final = MessageType(
+MESSAGE: Final = RosMessageType(
     "std_msgs/UInt8MultiArray",
     "82373f1612381bb6ee473b5cd6f5d89c",
     "MultiArrayLayout layout\nuint8[] data\n"
@@ -54,7 +54,7 @@ class Ros1Bus:
         name = f"/fieldkit/{address.name}_{writes}_{secrets.token_hex(4)}"
         prefix = f"/fieldkit/{address.name}"
         try:
-            self._node = Node(name, address.master, address.host)
+            self._node = RosNode(name, address.master, address.host)
         except OSError as error:
             raise ConfigurationError(f"{address} cannot be used: {error}", remedy="check ROS_IP") from error
         try:
@@ -104,8 +104,8 @@ class Ros1Address:
     Attributes:
         name: Its name.
         master: URI of the master.
-        host: Address of this machine for other nodes; empty for the one from which the master is reached.
-        listens: See `Address`.
+        host: TransportAddress of this machine for other nodes; empty for the one from which the master is reached.
+        listens: See `TransportAddress`.
     """
 
     name: str
@@ -118,16 +118,16 @@ class Ros1Address:
 
     @property
     def is_loopback(self) -> bool:
-        """See `Address`."""
+        """See `TransportAddress`."""
         return is_loopback(urlsplit(self.master).hostname or "") and (not self.host or is_loopback(self.host))
 
     def connect(self, deadline_s: float) -> samples.SampleChannel:
-        """Implement `Address.connect`."""
+        """Implement `TransportAddress.connect`."""
         bus = Ros1Bus(self, reads="answers", writes="requests", deadline_s=deadline_s)
         return samples.connected_channel(bus, self, deadline_s)
 
-    def listen(self) -> AbstractContextManager[Listener]:
-        """Implement `Address.listen`; the master may start later."""
+    def listen(self) -> AbstractContextManager[ChannelListener]:
+        """Implement `TransportAddress.listen`; the master may start later."""
         deadline_s = time.monotonic() + _PATIENCE_S
         return samples.listening(lambda: Ros1Bus(self, reads="requests", writes="answers", deadline_s=deadline_s))
 
@@ -144,4 +144,4 @@ def parse(text: str) -> Ros1Address:
     return Ros1Address(name)
 
 
-TRANSPORT: Final = Transport(("ros1:NAME",), "ros1:carts", parse)
+TRANSPORT: Final = FederateTransport(("ros1:NAME",), "ros1:carts", parse)

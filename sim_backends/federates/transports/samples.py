@@ -21,7 +21,7 @@ from sim_backends.federates.frames import (
     ProtocolFrame,
     read_header,
 )
-from sim_backends.federates.transports.contract import Listener
+from sim_backends.federates.transports.contract import ChannelListener
 
 _RUN: Final = struct.Struct("<Q")
 _KIND_OFFSET: Final = _RUN.size + 4
@@ -144,7 +144,7 @@ class SampleListener:
         self._waiting: deque[bytes] = deque(maxlen=_MAX_WAITING)
 
     def accept(self, deadline_s: float | None) -> SampleChannel:
-        """Implement `Listener.accept`."""
+        """Implement `ChannelListener.accept`."""
         while not self._waiting:
             sample = self._bus.take(deadline_s)
             if _is_hello(sample):
@@ -169,7 +169,7 @@ def connected_channel(bus: SampleBus, address: object, deadline_s: float) -> Sam
     return SampleChannel(bus, secrets.randbits(64), owns_bus=True)
 
 
-def listening(make_bus: Callable[[], SampleBus]) -> AbstractContextManager[Listener]:
+def listening(make_bus: Callable[[], SampleBus]) -> AbstractContextManager[ChannelListener]:
     """Return a listener on a bus, which is closed afterwards."""
 
     @contextmanager

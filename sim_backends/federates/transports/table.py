@@ -5,14 +5,14 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.transports import dds, ros1, tcp, udp
-from sim_backends.federates.transports.contract import Address, Transport
+from sim_backends.federates.transports.contract import FederateTransport, TransportAddress
 
-TRANSPORTS: Final[Sequence[Transport]] = (tcp.TRANSPORT, udp.TRANSPORT, dds.TRANSPORT, ros1.TRANSPORT)
+TRANSPORTS: Final[Sequence[FederateTransport]] = (tcp.TRANSPORT, udp.TRANSPORT, dds.TRANSPORT, ros1.TRANSPORT)
 FORMS: Final[Sequence[str]] = [form for transport in TRANSPORTS for form in transport.forms]
 _BY_SCHEME: Final = {form.partition(":")[0]: transport for transport in TRANSPORTS for form in transport.forms}
 
 
-def parse_address(text: str) -> Address | None:
+def parse_address(text: str) -> TransportAddress | None:
     """Return the address of a text; None if the text does not begin with the scheme of a transport.
 
     Raises:

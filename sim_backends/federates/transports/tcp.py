@@ -9,7 +9,7 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.channels import DeadlineError, StreamChannel, socket_channel
-from sim_backends.federates.transports.contract import HostAndPort, Transport, split_host_and_port
+from sim_backends.federates.transports.contract import FederateTransport, HostAndPort, split_host_and_port
 
 _RETRY_S: Final = 0.05
 
@@ -25,7 +25,7 @@ class TcpListener:
         self._server = server
 
     def accept(self, deadline_s: float | None) -> StreamChannel:
-        """Implement `Listener.accept`."""
+        """Implement `ChannelListener.accept`."""
         self._server.settimeout(None if deadline_s is None else max(deadline_s - time.monotonic(), 0.001))
         try:
             connection, _ = self._server.accept()
@@ -39,7 +39,7 @@ class TcpAddress(HostAndPort):
     """A TCP address."""
 
     def connect(self, deadline_s: float) -> StreamChannel:
-        """Implement `Address.connect`; refused attempts are repeated."""
+        """Implement `TransportAddress.connect`; refused attempts are repeated."""
         while True:
             left_s = deadline_s - time.monotonic()
             try:
@@ -53,7 +53,7 @@ class TcpAddress(HostAndPort):
 
     @contextmanager
     def listen(self) -> Iterator[TcpListener]:
-        """Implement `Address.listen`."""
+        """Implement `TransportAddress.listen`."""
         try:
             server = socket.create_server(
                 (self.host, self.port), family=socket.AF_INET6 if ":" in self.host else socket.AF_INET
@@ -64,7 +64,7 @@ class TcpAddress(HostAndPort):
             yield TcpListener(server)
 
 
-TRANSPORT: Final = Transport(
+TRANSPORT: Final = FederateTransport(
     ("tcp:HOST:PORT", "tcp-listen:HOST:PORT"),
     "tcp:127.0.0.1:7000 or tcp-listen:0.0.0.0:7000",
     lambda text: TcpAddress(*split_host_and_port(text)),

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.channels import DeadlineError
-from sim_backends.federates.transports.contract import HostAndPort, Transport, split_host_and_port
+from sim_backends.federates.transports.contract import FederateTransport, HostAndPort, split_host_and_port
 from sim_backends.federates.transports.datagrams import (
     DatagramChannel,
     DatagramHeader,
@@ -51,7 +51,7 @@ class UdpListener:
             self._socket = None
 
     def accept(self, deadline_s: float | None) -> DatagramChannel:
-        """Implement `Listener.accept`."""
+        """Implement `ChannelListener.accept`."""
         if self._socket is None:
             self._socket = self._address.bound_socket()
             self._secret = secrets.token_bytes(16)  # cookies of earlier connections are invalid
@@ -107,7 +107,7 @@ class UdpAddress(HostAndPort):
         return endpoint
 
     def connect(self, deadline_s: float) -> DatagramChannel:
-        """Implement `Address.connect`."""
+        """Implement `TransportAddress.connect`."""
         connection = secrets.randbits(64)
         retry_s, problem = _RETRY_S, "no answer"
         while time.monotonic() < deadline_s:
@@ -132,7 +132,7 @@ class UdpAddress(HostAndPort):
 
     @contextmanager
     def listen(self) -> Iterator[UdpListener]:
-        """Implement `Address.listen`."""
+        """Implement `TransportAddress.listen`."""
         listener = UdpListener(self)
         try:
             yield listener
@@ -150,7 +150,7 @@ def _request_cookie(endpoint: socket.socket, connection: int, limit_s: float) ->
     return None
 
 
-TRANSPORT: Final = Transport(
+TRANSPORT: Final = FederateTransport(
     ("udp:HOST:PORT", "udp-listen:HOST:PORT"),
     "udp:127.0.0.1:7000 or udp-listen:0.0.0.0:7000",
     lambda text: UdpAddress(*split_host_and_port(text)),

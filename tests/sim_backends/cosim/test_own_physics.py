@@ -1,7 +1,6 @@
-"""The physics class of docs/cosim-api.md, from the code on that page; and errors of incomplete physics classes."""
+"""The physics class of docs/cosim-api.md, the example `carts.py`; and errors of incomplete physics classes."""
 
 import math
-import re
 from typing import Any
 
 import pytest
@@ -11,25 +10,26 @@ from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.comparison import errors
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.policies.window_policies import Scheduled
+from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.studies.local_errors import local_errors
+from sim_backends.federates.frames import PHYSICS
 from sim_backends.world.motion import State
-from tests.helpers.paths import ROOT
+from sim_backends.world.world import load_world
+from tests.helpers import federate_examples
 
 MS = 1_000_000
 SCENARIO = load_scenario("convoy", {"duration": "1s"})
+WORLD = load_world(SCENARIO.world)
 
 
 @pytest.fixture(scope="module")
-def carts() -> Any:  # noqa: ANN401 (a class defined on the page)
-    page = (ROOT / "docs" / "cosim-api.md").read_text(encoding="utf-8")
-    (source,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Carts" in block)
-    names: dict[str, Any] = {"__name__": "example"}
-    exec(compile(source, "cosim-api.md", "exec"), names)
-    return names["Carts"]
+def carts() -> Any:  # noqa: ANN401 (a class of an example)
+    return federate_examples.carts()
 
 
 def physics(carts: Any) -> Any:  # noqa: ANN401 (as above)
-    return carts(build(SCENARIO).agents.states(0))
+    return carts(make_hello(SCENARIO, WORLD, bodies(SCENARIO, WORLD), 1, PHYSICS))
 
 
 # The paper's rule as printed stops if a subscriber is faster, as the drone is immediately.

@@ -1,6 +1,7 @@
 """The UDP transport: lost, repeated and reordered datagrams, and those of programs without a cookie."""
 
 import random
+import re
 import select
 import socket
 import struct
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
+from sim_backends.federates.exchanges import encode_number
 from sim_backends.federates.frames import MessageKind, encode
 from sim_backends.federates.transports import datagrams
 from sim_backends.federates.transports.datagrams import (
@@ -26,6 +28,7 @@ from sim_backends.federates.transports.datagrams import (
 )
 from sim_backends.federates.transports.udp import UdpAddress
 from tests.helpers.federate_transports import free_port
+from tests.helpers.paths import ROOT
 
 Forward = Callable[[bytes, bool], list[bytes]]
 """Returns the datagrams that the network delivers when it receives one; the flag is the direction."""
@@ -239,3 +242,10 @@ def test_the_layout_by_hand() -> None:
     assert datagrams._DATA_BYTES + DATAGRAM_HEADER_BYTES == MAX_DATAGRAM_BYTES == 1200
     assert unpack_datagram(datagram[:39]) is None
     assert unpack_datagram(b"FKUD" + struct.pack("<BBHQQQQ", 2, 3, 0, 1, 2, 3, 4)) is None
+
+
+def test_the_example_of_the_page() -> None:
+    page = (ROOT / "docs" / "federates.md").read_text(encoding="utf-8")
+    header = DatagramHeader(DatagramKind.DATA, 0x1122334455667788, 0xA1B2C3D4E5F60718, 5, 4)
+    datagram = pack_datagram(header, encode(MessageKind.PING, 3, 0, encode_number(42)))
+    assert re.findall(r"^    ([0-9a-f]+)$", page, re.MULTILINE) == [datagram.hex()]
