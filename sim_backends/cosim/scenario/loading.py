@@ -18,9 +18,9 @@ def editor_schema() -> dict[str, Any]:
     whole = CosimScenario.model_json_schema()
     models = {model.__name__: model for model in _models(Strict)}
     for part in (whole, *whole["$defs"].values()):
-        model = models.get(part["title"])
+        model = models.get(part.get("title", ""))
         if model is None:
-            continue  # an enumeration
+            continue  # an enumeration, or any JSON value
         part["description"] = without_links(class_description(model))
         meanings = attribute_meanings(model)
         for key, value in part["properties"].items():
