@@ -5,15 +5,11 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
-from typing import Final
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.answering import FederateService
 from sim_backends.federates.frames import ROLES
-
-BUILT_IN: Final = "builtin"
-"""Name of the built-in physics and of the built-in network."""
 
 
 @dataclass(frozen=True)

@@ -291,7 +291,6 @@ def _policy_names() -> Iterable[str]:
 
 
 def _federate_names(role: str) -> Iterable[str]:
-    from sim_backends.federates.frames import ROLES  # noqa: PLC0415 (as above)
-    from sim_backends.federates.named import BUILT_IN, federates  # noqa: PLC0415 (as above)
+    from sim_backends.cosim.scenario.external import simulators  # noqa: PLC0415 (as above)
 
-    return [BUILT_IN, *(name for name, federate in federates().items() if ROLES[federate.role] == role)]
+    return [simulator.name for simulator in simulators() if simulator.role == role]

@@ -8,20 +8,15 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
 from sim_backends.cosim.policies.registry import policies
+from sim_backends.cosim.scenario.external import simulators
 from sim_backends.cosim.scenario.loading import load_scenario, scenario_files
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.federates.frames import ROLES
-from sim_backends.federates.named import BUILT_IN, federates
 
 _SCENARIO: Final = (SheetColumn("scenario", "scenario", ""), SheetColumn("summary", "summary", ""))
 _SIMULATOR: Final = (
     SheetColumn("simulator", "simulator", ""),
     SheetColumn("role", "role", ""),
     SheetColumn("summary", "summary", ""),
-)
-_BUILT_IN_SUMMARIES: Final = (
-    ("physics", "robots with differential drives and quadrotors, with limits of velocity and acceleration"),
-    ("network", "802.11g and 802.11n in the world of the scenario, with UDP, TCP, DDS and ROS 1"),
 )
 _POLICY: Final = (SheetColumn("policy", "policy", ""), SheetColumn("summary", "what it does", ""))
 
@@ -35,16 +30,15 @@ def list_all(arguments: argparse.Namespace) -> int:
         except FieldkitError as error:
             show_note(f"{error.located}: this scenario is omitted")
     listed = [(name, _summary(kind)) for name, kind in policies().items()]
-    simulators = [(BUILT_IN, role, summary) for role, summary in _BUILT_IN_SUMMARIES]
-    simulators += [(name, ROLES[federate.role], federate.summary) for name, federate in federates().items()]
+    named = simulators()
     if arguments.format == "table":
         table([column.head for column in _SCENARIO], scenarios)
-        table([column.head for column in _SIMULATOR], simulators)
+        table([column.head for column in _SIMULATOR], named)
         table([column.head for column in _POLICY], listed)
         return 0
     sheets = {
         "scenarios": Sheet(_SCENARIO, scenarios, [SheetPart("scenarios", ("scenario", "summary"))]),
-        "simulators": Sheet(_SIMULATOR, simulators, [SheetPart("simulators", ("simulator", "role", "summary"))]),
+        "simulators": Sheet(_SIMULATOR, named, [SheetPart("simulators", ("simulator", "role", "summary"))]),
         "policies": Sheet(_POLICY, listed, [SheetPart("sync policies", ("policy", "summary"))]),
     }
     show_all(sheets, arguments.format)

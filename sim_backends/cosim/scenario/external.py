@@ -3,20 +3,25 @@
 import dataclasses
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.scenario.agent_setup import antennas, limits
-from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.schema import BUILT_IN, CosimScenario
 from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, Hello
-from sim_backends.federates.named import PythonFederate, named
+from sim_backends.federates.named import PythonFederate, federates, named
 from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
 from sim_backends.federates.transports.table import parse_address
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Body
 from sim_backends.world.world import World
+
+_BUILT_IN_SUMMARIES: Final = {
+    PHYSICS: "robots with differential drives and quadrotors, with limits of velocity and acceleration",
+    NETWORK: "802.11g and 802.11n in the world of the scenario, with UDP, TCP, DDS and ROS 1",
+}
 
 
 def without_federates(scenario: CosimScenario) -> CosimScenario:
@@ -85,6 +90,31 @@ def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
         "options": (scenario.physics if role == PHYSICS else scenario.network).options or {},
     }
     return json.dumps(configuration).encode()
+
+
+class SimulatorName(NamedTuple):
+    """A physics or a network that has a name.
+
+    Attributes:
+        name: Its name.
+        role: `physics` or `network`.
+        summary: What it is, in one line.
+    """
+
+    name: str
+    role: str
+    summary: str
+
+
+def simulators() -> list[SimulatorName]:
+    """Return the built-in simulators and those of installed packages; none of them is imported.
+
+    Raises:
+        ConfigurationError: The package of a simulator cannot be loaded.
+    """
+    built_in = (SimulatorName(BUILT_IN, ROLES[role], summary) for role, summary in _BUILT_IN_SUMMARIES.items())
+    others = (SimulatorName(name, ROLES[kind.role], kind.summary) for name, kind in federates().items())
+    return [*built_in, *others]
 
 
 def open_physics(

@@ -1,7 +1,7 @@
 """The schema of a scenario file. Checks that need more than the file are in `checks`."""
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
@@ -13,10 +13,12 @@ from sim_backends.cosim.policies.registry import policies, unknown_policy_remedy
 from sim_backends.cosim.programs.way_points import PERIOD_NS
 from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
-from sim_backends.federates.named import BUILT_IN
 from sim_backends.network.tcp.tcp_options import Congestion
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.obstacles import Place, Real
+
+BUILT_IN: Final = "builtin"
+"""Name of the built-in physics and of the built-in network."""
 
 
 def _check_policy_name(name: str) -> str:
