@@ -82,7 +82,7 @@ def test_a_trial_ends_valid(tmp_path: Path, pair: Pair) -> None:
     assert [(row["protocol"], row["attempt"], row["status"]) for row in table] == [
         ("tcp", "1", "valid"),
         ("udp", "1", "valid"),
-    ]
+    ], run.out + run.err
     for row in table:
         assert row["hash_match"] == "true", "nothing is lost on this radio"
         assert int(row["bag_messages"]) > 0

@@ -11,7 +11,7 @@ from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.steps import variants
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.scene import Refusal
-from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool, Variants
+from fieldkit.steps.variants import Netcat, PingTool, Recorder, Variants
 from fieldkit.trial import planned_evidence
 from fieldkit.trial.check import tools
 from fieldkit.trial.plan import Plan
@@ -153,22 +153,29 @@ def test_pair_without_udp_is_refused_once(sender: Netcat, receiver: Netcat, refu
 
 
 @pytest.mark.parametrize(
-    ("version", "is_refused"),
+    ("help_text", "is_refused"),
     [
-        ("Ncat: Version 7.93 ( https://nmap.org/ncat )", False),
-        ("Ncat 7.40 ( https://nmap.org/ncat )", False),
-        ("Ncat: Version 7.94SVN ( https://nmap.org/ncat )", True),
-        ("Ncat 7.95 ( https://nmap.org/ncat )", True),
-        ("Ncat 8.00 ( https://nmap.org/ncat )", True),
-        ("", True),
+        ((DATA / "ncat/7.93/about.txt").read_bytes(), False),
+        ((DATA / "ncat/7.95/about.txt").read_bytes(), True),
+        (b"Ncat: Version 7.93 ( https://nmap.org/ncat )\n", False),
+        (b"Ncat: Version 7.94SVN ( https://nmap.org/ncat )\n", True),
+        (b"Ncat 7.40 ( https://nmap.org/ncat )\n", False),
+        (b"Ncat 8.00 ( https://nmap.org/ncat )\n", True),
+        (b"", True),
     ],
+    ids=["7.93", "7.95", "version 7.93", "version 7.94SVN", "7.40", "8.00", "unknown"],
 )
-def test_ncat_that_truncates_datagrams_is_refused(version: str, is_refused: bool) -> None:
-    receiver = replace(DEFAULT, netcat=Netcat.NCAT, versions={Tool.NETCAT: version})
-    detected = {Role.SENDER: replace(DEFAULT, netcat=Netcat.OPENBSD), Role.RECEIVER: receiver}
+def test_ncat_that_truncates_datagrams_is_refused(help_text: bytes, is_refused: bool) -> None:
+    """The receiver's netcat is identified from its help; without a known version it counts as a new one."""
+    output = b"==> user <==\n1000\n\n==> exit 0 <==\n==> netcat <==\n%s\n==> exit 0 <==\n" % help_text
+    ncat = tools.parse(output, TURTLEBOT) if help_text else replace(DEFAULT, netcat=Netcat.NCAT)
+    detected = {Role.SENDER: replace(DEFAULT, netcat=Netcat.OPENBSD), Role.RECEIVER: ncat}
     refusals = list(los_plan().refusals(detected))
     assert bool(refusals) == is_refused
     assert all("truncates the datagrams of 16384 bytes" in refusal.what for refusal in refusals)
+    assert los_plan(protocols=(Protocol.TCP,)).refusals(detected) == ()
+    assert los_plan().refusals({Role.SENDER: ncat, Role.RECEIVER: ncat}) == ()
+    assert los_plan().refusals({Role.SENDER: ncat, Role.RECEIVER: replace(DEFAULT, netcat=Netcat.OPENBSD)}) == ()
 
 
 @pytest.mark.parametrize(

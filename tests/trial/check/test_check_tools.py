@@ -42,6 +42,7 @@ def with_tools(**names: str) -> RobotProfile:
         ("nc.traditional/1.10-47/about.txt", Netcat.TRADITIONAL, "[v1.10-47]"),
         ("nc.openbsd/1.219/about.txt", Netcat.OPENBSD, "OpenBSD netcat (Debian patchlevel 1.219-1)"),
         ("ncat/7.93/about.txt", Netcat.NCAT, "Ncat 7.93 ( https://nmap.org/ncat )"),
+        ("ncat/7.95/about.txt", Netcat.NCAT, "Ncat 7.95 ( https://nmap.org/ncat )"),
         (
             "busybox/1.35.0/nc-about.txt",
             Netcat.BUSYBOX,
