@@ -24,7 +24,7 @@ from sim_backends.federates.agent_states import STATE
 MESSAGE: Final = bytes(36)
 """As many bytes as a request to a physics."""
 PEERS: Final = ("helics inproc", "helics zmq_ss", "mosaik inproc", "mosaik subprocess")
-"""The core `ipc` of HELICS is missing: its broker has one name for the whole machine, and two runs disturb each other."""
+"""HELICS's core `ipc` is missing: its broker has one name for the machine, and two runs disturb each other."""
 _STATE_NUMBERS: Final = STATE.size // 8
 _LIMIT_S: Final = 300.0
 
