@@ -45,7 +45,7 @@ def _add_run(commands: Commands) -> None:
         parser.add_argument(
             f"--{role}",
             metavar="FEDERATE",
-            help=f"external {role}: a command, tcp:HOST:PORT or tcp-listen:HOST:PORT (default: the scenario's)",
+            help=f"external {role}: a command or an address such as tcp:HOST:PORT (default: the scenario's)",
         )
     parser.add_argument(
         "--out",
@@ -184,7 +184,7 @@ def _conform(commands: Commands) -> None:
         "federate",
         nargs="+",
         metavar="COMMAND",
-        help="its command, in one word or after --; tcp:HOST:PORT or tcp-listen:HOST:PORT",
+        help="its command, in one word or after --; or an address such as tcp:HOST:PORT",
     )
     parser.add_choice("--role", ("physics", "network"), help="its role (default: the first that it accepts)")
     parser.add_argument(
