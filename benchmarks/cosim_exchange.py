@@ -3,8 +3,8 @@
 An exchange with a physics is a request without commands and an answer with the states of all agents; an exchange with
 a network is a request with these states and an answer without packets. The federate does nothing else. The time is
 that of the coordinator's call; the rounds of all transports alternate. The floor is a plain socket between two Python
-programs, which sends and receives as many bytes and does nothing with them. `pipe to C` is
-`docs/examples/federates/carts.c` (physics only). The peers, HELICS and mosaik, exchange as much in each step
+programs, which sends and receives as many bytes and does nothing with them. `to C` is
+`docs/examples/federates/carts.c`. The peers, HELICS and mosaik, exchange as much in each step
 (`cosim_peers`).
 
 Both processes share the machine's processors, so other load changes the wall time: its minimum over the rounds is the
@@ -24,6 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -40,8 +41,8 @@ from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.motion import State
 
 COUNTS: Final = (3, 10, 50, 200)
-ROUNDS: Final = 5
-EXCHANGES: Final = 1000
+ROUNDS: Final = 15
+EXCHANGES: Final = 300
 STEPS: Final = 1000
 PEER_ROUNDS: Final = 3
 STEP_NS: Final = 1_000_000
@@ -176,6 +177,23 @@ def listening(role: str, scheme: str, count: int) -> Iterator[Party]:
         process.wait()
 
 
+@contextmanager
+def connected_to(program: Path, count: int) -> Iterator[Party]:
+    """Yield an exchange over TCP with a program that has the connection as its standard input and output."""
+    with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as pool:
+
+        def start() -> "subprocess.Popen[bytes]":
+            connection, _ = server.accept()
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with connection:
+                return subprocess.Popen((program,), stdin=connection, stdout=connection)
+
+        started = pool.submit(start)
+        with opened("physics", f"tcp:127.0.0.1:{server.getsockname()[1]}", count) as party:
+            yield Party(party.exchange, [started.result().pid])
+        started.result().wait()
+
+
 def free_port() -> int:
     """Return a port that no program uses."""
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -244,6 +262,7 @@ def results(count: int, program: Path | None, *, has_ros: bool) -> dict[str, Tim
         parties["plain socket"] = stack.enter_context(floor(_PHYSICS_REQUEST_BYTES, answer_bytes))
         if program is not None:
             parties["physics pipe to C"] = stack.enter_context(opened("physics", str(program), count))
+            parties["physics tcp to C"] = stack.enter_context(connected_to(program, count))
         parties["physics pipe"] = stack.enter_context(opened("physics", served("physics"), count))
         for scheme in ("tcp", "udp", "dds", *(("ros1",) if has_ros else ())):
             parties[f"physics {scheme}"] = stack.enter_context(listening("physics", scheme, count))

@@ -52,11 +52,14 @@ def serve_service(service: FederateService, *, address: str | None = None, runs:
 def _listen(address: TransportAddress, service: FederateService, runs: int | None) -> bool:
     token = read_token(address)
     succeeded, served = True, 0
-    with address.listen() as listener:
-        while runs is None or served < runs:
-            with closing(listener.accept(None)) as channel:
-                succeeded = serve_channel(channel, service, token, _HELLO_S)
-            served += 1
+    try:
+        with address.listen() as listener:
+            while runs is None or served < runs:
+                with closing(listener.accept(None)) as channel:
+                    succeeded = serve_channel(channel, service, token, _HELLO_S)
+                served += 1
+    except DeadlineError as error:  # no ROS master answers
+        raise SystemExit(str(error)) from error
     return succeeded
 
 

@@ -243,7 +243,7 @@ def open_session(
 
     Args:
         role: `PHYSICS` or `NETWORK`.
-        where: A name, a command, `tcp:HOST:PORT` or `tcp-listen:HOST:PORT`.
+        where: A name, a command, or an address of a transport (`transports.table`).
         hello: The hello that it receives; the token is added, and the interval of heartbeats
             suits the deadline.
         deadline_s: Longest wait for the connection and for each frame; None for no deadline.

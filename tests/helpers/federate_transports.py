@@ -30,8 +30,8 @@ def new_addresses(scheme: str) -> tuple[str, str]:
 
 
 @contextmanager
-def ros_master() -> Iterator[None]:
-    """Run a ROS master, and let `ROS_MASTER_URI` name it."""
+def ros_master() -> Iterator[str]:
+    """Run a ROS master, let `ROS_MASTER_URI` name it, and yield its URI."""
     port = free_port()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{port}")
@@ -45,7 +45,7 @@ def ros_master() -> Iterator[None]:
         )
         try:
             _wait_for_port(process, port)
-            yield
+            yield f"http://127.0.0.1:{port}"
         finally:
             process.terminate()
             process.wait()

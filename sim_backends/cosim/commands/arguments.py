@@ -181,7 +181,7 @@ def _conform(commands: Commands) -> None:
         "federate",
         nargs="+",
         metavar="COMMAND",
-        help="its command, in one word or after --; tcp:HOST:PORT or tcp-listen:HOST:PORT",
+        help="its command, in one word or after --; or an address such as tcp:HOST:PORT",
     )
     parser.add_choice("--role", ("physics", "network"), help="its role (default: the first that it accepts)")
     parser.add_argument(
@@ -245,7 +245,7 @@ def _add_federates(parser: Parser) -> None:
         action = parser.add_argument(
             f"--{role}",
             metavar="FEDERATE",
-            help=f"{role}: a simulator of `fieldkit cosim list`, a command, tcp:HOST:PORT or tcp-listen:HOST:PORT "
+            help=f"{role}: a simulator of `fieldkit cosim list`, a command or an address such as tcp:HOST:PORT "
             "(default: the scenario's)",
         )
         _set_completer(action, partial(_federate_names, role))

@@ -1,0 +1,85 @@
+"""ROS 1 nodes: messages through a real master, among Debian's own tools, nodes that have exited, and wrong types."""
+
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from sim_backends.federates.transports.ros1 import MESSAGE
+from sim_backends.ros1.framing import pack, pack_header
+from sim_backends.ros1.node import MasterError, RosMessageType, RosNode, call
+from tests.helpers.federate_transports import ros_master
+from tests.helpers.sshd import wait_until
+
+OTHER = RosMessageType("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
+
+
+@pytest.fixture(scope="module")
+def master() -> Iterator[str]:
+    with ros_master() as uri:
+        yield uri
+
+
+def after_s(duration_s: float) -> float:
+    return time.monotonic() + duration_s
+
+
+def until(condition: Callable[[], bool]) -> None:
+    wait_until(condition, Deadline.after(30))
+
+
+def test_messages_pass_between_nodes_and_to_ros(master: str) -> None:
+    with closing(RosNode("/a", master)) as a, closing(RosNode("/b", master)) as b:
+        subscriber = b.subscribe("/data", MESSAGE, after_s(30))
+        publisher = a.publish("/data", MESSAGE, after_s(30))
+        until(lambda: publisher.connections == 1 and subscriber.connections == 1)
+        for body in (b"", b"\0" * 12, bytes(200_000)):
+            assert publisher.publish(body, after_s(30)) == 1
+            assert subscriber.take(after_s(30)) == body
+        subscriber.close()
+        until(lambda: publisher.connections == 0)
+        shown = subprocess.run(("rostopic", "info", "/data"), capture_output=True, text=True, timeout=60, check=True)
+        assert "Type: std_msgs/UInt8MultiArray" in shown.stdout
+        assert " * /a (http://127.0.0.1:" in shown.stdout
+        assert publisher.publish(b"", after_s(30)) == 0
+        with pytest.raises(TimeoutError):
+            subscriber.take(after_s(0.01))
+
+
+def test_another_type_and_a_node_that_has_exited_are_ignored(master: str) -> None:
+    with closing(RosNode("/a", master)) as a, closing(RosNode("/b", master)) as b:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            gone = f"http://127.0.0.1:{server.getsockname()[1]}/"
+        call(master, "registerPublisher", "/gone", "/data2", MESSAGE.name, gone)
+        strings = b.subscribe("/data2", OTHER, after_s(30))
+        bytes_of = b.subscribe("/data3", MESSAGE, after_s(30))
+        publishers = [a.publish(f"/data{number}", MESSAGE, after_s(30)) for number in (2, 3)]
+        until(lambda: publishers[1].connections == 1 and bytes_of.connections == 1)
+        assert strings.connections == publishers[0].connections == 0
+
+
+def test_invalid_data_disconnect_only_their_sender(master: str) -> None:
+    with closing(RosNode("/a", master)) as a:
+        publisher = a.publish("/data4", MESSAGE, after_s(30))
+        port = a._stream_server.getsockname()[1]
+        for data in (b"\xff" * 8, pack(b"no header"), pack(pack_header({"topic": "/other"}))):
+            with socket.create_connection(("127.0.0.1", port)) as stream:
+                stream.sendall(data)
+                assert stream.recv(1) == b""
+        assert publisher.connections == 0
+
+
+def test_a_master_that_is_missing_or_another_program(master: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        uri = f"http://127.0.0.1:{server.getsockname()[1]}"
+    with (
+        closing(RosNode("/a", uri)) as a,
+        pytest.raises(TimeoutError, match=f"no ROS master answers at {uri}"),
+    ):
+        a.publish("/data", MESSAGE, after_s(0.2))
+    with pytest.raises(MasterError, match="refused registerPublisher"):
+        call(master, "registerPublisher", "/a", "", "", "")
