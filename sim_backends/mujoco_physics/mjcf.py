@@ -15,7 +15,7 @@ from sim_backends.mujoco_physics.chassis import CASTER_RADIUS_M, Chassis, quadro
 from sim_backends.physics.body import GRAVITY_M_S2
 from sim_backends.physics.quadrotor import QuadrotorLimits
 from sim_backends.world.obstacles import Raised, Ramp
-from sim_backends.world.shapes import Box, Cylinder, Shape
+from sim_backends.world.shapes import Box, Shape
 from sim_backends.world.world import World
 
 SENSED_NUMBERS: Final = 9
@@ -25,16 +25,16 @@ ATTITUDE_RATE_PER_S: Final = 30.0
 """Bandwidth of the control of a quadrotor's turning rates."""
 _CONTACT: Final = {"solref": "0.02 1", "solimp": "0.9 0.95 0.001"}
 """Softness of contacts of bodies, which have no friction, as in the built-in physics."""
-_TIRE: Final = {"solref": "0.003 1.6", "solimp": "0.1 0.1 0.001"}
-"""Softness of tires; a Husky compresses them by 0.3 mm."""
-_TIRE_SLIP: Final = "0.3 1"
+_GRIP: Final = {"solref": "0.003 1.6", "solimp": "0.1 0.1 0.001"}
+"""Softness of contacts with the ground; a Husky compresses its tires by 0.3 mm."""
+_GRIP_SLIP: Final = "0.3 1"
 """Softness of their friction. MuJoCo's contacts repel what slides on them, in proportion to its speed; with a stiffer
 friction, the wheels of a robot that turns would hop (documentation of MuJoCo, "Computation", convex relaxation)."""
+_BODY_FRICTION: Final = 0.3
+"""Friction of a robot that has fallen over; our estimate."""
 _IMPEDANCE_RATIO: Final = 10_000.0
 """Ratio of softness across and along a contact; it keeps a robot from creeping down a slope: 0.02 mm/s at 20 degrees.
 """
-_SKID_FRICTION: Final = 0.5
-"""Friction of a quadrotor on the ground; our estimate."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +117,12 @@ class _Document:
         _add(option, "flag", autoreset="disable")
         _add(_add(root, "default"), "geom", condim="1", **_CONTACT)
         self._meshes, self._bodies = _add(root, "asset"), _add(root, "worldbody")
-        self._tire_contacts = _add(root, "contact")
+        self._grips = _add(root, "contact")
         self._motors, self._sensors = _add(root, "actuator"), _add(root, "sensor")
         self._grounds: list[str] = []
 
     def add_world(self, world: World | None) -> None:
-        """Add ground and obstacles; tires have contacts of their own with the ground."""
+        """Add ground and obstacles."""
         _add(self._bodies, "geom", name=self._new_ground(), type="plane", size="0 0 1")
         for obstacle in world.obstacles if world is not None else ():
             if isinstance(obstacle, Ramp):
@@ -162,8 +162,10 @@ class _Document:
 
     def _add_vehicle(self, body: ET.Element, name: str, chassis: Chassis, friction: float) -> None:
         _add_inertia(body, chassis.mass_kg, chassis.centre_m, chassis.inertia_kg_m2)
-        for box in chassis.boxes:
-            _add_shape(body, box)
+        for index, box in enumerate(chassis.boxes):
+            shape = f"{name}b{index}"
+            _add_shape(body, box, name=shape)
+            self._add_grip(shape, _BODY_FRICTION)
         if chassis.caster_m is not None:
             forward_m, left_m, up_m = chassis.caster_m
             position = _text((forward_m, left_m, up_m + CASTER_RADIUS_M))
@@ -180,22 +182,8 @@ class _Document:
         _add(wheel, "joint", name=name, type="hinge", axis="0 1 0")
         # An ellipsoid has one contact with flat ground, below its centre; a cylinder would have four.
         size = _text((wheels.radius_m, wheels.width_m / 2, wheels.radius_m))
-        grip = _text((friction, 0.005, 0.0001))
-        mass = repr(wheels.mass_kg)
-        _add(
-            wheel, "geom", name=name, type="ellipsoid", size=size, mass=mass, condim="3", friction=grip, priority="1"
-        )
-        for ground in self._grounds:
-            _add(
-                self._tire_contacts,
-                "pair",
-                geom1=ground,
-                geom2=name,
-                condim="3",
-                friction=_text((friction, friction, 0.005, 0.0001, 0.0001)),
-                solreffriction=_TIRE_SLIP,
-                **_TIRE,
-            )
+        _add(wheel, "geom", name=name, type="ellipsoid", size=size, mass=repr(wheels.mass_kg))
+        self._add_grip(name, friction)
         # The motor also accelerates the robot: its share is a mass at the radius of the wheel.
         count = 2 * len(wheels.axles_m)
         inertia_kg_m2 = (chassis.mass_kg / count + wheels.mass_kg) * wheels.radius_m**2
@@ -213,15 +201,31 @@ class _Document:
             forcerange=_text((-wheels.torque_n_m, wheels.torque_n_m)),
         )
 
+    def _add_grip(self, name: str, friction: float) -> None:
+        """Add contacts with friction between a shape and the ground; contacts with obstacles have none."""
+        for ground in self._grounds:
+            _add(
+                self._grips,
+                "pair",
+                geom1=ground,
+                geom2=name,
+                condim="3",
+                friction=_text((friction, friction, 0.005, 0.0001, 0.0001)),
+                solreffriction=_GRIP_SLIP,
+                **_GRIP,
+            )
+
     def _add_quadrotor(self, body: ET.Element, name: str, limits: QuadrotorLimits) -> None:
         """Add a quadrotor: a thrust along its axis, and torques towards the attitude of a body without mass."""
         inertia_kg_m2, centre_m = quadrotor_inertia_kg_m2(limits), (0.0, 0.0, limits.height_m / 2)
         _add_inertia(body, limits.mass_kg, centre_m, inertia_kg_m2)
-        cylinder = Cylinder(centre_m, limits.radius_m, limits.height_m)
-        _add_shape(body, cylinder, condim="3", friction=_text((_SKID_FRICTION, 0.005, 0.0001)), priority="1")
+        # A cylinder that turns on a plane gets wrong contacts, 0.4 m deep, in MuJoCo 4.0.1.
+        half_axes_m = (limits.radius_m, limits.radius_m, limits.height_m / 2)
+        _add(body, "geom", type="ellipsoid", size=_text(half_axes_m), pos=_text(centre_m))
         centre, target = f"{name}c", f"{name}t"
         _add(body, "site", name=centre, pos=_text(centre_m))
-        _add(_add(self._bodies, "body", name=target, mocap="true"), "site", name=target)
+        attitude = _add(self._bodies, "body", name=target, mocap="true", quat=body.attrib["quat"])
+        _add(attitude, "site", name=target)
         thrust = _text(limits.thrust_n)
         _add(self._motors, "general", name=name, site=centre, gear="0 0 1 0 0 0", ctrlrange=thrust)
         for axis, moment_kg_m2 in enumerate(inertia_kg_m2, start=3):
