@@ -23,7 +23,7 @@ WHEEL_PER_S: Final = 40.0
 """Natural frequency of the speed control of a wheel, critically damped: 0.05 s behind its set-point."""
 ATTITUDE_RATE_PER_S: Final = 30.0
 """Bandwidth of the control of a quadrotor's turning rates."""
-_CONTACT: Final = {"solref": "0.02 1", "solimp": "0.9 0.95 0.001"}
+_CONTACT: Final = {"solref": "0.01 1", "solimp": "0.9 0.95 0.001"}
 """Softness of contacts of bodies, which have no friction, as in the built-in physics."""
 _GRIP: Final = {"solref": "0.003 1.6", "solimp": "0.1 0.1 0.001"}
 """Softness of contacts with the ground; a Husky compresses its tires by 0.3 mm."""

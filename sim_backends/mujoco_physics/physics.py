@@ -264,7 +264,7 @@ def _model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: Worl
     if isinstance(limits, QuadrotorLimits):
         return Model(place_m, quaternion(heading_rad), agent.antenna_m, 0.0, limits)
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    east, north = Ground(world, limits.friction).surface(e, n).grade
+    east, north = Ground(world, math.inf).surface(e, n).grade
     forward, left = east * cos + north * sin, north * cos - east * sin
     roll_rad = math.asin(left / math.hypot(1.0, forward, left))
     upright = quaternion(heading_rad, -math.atan(forward), roll_rad)
