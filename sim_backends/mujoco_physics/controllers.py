@@ -5,7 +5,7 @@ They run at `TICK_NS`, as on real robots; motors and attitude control run in MuJ
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 from sim_backends.mujoco_physics.chassis import Wheels
 from sim_backends.mujoco_physics.mjcf import quaternion
@@ -21,21 +21,21 @@ _UPRIGHT: Final = 0.1
 
 @dataclass(frozen=True)
 class Registers:
-    """Arrays of the simulation that controllers read and write.
+    """Arrays of the simulation that controllers read and write, flat; memory views are faster than NumPy for items.
 
     Attributes:
         ctrl: Set-points of the motors.
         qvel: Velocities of the joints; the first three of a free body are its velocity, metres per second.
-        xmat: Rotation matrices of the bodies, row by row.
-        mocap_quat: Target attitudes.
-        xfrc_applied: Forces and torques on the bodies.
+        xmat: Rotation matrices of the bodies, row by row: 9 numbers each.
+        mocap_quat: Target attitudes: 4 numbers each.
+        xfrc_applied: Forces and torques on the bodies: 6 numbers each.
     """
 
-    ctrl: Any
-    qvel: Any
-    xmat: Any
-    mocap_quat: Any
-    xfrc_applied: Any
+    ctrl: "memoryview[float]"
+    qvel: "memoryview[float]"
+    xmat: "memoryview[float]"
+    mocap_quat: "memoryview[float]"
+    xfrc_applied: "memoryview[float]"
 
 
 class Controller(Protocol):
@@ -124,9 +124,9 @@ class FlightController:
     def tick(self, registers: Registers, elapsed_s: float) -> bool:  # noqa: ARG002 (see Controller)
         """Implement `Controller.tick`."""
         limits, (body, mocap, dof, motor) = self._limits, self._indices
-        x_e, _, z_e, x_n, _, z_n, _, _, z_u = registers.xmat[body].tolist()
-        v_e, v_n, v_u = velocity_m_s = tuple(registers.qvel[dof : dof + 3].tolist())
-        f_e, f_n, f_u = self._law.thrust_m_s2(velocity_m_s, self._target)
+        x_e, _, z_e, x_n, _, z_n, _, _, z_u = registers.xmat[9 * body : 9 * body + 9]
+        v_e, v_n, v_u = registers.qvel[dof : dof + 3]
+        f_e, f_n, f_u = self._law.thrust_m_s2((v_e, v_n, v_u), self._target)
         yaw_rad = math.atan2(x_n, x_e)
         if self._held_rad is None:
             self._held_rad = yaw_rad
@@ -134,14 +134,20 @@ class FlightController:
         forward, left = f_e * cos + f_n * sin, f_n * cos - f_e * sin
         pitch_rad = math.atan2(z_e * cos + z_n * sin, z_u)
         roll_rad = math.asin(_clamp(z_e * sin - z_n * cos, 1.0))
-        registers.mocap_quat[mocap] = quaternion(
+        targets, first = registers.mocap_quat, 4 * mocap
+        targets[first], targets[first + 1], targets[first + 2], targets[first + 3] = quaternion(
             yaw_rad + _clamp(math.remainder(self._held_rad - yaw_rad, math.tau), self._max_turn_rad),
             pitch_rad + _clamp(math.atan2(forward, f_u) - pitch_rad, self._max_lean_rad),
             roll_rad + _clamp(-math.atan2(left, math.hypot(forward, f_u)) - roll_rad, self._max_lean_rad),
         )
         registers.ctrl[motor] = f_u / z_u * limits.mass_kg if z_u > _UPRIGHT else limits.thrust_n[0]
         drag_n_s_m = limits.drag_n_s_m + limits.drag_n_s2_m2 * math.hypot(v_e, v_n, v_u)
-        registers.xfrc_applied[body, :3] = -drag_n_s_m * v_e, -drag_n_s_m * v_n, -drag_n_s_m * v_u
+        forces, first = registers.xfrc_applied, 6 * body
+        forces[first], forces[first + 1], forces[first + 2] = (
+            -drag_n_s_m * v_e,
+            -drag_n_s_m * v_n,
+            -drag_n_s_m * v_u,
+        )
         return True
 
 

@@ -81,6 +81,8 @@ class MujocoPhysics:
     Attributes:
         step_ns: Time step; MuJoCo divides it if it is longer than 1 ms.
         limits_m_s2: Infinity for each agent, because a contact may change a velocity within a step.
+        model: The model, for example for MuJoCo's viewer.
+        data: Its present state.
 
     Raises:
         ConfigurationError: The step is not positive, or a robot's body is invalid.
@@ -102,15 +104,15 @@ class MujocoPhysics:
         limits = [_limits(agent, bodies.get(agent.name, {}).get("body")) for agent in hello.agents]
         robots = [_model(agent, limit, world) for agent, limit in zip(hello.agents, limits, strict=True)]
         text = model_xml(robots, world, hello.step_ns / self._substeps / 1e9)
-        self._model = mujoco.MjModel.from_xml_string(text)
+        self.model = mujoco.MjModel.from_xml_string(text)
         self._controllers = [
             self._controller(row, robot, limit) for row, (robot, limit) in enumerate(zip(robots, limits, strict=True))
         ]
         self._active = set(range(len(robots)))
         self._due: set[int] = set()
         self._ticked_steps = [-self._tick_steps] * len(robots)
-        self._use(mujoco.MjData(self._model))
-        mujoco.mj_step1(self._model, self._data)
+        self._use(mujoco.MjData(self.model))
+        mujoco.mj_step1(self.model, self.data)
         self._pending: dict[str, Any] = {}
         self._commands_step = 0
         self._last_to_ns = 0
@@ -136,24 +138,38 @@ class MujocoPhysics:
             self._advance_steps(step)
         return self._states
 
+    def run_controllers(self) -> None:
+        """Let the controllers that are due at the present step set their motors."""
+        step = self._step
+        rows = self._due if step % self._tick_steps else self._active
+        if not rows:
+            return
+        self._due = set()
+        for row in tuple(rows):
+            elapsed = min(step - self._ticked_steps[row], self._tick_steps)
+            self._ticked_steps[row] = step
+            if not self._controllers[row].tick(self._registers, elapsed * self.step_ns / 1e9):
+                self._active.discard(row)
+
     def __deepcopy__(self, memo: dict[int, Any]) -> "MujocoPhysics":
         other = object.__new__(type(self))
         memo[id(self)] = other
         own = {name: value for name, value in vars(self).items() if name not in _OF_MUJOCO}
-        vars(other).update(copy.deepcopy(own, memo), _model=self._model)
-        data = mujoco.MjData(self._model)
-        mujoco.mj_copyData(data, self._model, self._data)
+        vars(other).update(copy.deepcopy(own, memo), model=self.model)
+        data = mujoco.MjData(self.model)
+        mujoco.mj_copyData(data, self.model, self.data)
         other._use(data)
         return other
 
     def _use(self, data: Any) -> None:  # noqa: ANN401 (of MuJoCo)
-        """Use a state of the simulation; its arrays are read once, because reading an attribute is slow."""
-        self._data = data
-        self._sensors = data.sensordata
-        self._registers = Registers(data.ctrl, data.qvel, data.xmat, data.mocap_quat, data.xfrc_applied)
+        """Use a state of the simulation; views of its arrays are made once, because reading an attribute is slow."""
+        self.data = data
+        self._sensors = memoryview(data.sensordata)
+        arrays = data.ctrl, data.qvel, data.xmat, data.mocap_quat, data.xfrc_applied
+        self._registers = Registers(*(memoryview(array.reshape(-1)) for array in arrays))
 
     def _controller(self, row: int, robot: Model, limits: DriveLimits | QuadrotorLimits) -> Controller:
-        model = self._model
+        model = self.model
         if isinstance(limits, DriveLimits):
             assert isinstance(robot.body, Chassis)
             first = model.actuator(f"a{row}l0").id
@@ -179,7 +195,7 @@ class MujocoPhysics:
         if self._step >= step:
             return
         while self._step < step:
-            self._tick()
+            self.run_controllers()
             until = step
             if self._active:
                 until = min(step, (self._step // self._tick_steps + 1) * self._tick_steps)
@@ -190,21 +206,9 @@ class MujocoPhysics:
             self._raise_unstable(numbers)
         self._states = SensedStates(self._rows, numbers)
 
-    def _tick(self) -> None:
-        step = self._step
-        rows = self._due if step % self._tick_steps else self._active
-        if not rows:
-            return
-        self._due = set()
-        for row in sorted(rows):
-            elapsed = min(step - self._ticked_steps[row], self._tick_steps)
-            self._ticked_steps[row] = step
-            if not self._controllers[row].tick(self._registers, elapsed * self.step_ns / 1e9):
-                self._active.discard(row)
-
     def _integrate(self, count: int) -> None:
         """Take steps of MuJoCo, from derived quantities of the state to those of the new state."""
-        model, data = self._model, self._data
+        model, data = self.model, self.data
         mujoco.mj_step2(model, data)
         if count > 1:
             mujoco.mj_step(model, data, nstep=count - 1)
@@ -223,8 +227,8 @@ class MujocoPhysics:
             "",
         )
         if joint := re.search(r"DOF (\d+)", text):
-            root = self._model.body_rootid[self._model.dof_bodyid[int(joint.group(1))]]
-            name = next(name for name, row in self._rows.items() if self._model.body(f"a{row}").id == root)
+            root = self.model.body_rootid[self.model.dof_bodyid[int(joint.group(1))]]
+            name = next(name for name, row in self._rows.items() if self.model.body(f"a{row}").id == root)
         raise FederateError(
             f"mujoco became unstable until {seconds_text(self._step * self.step_ns)}, first at {name or 'no agent'}: "
             f"{' '.join(text.split())}",
@@ -232,7 +236,7 @@ class MujocoPhysics:
         )
 
 
-_OF_MUJOCO: Final = {"_model", "_data", "_sensors", "_registers"}
+_OF_MUJOCO: Final = {"model", "data", "_sensors", "_registers"}
 
 
 def _limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | QuadrotorLimits:

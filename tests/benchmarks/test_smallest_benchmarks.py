@@ -14,7 +14,16 @@ NOT_RUN = {
 }
 """Benchmarks that need more than CI has, with their tests; only their help is printed here."""
 
-PARTS = {"bash_peer", "footprint", "lifetimes", "namespaces", "own_time", "pandas_peer", "slow_links"} | {
+PARTS = {
+    "bash_peer",
+    "footprint",
+    "lifetimes",
+    "mujoco_fleet",
+    "namespaces",
+    "own_time",
+    "pandas_peer",
+    "slow_links",
+} | {
     "studies.middleware_cells",
     "studies.middleware_table",
     "studies.zenoh_plain",

@@ -13,6 +13,7 @@ from sim_backends.mujoco_physics.chassis import HUSKY
 from sim_backends.mujoco_physics.physics import MujocoPhysics
 from sim_backends.physics.body import GRAVITY_M_S2, Twist, Velocity
 from sim_backends.physics.differential_drive import HUSKY_A200
+from sim_backends.physics.quadrotor import IRIS
 from sim_backends.world.motion import State
 
 WALL = {
@@ -125,7 +126,7 @@ def test_robots_stop_at_a_wall_and_do_not_pass_it() -> None:
     simulation = physics(husky(), burger(east_m=2.5), iris(up_m=1.0), obstacles=(WALL,))
     commands = {"husky": Twist(1.0), "burger": Twist(0.2), "iris": Velocity((3.0, 0.0, 0.0))}
     after(simulation, 0, commands)
-    reach_m = {"husky": 0.9874 / 2, "burger": 0.07 - 0.032, "iris": 0.384}
+    reach_m = {"husky": 0.9874 / 2, "burger": 0.07 - 0.032, "iris": 0.384 * math.cos(IRIS.tilt_rad)}
     for tenth in range(1, 50):
         states = after(simulation, tenth / 10)
         for name, length_m in reach_m.items():

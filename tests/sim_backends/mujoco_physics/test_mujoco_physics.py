@@ -91,8 +91,8 @@ def test_a_command_that_no_robot_can_follow_is_refused(command: dict[str, object
 def test_an_unstable_simulation_is_an_error_that_names_time_and_agent() -> None:
     simulation = MujocoPhysics(HELLO)
     simulation.advance(20_000_000, {})
-    first = simulation._model.joint("a1").dofadr[0]
-    simulation._data.qvel[first] = 1e12
+    first = simulation.model.joint("a1").dofadr[0]
+    simulation.data.qvel[first] = 1e12
     with pytest.raises(FederateError, match=r"mujoco became unstable until 0\.03 s, first at bob") as caught:
         simulation.advance(30_000_000, {})
     assert "shorter step" in caught.value.remedy
