@@ -166,7 +166,8 @@ class MujocoPhysics:
         self.data = data
         self._sensors = memoryview(data.sensordata)
         arrays = data.ctrl, data.qvel, data.xmat, data.mocap_quat, data.xfrc_applied
-        self._registers = Registers(*(memoryview(array.reshape(-1)) for array in arrays))
+        views: list[Any] = [memoryview(array.reshape(-1)) for array in arrays]
+        self._registers = Registers(*views)
 
     def _controller(self, row: int, robot: Model, limits: DriveLimits | QuadrotorLimits) -> Controller:
         model = self.model

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -16,7 +16,7 @@ from sim_backends.physics.differential_drive import HUSKY_A200
 from sim_backends.physics.quadrotor import IRIS
 from sim_backends.world.motion import State
 
-WALL = {
+WALL: Mapping[str, object] = {
     "name": "wall",
     "kind": "wall",
     "from_m": [3, -4],
@@ -35,10 +35,15 @@ def ramp(degrees: float, length_m: float, centre_m: float = 0.0) -> dict[str, ob
 
 
 def physics(
-    *agents: AgentStart, obstacles: tuple[dict[str, object], ...] = (), bodies: Mapping[str, Any] | None = None
+    *agents: AgentStart, obstacles: Sequence[Mapping[str, object]] = (), bodies: Mapping[str, Any] | None = None
 ) -> MujocoPhysics:
     """A simulation with steps of 1 ms."""
-    world = {"name": "test", "summary": "", "area_m": [100, 100], "obstacles": list(obstacles)}
+    world = {
+        "name": "test",
+        "summary": "",
+        "area_m": [100, 100],
+        "obstacles": [dict(obstacle) for obstacle in obstacles],
+    }
     robots = {name: {"body": body} for name, body in (bodies or {}).items()}
     return MujocoPhysics(
         Hello(PHYSICS, agents, configuration=json.dumps({"world": world, "robots": robots}).encode())
@@ -137,7 +142,12 @@ def test_robots_stop_at_a_wall_and_do_not_pass_it() -> None:
 
 
 def test_a_robot_climbs_a_ramp_to_raised_ground_but_not_its_side() -> None:
-    raised = {"name": "raised", "kind": "raised", "centre_m": [7, 0], "size_m": [4, 20, 4 * math.tan(0.15)]}
+    raised: dict[str, object] = {
+        "name": "raised",
+        "kind": "raised",
+        "centre_m": [7, 0],
+        "size_m": [4, 20, 4 * math.tan(0.15)],
+    }
     obstacles = (ramp(math.degrees(0.15), 4, 3.0), raised)
     simulation = physics(husky(), burger("blocked", east_m=10.0), obstacles=obstacles)
     after(simulation, 0, {"husky": Twist(1.0), "blocked": Twist(-0.2)})
