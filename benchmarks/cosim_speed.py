@@ -5,7 +5,8 @@ Driving robots, 5 m apart, send 10 packets of 100 bytes per second to the next r
 factor; exchanges between physics and network per second; the cost of an exchange without the time of physics,
 programs and network; and the cost of the coordinator relative to a plain loop that steps the same programs, physics
 and network through the same windows, without policies, ledger or hash. If the two deliver different packets, or at
-different times, the benchmark raises an error. Shipped scenarios follow.
+different times, the benchmark raises an error. Shipped scenarios follow; then robots that drive and fly in MuJoCo, in
+windows of 10 ms, relative to MuJoCo's own steps.
 
 The benchmark runs in one thread without waiting, so all times are processor times. Other load still slows it down
 through shared caches and a lower clock.
@@ -22,6 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Final
 
+from benchmarks.mujoco_fleet import measure_mujoco
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.window_policies import SlidingWindow
@@ -39,6 +41,7 @@ from sim_backends.world.motion import State, WayPoints
 
 COUNTS: Final = (3, 10, 30, 100, 200)
 SCENARIOS: Final = ("baylands",)
+MUJOCO_COUNTS: Final = (3, 30)
 WINDOW_NS: Final = 1_100_000
 PERIOD_NS: Final = 100_000_000
 SIZE_BYTES: Final = 100
@@ -218,6 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="simulated time per round")
     parser.add_argument("--robots", type=int, nargs="*", default=COUNTS)
     parser.add_argument("--scenarios", nargs="*", default=SCENARIOS)
+    parser.add_argument("--mujoco", type=int, nargs="*", default=MUJOCO_COUNTS, help="numbers of robots in MuJoCo")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
     load_before = os.getloadavg()[0]
@@ -226,6 +230,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for count in options.robots
     }
     results |= {name: medians(options.rounds, partial(measure_scenario, name)) for name in options.scenarios}
+    results |= {
+        f"MuJoCo {count}": medians(options.rounds, partial(measure_mujoco, count, options.seconds))
+        for count in options.mujoco
+    }
     if options.json:
         print(json.dumps({"load_before": load_before, "figures": results}, indent=2))
         return

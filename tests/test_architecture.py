@@ -133,6 +133,7 @@ ONE_IMPORTER = {
     "rospy": "fieldkit/agent/ros1.py sim_backends/emulated/robot/ros_relay.py",
     "rclpy": "fieldkit/agent/ros2.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
+    "mujoco": "sim_backends/mujoco_physics/physics.py",
 }
 
 
@@ -257,7 +258,8 @@ def test_required_and_imported_packages_are_the_same() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
     required = {
-        re.split(r"[<>=]", line)[0] for line in (*project["dependencies"], *extras["pandas"], *extras["ros2"])
+        re.split(r"[<>=]", line)[0]
+        for line in (*project["dependencies"], *extras["mujoco"], *extras["pandas"], *extras["ros2"])
     }
     paths = modules("fieldkit") + modules("sim_backends")
     tops = {name.split(".")[0] for path in paths for name in imported_names(path)}

@@ -206,7 +206,7 @@ class DifferentialDrive:
     def course(self, pose: DrivePose, command: object, step_s: float) -> Arc:
         """Implement `Body.course`."""
         limits = self._limits
-        twist = _twist(command)
+        twist = checked_twist(command)
         speed_m_s = _clamp(twist.forward_m_s, limits.speed_m_s)
         turn_rad_s = _clamp(twist.turn_rad_s, limits.turn_rad_s)
         max_m_s2 = self._acceleration_m_s2(pose, faster=speed_m_s > pose.speed_m_s)
@@ -255,7 +255,7 @@ class DifferentialDrive:
         heading: Vector = (math.cos(pose.heading_rad), math.sin(pose.heading_rad), 0.0)
         direction: Vector = stop.sliding_velocity(heading if pose.speed_m_s > 0 else (-heading[0], -heading[1], 0.0))
         share = math.hypot(*direction)
-        max_m_s = min(abs(pose.speed_m_s), abs(_twist(command).forward_m_s) * share)
+        max_m_s = min(abs(pose.speed_m_s), abs(checked_twist(command).forward_m_s) * share)
         return pose._replace(
             place_m=stop.place_m,
             speed_m_s=math.copysign(max_m_s, pose.speed_m_s),
@@ -269,7 +269,12 @@ class DifferentialDrive:
         return math.hypot(limits.acceleration_m_s2, limits.speed_m_s * limits.turn_rad_s * stretch)
 
 
-def _twist(command: object) -> Twist:
+def checked_twist(command: object) -> Twist:
+    """Return a command to a robot on wheels; None means a twist of 0.
+
+    Raises:
+        ConfigurationError: It is not a `Twist` of finite numbers.
+    """
     if command is None:
         return Twist()
     if not isinstance(command, Twist) or not (

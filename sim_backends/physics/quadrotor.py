@@ -316,7 +316,7 @@ class Quadrotor:
 
     def course(self, pose: FlightPose, command: object, step_s: float) -> Glide | Flight:
         """Implement `Body.course`."""
-        target = self._target(command)
+        target = self.target(command)
         if self._is_steady(pose, target):
             return Glide(pose, target.velocity_m_s, step_s)
         return Flight(pose, self._autopilot, target, step_s)
@@ -333,8 +333,12 @@ class Quadrotor:
         """
         return self._limits.drive_m_s2() + self._limits.drag_m_s2(math.hypot(*pose.velocity_m_s))
 
-    def _target(self, command: object) -> Velocity:
-        """Return a command limited to the quadrotor's limits."""
+    def target(self, command: object) -> Velocity:
+        """Return a command limited to the quadrotor's limits; None means a velocity of 0.
+
+        Raises:
+            ConfigurationError: It is not a `Velocity` of finite numbers.
+        """
         if command is None:
             return Velocity()
         if not isinstance(command, Velocity) or not all(

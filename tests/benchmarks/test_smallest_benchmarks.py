@@ -19,6 +19,7 @@ PARTS = {
     "cosim_peers",
     "footprint",
     "lifetimes",
+    "mujoco_fleet",
     "namespaces",
     "own_time",
     "pandas_peer",

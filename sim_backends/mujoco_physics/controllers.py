@@ -1,0 +1,159 @@
+"""The controllers on board: wheel speeds of a robot on wheels, attitude and thrust of a quadrotor.
+
+They run at `TICK_NS`, as on real robots; motors and attitude control run in MuJoCo at every step.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from sim_backends.mujoco_physics.chassis import Wheels
+from sim_backends.mujoco_physics.mjcf import quaternion
+from sim_backends.physics.body import Velocity
+from sim_backends.physics.differential_drive import DriveLimits, checked_twist
+from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits, VelocityController
+
+TICK_NS: Final = 10_000_000
+"""Period of the controllers: PX4's velocity controller runs at 100 Hz."""
+_UPRIGHT: Final = 0.1
+"""Below this cosine of its tilt, a quadrotor's thrust cannot hold its height, and is the minimum."""
+
+
+@dataclass(frozen=True)
+class Registers:
+    """Arrays of the simulation that controllers read and write, flat; memory views are faster than NumPy for items.
+
+    Attributes:
+        ctrl: Set-points of the motors.
+        qvel: Velocities of the joints; the first three of a free body are its velocity, metres per second.
+        xmat: Rotation matrices of the bodies, row by row: 9 numbers each.
+        mocap_quat: Target attitudes: 4 numbers each.
+        xfrc_applied: Forces and torques on the bodies: 6 numbers each.
+    """
+
+    ctrl: "memoryview[float]"
+    qvel: "memoryview[float]"
+    xmat: "memoryview[float]"
+    mocap_quat: "memoryview[float]"
+    xfrc_applied: "memoryview[float]"
+
+
+class Controller(Protocol):
+    """A controller on board."""
+
+    def command(self, command: object) -> None:
+        """Follow a new command from the next tick on.
+
+        Raises:
+            ConfigurationError: The command does not suit the robot.
+        """
+        ...
+
+    def tick(self, registers: Registers, elapsed_s: float) -> bool:
+        """Set the motors; return False if nothing changes before the next command.
+
+        Args:
+            registers: The simulation.
+            elapsed_s: Time since the last tick.
+        """
+        ...
+
+
+class WheelController:
+    """Changes forward speed and yaw rate within their limits, like ROS's `diff_drive_controller`.
+
+    Args:
+        limits: Its limits.
+        wheels: Its wheels.
+        motors: Indices of the motors, first the left ones.
+    """
+
+    def __init__(self, limits: DriveLimits, wheels: Wheels, motors: range) -> None:
+        self._limits = limits
+        self._wheels = wheels
+        self._motors = motors
+        self._target = 0.0, 0.0
+        self._now = 0.0, 0.0
+
+    def command(self, command: object) -> None:
+        """Implement `Controller.command`."""
+        twist, limits = checked_twist(command), self._limits
+        self._target = _clamp(twist.forward_m_s, limits.speed_m_s), _clamp(twist.turn_rad_s, limits.turn_rad_s)
+
+    def tick(self, registers: Registers, elapsed_s: float) -> bool:
+        """Implement `Controller.tick`."""
+        if self._now == self._target:
+            return False
+        limits, wheels = self._limits, self._wheels
+        speed_m_s = _approached(self._now[0], self._target[0], limits.acceleration_m_s2 * elapsed_s)
+        turn_rad_s = _approached(self._now[1], self._target[1], limits.turn_acceleration_rad_s2 * elapsed_s)
+        self._now = speed_m_s, turn_rad_s
+        half_m_s = turn_rad_s * wheels.turning_track_m / 2
+        count = len(self._motors) // 2
+        for index, motor in enumerate(self._motors):
+            registers.ctrl[motor] = (speed_m_s + (-half_m_s if index < count else half_m_s)) / wheels.radius_m
+        return True
+
+
+class FlightController:
+    """Controls the velocity of a quadrotor, by the law of the built-in physics.
+
+    Args:
+        limits: Its limits.
+        body: Index of its body, of its target attitude, of its velocity, and of its thrust.
+        mocap: Index of its target attitude.
+        dof: Index of its velocity.
+        motor: Index of its thrust.
+    """
+
+    def __init__(self, limits: QuadrotorLimits, body: int, mocap: int, dof: int, motor: int) -> None:
+        self._limits = limits
+        self._law = VelocityController(limits)
+        self._quadrotor = Quadrotor(limits, (0.0, 0.0, 0.0))
+        self._indices = body, mocap, dof, motor
+        self._target = Velocity()
+        self._held_rad: float | None = None
+        self._max_lean_rad = limits.tilt_rate_rad_s * limits.lag_s
+        self._max_turn_rad = limits.yaw_rate_rad_s * limits.lag_s
+
+    def command(self, command: object) -> None:
+        """Implement `Controller.command`."""
+        self._target = self._quadrotor.target(command)
+        self._held_rad = self._target.yaw_rad
+
+    def tick(self, registers: Registers, elapsed_s: float) -> bool:  # noqa: ARG002 (see Controller)
+        """Implement `Controller.tick`."""
+        limits, (body, mocap, dof, motor) = self._limits, self._indices
+        x_e, _, z_e, x_n, _, z_n, _, _, z_u = registers.xmat[9 * body : 9 * body + 9]
+        v_e, v_n, v_u = registers.qvel[dof : dof + 3]
+        f_e, f_n, f_u = self._law.thrust_m_s2((v_e, v_n, v_u), self._target)
+        yaw_rad = math.atan2(x_n, x_e)
+        if self._held_rad is None:
+            self._held_rad = yaw_rad
+        cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+        forward, left = f_e * cos + f_n * sin, f_n * cos - f_e * sin
+        pitch_rad = math.atan2(z_e * cos + z_n * sin, z_u)
+        roll_rad = math.asin(_clamp(z_e * sin - z_n * cos, 1.0))
+        targets, first = registers.mocap_quat, 4 * mocap
+        targets[first], targets[first + 1], targets[first + 2], targets[first + 3] = quaternion(
+            yaw_rad + _clamp(math.remainder(self._held_rad - yaw_rad, math.tau), self._max_turn_rad),
+            pitch_rad + _clamp(math.atan2(forward, f_u) - pitch_rad, self._max_lean_rad),
+            roll_rad + _clamp(-math.atan2(left, math.hypot(forward, f_u)) - roll_rad, self._max_lean_rad),
+        )
+        registers.ctrl[motor] = f_u / z_u * limits.mass_kg if z_u > _UPRIGHT else limits.thrust_n[0]
+        drag_n_s_m = limits.drag_n_s_m + limits.drag_n_s2_m2 * math.hypot(v_e, v_n, v_u)
+        forces, first = registers.xfrc_applied, 6 * body
+        forces[first], forces[first + 1], forces[first + 2] = (
+            -drag_n_s_m * v_e,
+            -drag_n_s_m * v_n,
+            -drag_n_s_m * v_u,
+        )
+        return True
+
+
+def _clamp(value: float, limit: float) -> float:
+    return max(-limit, min(value, limit))
+
+
+def _approached(now: float, target: float, limit: float) -> float:
+    return target if abs(target - now) <= limit else now + math.copysign(limit, target - now)

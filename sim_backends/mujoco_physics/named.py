@@ -1,0 +1,27 @@
+"""The physics federate `mujoco`, found by its entry point; MuJoCo is imported when it is used."""
+
+import sys
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.federates.answering import FederateService
+from sim_backends.federates.frames import PHYSICS
+from sim_backends.federates.named import PythonFederate
+
+
+def load() -> FederateService:
+    """Import MuJoCo, and return the federate.
+
+    Raises:
+        ConfigurationError: MuJoCo is not installed, or cannot be loaded.
+    """
+    try:
+        from sim_backends.mujoco_physics.physics import SERVICE  # noqa: PLC0415 (it is not always installed)
+    except ImportError as error:
+        raise ConfigurationError(
+            f"the physics mujoco needs the Python package mujoco: {error}",
+            remedy=f"{sys.executable} -m pip install 'fieldkit[mujoco]'",
+        ) from error
+    return SERVICE
+
+
+MUJOCO = PythonFederate(PHYSICS, load)

@@ -1,0 +1,283 @@
+"""The physics federate in MuJoCo: the one module that imports it."""
+
+import copy
+import json
+import math
+import re
+from collections.abc import Iterator, KeysView, Mapping, Sequence
+from typing import Any, Final
+
+import mujoco
+from typing_extensions import override
+
+from fieldkit.core.errors import ConfigurationError, did_you_mean
+from sim_backends.federates.answering import FederateService
+from sim_backends.federates.handshake import AgentStart, Hello
+from sim_backends.federates.protocols import FederateError, seconds_text
+from sim_backends.mujoco_physics.chassis import Chassis, chassis
+from sim_backends.mujoco_physics.controllers import (
+    TICK_NS,
+    Controller,
+    FlightController,
+    Registers,
+    WheelController,
+)
+from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, Model, model_xml, quaternion
+from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
+from sim_backends.physics.ground import Ground
+from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import BODIES, quadrotor
+from sim_backends.world.motion import State
+from sim_backends.world.world import World
+
+_LONGEST_STEP_NS: Final = 1_000_000
+"""Longest step of MuJoCo: with longer ones, tires that slide sideways hop."""
+
+
+class SensedStates(Mapping[str, State]):
+    """The states of all agents at a step, each created on request.
+
+    Args:
+        rows: Number of each agent.
+        numbers: The numbers of all sensors.
+    """
+
+    def __init__(self, rows: Mapping[str, int], numbers: Sequence[float]) -> None:
+        self._rows = rows
+        self._numbers = numbers
+        self._cache: dict[str, State] = {}
+
+    def __getitem__(self, name: str) -> State:
+        state = self._cache.get(name)
+        if state is None:
+            begin = self._rows[name] * SENSED_NUMBERS
+            e, n, u, v_e, v_n, v_u, x_e, x_n, _ = self._numbers[begin : begin + SENSED_NUMBERS]
+            state = self._cache[name] = State((e, n, u), (v_e, v_n, v_u), math.atan2(x_n, x_e))
+        return state
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SensedStates":
+        return self  # it is immutable
+
+    @override
+    def keys(self) -> KeysView[str]:
+        return self._rows.keys()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+
+class MujocoPhysics:
+    """Moves the agents of a run in MuJoCo.
+
+    Its time is a number of steps. A command applies at the first step that is not before it. The result does not
+    depend on how the time is divided into calls.
+
+    Args:
+        hello: The run: agents, step, and configuration with `world` and `robots`, both optional.
+
+    Attributes:
+        step_ns: Time step; MuJoCo divides it if it is longer than 1 ms.
+        limits_m_s2: Infinity for each agent, because a contact may change a velocity within a step.
+        model: The model, for example for MuJoCo's viewer.
+        data: Its present state.
+
+    Raises:
+        ConfigurationError: The step is not positive, or a robot's body is invalid.
+    """
+
+    def __init__(self, hello: Hello) -> None:
+        if hello.step_ns <= 0:
+            raise ConfigurationError(
+                f"a step of {hello.step_ns} ns is not positive", remedy="use for example 1000000"
+            )
+        self.step_ns = hello.step_ns
+        self.limits_m_s2: Mapping[str, float] = {agent.name: math.inf for agent in hello.agents}
+        self._rows = {agent.name: row for row, agent in enumerate(hello.agents)}
+        self._substeps = -(-hello.step_ns // _LONGEST_STEP_NS)
+        self._tick_steps = max(round(TICK_NS / hello.step_ns), 1)
+        configuration = json.loads(hello.configuration)
+        world = World.model_validate(configuration["world"]) if "world" in configuration else None
+        bodies = configuration.get("robots", {})
+        limits = [_limits(agent, bodies.get(agent.name, {}).get("body")) for agent in hello.agents]
+        robots = [_model(agent, limit, world) for agent, limit in zip(hello.agents, limits, strict=True)]
+        text = model_xml(robots, world, hello.step_ns / self._substeps / 1e9)
+        self.model = mujoco.MjModel.from_xml_string(text)
+        self._controllers = [
+            self._controller(row, robot, limit) for row, (robot, limit) in enumerate(zip(robots, limits, strict=True))
+        ]
+        self._active = set(range(len(robots)))
+        self._due: set[int] = set()
+        self._ticked_steps = [-self._tick_steps] * len(robots)
+        self._use(mujoco.MjData(self.model))
+        mujoco.mj_step1(self.model, self.data)
+        self._pending: dict[str, Any] = {}
+        self._commands_step = 0
+        self._last_to_ns = 0
+        self._step = 0
+        self._states = SensedStates(self._rows, self._sensors.tolist())
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        """Implement `PhysicsFederate.advance`.
+
+        Raises:
+            ConfigurationError: A command is for an unknown agent, or for another kind of robot.
+            FederateError: The simulation has become unstable.
+        """
+        if commands:
+            self._pending |= commands
+            self._commands_step = -(-self._last_to_ns // self.step_ns)
+        self._last_to_ns = to_ns
+        step = to_ns // self.step_ns
+        if self._pending and self._commands_step <= step:
+            self._advance_steps(self._commands_step)
+            self._apply_commands()
+        if step != self._step:
+            self._advance_steps(step)
+        return self._states
+
+    def run_controllers(self) -> None:
+        """Let the controllers that are due at the present step set their motors."""
+        step = self._step
+        rows = self._due if step % self._tick_steps else self._active
+        if not rows:
+            return
+        self._due = set()
+        for row in tuple(rows):
+            elapsed = min(step - self._ticked_steps[row], self._tick_steps)
+            self._ticked_steps[row] = step
+            if not self._controllers[row].tick(self._registers, elapsed * self.step_ns / 1e9):
+                self._active.discard(row)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "MujocoPhysics":
+        other = object.__new__(type(self))
+        memo[id(self)] = other
+        own = {name: value for name, value in vars(self).items() if name not in _OF_MUJOCO}
+        vars(other).update(copy.deepcopy(own, memo), model=self.model)
+        data = mujoco.MjData(self.model)
+        mujoco.mj_copyData(data, self.model, self.data)
+        other._use(data)
+        return other
+
+    def _use(self, data: Any) -> None:  # noqa: ANN401 (of MuJoCo)
+        """Use a state of the simulation; views of its arrays are made once, because reading an attribute is slow."""
+        self.data = data
+        self._sensors = memoryview(data.sensordata)
+        arrays = data.ctrl, data.qvel, data.xmat, data.mocap_quat, data.xfrc_applied
+        views: list[Any] = [memoryview(array.reshape(-1)) for array in arrays]
+        self._registers = Registers(*views)
+
+    def _controller(self, row: int, robot: Model, limits: DriveLimits | QuadrotorLimits) -> Controller:
+        model = self.model
+        if isinstance(limits, DriveLimits):
+            assert isinstance(robot.body, Chassis)
+            first = model.actuator(f"a{row}l0").id
+            count = 2 * len(robot.body.wheels.axles_m)
+            return WheelController(limits, robot.body.wheels, range(first, first + count))
+        body, target = model.body(f"a{row}"), model.body(f"a{row}t")
+        velocity = int(model.jnt_dofadr[body.jntadr[0]])
+        return FlightController(limits, body.id, int(target.mocapid[0]), velocity, model.actuator(f"a{row}").id)
+
+    def _apply_commands(self) -> None:
+        commands, self._pending = self._pending, {}
+        for name, command in commands.items():
+            if name not in self._rows:
+                remedy = did_you_mean(name, self._rows, f"agents: {', '.join(self._rows)}")
+                raise ConfigurationError(f"a command is for {name}, which is not an agent", remedy=remedy)
+            row = self._rows[name]
+            self._controllers[row].command(command)
+            self._active.add(row)
+            self._due.add(row)
+
+    def _advance_steps(self, step: int) -> None:
+        """Advance to a step; controllers tick at multiples of their period, and when they get a command."""
+        if self._step >= step:
+            return
+        while self._step < step:
+            self.run_controllers()
+            until = step
+            if self._active:
+                until = min(step, (self._step // self._tick_steps + 1) * self._tick_steps)
+            self._integrate((until - self._step) * self._substeps)
+            self._step = until
+        numbers = self._sensors.tolist()
+        if _WARNINGS or not math.isfinite(sum(numbers)):
+            self._raise_unstable(numbers)
+        self._states = SensedStates(self._rows, numbers)
+
+    def _integrate(self, count: int) -> None:
+        """Take steps of MuJoCo, from derived quantities of the state to those of the new state."""
+        model, data = self.model, self.data
+        mujoco.mj_step2(model, data)
+        if count > 1:
+            mujoco.mj_step(model, data, nstep=count - 1)
+        mujoco.mj_step1(model, data)
+
+    def _raise_unstable(self, numbers: Sequence[float]) -> None:
+        """Raise the error that names time and agent."""
+        text = _WARNINGS[0] if _WARNINGS else "a state is not finite"
+        _WARNINGS.clear()
+        name = next(
+            (
+                name
+                for name, row in self._rows.items()
+                if not math.isfinite(sum(numbers[SENSED_NUMBERS * row :][:SENSED_NUMBERS]))
+            ),
+            "",
+        )
+        if joint := re.search(r"DOF (\d+)", text):
+            root = self.model.body_rootid[self.model.dof_bodyid[int(joint.group(1))]]
+            name = next(name for name, row in self._rows.items() if self.model.body(f"a{row}").id == root)
+        raise FederateError(
+            f"mujoco became unstable until {seconds_text(self._step * self.step_ns)}, first at {name or 'no agent'}: "
+            f"{' '.join(text.split())}",
+            remedy="start robots apart from each other and from obstacles, or use a shorter step",
+        )
+
+
+_OF_MUJOCO: Final = {"model", "data", "_sensors", "_registers"}
+
+
+def _limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | QuadrotorLimits:
+    """Return the limits of an agent: those of the configuration, or else those of its profile.
+
+    Raises:
+        ConfigurationError: The configuration has other limits than its kind of robot.
+    """
+    if body is not None:
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in body.items()
+        }
+        try:
+            return QuadrotorLimits(**values) if agent.flies else DriveLimits(**values)
+        except TypeError as error:
+            raise ConfigurationError(
+                f"the body of {agent.name} is invalid: {error}", remedy="use the configuration of a scenario"
+            ) from error
+    if agent.flies:
+        return quadrotor(agent.profile)
+    known = BODIES.get(agent.profile)
+    return known if isinstance(known, DriveLimits) else TURTLEBOT3_BURGER
+
+
+def _model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: World | None) -> Model:
+    """Return an agent at its start, a robot on wheels upright on the ground below it."""
+    e, n, u = agent.start.position_m
+    place_m, heading_rad = (e, n, u - agent.antenna_m), agent.start.heading_rad or 0.0
+    if isinstance(limits, QuadrotorLimits):
+        return Model(place_m, quaternion(heading_rad), agent.antenna_m, 0.0, limits)
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    east, north = Ground(world, math.inf).surface(e, n).grade
+    forward, left = east * cos + north * sin, north * cos - east * sin
+    roll_rad = math.asin(left / math.hypot(1.0, forward, left))
+    upright = quaternion(heading_rad, -math.atan(forward), roll_rad)
+    return Model(place_m, upright, agent.antenna_m, limits.friction, chassis(agent.profile, limits))
+
+
+_WARNINGS: Final[list[str]] = []
+"""Warnings of MuJoCo, which it would otherwise write to `MUJOCO_LOG.TXT` in the current folder."""
+mujoco.set_mju_user_warning(_WARNINGS.append)
+
+SERVICE: Final = FederateService(MujocoPhysics, name="mujoco", software=f"MuJoCo {mujoco.__version__}")

@@ -1,0 +1,188 @@
+"""Motion in MuJoCo against closed forms: falling, driving, turning, braking, slopes, walls, flying, rest."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pytest
+
+from sim_backends.federates.frames import PHYSICS
+from sim_backends.federates.handshake import AgentStart, Hello
+from sim_backends.mujoco_physics.chassis import HUSKY
+from sim_backends.mujoco_physics.physics import MujocoPhysics
+from sim_backends.physics.body import GRAVITY_M_S2, Twist, Velocity
+from sim_backends.physics.differential_drive import HUSKY_A200
+from sim_backends.physics.quadrotor import IRIS
+from sim_backends.world.motion import State
+
+WALL: Mapping[str, object] = {
+    "name": "wall",
+    "kind": "wall",
+    "from_m": [3, -4],
+    "to_m": [3, 4],
+    "height": "2m",
+    "thickness": "0.2m",
+    "material": "brick",
+}
+FACE_M = 2.9
+
+
+def ramp(degrees: float, length_m: float, centre_m: float = 0.0) -> dict[str, object]:
+    """A ramp that rises eastwards."""
+    rise_m = length_m * math.tan(math.radians(degrees))
+    return {"name": "ramp", "kind": "ramp", "centre_m": [centre_m, 0], "size_m": [length_m, 20, rise_m]}
+
+
+def physics(
+    *agents: AgentStart, obstacles: Sequence[Mapping[str, object]] = (), bodies: Mapping[str, Any] | None = None
+) -> MujocoPhysics:
+    """A simulation with steps of 1 ms."""
+    world = {
+        "name": "test",
+        "summary": "",
+        "area_m": [100, 100],
+        "obstacles": [dict(obstacle) for obstacle in obstacles],
+    }
+    robots = {name: {"body": body} for name, body in (bodies or {}).items()}
+    return MujocoPhysics(
+        Hello(PHYSICS, agents, configuration=json.dumps({"world": world, "robots": robots}).encode())
+    )
+
+
+def husky(name: str = "husky", east_m: float = 0.0, north_m: float = 0.0, up_m: float = 0.0) -> AgentStart:
+    return AgentStart(name, "husky", State((east_m, north_m, up_m + 0.39), heading_rad=0.0), False, 0.39)
+
+
+def burger(name: str = "burger", east_m: float = 0.0, north_m: float = 3.0, up_m: float = 0.0) -> AgentStart:
+    start = State((east_m, north_m, up_m + 0.192), heading_rad=0.0)
+    return AgentStart(name, "turtlebot3_burger", start, False, 0.192)
+
+
+def iris(name: str = "iris", east_m: float = 0.0, up_m: float = 5.0) -> AgentStart:
+    return AgentStart(name, "iris", State((east_m, -3.0, up_m), heading_rad=0.0), True)
+
+
+def after(
+    simulation: MujocoPhysics, seconds: float, commands: Mapping[str, Any] | None = None
+) -> Mapping[str, State]:
+    return simulation.advance(round(seconds * 1e9), commands or {})
+
+
+def test_a_robot_above_the_ground_falls_freely() -> None:
+    simulation = physics(husky(up_m=5.0))
+    for steps in (1, 100, 900):
+        state = simulation.advance(steps * 1_000_000, {})["husky"]
+        # The sum of n steps of the semi-implicit Euler method; g t^2 / 2 is its limit.
+        fallen_m = GRAVITY_M_S2 * 1e-6 * steps * (steps + 1) / 2
+        assert state.position_m == pytest.approx((0.0, 0.0, 5.39 - fallen_m), abs=1e-9)
+        assert state.velocity_m_s[2] == pytest.approx(-GRAVITY_M_S2 * steps / 1000)
+
+
+def test_robots_drive_straight_at_the_commanded_speed() -> None:
+    simulation = physics(husky(), burger())
+    after(simulation, 0, {"husky": Twist(1.0), "burger": Twist(0.2)})
+    before = after(simulation, 1)
+    later = after(simulation, 4)
+    for name, speed_m_s, slip in (("husky", 1.0, 0.001), ("burger", 0.2, 0.004)):
+        driven_m = later[name].position_m[0] - before[name].position_m[0]
+        assert driven_m == pytest.approx(3 * speed_m_s, rel=slip)
+        assert later[name].position_m[1] == pytest.approx(before[name].position_m[1], abs=1e-6)
+
+
+def test_turning_rates_follow_from_friction() -> None:
+    """A skid-steered robot turns where the moments of friction vanish; one with two wheels rolls."""
+    simulation = physics(husky(), burger())
+    after(simulation, 0, {"husky": Twist(0.0, 1.0), "burger": Twist(0.0, 1.0)})
+    before = after(simulation, 1.5)
+    later = after(simulation, 2.5)
+    base_m, track_m = HUSKY.wheels.axles_m[0], HUSKY.wheels.track_m / 2
+    expected = {"husky": 1.875 * track_m**2 / (base_m**2 + track_m**2), "burger": 1.0}
+    for name, rate_rad_s in expected.items():
+        turned_rad = (later[name].heading_rad or 0.0) - (before[name].heading_rad or 0.0)
+        assert turned_rad == pytest.approx(rate_rad_s, rel=0.005)
+        assert later[name].position_m == pytest.approx(before[name].position_m, abs=2e-3)
+
+
+def test_the_speed_changes_at_the_limit_of_the_drive_or_of_friction() -> None:
+    slippery = vars(HUSKY_A200) | {"friction": 0.1}
+    simulation = physics(husky(), husky("slippery", north_m=4.0), bodies={"slippery": slippery})
+    after(simulation, 0, dict.fromkeys(("husky", "slippery"), Twist(1.0)))
+    first, second = after(simulation, 0.15), after(simulation, 0.25)
+    expected_m_s2 = {"husky": HUSKY_A200.acceleration_m_s2, "slippery": 0.1 * GRAVITY_M_S2}
+    for name, limit_m_s2 in expected_m_s2.items():
+        gained_m_s = second[name].velocity_m_s[0] - first[name].velocity_m_s[0]
+        assert gained_m_s / 0.1 == pytest.approx(limit_m_s2, rel=0.05)
+
+
+def test_friction_holds_a_robot_on_a_slope_up_to_its_coefficient() -> None:
+    grade, height_m = math.tan(math.radians(20)), 10 * math.tan(math.radians(20))
+    slippery = vars(HUSKY_A200) | {"friction": 0.2}
+    agents = husky(up_m=height_m), husky("slippery", north_m=5.0, up_m=height_m)
+    simulation = physics(*agents, obstacles=(ramp(20, 20),), bodies={"slippery": slippery})
+    first, second = after(simulation, 1), after(simulation, 2)
+    assert math.dist(first["husky"].position_m, second["husky"].position_m) < 1e-4
+    normal_m_s2 = GRAVITY_M_S2 / math.hypot(1, grade)
+    slid_m_s = math.dist(first["slippery"].velocity_m_s, second["slippery"].velocity_m_s)
+    assert slid_m_s == pytest.approx((grade - 0.2) * normal_m_s2, rel=0.02)
+
+
+def test_robots_stop_at_a_wall_and_do_not_pass_it() -> None:
+    simulation = physics(husky(), burger(east_m=2.5), iris(up_m=1.0), obstacles=(WALL,))
+    commands = {"husky": Twist(1.0), "burger": Twist(0.2), "iris": Velocity((3.0, 0.0, 0.0))}
+    after(simulation, 0, commands)
+    reach_m = {"husky": 0.9874 / 2, "burger": 0.07 - 0.032, "iris": 0.384 * math.cos(IRIS.tilt_rad)}
+    for tenth in range(1, 50):
+        states = after(simulation, tenth / 10)
+        for name, length_m in reach_m.items():
+            assert states[name].position_m[0] < FACE_M - length_m + 0.05
+    for name in ("husky", "burger"):
+        assert states[name].position_m[0] == pytest.approx(FACE_M - reach_m[name], abs=0.01)
+        assert math.hypot(*states[name].velocity_m_s) < 0.01
+
+
+def test_a_robot_climbs_a_ramp_to_raised_ground_but_not_its_side() -> None:
+    raised: dict[str, object] = {
+        "name": "raised",
+        "kind": "raised",
+        "centre_m": [7, 0],
+        "size_m": [4, 20, 4 * math.tan(0.15)],
+    }
+    obstacles = (ramp(math.degrees(0.15), 4, 3.0), raised)
+    simulation = physics(husky(), burger("blocked", east_m=10.0), obstacles=obstacles)
+    after(simulation, 0, {"husky": Twist(1.0), "blocked": Twist(-0.2)})
+    states = after(simulation, 7.5)
+    east_m, north_m, up_m = states["husky"].position_m
+    assert east_m == pytest.approx(7.3, abs=0.1)
+    assert (north_m, up_m) == pytest.approx((0.0, 4 * math.tan(0.15) + 0.39), abs=0.01)
+    assert 9.1 <= states["blocked"].position_m[0] < 9.15
+    assert states["blocked"].position_m[2] == pytest.approx(0.192, abs=0.01)
+
+
+def test_a_quadrotor_reaches_the_commanded_velocity_and_holds_its_height() -> None:
+    simulation = physics(iris())
+    after(simulation, 0, {"iris": Velocity((3.0, 1.0, 0.0), 1.0)})
+    lowest_m = min(after(simulation, tenth / 10)["iris"].position_m[2] for tenth in range(60))
+    state = after(simulation, 6)["iris"]
+    assert state.velocity_m_s == pytest.approx((3.0, 1.0, 0.0), abs=0.01)
+    assert state.heading_rad == pytest.approx(1.0, abs=1e-3)
+    assert lowest_m == pytest.approx(5.0, abs=0.1)
+    after(simulation, 6, {"iris": Velocity((0.0, 0.0, -9.0))})
+    assert after(simulation, 8)["iris"].velocity_m_s[2] == pytest.approx(-1.5, abs=0.01)
+
+
+def test_a_quadrotor_turns_on_the_ground_and_takes_off() -> None:
+    simulation = physics(iris(up_m=0.0))
+    after(simulation, 0, {"iris": Velocity(yaw_rad=3.0)})
+    assert after(simulation, 3)["iris"].position_m[2] == pytest.approx(0.0, abs=1e-3)
+    after(simulation, 3, {"iris": Velocity((0.0, 0.0, 1.0))})
+    assert after(simulation, 5)["iris"].position_m[2] == pytest.approx(1.75, abs=0.05)
+
+
+def test_robots_at_rest_do_not_drift() -> None:
+    simulation = physics(husky(), burger(), iris())
+    settled = after(simulation, 1)
+    states = after(simulation, 6)
+    for name, state in states.items():
+        assert math.dist(state.position_m, settled[name].position_m) < 1e-6
+        assert math.hypot(*state.velocity_m_s) < 1e-6
