@@ -5,9 +5,13 @@
 
 #include "simulator.h"
 
-#include "ns3/mobility-module.h"
-#include "ns3/network-module.h"
-#include "ns3/wifi-module.h"
+#include "ns3/mobility-model.h"
+#include "ns3/propagation-delay-model.h"
+#include "ns3/tag.h"
+#include "ns3/wifi-mac-queue.h"
+#include "ns3/wifi-mac.h"
+#include "ns3/wifi-net-device.h"
+#include "ns3/wifi-phy.h"
 
 #include <functional>
 #include <unordered_map>
@@ -106,26 +110,21 @@ class FrameTracker
                     "Enqueue", OnMpdu([this, station](Ptr<const WifiMpdu> mpdu) { Enqueued(station, mpdu); }));
             }
         }
-        mac->TraceConnectWithoutContext("AckedMpdu", OnMpdu([this](Ptr<const WifiMpdu> mpdu) {
-                                            FrameTag tag;
-                                            if (mpdu->GetPacket()->PeekPacketTag(tag))
-                                            {
-                                                m_frames.erase(tag.number);
-                                            }
-                                        }));
+        mac->TraceConnectWithoutContext("AckedMpdu",
+                                        OnMpdu([this](Ptr<const WifiMpdu> mpdu) { Acknowledged(mpdu->GetPacket()); }));
         mac->TraceConnectWithoutContext(
             "DroppedMpdu", Callback<void, WifiMacDropReason, Ptr<const WifiMpdu>>(
                                [this](WifiMacDropReason reason, Ptr<const WifiMpdu> mpdu) { Dropped(reason, mpdu); }));
         mac->TraceConnectWithoutContext("MacTxDrop", Callback<void, Ptr<const Packet>>([this](Ptr<const Packet> packet) {
                                             Lost(packet, "not associated");
                                         }));
-        auto phy = device->GetPhy();
-        phy->TraceConnectWithoutContext(
+        device->GetPhy()->TraceConnectWithoutContext(
             "PhyTxBegin", Callback<void, Ptr<const Packet>, double>(
                               [this, station](Ptr<const Packet> packet, double) { Transmitted(station, packet); }));
-        phy->TraceConnectWithoutContext(
-            "PhyRxEnd", Callback<void, Ptr<const Packet>>(
-                            [this, station](Ptr<const Packet> packet) { Received(station, packet); }));
+        // It is passed to the host in the order of sequence numbers, possibly after its acknowledgement.
+        mac->TraceConnectWithoutContext("MacRx", Callback<void, Ptr<const Packet>>([this, station](Ptr<const Packet> packet) {
+                                            Received(station, packet);
+                                        }));
     }
 
     // The parts of the delay of the frame that a station receives now.
@@ -155,6 +154,7 @@ class FrameTracker
         int64_t first_ns = -1; // start of its first attempt
         int64_t propagation_ns = 0;
         bool is_received = false;
+        bool is_acknowledged = false;
         DelayParts parts; // of the hops before; once it is received, of this hop too
     };
 
@@ -174,8 +174,9 @@ class FrameTracker
             {
                 return; // the queue has replaced the same frame
             }
-            if (previous != m_frames.end())
+            if (previous != m_frames.end()) // the access point forwards it
             {
+                Complete(previous->second);
                 frame.parts = previous->second.parts;
             }
             packet->RemovePacketTag(tag);
@@ -212,16 +213,42 @@ class FrameTracker
     {
         FrameTag tag;
         auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
-        if (found == m_frames.end() || found->second.to != station || found->second.is_received)
+        if (found == m_frames.end() || found->second.to != station)
         {
             return;
         }
-        HopFrame& frame = found->second;
-        frame.is_received = true;
-        frame.parts.queueing_ns += frame.first_ns - frame.enqueued_ns;
-        frame.parts.propagation_ns += frame.propagation_ns;
-        frame.parts.transmission_ns += NowNs() - frame.first_ns - frame.propagation_ns;
-        m_last[station] = {NowNs(), frame.parts};
+        Complete(found->second);
+        m_last[station] = {NowNs(), found->second.parts};
+        if (found->second.is_acknowledged)
+        {
+            m_frames.erase(found);
+        }
+    }
+
+    // Add the parts of a hop that ends now.
+    static void Complete(HopFrame& frame)
+    {
+        if (!frame.is_received)
+        {
+            frame.is_received = true;
+            frame.parts.queueing_ns += frame.first_ns - frame.enqueued_ns;
+            frame.parts.propagation_ns += frame.propagation_ns;
+            frame.parts.transmission_ns += NowNs() - frame.first_ns - frame.propagation_ns;
+        }
+    }
+
+    void Acknowledged(Ptr<const Packet> packet)
+    {
+        FrameTag tag;
+        auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
+        if (found != m_frames.end() && found->second.is_received)
+        {
+            m_frames.erase(found);
+        }
+        else if (found != m_frames.end())
+        {
+            found->second.is_acknowledged = true;
+        }
     }
 
     void Dropped(WifiMacDropReason reason, Ptr<const WifiMpdu> mpdu)

@@ -6,6 +6,8 @@
 
 #include "transports.h"
 
+#include "ns3/rng-seed-manager.h"
+
 #include <fstream>
 #include <iostream>
 #include <unistd.h>

@@ -5,7 +5,10 @@
 
 #include "wire.h"
 
-#include "ns3/core-module.h"
+#include "ns3/map-scheduler.h"
+#include "ns3/nstime.h"
+#include "ns3/object-factory.h"
+#include "ns3/simulator.h"
 
 #include <chrono>
 

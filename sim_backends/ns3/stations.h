@@ -6,9 +6,23 @@
 #include "channel.h"
 #include "frames.h"
 
-#include "ns3/internet-module.h"
-#include "ns3/propagation-module.h"
-#include "ns3/traffic-control-module.h"
+#include "ns3/arp-cache.h"
+#include "ns3/boolean.h"
+#include "ns3/config.h"
+#include "ns3/double.h"
+#include "ns3/internet-stack-helper.h"
+#include "ns3/ipv4-address-helper.h"
+#include "ns3/ipv4-interface.h"
+#include "ns3/ipv4-l3-protocol.h"
+#include "ns3/propagation-loss-model.h"
+#include "ns3/queue-size.h"
+#include "ns3/ssid.h"
+#include "ns3/string.h"
+#include "ns3/traffic-control-helper.h"
+#include "ns3/uinteger.h"
+#include "ns3/wifi-helper.h"
+#include "ns3/wifi-mac-helper.h"
+#include "ns3/yans-wifi-helper.h"
 
 namespace fieldkit
 {
@@ -123,7 +137,24 @@ ModeName(const std::string& mode, bool is_high_band)
     return mode[0] == 'n' ? "HtMcs" + number : (is_high_band ? "OfdmRate" : "ErpOfdmRate") + number + "Mbps";
 }
 
-// Give the stations Wi-Fi, IP addresses and positions.
+// Let a station know the addresses of all others, as in fieldkit's network, which has no ARP.
+inline void
+FillArpCache(const Station& station, const std::vector<Station>& stations)
+{
+    auto ipv4 = station.node->GetObject<Ipv4L3Protocol>();
+    auto cache = ipv4->GetInterface(ipv4->GetInterfaceForDevice(station.device))->GetArpCache();
+    for (const Station& other : stations)
+    {
+        if (&other != &station && cache->Lookup(other.address) == nullptr)
+        {
+            auto entry = cache->Add(other.address);
+            entry->SetMacAddress(other.device->GetAddress());
+            entry->MarkPermanent();
+        }
+    }
+}
+
+// Give the stations Wi-Fi, IP addresses and positions; callbacks of ns-3 keep references to `stations`.
 inline void
 Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel, FrameTracker& tracker)
 {
@@ -196,7 +227,6 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
         tracker.Add(station.device, station.mobility);
         g_heartbeat.Check(NowNs());
     }
-    // All stations know each other's addresses, as in fieldkit's network.
     for (Station& station : stations)
     {
         auto ipv4 = station.node->GetObject<Ipv4L3Protocol>();
@@ -208,16 +238,10 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
                                                      ? "reassembly timed out"
                                                      : "no route");
                         }));
-        auto cache = ipv4->GetInterface(ipv4->GetInterfaceForDevice(station.device))->GetArpCache();
-        for (const Station& other : stations)
-        {
-            if (&other != &station)
-            {
-                auto entry = cache->Add(other.address);
-                entry->SetMacAddress(other.device->GetAddress());
-                entry->MarkPermanent();
-            }
-        }
+        FillArpCache(station, stations);
+        // A change of the link, for example an association, empties the cache.
+        station.device->AddLinkChangeCallback(
+            Callback<void>([&station, &stations] { FillArpCache(station, stations); }));
     }
 }
 

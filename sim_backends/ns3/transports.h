@@ -5,6 +5,11 @@
 
 #include "stations.h"
 
+#include "ns3/inet-socket-address.h"
+#include "ns3/socket.h"
+#include "ns3/tcp-socket-factory.h"
+#include "ns3/udp-socket-factory.h"
+
 #include <deque>
 #include <memory>
 
