@@ -108,6 +108,9 @@ class FrameTracker
             {
                 queue->TraceConnectWithoutContext(
                     "Enqueue", OnMpdu([this, station](Ptr<const WifiMpdu> mpdu) { Enqueued(station, mpdu); }));
+                queue->TraceConnectWithoutContext("DropBeforeEnqueue", OnMpdu([this](Ptr<const WifiMpdu> mpdu) {
+                                                      Lost(mpdu->GetPacket(), "queue full");
+                                                  }));
             }
         }
         mac->TraceConnectWithoutContext("AckedMpdu",
@@ -253,8 +256,12 @@ class FrameTracker
 
     void Dropped(WifiMacDropReason reason, Ptr<const WifiMpdu> mpdu)
     {
+        if (reason == WIFI_MAC_DROP_FAILED_ENQUEUE)
+        {
+            return Lost(mpdu->GetPacket(), "queue full");
+        }
         FrameTag tag;
-        if (reason != WIFI_MAC_DROP_FAILED_ENQUEUE && mpdu->GetPacket()->PeekPacketTag(tag))
+        if (mpdu->GetPacket()->PeekPacketTag(tag))
         {
             auto found = m_frames.find(tag.number);
             bool is_received = found != m_frames.end() && found->second.is_received;
@@ -264,15 +271,8 @@ class FrameTracker
                 return;
             }
         }
-        switch (reason)
-        {
-        case WIFI_MAC_DROP_FAILED_ENQUEUE:
-            return Lost(mpdu->GetPacket(), "queue full");
-        case WIFI_MAC_DROP_REACHED_RETRY_LIMIT:
-            return Lost(mpdu->GetPacket(), "retries exhausted");
-        default:
-            return Lost(mpdu->GetPacket(), "too old in the queue");
-        }
+        bool is_unanswered = reason == WIFI_MAC_DROP_REACHED_RETRY_LIMIT;
+        Lost(mpdu->GetPacket(), is_unanswered ? "retries exhausted" : "dropped by the MAC");
     }
 
     uint64_t m_count = 0;

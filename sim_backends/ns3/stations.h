@@ -19,6 +19,7 @@
 #include "ns3/ssid.h"
 #include "ns3/string.h"
 #include "ns3/traffic-control-helper.h"
+#include "ns3/traffic-control-layer.h"
 #include "ns3/uinteger.h"
 #include "ns3/wifi-helper.h"
 #include "ns3/wifi-mac-helper.h"
@@ -43,6 +44,12 @@ class AgentMobility : public MobilityModel
         m_velocity = velocity;
         m_sinceNs = since_ns;
         m_stepNs = step_ns;
+    }
+
+    // ns-3 3.48 requires it.
+    virtual Ptr<MobilityModel> Copy() const
+    {
+        return CreateObject<AgentMobility>(*this);
     }
 
     size_t station = 0;
@@ -238,6 +245,10 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
                                                      ? "reassembly timed out"
                                                      : "no route");
                         }));
+        // A full queue of the MAC stops the device.
+        station.node->GetObject<TrafficControlLayer>()->TraceConnectWithoutContext(
+            "TcDrop",
+            Callback<void, Ptr<const Packet>>([&tracker](Ptr<const Packet> packet) { tracker.Lost(packet, "queue full"); }));
         FillArpCache(station, stations);
         // A change of the link, for example an association, empties the cache.
         station.device->AddLinkChangeCallback(
