@@ -1,4 +1,4 @@
-// Frames on their way: what the delay of each consists of, and which of them are lost.
+// Frames in transit: the parts of their delays, and the frames that are lost.
 
 #ifndef FIELDKIT_FRAMES_H
 #define FIELDKIT_FRAMES_H

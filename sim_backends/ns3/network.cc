@@ -15,14 +15,14 @@
 namespace fieldkit
 {
 
-// Positions of messages over publish-subscribe without a middleware: the headers that RTPS adds to a sample.
+// Headers of RTPS in the datagram of a sample: of the message, its time stamp and its data.
 constexpr uint64_t kRtpsHeaderBytes = 20 + 12 + 24;
 
 constexpr uint32_t kDeterministic = 1;
 constexpr uint32_t kNextEvent = 4;
 constexpr uint32_t kExtrapolates = 8;
 
-// Stations without an access point need none of the time before 0; with one, they scan and associate.
+// Time before 0 in which stations scan, and associate with their access point.
 constexpr int64_t kAssociationNs = 1'000'000'000;
 
 class Network

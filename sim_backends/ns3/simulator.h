@@ -48,8 +48,7 @@ class Heartbeat
 
 inline Heartbeat g_heartbeat;
 
-// Time of ns-3 at time 0 of the co-simulation. Before it, stations associate with their access point; nothing can be sent
-// before ns-3 has run for the first time.
+// Time of ns-3 at time 0 of the co-simulation. It is above 0 because ns-3 sends nothing before it has run for the first time.
 inline int64_t g_start_ns = 1'000'000;
 
 inline int64_t
@@ -58,7 +57,7 @@ NowNs()
     return Simulator::Now().GetNanoSeconds() - g_start_ns;
 }
 
-// The scheduler of ns-3, which can be asked for the next event.
+// The scheduler of ns-3, with access to the next event.
 class PeekScheduler : public MapScheduler
 {
   public:

@@ -144,7 +144,7 @@ ModeName(const std::string& mode, bool is_high_band)
     return mode[0] == 'n' ? "HtMcs" + number : (is_high_band ? "OfdmRate" : "ErpOfdmRate") + number + "Mbps";
 }
 
-// Let a station know the addresses of all others, as in fieldkit's network, which has no ARP.
+// Add the addresses of all others to the ARP cache of a station, because fieldkit's network has no ARP.
 inline void
 FillArpCache(const Station& station, const std::vector<Station>& stations)
 {

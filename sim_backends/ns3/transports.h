@@ -28,7 +28,7 @@ struct CoordinatorPacket
     std::string protocol;
 };
 
-// What becomes of packets.
+// Called with the id of a packet that has arrived or is dropped.
 struct Fates
 {
     std::function<void(uint64_t)> arrive;

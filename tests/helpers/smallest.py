@@ -285,6 +285,7 @@ CASES: Final[Mapping[str, Smallest]] = {
     "cosim_discovery": Smallest("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
     "cosim_exchange": Smallest("", {"COUNTS": (3,), "ROUNDS": 1, "EXCHANGES": 5}),
     "cosim_speed": Smallest("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy"),
+    "cosim_speed_ns3": Smallest("--rounds 1 --seconds 0.1 --robots 2"),
     "cosim_vs_ns3": Smallest("", shrink=_one_link),
     "emane": Smallest("--rounds 1", {"ROBOTS": 2, "PINGS": 3}, shrink=_one_radio, emulated=True),
     "studies.field_shape": Smallest("--out FOLDER/lab --repeats 1", shrink=_one_trial, emulated=True),
