@@ -24,14 +24,15 @@ _SHOWN_LINES: Final = 15
 
 @dataclass(frozen=True)
 class CompiledProgram:
-    """A program in one C++ file.
+    """A program in one C++ file and its headers.
 
     Attributes:
         name: Its name in messages and file names.
-        source: The file.
+        source: The file. Headers that it includes are beside it, and end in `.h`.
         packages: Names of its libraries for pkg-config.
         install: Command that installs the compiler and the libraries.
         flags: Other options of the compiler.
+        libraries: Options that link the libraries; None for those of pkg-config.
         duration: Usual time of a compilation, for the message: `about 30 s`.
     """
 
@@ -40,6 +41,7 @@ class CompiledProgram:
     packages: Sequence[str]
     install: str
     flags: Sequence[str] = ("-O2", "-std=c++17")
+    libraries: Sequence[str] | None = None
     duration: str = "about 30 s"
 
     def path(self) -> Path:
@@ -50,7 +52,9 @@ class CompiledProgram:
         """
         compiler, libraries = self._environment()
         digest = hashlib.sha256(self.source.read_bytes())
-        digest.update("\0".join((*self.flags, compiler, *libraries)).encode())
+        for header in sorted(self.source.parent.glob("*.h")):
+            digest.update(header.read_bytes())
+        digest.update("\0".join((*self.flags, *(self.libraries or ()), compiler, *libraries)).encode())
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
         program = folder / f"{self.name}-{digest.hexdigest()[:16]}"
@@ -82,7 +86,10 @@ class CompiledProgram:
 
     def _compile(self, program: Path) -> None:
         sys.stderr.write(f"note: compiling {self.name}, once for these libraries: {self.duration}\n")
-        options = _output("pkg-config", "--cflags", "--libs", *self.packages).stdout.split() if self.packages else []
+        options = self.libraries
+        if options is None:
+            arguments = ("--cflags", "--libs", *self.packages)
+            options = _output("pkg-config", *arguments).stdout.split() if self.packages else []
         with tempfile.TemporaryDirectory(dir=program.parent, prefix=f".{self.name}-") as folder:
             result = Path(folder) / "program"
             words = ["g++", *self.flags, "-o", str(result), str(self.source), *options]

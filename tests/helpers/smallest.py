@@ -288,6 +288,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     "cosim_discovery": MinimalRun("", {"COUNT": 3, "SEEDS": (1,), "ROWS": ((0.0, None), (0.1, "g6"))}),
     "cosim_exchange": MinimalRun("", {"COUNTS": (3,), "ROUNDS": 1, "EXCHANGES": 5, "STEPS": 5, "PEER_ROUNDS": 1}),
     "cosim_speed": MinimalRun("--rounds 1 --seconds 0.2 --robots 2 --scenarios convoy --mujoco 3"),
+    "cosim_speed_ns3": MinimalRun("--rounds 1 --seconds 0.1 --robots 2"),
     "cosim_vs_ns3": MinimalRun("", shrink=_one_link),
     "emane": MinimalRun("--rounds 1", {"ROBOTS": 2, "PINGS": 3}, shrink=_one_radio, emulated=True),
     "studies.field_shape": MinimalRun("--out FOLDER/lab --repeats 1", shrink=_one_trial, emulated=True),

@@ -5,7 +5,7 @@ import shlex
 from functools import partial
 
 from fieldkit.cli.display import show_note
-from fieldkit.core.errors import FieldkitError
+from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.scenario.agent_setup import bodies
@@ -16,6 +16,7 @@ from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import CheckResult, run_checks
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import Hello
+from sim_backends.federates.named import named
 from sim_backends.federates.protocols import FederateError
 from sim_backends.federates.session import open_session
 from sim_backends.world.world import load_world
@@ -58,6 +59,8 @@ def _role(where: str, scenario: CosimScenario, requested: str | None, deadline_s
         FieldkitError: It accepts none.
     """
     roles = [role for role in (PHYSICS, NETWORK) if requested in {None, ROLES[role]}]
+    if requested is None:
+        roles = [role for role in roles if _has_role(where, role)] or roles
     for role in roles:
         try:
             session, _, _ = open_session(role, where, _hello(scenario, role), deadline_s)
@@ -68,6 +71,14 @@ def _role(where: str, scenario: CosimScenario, requested: str | None, deadline_s
         session.close()
         return role, session.name
     raise FieldkitError(f"{where} has no role")
+
+
+def _has_role(where: str, role: int) -> bool:
+    """Return True if a federate is known by a name, and has a role."""
+    try:
+        return named(where, role) is not None
+    except ConfigurationError:  # the other role, or its package cannot be loaded
+        return False
 
 
 def _show(result: CheckResult) -> None:

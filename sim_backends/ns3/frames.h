@@ -1,0 +1,288 @@
+// Frames in transit: the parts of their delays, and the frames that are lost.
+
+#ifndef FIELDKIT_FRAMES_H
+#define FIELDKIT_FRAMES_H
+
+#include "simulator.h"
+
+#include "ns3/mobility-model.h"
+#include "ns3/propagation-delay-model.h"
+#include "ns3/tag.h"
+#include "ns3/wifi-mac-queue.h"
+#include "ns3/wifi-mac.h"
+#include "ns3/wifi-net-device.h"
+#include "ns3/wifi-phy.h"
+
+#include <functional>
+#include <unordered_map>
+
+namespace fieldkit
+{
+
+// A number that a packet carries without using any bytes.
+class NumberTag : public Tag
+{
+  public:
+    uint32_t GetSerializedSize() const override
+    {
+        return sizeof number;
+    }
+
+    void Serialize(TagBuffer buffer) const override
+    {
+        buffer.WriteU64(number);
+    }
+
+    void Deserialize(TagBuffer buffer) override
+    {
+        number = buffer.ReadU64();
+    }
+
+    void Print(std::ostream& stream) const override
+    {
+        stream << number;
+    }
+
+    uint64_t number = 0;
+};
+
+// The id of a packet of the coordinator, on all its IP fragments.
+class IdTag : public NumberTag
+{
+  public:
+    static TypeId GetTypeId()
+    {
+        static TypeId type = TypeId("fieldkit::IdTag").SetParent<Tag>().AddConstructor<IdTag>();
+        return type;
+    }
+
+    TypeId GetInstanceTypeId() const override
+    {
+        return GetTypeId();
+    }
+};
+
+// The number of a frame on one hop.
+class FrameTag : public NumberTag
+{
+  public:
+    static TypeId GetTypeId()
+    {
+        static TypeId type = TypeId("fieldkit::FrameTag").SetParent<Tag>().AddConstructor<FrameTag>();
+        return type;
+    }
+
+    TypeId GetInstanceTypeId() const override
+    {
+        return GetTypeId();
+    }
+};
+
+// Parts of a delay; the processing in hosts is what remains of it.
+struct DelayParts
+{
+    int64_t queueing_ns = 0;
+    int64_t transmission_ns = 0;
+    int64_t propagation_ns = 0;
+};
+
+// Follows the frames of all stations by ns-3's traces.
+class FrameTracker
+{
+  public:
+    // Called with the id of a packet, one of whose frames is lost, and the reason.
+    std::function<void(uint64_t, const std::string&)> on_lost;
+
+    // Follow the frames of the next station; `mobility` has its position.
+    void Add(Ptr<WifiNetDevice> device, Ptr<MobilityModel> mobility)
+    {
+        size_t station = m_mobilities.size();
+        m_mobilities.push_back(mobility);
+        m_last.emplace_back();
+        m_stations[Mac48Address::ConvertFrom(device->GetAddress())] = station;
+        using OnMpdu = Callback<void, Ptr<const WifiMpdu>>;
+        auto mac = device->GetMac();
+        for (AcIndex access : {AC_BE, AC_BE_NQOS})
+        {
+            if (auto queue = mac->GetTxopQueue(access))
+            {
+                queue->TraceConnectWithoutContext(
+                    "Enqueue", OnMpdu([this, station](Ptr<const WifiMpdu> mpdu) { Enqueued(station, mpdu); }));
+                queue->TraceConnectWithoutContext("DropBeforeEnqueue", OnMpdu([this](Ptr<const WifiMpdu> mpdu) {
+                                                      Lost(mpdu->GetPacket(), "queue full");
+                                                  }));
+            }
+        }
+        mac->TraceConnectWithoutContext("AckedMpdu",
+                                        OnMpdu([this](Ptr<const WifiMpdu> mpdu) { Acknowledged(mpdu->GetPacket()); }));
+        mac->TraceConnectWithoutContext(
+            "DroppedMpdu", Callback<void, WifiMacDropReason, Ptr<const WifiMpdu>>(
+                               [this](WifiMacDropReason reason, Ptr<const WifiMpdu> mpdu) { Dropped(reason, mpdu); }));
+        mac->TraceConnectWithoutContext("MacTxDrop", Callback<void, Ptr<const Packet>>([this](Ptr<const Packet> packet) {
+                                            Lost(packet, "not associated");
+                                        }));
+        device->GetPhy()->TraceConnectWithoutContext(
+            "PhyTxBegin", Callback<void, Ptr<const Packet>, double>(
+                              [this, station](Ptr<const Packet> packet, double) { Transmitted(station, packet); }));
+        // It is passed to the host in the order of sequence numbers, possibly after its acknowledgement.
+        mac->TraceConnectWithoutContext("MacRx", Callback<void, Ptr<const Packet>>([this, station](Ptr<const Packet> packet) {
+                                            Received(station, packet);
+                                        }));
+    }
+
+    // The parts of the delay of the frame that a station receives now.
+    DelayParts PartsNow(size_t station) const
+    {
+        const auto& [at_ns, parts] = m_last[station];
+        return at_ns == NowNs() ? parts : DelayParts();
+    }
+
+    // Report the packet of a frame or IP packet as lost.
+    void Lost(Ptr<const Packet> packet, const std::string& reason)
+    {
+        IdTag tag;
+        if (packet->PeekPacketTag(tag))
+        {
+            on_lost(tag.number, reason);
+        }
+    }
+
+  private:
+    static constexpr size_t kNoStation = SIZE_MAX;
+
+    struct HopFrame
+    {
+        size_t to = kNoStation;
+        int64_t enqueued_ns = 0;
+        int64_t first_ns = -1; // start of its first attempt
+        int64_t propagation_ns = 0;
+        bool is_received = false;
+        bool is_acknowledged = false;
+        DelayParts parts; // of the hops before; once it is received, of this hop too
+    };
+
+    void Enqueued(size_t station, Ptr<const WifiMpdu> mpdu)
+    {
+        if (!mpdu->GetHeader().IsData())
+        {
+            return;
+        }
+        auto packet = ConstCast<Packet>(mpdu->GetPacket());
+        HopFrame frame;
+        FrameTag tag;
+        if (packet->PeekPacketTag(tag))
+        {
+            auto previous = m_frames.find(tag.number);
+            if (previous != m_frames.end() && previous->second.to != station)
+            {
+                return; // the queue has replaced the same frame
+            }
+            if (previous != m_frames.end()) // the access point forwards it
+            {
+                Complete(previous->second);
+                frame.parts = previous->second.parts;
+            }
+            packet->RemovePacketTag(tag);
+        }
+        auto to = m_stations.find(mpdu->GetHeader().GetAddr1());
+        frame.to = to == m_stations.end() ? kNoStation : to->second;
+        frame.enqueued_ns = NowNs();
+        tag.number = ++m_count;
+        m_frames[tag.number] = frame;
+        packet->AddPacketTag(tag);
+    }
+
+    void Transmitted(size_t station, Ptr<const Packet> packet)
+    {
+        FrameTag tag;
+        auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
+        if (found == m_frames.end())
+        {
+            return;
+        }
+        HopFrame& frame = found->second;
+        if (frame.first_ns < 0)
+        {
+            frame.first_ns = NowNs();
+        }
+        if (frame.to != kNoStation)
+        {
+            frame.propagation_ns =
+                m_delay->GetDelay(m_mobilities[station], m_mobilities[frame.to]).GetNanoSeconds();
+        }
+    }
+
+    void Received(size_t station, Ptr<const Packet> packet)
+    {
+        FrameTag tag;
+        auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
+        if (found == m_frames.end() || found->second.to != station)
+        {
+            return;
+        }
+        Complete(found->second);
+        m_last[station] = {NowNs(), found->second.parts};
+        if (found->second.is_acknowledged)
+        {
+            m_frames.erase(found);
+        }
+    }
+
+    // Add the parts of a hop that ends now.
+    static void Complete(HopFrame& frame)
+    {
+        if (!frame.is_received)
+        {
+            frame.is_received = true;
+            frame.parts.queueing_ns += frame.first_ns - frame.enqueued_ns;
+            frame.parts.propagation_ns += frame.propagation_ns;
+            frame.parts.transmission_ns += NowNs() - frame.first_ns - frame.propagation_ns;
+        }
+    }
+
+    void Acknowledged(Ptr<const Packet> packet)
+    {
+        FrameTag tag;
+        auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
+        if (found != m_frames.end() && found->second.is_received)
+        {
+            m_frames.erase(found);
+        }
+        else if (found != m_frames.end())
+        {
+            found->second.is_acknowledged = true;
+        }
+    }
+
+    void Dropped(WifiMacDropReason reason, Ptr<const WifiMpdu> mpdu)
+    {
+        if (reason == WIFI_MAC_DROP_FAILED_ENQUEUE)
+        {
+            return Lost(mpdu->GetPacket(), "queue full");
+        }
+        FrameTag tag;
+        if (mpdu->GetPacket()->PeekPacketTag(tag))
+        {
+            auto found = m_frames.find(tag.number);
+            bool is_received = found != m_frames.end() && found->second.is_received;
+            m_frames.erase(tag.number);
+            if (is_received) // only its acknowledgements were lost
+            {
+                return;
+            }
+        }
+        bool is_unanswered = reason == WIFI_MAC_DROP_REACHED_RETRY_LIMIT;
+        Lost(mpdu->GetPacket(), is_unanswered ? "retries exhausted" : "dropped by the MAC");
+    }
+
+    uint64_t m_count = 0;
+    std::unordered_map<uint64_t, HopFrame> m_frames;
+    std::map<Mac48Address, size_t> m_stations;
+    std::vector<Ptr<MobilityModel>> m_mobilities;
+    std::vector<std::pair<int64_t, DelayParts>> m_last; // of each station: when it received a frame, and its parts
+    Ptr<ConstantSpeedPropagationDelayModel> m_delay = CreateObject<ConstantSpeedPropagationDelayModel>();
+};
+
+} // namespace fieldkit
+
+#endif

@@ -1,0 +1,621 @@
+// The network federate of ns-3: docs/ns3.md. Standard input and output carry the protocol of docs/federates.md.
+//
+//     network VERSION                 serve one run
+//     network VERSION alone FILE      simulate the requests of a recorded run in one go, and print its processor time
+//     network VERSION losses          print the losses of links, for tests
+
+#include "transports.h"
+
+#include "ns3/rng-seed-manager.h"
+
+#include <fstream>
+#include <iostream>
+#include <unistd.h>
+
+namespace fieldkit
+{
+
+// Headers of RTPS in the datagram of a sample: of the message, its time stamp and its data.
+constexpr uint64_t kRtpsHeaderBytes = 20 + 12 + 24;
+
+constexpr uint32_t kDeterministic = 1;
+constexpr uint32_t kNextEvent = 4;
+constexpr uint32_t kExtrapolates = 8;
+
+// Time before 0 in which stations scan, and associate with their access point.
+constexpr int64_t kAssociationNs = 1'000'000'000;
+
+class Network
+{
+  public:
+    explicit Network(std::string version)
+        : m_version(std::move(version))
+    {
+    }
+
+    bool IsReady() const
+    {
+        return m_channel != nullptr;
+    }
+
+    std::string Hello(const std::string& body)
+    {
+        Reader reader(body);
+        if (reader.Bytes(8) != "FIELDKIT" || reader.Get<uint16_t>() != kVersion)
+        {
+            throw Refusal("this is not version 1 of the protocol");
+        }
+        if (reader.Get<uint8_t>() != kNetworkRole)
+        {
+            throw Refusal("this federate is a network");
+        }
+        reader.Get<uint8_t>();
+        g_heartbeat.interval = std::chrono::milliseconds(reader.Get<uint32_t>());
+        auto seed = reader.Get<uint64_t>();
+        auto step_ns = reader.Get<int64_t>();
+        reader.Get<int64_t>(); // end_ns
+        std::string hash = reader.Bytes(32);
+        reader.Text(); // token
+        reader.Text(); // name of the scenario
+        std::vector<std::pair<std::string, Vector>> agents;
+        for (auto left = reader.Count(2 + 2 + 9 + kStateBytes); left > 0; left--)
+        {
+            std::string name = reader.Text();
+            reader.Text(); // profile
+            reader.Bytes(1 + 8 + 8); // flies, antenna_m; the state's agent and reserved
+            auto east = reader.Get<double>();
+            auto north = reader.Get<double>();
+            auto up = reader.Get<double>();
+            reader.Bytes(kStateBytes - 8 - 3 * 8);
+            agents.emplace_back(name, Vector(east, north, up));
+        }
+        std::string configuration = reader.Bytes(reader.Count(1));
+        reader.End();
+        try
+        {
+            Configure(seed, agents, Json::parse(configuration));
+        }
+        catch (const Json::exception& error)
+        {
+            throw Refusal(std::string("the configuration is not as expected: ") + error.what());
+        }
+        Writer answer;
+        answer.Put(kVersion).Put(kNetworkRole).Put(uint8_t{0});
+        answer.Put(kDeterministic | kNextEvent | kExtrapolates).Put(step_ns).Put(NextEventNs());
+        answer.data += hash;
+        answer.PutText("ns-3").PutText("ns-3 " + m_version);
+        answer.Put(uint16_t{0}); // commands
+        answer.Put(static_cast<uint16_t>(m_carriesTopics ? 3 : 2)).PutText("udp").PutText("tcp");
+        if (m_carriesTopics)
+        {
+            answer.PutText("topic");
+        }
+        answer.Put(static_cast<uint32_t>(m_setup.relay >= 0));
+        if (m_setup.relay >= 0)
+        {
+            answer.Put(m_stations[m_setup.relay].agent);
+        }
+        answer.Put(uint32_t{0}); // emitters
+        return answer.data;
+    }
+
+    std::string Advance(const std::string& body)
+    {
+        int64_t to_ns = Schedule(body, false);
+        if (to_ns >= NowNs())
+        {
+            RunUntil(to_ns);
+        }
+        Writer answer;
+        answer.Put(to_ns).Put(NextEventNs());
+        answer.Put(m_arrivalCount);
+        answer.data += m_arrivals.data;
+        answer.Put(m_dropCount);
+        answer.data += m_drops.data;
+        m_arrivals.data.clear();
+        m_drops.data.clear();
+        m_arrivalCount = m_dropCount = 0;
+        return answer.data;
+    }
+
+    // Prepare a request, and return its `to_ns`.
+    //
+    // With `is_ahead`, the simulator has not reached the beginning of the window, and states are set in events.
+    int64_t Schedule(const std::string& body, bool is_ahead)
+    {
+        Reader reader(body);
+        auto to_ns = reader.Get<int64_t>();
+        auto since_ns = reader.Get<int64_t>();
+        auto reckoning_ns = reader.Get<int64_t>();
+        if (reader.Count(6) != 0)
+        {
+            throw Refusal("an agent has appeared, which ns-3 does not support");
+        }
+        if (to_ns < m_toNs)
+        {
+            throw Refusal("time runs backwards to " + std::to_string(to_ns) + " ns");
+        }
+        int64_t from_ns = m_toNs;
+        m_toNs = to_ns;
+        for (auto left = reader.Count(kStateBytes); left > 0; left--)
+        {
+            auto agent = reader.Get<uint32_t>();
+            reader.Get<uint32_t>();
+            auto x = reader.Get<double>();
+            auto y = reader.Get<double>();
+            auto z = reader.Get<double>();
+            auto x_s = reader.Get<double>();
+            auto y_s = reader.Get<double>();
+            auto z_s = reader.Get<double>();
+            reader.Bytes(16);
+            if (agent >= m_stationOf.size())
+            {
+                throw Refusal("agent " + std::to_string(agent) + " was not announced");
+            }
+            if (m_stationOf[agent] < 0)
+            {
+                continue; // it has no radio
+            }
+            auto mobility = m_stations[m_stationOf[agent]].mobility;
+            Vector position(x, y, z);
+            Vector velocity(x_s, y_s, z_s);
+            if (is_ahead && from_ns > NowNs())
+            {
+                Simulator::Schedule(NanoSeconds(from_ns - NowNs()), [=] {
+                    mobility->Move(position, velocity, since_ns, reckoning_ns);
+                });
+            }
+            else
+            {
+                mobility->Move(position, velocity, since_ns, reckoning_ns);
+            }
+        }
+        for (auto left = reader.Count(kPacketBytes); left > 0; left--)
+        {
+            Enter(ReadPacket(reader));
+        }
+        reader.End();
+        return to_ns;
+    }
+
+    size_t arrivals() const
+    {
+        return m_arrivalCount;
+    }
+
+    size_t drops() const
+    {
+        return m_dropCount;
+    }
+
+    // Sum of the times of all arrivals, which differs if one differs.
+    uint64_t checksum() const
+    {
+        return m_checksum;
+    }
+
+  private:
+    void Configure(uint64_t seed, const std::vector<std::pair<std::string, Vector>>& agents, const Json& configuration)
+    {
+        const Json& scenario = configuration.at("scenario");
+        const Json& radio = scenario.at("radio");
+        ReadOptions(seed, configuration.at("options"), scenario);
+        for (const char* key : {"loss", "delay", "rate", "jitter"})
+        {
+            if (radio.contains(key))
+            {
+                throw Refusal(std::string("fixed links are not Wi-Fi: remove ") + key + " of the radio");
+            }
+        }
+        RngSeedManager::SetSeed(1);
+        RngSeedManager::SetRun(seed);
+        AddStations(agents, configuration.at("robots"));
+        m_setup.mode = radio.value("mode", "");
+        if (m_setup.mode.substr(0, 1) == "n" && m_setup.standard != "802.11n")
+        {
+            throw Refusal("the mode " + m_setup.mode + " needs the standard 802.11n in all radios");
+        }
+        m_setup.noise_dbm = Number(radio.at("noise_floor_dbm"));
+        m_setup.queue_packets = radio.at("queue_packets");
+        if (scenario.at("topology") == "master")
+        {
+            m_setup.relay = static_cast<int>(StationNamed(scenario.at("relay")));
+            g_start_ns = kAssociationNs;
+        }
+        std::vector<std::string> names;
+        for (const Station& station : m_stations)
+        {
+            names.push_back(station.name);
+        }
+        m_channel = std::make_unique<Channel>(seed, radio, configuration.at("world"), names);
+        PeekScheduler::Use();
+        TcpTransport::SetDefaults(scenario.at("tcp").at("congestion"));
+        m_tracker.on_lost = [this](uint64_t id, const std::string& reason) { Drop(id, reason); };
+        Install(m_stations, m_setup, *m_channel, m_tracker);
+        Fates fates{[this](uint64_t id) { Arrive(id); },
+                    [this](uint64_t id, const std::string& reason) { Drop(id, reason); }};
+        m_udp = std::make_unique<UdpTransport>(m_stations, fates);
+        m_tcp = std::make_unique<TcpTransport>(m_stations, fates);
+        for (const Json& fault : scenario.at("faults"))
+        {
+            AddFault(fault);
+        }
+        RunUntil(-1);
+    }
+
+    void ReadOptions(uint64_t seed, const Json& options, const Json& scenario)
+    {
+        for (const auto& [name, value] : options.items())
+        {
+            if (name == "standard" && (value == "802.11a" || value == "802.11g" || value == "802.11n"))
+            {
+                m_setup.standard = value;
+                m_hasStandard = true;
+            }
+            else if (name == "ampdu_bytes" && value.is_number_unsigned() && value <= 65535)
+            {
+                m_setup.ampdu_bytes = value;
+            }
+            else if (name == "topics" && value == "udp")
+            {
+                m_carriesTopics = true;
+            }
+            else if (name == "delay_parts" && value.is_string())
+            {
+                std::string path = value;
+                auto place = path.find("{seed}");
+                if (place != std::string::npos)
+                {
+                    path.replace(place, 6, std::to_string(seed));
+                }
+                m_parts.open(path, std::ios::trunc);
+                if (!m_parts)
+                {
+                    throw Refusal("the file of delay_parts cannot be written: " + path);
+                }
+                m_parts << "flow,number,delay_ns,processing_ns,queueing_ns,transmission_ns,propagation_ns\n";
+            }
+            else
+            {
+                throw Refusal("the option " + name + ": " + value.dump() +
+                              " is not one of standard: 802.11a, 802.11g or 802.11n; ampdu_bytes: 0 to 65535; topics: "
+                              "udp; delay_parts: FILE");
+            }
+        }
+        for (const Json& traffic : scenario.at("traffic"))
+        {
+            bool is_reliable =
+                !traffic.contains("qos") || traffic["qos"].value("reliability", "reliable") == "reliable";
+            if (m_carriesTopics && traffic.at("protocol") == "topic" && is_reliable)
+            {
+                throw Refusal("topics: udp carries best_effort topics only, and those of " +
+                              traffic.at("from").get<std::string>() + " are reliable");
+            }
+        }
+    }
+
+    void AddStations(const std::vector<std::pair<std::string, Vector>>& agents, const Json& robots)
+    {
+        bool is_ht = true;
+        for (const auto& [name, position] : agents)
+        {
+            const Json radio = robots.at(name).at("radio");
+            m_stationOf.push_back(radio.is_null() ? -1 : static_cast<int>(m_stations.size()));
+            if (radio.is_null())
+            {
+                continue;
+            }
+            Station station;
+            station.name = name;
+            station.agent = static_cast<uint32_t>(m_stationOf.size() - 1);
+            station.tx_power_dbm = Number(radio.at("tx_power_dbm"));
+            station.sensitivity_dbm = Number(radio.at("sensitivity_dbm"));
+            station.mobility = CreateObject<AgentMobility>();
+            station.mobility->SetPosition(position);
+            m_stations.push_back(station);
+            is_ht = is_ht && radio.at("standard") == "802.11n";
+        }
+        if (!m_hasStandard && !is_ht)
+        {
+            m_setup.standard = "802.11g";
+        }
+    }
+
+    size_t StationNamed(const std::string& name) const
+    {
+        for (size_t number = 0; number < m_stations.size(); number++)
+        {
+            if (m_stations[number].name == name)
+            {
+                return number;
+            }
+        }
+        throw Refusal("there is no station " + name);
+    }
+
+    void AddFault(const Json& fault)
+    {
+        std::string kind = fault.at("kind");
+        if (kind == "jammer")
+        {
+            throw Refusal("ns-3 has no jammers: remove the fault");
+        }
+        std::vector<std::pair<size_t, size_t>> pairs;
+        int off = -1;
+        if (kind == "link-cut")
+        {
+            pairs.emplace_back(StationNamed(fault.at("between")[0]), StationNamed(fault.at("between")[1]));
+        }
+        else if (kind == "node-loss")
+        {
+            off = static_cast<int>(StationNamed(fault.at("agent")));
+            for (size_t other = 0; other < m_stations.size(); other++)
+            {
+                if (other != static_cast<size_t>(off))
+                {
+                    pairs.emplace_back(off, other);
+                }
+            }
+        }
+        auto change = [this, pairs, off](int by) {
+            for (const auto& [a, b] : pairs)
+            {
+                m_channel->Cut(a, b, by);
+            }
+            if (off >= 0)
+            {
+                m_stations[off].off += by;
+            }
+        };
+        auto at = [](const Json& seconds) { return NanoSeconds(g_start_ns + std::llround(Number(seconds) * 1e9)); };
+        Simulator::Schedule(at(fault.at("from")), [change] { change(1); });
+        if (fault.contains("to"))
+        {
+            Simulator::Schedule(at(fault.at("to")), [change] { change(-1); });
+        }
+    }
+
+    CoordinatorPacket ReadPacket(Reader& reader) const
+    {
+        CoordinatorPacket packet;
+        packet.id = reader.Get<uint64_t>();
+        packet.number = reader.Get<int64_t>();
+        packet.size_bytes = reader.Get<uint64_t>();
+        reader.Get<int64_t>(); // sent_ns
+        packet.enters_ns = reader.Get<int64_t>();
+        for (size_t* end : {&packet.source, &packet.destination})
+        {
+            auto agent = reader.Get<uint32_t>();
+            if (agent >= m_stationOf.size() || m_stationOf[agent] < 0)
+            {
+                throw Refusal("agent " + std::to_string(agent) + " has no radio");
+            }
+            *end = m_stationOf[agent];
+        }
+        packet.flow = reader.Text();
+        packet.protocol = reader.Text();
+        if (packet.protocol != "udp" && packet.protocol != "tcp" && !(m_carriesTopics && packet.protocol == "topic"))
+        {
+            throw Refusal("there is no transport " + packet.protocol);
+        }
+        uint64_t limit = packet.protocol == "tcp" ? uint64_t{1} << 30 : 65507 - kRtpsHeaderBytes;
+        if (packet.size_bytes > limit)
+        {
+            throw Refusal("a packet of " + std::to_string(packet.size_bytes) + " bytes is too large for " +
+                          packet.protocol);
+        }
+        return packet;
+    }
+
+    void Enter(const CoordinatorPacket& packet)
+    {
+        if (!m_pending.emplace(packet.id, packet).second)
+        {
+            throw Refusal("packet " + std::to_string(packet.id) + " has entered before");
+        }
+        Time after = NanoSeconds(std::max<int64_t>(packet.enters_ns - NowNs(), 0));
+        uint32_t context = m_stations[packet.source].node->GetId();
+        Simulator::ScheduleWithContext(context, after, [this, id = packet.id] { Send(m_pending.at(id)); });
+    }
+
+    void Send(const CoordinatorPacket packet)
+    {
+        if (m_stations[packet.source].off > 0)
+        {
+            Drop(packet.id, "radio off");
+        }
+        else if (packet.protocol == "tcp")
+        {
+            m_tcp->Send(packet);
+        }
+        else
+        {
+            m_udp->Send(packet, packet.protocol == "topic" ? kRtpsHeaderBytes : 0);
+        }
+    }
+
+    void Arrive(uint64_t id)
+    {
+        auto found = m_pending.find(id);
+        if (found == m_pending.end())
+        {
+            return;
+        }
+        const CoordinatorPacket& packet = found->second;
+        int64_t now_ns = NowNs();
+        m_arrivals.Put(id).Put(now_ns).Put(m_stations[packet.destination].agent).Put(uint32_t{0});
+        m_arrivalCount++;
+        m_checksum = m_checksum * 31 + static_cast<uint64_t>(now_ns);
+        if (m_parts.is_open())
+        {
+            WriteParts(packet, now_ns - packet.enters_ns, m_tracker.PartsNow(packet.destination));
+        }
+        m_pending.erase(found);
+    }
+
+    // Write the parts of a delay. A frame may have been queued before a message of TCP that it completes: no part exceeds
+    // what the others leave of the delay.
+    void WriteParts(const CoordinatorPacket& packet, int64_t delay_ns, const DelayParts& parts)
+    {
+        int64_t propagation_ns = std::min(parts.propagation_ns, delay_ns);
+        int64_t transmission_ns = std::min(parts.transmission_ns, delay_ns - propagation_ns);
+        int64_t queueing_ns = std::min(parts.queueing_ns, delay_ns - propagation_ns - transmission_ns);
+        int64_t processing_ns = delay_ns - propagation_ns - transmission_ns - queueing_ns;
+        std::string flow = packet.flow;
+        for (size_t place = 0; (place = flow.find('"', place)) != std::string::npos; place += 2)
+        {
+            flow.insert(place, 1, '"');
+        }
+        m_parts << '"' << flow << "\"," << packet.number << ',' << delay_ns << ',' << processing_ns << ','
+                << queueing_ns << ',' << transmission_ns << ',' << propagation_ns << '\n';
+    }
+
+    void Drop(uint64_t id, const std::string& reason)
+    {
+        if (m_pending.erase(id) > 0)
+        {
+            m_drops.Put(id).PutText(reason);
+            m_dropCount++;
+        }
+    }
+
+    static int64_t NextEventNs()
+    {
+        int64_t next_ns;
+        return PeekScheduler::NextNs(next_ns) ? next_ns : -1;
+    }
+
+    std::string m_version;
+    WifiSetup m_setup;
+    bool m_hasStandard = false;
+    bool m_carriesTopics = false;
+    std::ofstream m_parts;
+    std::vector<Station> m_stations;
+    std::vector<int> m_stationOf; // by agent; -1 if it has no radio
+    std::unique_ptr<Channel> m_channel;
+    FrameTracker m_tracker;
+    std::unique_ptr<UdpTransport> m_udp;
+    std::unique_ptr<TcpTransport> m_tcp;
+    int64_t m_toNs = -1;
+    std::unordered_map<uint64_t, CoordinatorPacket> m_pending;
+    Writer m_arrivals, m_drops;
+    uint32_t m_arrivalCount = 0, m_dropCount = 0;
+    uint64_t m_checksum = 0;
+};
+
+// Answer requests until the coordinator ends the run.
+int
+Serve(Network& network, std::FILE* output)
+{
+    Frame frame;
+    while (ReadFrame(stdin, frame))
+    {
+        g_heartbeat.Begin(output, frame);
+        std::string answer;
+        uint16_t kind;
+        try
+        {
+            switch (frame.kind)
+            {
+            case kBye:
+                return 0;
+            case kRelease:
+                continue;
+            case kPing:
+                kind = kPong;
+                answer = Reader(frame.body).Bytes(8);
+                break;
+            case kHello:
+                kind = kWelcome;
+                answer = network.Hello(frame.body);
+                break;
+            case kAdvanceNetwork:
+                kind = kOutcomes;
+                if (!network.IsReady() || frame.copy != 0)
+                {
+                    throw Refusal("hello is missing, or there is no such copy");
+                }
+                answer = network.Advance(frame.body);
+                break;
+            default:
+                throw Refusal("the request is not supported");
+            }
+        }
+        catch (const std::exception& error)
+        {
+            WriteFrame(output, frame, kError, Writer().PutText(std::string(error.what()).substr(0, 1000)).data);
+            return 1;
+        }
+        if (!WriteFrame(output, frame, kind, answer))
+        {
+            return 0; // the coordinator has closed the connection
+        }
+    }
+    return 0;
+}
+
+// Simulate the requests of a file without a coordinator.
+int
+RunAlone(Network& network, const char* path)
+{
+    std::FILE* stream = std::fopen(path, "rb");
+    Frame frame;
+    int64_t to_ns = -1;
+    std::clock_t started = 0;
+    while (stream != nullptr && ReadFrame(stream, frame))
+    {
+        if (frame.kind == kHello)
+        {
+            network.Hello(frame.body);
+            started = std::clock();
+        }
+        else if (frame.kind == kAdvanceNetwork)
+        {
+            to_ns = network.Schedule(frame.body, true);
+        }
+    }
+    RunUntil(to_ns);
+    double spent_s = static_cast<double>(std::clock() - started) / CLOCKS_PER_SEC;
+    std::cout << Json{{"arrivals", network.arrivals()},
+                      {"drops", network.drops()},
+                      {"checksum", network.checksum()},
+                      {"spent_s", spent_s}}
+              << "\n";
+    return stream == nullptr;
+}
+
+// Print the loss in dB of each link of a JSON text: seed, radio, world, names, and rows of time, two indices and positions.
+int
+PrintLosses()
+{
+    auto request = Json::parse(std::cin);
+    Channel channel(request.at("seed"), request.at("radio"), request.at("world"), request.at("names"));
+    Json losses_db;
+    for (const Json& row : request.at("links"))
+    {
+        losses_db.push_back(channel.LossDb(row[0], row[1], row[2], row[3], row[4]));
+    }
+    std::cout << losses_db << "\n";
+    return 0;
+}
+
+} // namespace fieldkit
+
+int
+main(int count, char** words)
+{
+    std::string task = count > 2 ? words[2] : "serve";
+    if (task == "losses")
+    {
+        return fieldkit::PrintLosses();
+    }
+    // ns-3 may print to standard output, which carries the protocol.
+    std::FILE* output = ::fdopen(::dup(1), "wb");
+    fieldkit::Network network(count > 1 ? words[1] : "");
+    if (task == "alone" && count > 3)
+    {
+        return fieldkit::RunAlone(network, words[3]);
+    }
+    ::dup2(2, 1);
+    return fieldkit::Serve(network, output);
+}

@@ -1,0 +1,123 @@
+// Control of ns-3's simulator: time of the next event, running to a time inclusively, reports while it computes.
+
+#ifndef FIELDKIT_SIMULATOR_H
+#define FIELDKIT_SIMULATOR_H
+
+#include "wire.h"
+
+#include "ns3/map-scheduler.h"
+#include "ns3/nstime.h"
+#include "ns3/object-factory.h"
+#include "ns3/simulator.h"
+
+#include <chrono>
+
+namespace fieldkit
+{
+
+using namespace ns3;
+
+// Sends `busy` while a request takes longer than the heartbeat.
+class Heartbeat
+{
+  public:
+    void Begin(std::FILE* stream, const Frame& request)
+    {
+        m_stream = stream;
+        m_request = {request.kind, request.request, request.copy, {}};
+        m_last = std::chrono::steady_clock::now();
+    }
+
+    void Check(int64_t at_ns)
+    {
+        auto now = std::chrono::steady_clock::now();
+        if (m_stream != nullptr && now - m_last >= interval)
+        {
+            m_last = now;
+            WriteFrame(m_stream, m_request, kBusy, Writer().Put(at_ns).data);
+        }
+    }
+
+    std::chrono::milliseconds interval{1000};
+
+  private:
+    std::FILE* m_stream = nullptr;
+    Frame m_request;
+    std::chrono::steady_clock::time_point m_last;
+};
+
+inline Heartbeat g_heartbeat;
+
+// Time of ns-3 at time 0 of the co-simulation. It is above 0 because ns-3 sends nothing before it has run for the first time.
+inline int64_t g_start_ns = 1'000'000;
+
+inline int64_t
+NowNs()
+{
+    return Simulator::Now().GetNanoSeconds() - g_start_ns;
+}
+
+// The scheduler of ns-3, with access to the next event.
+class PeekScheduler : public MapScheduler
+{
+  public:
+    static TypeId GetTypeId()
+    {
+        static TypeId type =
+            TypeId("fieldkit::PeekScheduler").SetParent<MapScheduler>().AddConstructor<PeekScheduler>();
+        return type;
+    }
+
+    PeekScheduler()
+    {
+        s_current = this;
+    }
+
+    Scheduler::Event RemoveNext() override
+    {
+        if (++m_events % 1024 == 0)
+        {
+            g_heartbeat.Check(NowNs());
+        }
+        return MapScheduler::RemoveNext();
+    }
+
+    // Time of the next event; false if there is none.
+    static bool NextNs(int64_t& at_ns)
+    {
+        if (s_current->IsEmpty())
+        {
+            return false;
+        }
+        at_ns = static_cast<int64_t>(s_current->PeekNext().key.m_ts) - g_start_ns;
+        return true;
+    }
+
+    static void Use()
+    {
+        ObjectFactory factory;
+        factory.SetTypeId(GetTypeId());
+        Simulator::SetScheduler(factory);
+    }
+
+  private:
+    static inline PeekScheduler* s_current = nullptr;
+    uint64_t m_events = 0;
+};
+
+// Process all events up to a time, inclusively.
+inline void
+RunUntil(int64_t to_ns)
+{
+    int64_t next_ns;
+    do
+    {
+        Simulator::Stop(NanoSeconds(to_ns - NowNs()));
+        Simulator::Run();
+        // An event at `to_ns` may have scheduled others at this time, after the event that stops the simulator.
+    } while (PeekScheduler::NextNs(next_ns) && next_ns <= to_ns);
+}
+
+} // namespace fieldkit
+
+#endif

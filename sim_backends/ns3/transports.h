@@ -1,0 +1,273 @@
+// The transports of packets: ns-3's UDP and TCP sockets.
+
+#ifndef FIELDKIT_TRANSPORTS_H
+#define FIELDKIT_TRANSPORTS_H
+
+#include "stations.h"
+
+#include "ns3/inet-socket-address.h"
+#include "ns3/socket.h"
+#include "ns3/tcp-socket-factory.h"
+#include "ns3/udp-socket-factory.h"
+
+#include <deque>
+#include <memory>
+
+namespace fieldkit
+{
+
+struct CoordinatorPacket
+{
+    uint64_t id = 0;
+    int64_t number = 0;
+    uint64_t size_bytes = 0;
+    int64_t enters_ns = 0;
+    size_t source = 0; // stations
+    size_t destination = 0;
+    std::string flow;
+    std::string protocol;
+};
+
+// Called with the id of a packet that has arrived or is dropped.
+struct Fates
+{
+    std::function<void(uint64_t)> arrive;
+    std::function<void(uint64_t, const std::string&)> drop;
+};
+
+constexpr uint16_t kUdpPort = 7411;
+constexpr uint16_t kTcpPort = 7412;
+
+// Each packet is one datagram, which IP fragments.
+class UdpTransport
+{
+  public:
+    UdpTransport(const std::vector<Station>& stations, Fates fates)
+        : m_stations(stations),
+          m_fates(std::move(fates))
+    {
+        for (const Station& station : stations)
+        {
+            auto socket = Socket::CreateSocket(station.node, UdpSocketFactory::GetTypeId());
+            socket->Bind(InetSocketAddress(Ipv4Address::GetAny(), kUdpPort));
+            socket->SetRecvCallback(MakeCallback(&UdpTransport::Receive, this));
+            m_sockets.push_back(socket);
+        }
+    }
+
+    void Send(const CoordinatorPacket& packet, uint64_t header_bytes)
+    {
+        auto datagram = Create<Packet>(static_cast<uint32_t>(packet.size_bytes + header_bytes));
+        IdTag tag;
+        tag.number = packet.id;
+        datagram->AddPacketTag(tag);
+        InetSocketAddress to(m_stations[packet.destination].address, kUdpPort);
+        if (m_sockets[packet.source]->SendTo(datagram, 0, to) < 0)
+        {
+            m_fates.drop(packet.id, "no route");
+        }
+    }
+
+  private:
+    void Receive(Ptr<Socket> socket)
+    {
+        while (auto datagram = socket->Recv())
+        {
+            IdTag tag;
+            if (datagram->PeekPacketTag(tag))
+            {
+                m_fates.arrive(tag.number);
+            }
+        }
+    }
+
+    const std::vector<Station>& m_stations;
+    Fates m_fates;
+    std::vector<Ptr<Socket>> m_sockets;
+};
+
+// Each flow has a connection, which its first message opens. A message arrives when its last byte has been read.
+class TcpTransport
+{
+  public:
+    static void SetDefaults(const std::string& congestion)
+    {
+        bool is_newreno = congestion == "newreno";
+        auto type = TypeId::LookupByName(is_newreno ? "ns3::TcpLinuxReno" : "ns3::TcpCubic");
+        // The values of fieldkit's own TCP, which are those of Linux (sim_backends/network/tcp/tcp_options.py).
+        Config::SetDefault("ns3::TcpL4Protocol::SocketType", TypeIdValue(type));
+        Config::SetDefault("ns3::TcpCubic::HyStart", BooleanValue(false));
+        Config::SetDefault("ns3::TcpSocket::SegmentSize", UintegerValue(1448));
+        Config::SetDefault("ns3::TcpSocket::InitialCwnd", UintegerValue(10));
+        Config::SetDefault("ns3::TcpSocket::SndBufSize", UintegerValue(8 << 20));
+        Config::SetDefault("ns3::TcpSocket::RcvBufSize", UintegerValue(3 << 20));
+        Config::SetDefault("ns3::TcpSocket::DelAckCount", UintegerValue(2));
+        Config::SetDefault("ns3::TcpSocket::DelAckTimeout", TimeValue(MilliSeconds(40)));
+        Config::SetDefault("ns3::TcpSocket::ConnTimeout", TimeValue(Seconds(1)));
+        Config::SetDefault("ns3::TcpSocket::DataRetries", UintegerValue(15));
+        Config::SetDefault("ns3::TcpSocketBase::MinRto", TimeValue(MilliSeconds(200)));
+    }
+
+    TcpTransport(const std::vector<Station>& stations, Fates fates)
+        : m_stations(stations),
+          m_fates(std::move(fates))
+    {
+        for (const Station& station : stations)
+        {
+            auto socket = Socket::CreateSocket(station.node, TcpSocketFactory::GetTypeId());
+            socket->Bind(InetSocketAddress(Ipv4Address::GetAny(), kTcpPort));
+            socket->Listen();
+            socket->SetAcceptCallback(MakeNullCallback<bool, Ptr<Socket>, const Address&>(),
+                                      MakeCallback(&TcpTransport::Accept, this));
+            m_listeners.push_back(socket);
+        }
+    }
+
+    void Send(const CoordinatorPacket& packet)
+    {
+        auto key = std::make_tuple(packet.source, packet.destination, packet.flow);
+        auto& connection = m_connections[key];
+        if (connection == nullptr)
+        {
+            connection = Open(packet, key);
+        }
+        connection->queued_bytes += packet.size_bytes;
+        connection->messages.push_back({packet.id, connection->queued_bytes});
+        Write(connection);
+    }
+
+  private:
+    using Key = std::tuple<size_t, size_t, std::string>;
+
+    struct Message
+    {
+        uint64_t id;
+        uint64_t end; // position after its last byte in the stream
+    };
+
+    struct Connection
+    {
+        Ptr<Socket> sender;
+        bool is_open = false;
+        uint64_t queued_bytes = 0;
+        uint64_t written_bytes = 0;
+        uint64_t read_bytes = 0;
+        std::deque<Message> messages; // that have not arrived
+    };
+
+    using ConnectionPointer = std::shared_ptr<Connection>;
+    using OnSocket = Callback<void, Ptr<Socket>>;
+
+    ConnectionPointer Open(const CoordinatorPacket& packet, const Key& key)
+    {
+        auto connection = std::make_shared<Connection>();
+        const Station& source = m_stations[packet.source];
+        auto socket = Socket::CreateSocket(source.node, TcpSocketFactory::GetTypeId());
+        connection->sender = socket;
+        socket->Bind();
+        Address own;
+        socket->GetSockName(own);
+        m_byEnd[{source.address, InetSocketAddress::ConvertFrom(own).GetPort()}] = connection;
+        std::weak_ptr<Connection> weak = connection;
+        socket->SetConnectCallback(OnSocket([this, weak](Ptr<Socket>) {
+                                       if (auto opened = weak.lock())
+                                       {
+                                           opened->is_open = true;
+                                           Write(opened);
+                                       }
+                                   }),
+                                   OnSocket([this, key, weak](Ptr<Socket>) { GiveUp(key, weak); }));
+        socket->SetCloseCallbacks(OnSocket([this, key, weak](Ptr<Socket>) { GiveUp(key, weak); }),
+                                  OnSocket([this, key, weak](Ptr<Socket>) { GiveUp(key, weak); }));
+        socket->SetSendCallback(Callback<void, Ptr<Socket>, uint32_t>([this, weak](Ptr<Socket>, uint32_t) {
+            if (auto writable = weak.lock())
+            {
+                Write(writable);
+            }
+        }));
+        socket->Connect(InetSocketAddress(m_stations[packet.destination].address, kTcpPort));
+        return connection;
+    }
+
+    static void Write(const ConnectionPointer& connection)
+    {
+        while (connection->is_open && connection->written_bytes < connection->queued_bytes)
+        {
+            uint64_t size = std::min<uint64_t>(connection->queued_bytes - connection->written_bytes,
+                                               connection->sender->GetTxAvailable());
+            if (size == 0)
+            {
+                return;
+            }
+            // Counted before, as Send may call this function again.
+            connection->written_bytes += size;
+            int sent = connection->sender->Send(Create<Packet>(static_cast<uint32_t>(size)));
+            if (sent < 0 || static_cast<uint64_t>(sent) < size)
+            {
+                connection->written_bytes -= size - std::max(sent, 0);
+                return;
+            }
+        }
+    }
+
+    void Accept(Ptr<Socket> socket, const Address& from)
+    {
+        auto end = InetSocketAddress::ConvertFrom(from);
+        std::weak_ptr<Connection> weak = m_byEnd[{end.GetIpv4(), end.GetPort()}];
+        socket->SetRecvCallback(OnSocket([this, weak](Ptr<Socket> readable) {
+            uint64_t bytes = 0;
+            while (auto data = readable->Recv())
+            {
+                if (data->GetSize() == 0)
+                {
+                    break;
+                }
+                bytes += data->GetSize();
+            }
+            if (auto connection = weak.lock())
+            {
+                Read(*connection, bytes);
+            }
+        }));
+        m_receivers.push_back(socket);
+    }
+
+    void Read(Connection& connection, uint64_t bytes)
+    {
+        connection.read_bytes += bytes;
+        while (!connection.messages.empty() && connection.messages.front().end <= connection.read_bytes)
+        {
+            m_fates.arrive(connection.messages.front().id);
+            connection.messages.pop_front();
+        }
+    }
+
+    void GiveUp(const Key& key, const std::weak_ptr<Connection>& weak)
+    {
+        auto connection = weak.lock();
+        if (connection == nullptr || m_connections[key] != connection)
+        {
+            return;
+        }
+        m_connections[key] = nullptr;
+        m_closed.push_back(connection); // its socket is calling
+        connection->is_open = false;
+        for (const Message& message : connection->messages)
+        {
+            m_fates.drop(message.id, "TCP connection given up");
+        }
+        connection->messages.clear();
+    }
+
+    const std::vector<Station>& m_stations;
+    Fates m_fates;
+    std::vector<Ptr<Socket>> m_listeners;
+    std::vector<Ptr<Socket>> m_receivers;
+    std::map<Key, ConnectionPointer> m_connections;
+    std::map<std::pair<Ipv4Address, uint16_t>, ConnectionPointer> m_byEnd;
+    std::vector<ConnectionPointer> m_closed;
+};
+
+} // namespace fieldkit
+
+#endif
