@@ -153,7 +153,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     load_before, results = os.getloadavg()[0], {}
     for count in options.robots:
         with tempfile.TemporaryDirectory() as name:
-            scenario, requests = scenario_of(count, options.seconds, options.rate, Path(name)), Path(name) / "requests"
+            scenario, requests = (
+                scenario_of(count, options.seconds, options.rate, Path(name)),
+                Path(name) / "requests",
+            )
             run_coupled(scenario, requests)
             rounds = [measure(scenario, requests) for _ in range(options.rounds)]
         results[f"{count} robots"] = {key: statistics.median(row[key] for row in rounds) for key in rounds[0]}

@@ -47,7 +47,7 @@ def before_data_s(repeat: Path) -> float:
 
 def test_throughput_equals_that_of_the_radios_air_log(tmp_path: Path) -> None:
     """The radio's log has the time and length of each received frame; ping starts a second after a UDP transfer."""
-    lab = make_lab(tmp_path / "air", "{fading: false}\n  record_air: true", topic="/imu", repeats=1)
+    lab = make_lab(tmp_path / "air", "{fading: false}, record_air: true", topic="/imu", repeats=1)
     run: Run = run_here(lab, "trial", "quick", "5m", "--protocol", "udp", "--record", "5s")
     assert run.code == 0, run.err
     trial = only_trial(lab)

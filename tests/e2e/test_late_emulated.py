@@ -11,7 +11,7 @@ pytestmark = pytest.mark.emulated
 
 
 def test_a_repeat_with_excessive_lateness_does_not_count(tmp_path: Path) -> None:
-    lab = make_lab(tmp_path / "late", "{}\n  late_bound: 0.001ms")
+    lab = make_lab(tmp_path / "late", "{}, late_bound: 0.001ms")
     procedure = lab / "procedures" / "quick.yaml"
     procedure.write_text(
         procedure.read_text(encoding="utf-8").replace("attempts: 3", "attempts: 1"), encoding="utf-8"

@@ -8,7 +8,7 @@ import pytest
 
 from tests.helpers.host import LeakError
 
-ALLOWED: Final = 3
+ALLOWED: Final = 1
 """Number of second tries that a run may have; find the cause of each. If the causes are fixed, set this to 0."""
 
 _FAILED: Final = pytest.StashKey[bool]()
@@ -44,7 +44,7 @@ class _Count:
             terminalreporter.section(f"first try of {report.nodeid}")
             terminalreporter.write_line(report.longreprtext)
         if len(self.tries) > ALLOWED:
-            terminalreporter.section(f"{len(self.tries)} tests ran twice; at most {ALLOWED} are allowed", red=True)
+            terminalreporter.section(f"{len(self.tries)} tests ran twice; the limit is {ALLOWED}", red=True)
             for test in self.tries:
                 terminalreporter.write_line(test)
 

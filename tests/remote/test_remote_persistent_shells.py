@@ -26,6 +26,7 @@ from fieldkit.remote.persistent_shells import PersistentShell, wait_for_start
 from fieldkit.remote.script import CALL, SCRIPT, SCRIPT_PATH
 from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshSession, SshShell
+from tests.helpers.host import wait_for_end
 from tests.helpers.sshd import Server, sshd, wait_until
 from tests.helpers.userlands import USERLANDS, userland_path
 
@@ -170,7 +171,8 @@ def test_unrequested_command_ends_with_its_link(debian_robot: Robot) -> None:
     debian_robot.shell.begin((*CALL, "left", ": >done"), deadline=soon())
     wait_until((debian_robot.home / "done").exists, soon())
     debian_robot.shell.close()
-    wait_until(lambda: not Path(f"/proc/{pid}").exists(), soon())
+    # If its parent exits first, it remains a zombie of this process.
+    wait_for_end({pid}, within_s=SOON)
 
 
 @pytest.mark.emulated

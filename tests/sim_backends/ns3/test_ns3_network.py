@@ -114,10 +114,10 @@ def test_udp_has_the_goodput_and_losses_of_the_built_in_network(standard: str, s
         assert (ours > 20) == (distance_m < 45)
 
 
-@pytest.mark.parametrize("changes", [{}, RELAYED, {"network__options__ampdu_bytes": 65535}], ids=("", "relay", "ampdu"))
-def test_the_parts_of_each_delay_add_up_to_it(
-    changes: dict[str, Any], simulated: Simulated, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(
+    "changes", [{}, RELAYED, {"network__options__ampdu_bytes": 65535}], ids=("", "relay", "ampdu")
+)
+def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated: Simulated, tmp_path: Path) -> None:
     traffic = [*with_traffic(), TCP | {"protocol": "tcp"}]
     standard = "802.11n" if "network__options__ampdu_bytes" in changes else "802.11a"
     simulation = simulated(
@@ -161,7 +161,9 @@ def test_losses_have_reasons(simulated: Simulated) -> None:
     lost_ns = [fate.packet.sent_ns for fate in run.fates.values() if fate.reason]
     assert len(lost_ns) == pytest.approx(20, abs=2)
     assert all(90e6 < at_ns < 200e6 or 290e6 < at_ns < 400e6 for at_ns in lost_ns)
-    unassociated = simulated(**{key.replace(".", "__"): value for key, value in RELAYED.items()} | {"agents__bob__at_m": [500, 0]})
+    unassociated = simulated(
+        **{key.replace(".", "__"): value for key, value in RELAYED.items()} | {"agents__bob__at_m": [500, 0]}
+    )
     assert reasons(unassociated.run()).keys() - {""} <= {"retries exhausted", "dropped by the MAC", "no route"}
 
 
@@ -196,7 +198,10 @@ def test_topics_of_best_effort_are_carried_as_udp_if_the_scenario_says_so(simula
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"network__options__standard": "802.11ax"}, 'the option standard: "802.11ax" is not one of standard: 802.11a'),
+        (
+            {"network__options__standard": "802.11ax"},
+            'the option standard: "802.11ax" is not one of standard: 802.11a',
+        ),
         ({"network__options__topics": "udp", "traffic": with_traffic(protocol="topic")}, "those of ann are reliable"),
         ({"radio__mode": "n3"}, "the mode n3 needs"),
         ({"radio__loss": "1%"}, "fixed links are not Wi-Fi"),

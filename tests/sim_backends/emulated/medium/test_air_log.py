@@ -104,7 +104,7 @@ def test_each_hop_of_a_ping_is_in_both_files(
 
 @pytest.mark.emulated
 def test_a_site_file_with_record_air_adds_the_files_to_the_evidence(tmp_path: Path) -> None:
-    lab = make_lab(tmp_path / "air", "{fading: false}\n  record_air: true")
+    lab = make_lab(tmp_path / "air", "{fading: false}, record_air: true")
     run = run_here(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
     assert run.code == 0, run.err
     trial = only_trial(lab)
