@@ -28,10 +28,8 @@ def _membership(group: str, device: str | None) -> bytes:
     try:
         index = 0 if device is None else socket.if_nametoindex(device)
     except OSError as error:
-        raise ConfigurationError(
-            f"there is no network interface {device!r}", remedy="list them: ip link"
-        ) from error
-    return _MREQN.pack(socket.inet_aton(group), socket.inet_aton("0.0.0.0"), index)
+        raise ConfigurationError(f"there is no network interface {device!r}", remedy="list them: ip link") from error
+    return _MREQN.pack(socket.inet_aton(group), bytes(4), index)
 
 
 def _unusable(channel: str, device: str | None, error: OSError) -> ConfigurationError:

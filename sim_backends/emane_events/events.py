@@ -146,9 +146,7 @@ class EventDatagram:
 
 def _serialized(content: Value) -> SerializedEvent:
     values = fields_by_number(as_bytes(content), (1, 2, 3))
-    return SerializedEvent(
-        as_integer(values[1], 1 << 32), as_integer(values[2], 1 << 32), as_bytes(values[3])
-    )
+    return SerializedEvent(as_integer(values[1], 1 << 32), as_integer(values[2], 1 << 32), as_bytes(values[3]))
 
 
 def encode_locations(locations: Sequence[NemLocation]) -> bytes:
@@ -200,9 +198,7 @@ def _three_numbers(content: bytes) -> tuple[float, float, float]:
 def encode_pathlosses(losses: Sequence[NemPathloss]) -> bytes:
     """Return the message `PathlossEvent`."""
     return b"".join(
-        bytes_field(
-            1, integer_field(1, loss.nem) + float_field(2, loss.forward_db) + float_field(3, loss.reverse_db)
-        )
+        bytes_field(1, integer_field(1, loss.nem) + float_field(2, loss.forward_db) + float_field(3, loss.reverse_db))
         for loss in losses
     )
 
@@ -217,7 +213,5 @@ def decode_pathlosses(content: bytes) -> list[NemPathloss]:
     for field, value in fields(content):
         if field == 1:
             values = fields_by_number(as_bytes(value), (1, 2, 3))
-            losses.append(
-                NemPathloss(as_integer(values[1], 1 << 32), as_real(values[2]), as_real(values[3]))
-            )
+            losses.append(NemPathloss(as_integer(values[1], 1 << 32), as_real(values[2]), as_real(values[3])))
     return losses

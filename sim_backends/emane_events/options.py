@@ -67,7 +67,9 @@ class EmaneOptions(Strict):
             return {name: number for number, name in enumerate(names, 1)}
         for name in (*names, *self.nems):
             if name not in self.nems or name not in names:
-                raise ValueError(f"nems must list each agent once: {name} is {'missing' if name in names else 'unknown'}")
+                raise ValueError(
+                    f"nems must list each agent once: {name} is {'missing' if name in names else 'unknown'}"
+                )
         if len(set(self.nems.values())) < len(self.nems):
             raise ValueError("nems: two agents have the same identifier")
         return {name: self.nems[name] for name in names}

@@ -268,13 +268,12 @@ public:
     /* Connect, stop the robots, reset the world, place the robots, and let them come to rest: that is time 0. */
     void begin()
     {
-        request_ = "start";
         connect();
         pause();
         measure_step();
         int64_t settle_steps = std::max<int64_t>(std::llround(options_.settle_s * 1e9 / double(step_ns_)), 1);
         send_commands();
-        step(settle_steps); /* they may move from an earlier run */
+        come_to_rest(settle_steps);
         if (options_.reset)
             reset();
         if (options_.place)
@@ -292,7 +291,6 @@ public:
         int64_t at = reached_ns() / step_ns_;
         if (to_step <= at)
             return;
-        request_ = "advance from " + seconds(reached_ns()) + " to " + seconds(to_step * step_ns_);
         int64_t period = std::max<int64_t>(std::llround(options_.control_period_s * 1e9 / double(step_ns_)), 1);
         std::vector<Pose> before = poses_of_agents();
         int64_t before_at = at;
@@ -351,12 +349,11 @@ private:
                              agent.model);
     }
 
-    /* The world's name, its time, and the request, for messages. */
+    /* Fail with the world's name and its last time; the coordinator adds the request. */
     [[noreturn]] void fail(const std::string &what) const
     {
-        throw Failure("Gazebo world '" + options_.world + "' at " +
-                      (now_ns_ < 0 ? std::string("an unknown time") : seconds(now_ns_ - start_ns_)) +
-                      (start_ns_ ? " of the run" : "") + ", request to " + request_ + ": " + what);
+        std::string last = start_ns_ ? ", whose last time is " + seconds(reached_ns()) : ", which has not started";
+        throw Failure("Gazebo world '" + options_.world + "'" + last + ": " + what);
     }
 
     /* Wait until a condition holds, with the lock. Progress of the clock extends the deadline. */
@@ -380,7 +377,7 @@ private:
             }
             if (now >= check) {
                 check = now + std::chrono::milliseconds(500);
-                if (is_connected_ && !unlocked(lock, [&] { return has_service(options_.name(options_.control_service)); }))
+                if (is_connected_ && !unlocked(lock, [&] { return has_service(control_service()); }))
                     fail("it has disappeared" + last_message());
                 continue;
             }
@@ -400,9 +397,9 @@ private:
         if (clock_ns_ < 0)
             return "; no message of its clock has arrived on " + options_.name(options_.clock_topic);
         double silent_s = std::chrono::duration<double>(Clock::now() - clock_at_).count();
-        char text[80];
-        std::snprintf(text, sizeof text, "; its clock is at %s, received %.1f s ago",
-                      seconds(clock_ns_ - start_ns_).c_str(), silent_s);
+        char text[120];
+        std::snprintf(text, sizeof text, "; Gazebo's clock is at %s, received %.1f s ago",
+                      seconds(clock_ns_).c_str(), silent_s);
         return text;
     }
 
@@ -445,7 +442,7 @@ private:
             if (!agent.publisher)
                 fail("the topic " + command_topic(agent) + " has an invalid name");
         }
-        std::string control = options_.name(options_.control_service);
+        std::string control = control_service();
         std::unique_lock<std::mutex> lock(mutex_);
         wait(lock, [&] { return unlocked(lock, [&] { return has_service(control); }); },
              [&] { return "the service " + control + " has not been found (" + list_worlds() + ")"; });
@@ -533,8 +530,10 @@ private:
         changed_.notify_all();
     }
 
-    /* Send a request to a service that returns a Boolean, and wait for its answer or for a condition. */
-    template <typename Request> void call(const std::string &service, const Request &request)
+    /* The answer of a service: -1 before it arrives, else 0 or 1. */
+    using Answer = std::shared_ptr<int>;
+
+    template <typename Request> Answer send(const std::string &service, const Request &request)
     {
         auto answer = std::make_shared<int>(-1);
         std::function<void(const msgs::Boolean &, const bool)> on_answer = [this, answer](const msgs::Boolean &value,
@@ -545,25 +544,51 @@ private:
         };
         if (!node_.Request(service, request, on_answer))
             fail("the service " + service + " cannot be called");
-        std::unique_lock<std::mutex> lock(mutex_);
-        wait(lock, [&] { return *answer >= 0; }, [&] { return "the service " + service + " has not answered"; });
+        return answer;
+    }
+
+    void check(const Answer &answer, const std::string &service) const
+    {
         if (*answer == 0)
             fail("the service " + service + " has refused the request");
     }
 
-    void control(uint32_t steps, bool resets = false)
+    /* Send a request that may arrive twice, and wait for its answer. The first answer to a new process may be lost, as
+     * Gazebo Transport does not wait until its connection is complete; so the request is repeated. */
+    template <typename Request> void call(const std::string &service, const Request &request)
+    {
+        Answer answer = send(service, request);
+        auto repeat_at = Clock::now() + std::chrono::seconds(1);
+        std::unique_lock<std::mutex> lock(mutex_);
+        wait(lock,
+             [&] {
+                 if (*answer < 0 && Clock::now() > repeat_at) {
+                     repeat_at = Clock::now() + std::chrono::seconds(1);
+                     lock.unlock();
+                     answer = send(service, request);
+                     lock.lock();
+                 }
+                 return *answer >= 0;
+             },
+             [&] { return "the service " + service + " has not answered"; });
+        check(answer, service);
+    }
+
+    msgs::WorldControl control_request(uint32_t steps, bool resets = false) const
     {
         msgs::WorldControl request;
         request.set_pause(true); /* a request without it would let the world run */
         request.set_multi_step(steps);
         if (resets)
             request.mutable_reset()->set_all(true);
-        call(options_.name(options_.control_service), request);
+        return request;
     }
+
+    std::string control_service() const { return options_.name(options_.control_service); }
 
     void pause()
     {
-        control(0);
+        call(control_service(), control_request(0));
         std::unique_lock<std::mutex> lock(mutex_);
         same_clocks_ = 0;
         wait(lock, [&] { return same_clocks_ >= 3; },
@@ -574,11 +599,11 @@ private:
     void measure_step()
     {
         int64_t before_ns = now_ns_;
-        control(1);
+        Answer answer = send(control_service(), control_request(1));
         std::unique_lock<std::mutex> lock(mutex_);
         wait(lock, [&] { return clock_ns_ > before_ns; }, [] { return std::string("it has not made a step"); });
         step_ns_ = clock_ns_ - before_ns;
-        wait_for_poses(lock, before_ns + step_ns_, before_ns);
+        wait_for_poses(lock, before_ns + step_ns_, before_ns, answer);
     }
 
     /* Advance by a number of steps: the poses are those after the last one. */
@@ -593,9 +618,9 @@ private:
                                              : "another program has advanced it" + last_message());
             }
             int64_t before_ns = now_ns_;
-            control(steps);
+            Answer answer = send(control_service(), control_request(steps));
             std::unique_lock<std::mutex> lock(mutex_);
-            wait_for_poses(lock, before_ns + steps * step_ns_, before_ns);
+            wait_for_poses(lock, before_ns + steps * step_ns_, before_ns, answer);
             count -= steps;
         }
         for (size_t i = 0; i < agents_.size(); i++)
@@ -603,12 +628,13 @@ private:
     }
 
     /* The clock of a step is published before the step is made, so only poses with its time stamp are valid. */
-    void wait_for_poses(std::unique_lock<std::mutex> &lock, int64_t target_ns, int64_t before_ns)
+    void wait_for_poses(std::unique_lock<std::mutex> &lock, int64_t target_ns, int64_t before_ns, const Answer &answer)
     {
         wait(lock,
              [&] {
+                 check(answer, control_service());
                  if (clock_ns_ > target_ns || pose_ns_ > target_ns)
-                     fail("it has advanced beyond " + seconds(target_ns - start_ns_) +
+                     fail("it has advanced beyond Gazebo's time " + seconds(target_ns) +
                           ", another program may control it" + last_message());
                  if (clock_ns_ < before_ns)
                      fail("it was reset" + last_message());
@@ -616,10 +642,10 @@ private:
              },
              [&]() -> std::string {
                  if (clock_ns_ == target_ns)
-                     return "no poses of the time " + seconds(target_ns - start_ns_) + " have arrived on " +
+                     return "no poses of Gazebo's time " + seconds(target_ns) + " have arrived on " +
                             options_.name(options_.pose_topic) + " (the last ones are of " +
-                            seconds(pose_ns_ - start_ns_) + "; is dynamic_pose_hertz too small?)";
-                 return "it has not reached " + seconds(target_ns - start_ns_) + ", another program may have paused it";
+                            seconds(pose_ns_) + "; is dynamic_pose_hertz too small?)";
+                 return "it has not reached Gazebo's time " + seconds(target_ns) + ", another program may have paused it";
              });
         now_ns_ = target_ns;
         for (const Agent &agent : agents_)
@@ -627,9 +653,28 @@ private:
                 fail("the model " + agent.model + " has been removed");
     }
 
+    /* Robots may still move from an earlier run, and a new position keeps the velocity. */
+    void come_to_rest(int64_t steps)
+    {
+        step(steps);
+        for (int round = 0; round < 20; round++) {
+            std::vector<Pose> before = poses_of_agents();
+            step(std::max<int64_t>(steps / 4, 1));
+            double moved = 0;
+            for (size_t i = 0; i < agents_.size(); i++) {
+                const Pose &p = agents_[i].pose, &q = before[i];
+                moved = std::max({moved, std::fabs(p.position.x - q.position.x), std::fabs(p.position.y - q.position.y),
+                                  std::fabs(p.position.z - q.position.z),
+                                  std::fabs(std::remainder(p.yaw() - q.yaw(), 2 * M_PI))});
+            }
+            if (moved < 1e-4)
+                return;
+        }
+    }
+
     void reset()
     {
-        control(0, true);
+        call(control_service(), control_request(0, true));
         std::unique_lock<std::mutex> lock(mutex_);
         wait(lock, [&] { return clock_ns_ == 0; },
              [] { return std::string("its clock has not returned to 0 after a reset (option reset: false avoids it)"); });
@@ -684,7 +729,7 @@ private:
         }
         if (options_.acknowledge != "off")
             for (size_t i = 0; i <= agents_.size(); i++)
-                control(0);
+                call(control_service(), control_request(0));
     }
 
     bool any_turns() const
@@ -731,7 +776,6 @@ private:
     int heartbeat_;
     Clock::time_point next_heartbeat_ = Clock::now();
     std::map<std::string, size_t> by_model_;
-    std::string request_;
     int64_t step_ns_ = 0, now_ns_ = -1, start_ns_ = 0, window_at_ = 0;
     std::vector<Pose> window_poses_;
     bool is_connected_ = false, uses_fence_ = false;

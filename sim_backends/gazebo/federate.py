@@ -35,9 +35,8 @@ def adapter() -> CompiledProgram:
 
 
 def _are_installed(names: tuple[str, ...]) -> bool:
-    if shutil.which("pkg-config") is None:
-        return False
-    return subprocess.run(["pkg-config", "--exists", *names], check=False).returncode == 0
+    program = shutil.which("pkg-config")
+    return program is not None and subprocess.run([program, "--exists", *names], check=False).returncode == 0
 
 
 def _command() -> str:

@@ -21,7 +21,7 @@ Version = Literal["fortress", "garden"]
 """Names of the plugins: those of Fortress, or those of Garden, which later versions also accept."""
 
 REAL_TIME_FACTOR: Final = 5.0
-"""Upper limit of the speed; a paused Gazebo also repeats its loop at this rate, so a larger one uses the processor."""
+"""Upper limit of the speed. A paused Gazebo repeats its loop at this rate too, so a larger one uses the processor."""
 POSE_HZ: Final = 2000
 """Largest rate of poses in wall time; at the default of 60 Hz each window takes up to 17 ms."""
 _SLAB_M: Final = 0.1
@@ -120,12 +120,8 @@ def _add_fence(world: Element, parent: World, version: Version) -> None:
 
 
 def _plugin(parent: Element, version: Version, name: str, file: str) -> Element:
-    library, namespace = (
-        ("ignition-gazebo", "ignition::gazebo") if version == "fortress" else ("gz-sim", "gz::sim")
-    )
-    return SubElement(
-        parent, "plugin", filename=f"{library}-{file}-system", name=f"{namespace}::systems::{name}"
-    )
+    library, namespace = ("ignition-gazebo", "ignition::gazebo") if version == "fortress" else ("gz-sim", "gz::sim")
+    return SubElement(parent, "plugin", filename=f"{library}-{file}-system", name=f"{namespace}::systems::{name}")
 
 
 def _texts(parent: Element, /, **values: float | str) -> None:
@@ -233,7 +229,9 @@ def _add_drive(model: Element, limits: DriveLimits, version: Version) -> None:
     wheel_kg = 0.05 * chassis.mass_kg
     low_m = chassis.clearance_m + size_m[2] / 2
     # The centre of mass is low, as batteries and motors are.
-    _add_inertia(link, chassis.mass_kg - wheel_kg * len(wheels), size_m, (0.0, 0.0, chassis.clearance_m + size_m[2] / 4))
+    _add_inertia(
+        link, chassis.mass_kg - wheel_kg * len(wheels), size_m, (0.0, 0.0, chassis.clearance_m + size_m[2] / 4)
+    )
     _add_shape(link, "box", Box(_UPRIGHT, size_m), (0.0, 0.0, low_m))
     if not chassis.base_m:
         _add_casters(link, chassis)
@@ -295,5 +293,3 @@ def _add_quadrotor(model: Element, limits: QuadrotorLimits, version: Version, st
     plugin = _plugin(model, version, "VelocityControl", "velocity-control")
     # The plugin sets the velocity before each step, and gravity reduces it within the step.
     _texts(plugin, initial_linear=f"0 0 {GRAVITY_M_S2 * step_ns / 1e9:.9g}")
-
-

@@ -49,6 +49,12 @@ def _add_run(commands: Commands) -> None:
             help=f"external {role}: a command, tcp:HOST:PORT or tcp-listen:HOST:PORT (default: the scenario's)",
         )
     parser.add_argument(
+        "--emane-events",
+        metavar="GROUP:PORT",
+        help="publish positions and path losses to EMANE, for example 224.1.2.8:45703",
+    )
+    parser.add_argument("--emane-device", metavar="NAME", help="network interface of these events")
+    parser.add_argument(
         "--out",
         type=Path,
         metavar="FOLDER",

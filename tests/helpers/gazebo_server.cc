@@ -5,7 +5,7 @@
  * without `pause` lets the world run, and a reset sets the time to 0 without moving the models. DART clears commands
  * to joints after each step.
  *
- *     server WORLD.sdf [--reset world] [--fault KIND@SECONDS]
+ *     gazebo_server WORLD.sdf [--reset world] [--fault KIND@SECONDS]
  *
  * `--reset world` builds the world and its plugins again, as later versions do. A fault is what another program does
  * at a simulated time: `pause`, `reset`, `step` (one more step than requested), `remove` (the first model that moves),
