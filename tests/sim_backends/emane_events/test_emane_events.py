@@ -64,8 +64,12 @@ MESSAGES: Final = {
     "Position": [("latitudeDegrees", 1, DOUBLE), ("longitudeDegrees", 2, DOUBLE), ("altitudeMeters", 3, DOUBLE)],
     "Velocity": [("azimuthDegrees", 1, DOUBLE), ("elevationDegrees", 2, DOUBLE), ("magnitude", 3, DOUBLE)],
     "Orientation": [("rollDegrees", 1, DOUBLE), ("pitchDegrees", 2, DOUBLE), ("yawDegrees", 3, DOUBLE)],
-    "Location": [("nemId", 1, UINT32), ("position", 2, "Position"), ("velocity", 3, "Velocity")]
-    + [("orientation", 4, "Orientation")],
+    "Location": [
+        ("nemId", 1, UINT32),
+        ("position", 2, "Position"),
+        ("velocity", 3, "Velocity"),
+        ("orientation", 4, "Orientation"),
+    ],
     "LocationEvent": [("locations", 1, "Location")],
     "Pathloss": [("nemId", 1, UINT32), ("forwardPathlossdB", 2, FLOAT), ("reversePathlossdB", 3, FLOAT)],
     "PathlossEvent": [("pathlosses", 1, "Pathloss")],
@@ -94,7 +98,7 @@ def messages() -> dict[str, Any]:
     }
 
 
-def location_event(messages: dict[str, Any], **more: Any) -> Any:
+def location_event(messages: dict[str, Any], **more: object) -> Any:  # noqa: ANN401 (a class made at run time)
     event = messages["LocationEvent"]()
     for location in LOCATIONS:
         added = event.locations.add(nemId=location.nem, **more)
@@ -161,8 +165,8 @@ def sized(content: bytes) -> bytes:
         sized(b"\x0a\x7f"),
         sized(b"\x0b"),
         sized(b"\x80" * 11),
-    ]
-    + [EventDatagram(UUID, 1, [SerializedEvent(1, 100, b"x")]).encode()[:-1]],
+        EventDatagram(UUID, 1, [SerializedEvent(1, 100, b"x")]).encode()[:-1],
+    ],
 )
 def test_a_malformed_datagram_is_refused(datagram: bytes) -> None:
     with pytest.raises(MalformedEventError):

@@ -166,8 +166,8 @@ def test_a_scenario_runs_with_it_by_its_name(
         ({"acknowledge": "no"}, "is 'no', not auto, required or off"),
         ({"command_topics": {"drone": "/nowhere"}}, "nothing subscribes to the commands of drone on /nowhere"),
         (
-            {"origins_m": {"drone": [0, 0, 9]}, "place": False},
-            "the model drone is 9.* m away from the start of drone",
+            {"origins_m": {"leader": [0, 0, 9]}, "place": False},
+            "the model leader is .* m away from the start of leader",
         ),
     ],
 )
@@ -182,7 +182,7 @@ def test_a_world_that_does_not_fit_is_reported(
     ("fault", "message"),
     [
         ("pause", "it has not reached Gazebo's time .* another program may have paused it within 2 s"),
-        ("reset", "it was reset; Gazebo's clock is at 0 s"),
+        ("reset", "it was reset; Gazebo's clock is at 0"),
         ("step", "another program has advanced it; Gazebo's clock is at|it has advanced beyond"),
         ("remove", "the model leader has been removed"),
     ],
