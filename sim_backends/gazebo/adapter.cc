@@ -31,14 +31,18 @@ namespace msgs = ignition::msgs;
 namespace transport = ignition::transport;
 #endif
 
+#include <fcntl.h>
 #include <nlohmann/json.hpp>
+#include <sys/file.h>
 #include <unistd.h>
 
 #include <algorithm>
+#include <cerrno>
 #include <chrono>
 #include <cmath>
 #include <condition_variable>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <functional>
 #include <limits>
@@ -48,6 +52,7 @@ namespace transport = ignition::transport;
 #include <set>
 #include <stdexcept>
 #include <string>
+#include <thread>
 #include <vector>
 
 using Clock = std::chrono::steady_clock;
@@ -268,6 +273,7 @@ public:
     /* Connect, stop the robots, reset the world, place the robots, and let them come to rest: that is time 0. */
     void begin()
     {
+        wait_for_other_runs();
         connect();
         pause();
         measure_step();
@@ -382,6 +388,26 @@ private:
                 continue;
             }
             changed_.wait_until(lock, std::min({limit, next_heartbeat_, check, now + std::chrono::milliseconds(100)}));
+        }
+    }
+
+    /* Runs of this machine use a world one after the other: a shootout starts several at a time. The lock ends with
+     * the process. */
+    void wait_for_other_runs()
+    {
+        const char *partition = std::getenv("IGN_PARTITION");
+        size_t key = std::hash<std::string>()(options_.world + "\n" + (partition ? partition : ""));
+        std::string path = "/tmp/fieldkit-gazebo-" + std::to_string(getuid()) + "-" + std::to_string(key) + ".lock";
+        int file = open(path.c_str(), O_RDWR | O_CREAT | O_CLOEXEC | O_NOFOLLOW, 0600);
+        if (file < 0)
+            fail("the lock file " + path + " cannot be opened: " + std::strerror(errno));
+        auto limit = Clock::now() + std::chrono::duration<double>(50 * options_.timeout_s);
+        while (flock(file, LOCK_EX | LOCK_NB) != 0) {
+            if (Clock::now() >= limit)
+                fail("another run uses it (" + path + ")");
+            if (Clock::now() >= next_heartbeat_)
+                beat();
+            std::this_thread::sleep_for(std::chrono::milliseconds(20));
         }
     }
 
@@ -905,12 +931,14 @@ private:
             }
         limit_m_s2_ = options.limit_m_s2;
         bool is_deterministic = options.deterministic;
-        gazebo_ = std::make_unique<Gazebo>(std::move(options), std::move(agents), heartbeat_ms);
-        gazebo_->report_busy = [this](int64_t at_ns) {
+        auto report_busy = [this](int64_t at_ns) {
             Writer busy;
             busy.number(static_cast<uint64_t>(at_ns), 8);
             send(BUSY, busy);
         };
+        report_busy(0); /* the first use of Gazebo Transport takes a while */
+        gazebo_ = std::make_unique<Gazebo>(std::move(options), std::move(agents), heartbeat_ms);
+        gazebo_->report_busy = report_busy;
         gazebo_->begin();
         answer.number(VERSION, 2);
         answer.number(PHYSICS, 1);

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -51,8 +52,11 @@ def connected(
     running: GazeboServer,
     options: Mapping[str, object] | None = None,
     changes: Mapping[str, object] | None = None,
+    deadline_s: float = 30.0,
 ) -> Iterator[RemotePhysics]:
-    physics = open_physics(shlex.quote(str(adapter().path())), hello(running, options or {}, changes or {}), 30.0)
+    physics = open_physics(
+        shlex.quote(str(adapter().path())), hello(running, options or {}, changes or {}), deadline_s
+    )
     try:
         yield physics
     finally:
@@ -129,6 +133,16 @@ def test_poses_of_an_older_time_are_not_used(exact: GazeboServer, tmp_path: Path
         assert state.position_m == pytest.approx(expected[-1][name].position_m, abs=1e-6)
 
 
+def test_it_reports_that_it_is_busy_if_gazebo_is_slow(tmp_path: Path) -> None:
+    assert "<real_time_factor>5<" in SDF
+    slow = SDF.replace("<real_time_factor>5<", "<real_time_factor>0.05<")
+    started_s = time.monotonic()
+    # 0.2 s until the robots are at rest take 4 s, which is longer than the deadline.
+    with gazebo_server(tmp_path, slow) as running, connected(running, deadline_s=3.0) as physics:
+        assert time.monotonic() - started_s > 3
+        assert physics.advance(0, {}).keys() == {"leader", "follower", "drone"}
+
+
 def test_a_run_starts_with_robots_at_their_starts_and_an_obstacle_stops_them(server: GazeboServer) -> None:
     with connected(server, {"velocity": "window"}) as physics:
         drive(physics)
@@ -142,16 +156,16 @@ def test_a_run_starts_with_robots_at_their_starts_and_an_obstacle_stops_them(ser
     assert stopped["leader"].position_m[0] == pytest.approx(33 - 0.495, abs=0.02)
 
 
-def test_a_scenario_runs_with_it_by_its_name(
+def test_parallel_runs_use_it_one_after_the_other_by_its_name(
     server: GazeboServer, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     options = ", ".join(f"{key}: {value}" for key, value in server.options.items())
     words = ["cosim", "run", "convoy", "--physics", "gazebo", "--set", f"physics.options={{{options}}}"]
-    code = main([*words, "--duration", "2s", "--policy", "sliding_window", "--window", "20ms", "--format", "csv"])
+    code = main([*words, "--duration", "500ms", "--window", "20ms", "--policy", "sliding_window", "--seeds", "2"])
     output = capsys.readouterr()
     assert code == 0, output.err
-    assert "leader" in output.out
+    assert "2 seeds" in output.out or "leader" in output.out
 
 
 @pytest.mark.parametrize(
