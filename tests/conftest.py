@@ -57,6 +57,7 @@ _LONG: Final = (
     "test_rosbag_behaviour",
     "test_check_emulated",
     "test_conformance",
+    "test_gazebo_federate",
     "test_cosim_run",
     "test_cosim_shootout",
     "test_emulated_lab",
