@@ -31,9 +31,9 @@ namespace msgs = ignition::msgs;
 namespace transport = ignition::transport;
 #endif
 
-#include <fcntl.h>
 #include <nlohmann/json.hpp>
-#include <sys/file.h>
+#include <sys/socket.h>
+#include <sys/un.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -391,20 +391,23 @@ private:
         }
     }
 
-    /* Runs of this machine use a world one after the other: a shootout starts several at a time. The lock ends with
-     * the process. */
+    /* Runs of this machine use a world one after the other: a shootout starts several at a time. Only one process can
+     * have a name of an abstract socket, and the name is free when that process ends. */
     void wait_for_other_runs()
     {
         const char *partition = std::getenv("IGN_PARTITION");
         size_t key = std::hash<std::string>()(options_.world + "\n" + (partition ? partition : ""));
-        std::string path = "/tmp/fieldkit-gazebo-" + std::to_string(getuid()) + "-" + std::to_string(key) + ".lock";
-        int file = open(path.c_str(), O_RDWR | O_CREAT | O_CLOEXEC | O_NOFOLLOW, 0600);
-        if (file < 0)
-            fail("the lock file " + path + " cannot be opened: " + std::strerror(errno));
+        std::string name = "fieldkit-gazebo-" + std::to_string(getuid()) + "-" + std::to_string(key);
+        sockaddr_un address = {};
+        address.sun_family = AF_UNIX;
+        name.copy(address.sun_path + 1, sizeof address.sun_path - 1); /* abstract: the first byte is 0 */
+        int lock = socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
         auto limit = Clock::now() + std::chrono::duration<double>(50 * options_.timeout_s);
-        while (flock(file, LOCK_EX | LOCK_NB) != 0) {
+        while (lock < 0 || bind(lock, reinterpret_cast<sockaddr *>(&address), sizeof address) != 0) {
+            if (lock < 0 || errno != EADDRINUSE)
+                fail(std::string("a socket cannot be bound: ") + std::strerror(errno));
             if (Clock::now() >= limit)
-                fail("another run uses it (" + path + ")");
+                fail("another run of this machine uses it");
             if (Clock::now() >= next_heartbeat_)
                 beat();
             std::this_thread::sleep_for(std::chrono::milliseconds(20));

@@ -173,7 +173,7 @@ def test_parallel_runs_use_it_one_after_the_other_by_its_name(
     [
         (
             {"world": "moon"},
-            "no service|/world/moon/control has not been found \\(visible worlds: baylands\\) within 2 s",
+            "no service|/world/moon/control has not been found \\(visible worlds: baylands\\) within 4 s",
         ),
         ({"models": {"drone": "kite"}}, "it has no moving model kite \\(models and links: leader, follower, drone"),
         ({"speed": 1}, "physics.options has no key 'speed'; keys: acknowledge, "),
@@ -188,14 +188,14 @@ def test_parallel_runs_use_it_one_after_the_other_by_its_name(
 def test_a_world_that_does_not_fit_is_reported(
     server: GazeboServer, options: Mapping[str, object], message: str
 ) -> None:
-    with pytest.raises(FederateError, match=message), connected(server, {"timeout_s": 2, **options}):
+    with pytest.raises(FederateError, match=message), connected(server, {"timeout_s": 4, **options}):
         pass
 
 
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        ("pause", "it has not reached Gazebo's time .* another program may have paused it within 2 s"),
+        ("pause", "it has not reached Gazebo's time .* another program may have paused it within 4 s"),
         ("reset", "it was reset; Gazebo's clock is at 0"),
         ("step", "another program has advanced it; Gazebo's clock is at|it has advanced beyond"),
         ("remove", "the model leader has been removed"),
@@ -203,7 +203,7 @@ def test_a_world_that_does_not_fit_is_reported(
 )
 def test_another_program_that_controls_gazebo_is_reported(tmp_path: Path, fault: str, message: str) -> None:
     with gazebo_server(tmp_path, SDF, "--fault", f"{fault}@0.3545") as running:
-        error = error_of(running, {"timeout_s": 2})
+        error = error_of(running, {"timeout_s": 4})
     assert error.startswith("physics gazebo (")
     assert "failed at the request to advance from 0.25 s to 0.26 s" in error or fault != "pause"
     assert "Gazebo world 'baylands', whose last time is 0.2" in error
@@ -213,8 +213,8 @@ def test_another_program_that_controls_gazebo_is_reported(tmp_path: Path, fault:
 def test_a_gazebo_that_ends_or_is_suspended_is_reported(tmp_path: Path) -> None:
     with gazebo_server(tmp_path, SDF, "--fault", "exit@0.3545") as running:
         assert "it has disappeared; Gazebo's clock is at 0.35" in error_of(running, {})
-    with gazebo_server(tmp_path, SDF) as running, connected(running, {"timeout_s": 2}) as physics:
+    with gazebo_server(tmp_path, SDF) as running, connected(running, {"timeout_s": 4}) as physics:
         physics.advance(WINDOW_NS, {})
         running.suspend()
-        with pytest.raises(FederateError, match=r"'baylands', whose last time is 0.01 s: .* within 2 s"):
+        with pytest.raises(FederateError, match=r"'baylands', whose last time is 0.01 s: .* within 4 s"):
             physics.advance(2 * WINDOW_NS, {})
