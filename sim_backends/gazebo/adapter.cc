@@ -302,15 +302,16 @@ public:
         int64_t before_at = at;
         while (at < to_step) {
             int64_t next = to_step;
-            if (any_turns())
+            bool turned = any_turns();
+            if (turned)
                 next = std::min(next, (at / period + 1) * period);
             if (options_.velocity == "step" && next == to_step && next - at > 1)
                 next--;
             before = poses_of_agents(), before_at = at;
             step(next - at);
             at = next;
-            if (any_turns() && at % period == 0)
-                send_commands();
+            if (turned && at % period == 0)
+                send_commands(); /* also when it has reached its direction, to stop it */
         }
         if (options_.velocity == "window")
             before = window_poses_, before_at = window_at_;
@@ -384,7 +385,7 @@ private:
             if (now >= check) {
                 check = now + std::chrono::milliseconds(500);
                 if (is_connected_ && !unlocked(lock, [&] { return has_service(control_service()); }))
-                    fail("it has disappeared" + last_message());
+                    fail("it has disappeared, or is suspended" + last_message());
                 continue;
             }
             changed_.wait_until(lock, std::min({limit, next_heartbeat_, check, now + std::chrono::milliseconds(100)}));
