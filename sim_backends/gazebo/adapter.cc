@@ -16,6 +16,8 @@
 #include <gz/msgs/twist.pb.h>
 #include <gz/msgs/world_control.pb.h>
 #include <gz/transport/Node.hh>
+#include <gz/transport/config.hh>
+#define SOFTWARE "Gazebo Transport " GZ_TRANSPORT_VERSION_FULL
 namespace msgs = gz::msgs;
 namespace transport = gz::transport;
 #else
@@ -27,6 +29,8 @@ namespace transport = gz::transport;
 #include <ignition/msgs/twist.pb.h>
 #include <ignition/msgs/world_control.pb.h>
 #include <ignition/transport/Node.hh>
+#include <ignition/transport/config.hh>
+#define SOFTWARE "Ignition Transport " IGNITION_TRANSPORT_VERSION_FULL
 namespace msgs = ignition::msgs;
 namespace transport = ignition::transport;
 #endif
@@ -952,11 +956,7 @@ private:
         answer.number(UINT64_MAX, 8); /* next_event_ns: -1 */
         answer.data += hash;
         answer.text("gazebo");
-#ifdef FIELDKIT_GZ
-        answer.text("Gazebo Transport");
-#else
-        answer.text("Ignition Transport 11");
-#endif
+        answer.text(SOFTWARE);
         answer.number(2, 2);
         answer.number(TWIST, 2);
         answer.number(VELOCITY, 2);

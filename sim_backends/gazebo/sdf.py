@@ -99,7 +99,7 @@ def world_sdf(
     _add_fence(element, world, version)
     sun = SubElement(element, "light", type="directional", name="sun")
     _texts(sun, cast_shadows="true", pose="0 0 20 0 0 0", direction="-0.5 0.1 -0.9", diffuse="0.8 0.8 0.8 1")
-    ground = _static_model(element, "ground")
+    ground = _static_model(element, "ground_plane")
     for kind in ("collision", "visual"):
         geometry = SubElement(SubElement(ground, kind, name=kind), "geometry")
         _texts(SubElement(geometry, "plane"), normal="0 0 1", size="{:g} {:g}".format(*(4 * m for m in world.area_m)))

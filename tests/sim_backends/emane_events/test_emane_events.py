@@ -5,7 +5,7 @@ import math
 import struct
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -13,6 +13,8 @@ from typing import Any, Final
 import pyproj
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
@@ -171,6 +173,22 @@ def sized(content: bytes) -> bytes:
 def test_a_malformed_datagram_is_refused(datagram: bytes) -> None:
     with pytest.raises(MalformedEventError):
         EventDatagram.decode(datagram)
+
+
+@given(
+    position=st.integers(0, 200),
+    replacement=st.binary(max_size=4),
+    content=st.sampled_from([encode_locations(LOCATIONS), encode_pathlosses(LOSSES)]),
+)
+def test_altered_bytes_give_an_event_or_the_error(position: int, replacement: bytes, content: bytes) -> None:
+    datagram = EventDatagram(UUID, 1, [SerializedEvent(1, 100, content)]).encode()
+    altered = datagram[:position] + replacement + datagram[position + len(replacement) :]
+    for decode in (EventDatagram.decode, lambda data: EventDatagram.decode(sized(data[2:]))):
+        with suppress(MalformedEventError):
+            for event in decode(altered).events:
+                for read in (decode_locations, decode_pathlosses):
+                    with suppress(MalformedEventError):
+                        assert isinstance(read(event.content), list)
 
 
 def test_numbers_that_do_not_fit_are_refused() -> None:

@@ -145,6 +145,7 @@ def test_it_reports_that_it_is_busy_if_gazebo_is_slow(tmp_path: Path) -> None:
 
 def test_a_run_starts_with_robots_at_their_starts_and_an_obstacle_stops_them(server: GazeboServer) -> None:
     with connected(server, {"velocity": "window"}) as physics:
+        assert physics.welcome.software.startswith("Ignition Transport 11.")
         drive(physics)
     places = {"agents.leader.at_m": [31.8, 53], "agents.follower.heading_deg": 90}
     with connected(server, changes=places) as physics:

@@ -1,14 +1,18 @@
-"""SDF worlds have the obstacles of the world file and the robots of the scenario."""
+"""SDF worlds have the obstacles of the world file and the robots of the scenario; a missing library is reported."""
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from xml.etree.ElementTree import Element, fromstring
 
 import pytest
 
 from fieldkit.cli import main
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import load_scenario
 from sim_backends.cosim.scenario.sdf_world import scenario_sdf
+from sim_backends.federates.frames import PHYSICS
+from sim_backends.federates.named import command_line
 from sim_backends.gazebo.sdf import SdfRobot, world_sdf
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER
 from sim_backends.world.obstacles import Ramp
@@ -111,3 +115,13 @@ def test_the_command_prints_the_plugins_of_a_version(capsys: pytest.CaptureFixtu
         "gz-sim-diff-drive-system",
         "gz-sim-velocity-control-system",
     }
+
+
+def test_missing_libraries_are_reported_with_the_command_that_installs_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PKG_CONFIG_LIBDIR", str(tmp_path))
+    monkeypatch.delenv("PKG_CONFIG_PATH", raising=False)
+    with pytest.raises(ConfigurationError, match="gazebo-adapter needs the library ignition-transport11") as caught:
+        command_line("gazebo", PHYSICS)
+    assert "apt-get install g++ pkg-config nlohmann-json3-dev libignition-transport-dev" in caught.value.remedy
