@@ -50,6 +50,7 @@ _LONG: Final = (
     "test_trial_crash",
     "test_check_emulated",
     "test_conformance",
+    "test_gazebo_federate",
     "test_tool_variants",
     "test_fuzz",
     "test_cli_varied",

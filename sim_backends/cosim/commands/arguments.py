@@ -27,6 +27,7 @@ def add(parser: Parser) -> None:
     _add_plot(commands)
     _add_replay(commands)
     _conform(commands)
+    _add_sdf(commands)
     _add_list(commands)
     _add_schema(commands)
 
@@ -43,6 +44,12 @@ def _add_run(commands: Commands) -> None:
     _add_window(parser, "window of the sync policy")
     _add_seeds(parser)
     _add_federates(parser)
+    parser.add_argument(
+        "--emane-events",
+        metavar="GROUP:PORT",
+        help="publish positions and path losses to EMANE, for example 224.1.2.8:45703",
+    )
+    parser.add_argument("--emane-device", metavar="NAME", help="network interface of these events")
     parser.add_argument(
         "--out",
         type=Path,
@@ -187,12 +194,30 @@ def _conform(commands: Commands) -> None:
     parser.add_argument(
         "--scenario", default="convoy", metavar="SCENARIO", help="scenario that it receives (default convoy)"
     )
+    _add_changes(parser)
     parser.add_argument(
         "--windows", type=natural, default=2000, metavar="N", help="windows of the check for drift (default 2000)"
     )
     parser.add_argument("--deadline", metavar="TIME", help="longest wait for an answer, in wall time (default 30s)")
     parser.add_choice("--format", ("table", "json"), default="table", help="output format (default table)")
     parser.set_defaults(run=f"{_PACKAGE}.conform:run")
+
+
+def _add_sdf(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "sdf",
+        help="print the world of a scenario for Gazebo",
+        description="Print the world of a scenario and its robots as SDF, for --physics gazebo.",
+        epilog="example: fieldkit cosim sdf convoy > convoy.sdf",
+    )
+    _add_scenario(parser)
+    parser.add_choice(
+        "--gazebo",
+        ("fortress", "garden"),
+        default="fortress",
+        help="names of the plugins: fortress (default), or garden for it and later versions",
+    )
+    parser.set_defaults(run=f"{_PACKAGE}.sdf:run")
 
 
 def _add_list(commands: Commands) -> None:

@@ -9,8 +9,7 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.scenario.agent_setup import bodies
-from sim_backends.cosim.scenario.external import make_hello, without_federates
-from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import CheckResult, run_checks
@@ -30,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     where = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
     deadline_s = settings.deadline_s(arguments.deadline)
-    scenario = without_federates(load_scenario(arguments.scenario))
+    scenario = settings.scenario(arguments)  # a hello has the options of its role, and not the federate
     role, name = _role(where, scenario, arguments.role, deadline_s)
     opener = partial(open_session, role, where, deadline_s=deadline_s)
     target = Target(opener, _hello(scenario, role), arguments.windows)

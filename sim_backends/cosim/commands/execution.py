@@ -16,7 +16,9 @@ from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder, StateSamples
+from sim_backends.cosim.run_record import WindowObserver
 from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.emane import EmaneObserver, emane_observer
 from sim_backends.cosim.scenario.external import has_addresses
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
@@ -73,11 +75,15 @@ def simulate(
     """
     recorder = None if folder is None else RunRecorder(folder.recording(seed), _run_settings(scenario, policy, seed))
     samples = StateSamples(recorder) if has_followers(scenario) else None
-    simulation = build(scenario, policy=policy, seed=seed, recorder=samples or recorder, deadline_s=deadline_s)
+    observer: WindowObserver | None = samples or recorder
+    publisher: EmaneObserver | nullcontext[None] = nullcontext()
+    if scenario.emane is not None:
+        observer = publisher = emane_observer(scenario, seed, observer)
+    simulation = build(scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s)
     states_at_start = [(0, name, state) for name, state in simulation.agents.states(0).items()]
     ended_by: FieldkitError | KeyboardInterrupt | None = None
     try:
-        with simulation, recorder or nullcontext(), between_windows(simulation.coordinator):
+        with simulation, publisher, recorder or nullcontext(), between_windows(simulation.coordinator):
             simulation.run(progress=progress)
     except (FieldkitError, KeyboardInterrupt) as error:
         ended_by = error

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from fieldkit.cli.display import show_note, showing_progress
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.text import print_text
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate_all
@@ -43,6 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = settings.scenario(arguments)
     policy = settings.policy(arguments, scenario)
     seeds = settings.seeds(arguments, scenario)
+    if scenario.emane is not None and len(seeds) > 1:
+        raise ConfigurationError("only one run can publish events of EMANE", remedy="add --seed 1")
     text = settings.policy_text(policy, scenario)
     build(
         without_federates(scenario), policy=policy

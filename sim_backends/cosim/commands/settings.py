@@ -60,6 +60,8 @@ _KEYS: Final = (
     ("window", "policy.window"),
     ("physics", "physics.federate"),
     ("network", "network.federate"),
+    ("emane_events", "emane.channel"),
+    ("emane_device", "emane.device"),
 )
 """Options that change values of a scenario."""
 

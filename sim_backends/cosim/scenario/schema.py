@@ -13,6 +13,7 @@ from sim_backends.cosim.policies.registry import policies, unknown_policy_remedy
 from sim_backends.cosim.programs.way_points import PERIOD_NS
 from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
+from sim_backends.emane_events.options import EmaneOptions
 from sim_backends.network.tcp.tcp_options import Congestion
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.obstacles import Place, Real
@@ -182,6 +183,7 @@ class CosimScenario(Named):
         topology: `masterless`, or `master`: all packets pass the relay, which is also the host of a ROS 1 master.
         relay: The agent whose access point relays.
         policy: The sync policy.
+        emane: If given, a run publishes its positions to the network emulator EMANE.
         agents: The agents by name.
         traffic: The traffic between them.
         faults: The faults.
@@ -198,6 +200,7 @@ class CosimScenario(Named):
     topology: Topology = Topology.MASTERLESS
     relay: Name | None = None
     policy: PolicyChoice = PolicyChoice.defaults()
+    emane: EmaneOptions | None = None
     agents: Annotated[dict[Name, AgentPlan], Field(min_length=1)]
     traffic: tuple[Traffic, ...] = ()
     faults: tuple[Fault, ...] = ()

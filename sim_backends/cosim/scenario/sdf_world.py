@@ -1,0 +1,28 @@
+"""The world of a scenario as SDF, for Gazebo."""
+
+from sim_backends.cosim.scenario.agent_setup import bodies, limits
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.gazebo.sdf import SdfRobot, Version, world_sdf
+from sim_backends.physics.bodies import Bodies
+from sim_backends.world.world import load_world
+
+
+def scenario_sdf(scenario: CosimScenario, version: Version = "fortress") -> str:
+    """Return an SDF file with the scenario's obstacles and with its robots at their starts.
+
+    Args:
+        scenario: The scenario.
+        version: As for `world_sdf`.
+
+    Raises:
+        ConfigurationError: The world does not exist, or a robot starts within an obstacle.
+    """
+    world = load_world(scenario.world)
+    scenario_bodies = bodies(scenario, world)
+    states = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns).advance(0, {})
+    robots = {}
+    for name, plan in scenario.agents.items():
+        east_m, north_m, up_m = states[name].position_m
+        place_m = (east_m, north_m, up_m - scenario_bodies[name].antenna_m)
+        robots[name] = SdfRobot(limits(plan.robot), place_m, states[name].heading_rad or 0.0)
+    return world_sdf(world, robots, step_ns=scenario.physics.step_ns, version=version)

@@ -1,0 +1,122 @@
+"""The physics federate `emane`: agents that have the locations of EMANE's events, in real time."""
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from sim_backends.emane_events.channel import EventListener
+from sim_backends.emane_events.events import LOCATION, SerializedEvent, decode_locations
+from sim_backends.emane_events.geodesy import LocalFrame, velocity_m_s
+from sim_backends.emane_events.options import EmaneOptions
+from sim_backends.emane_events.protobuf import MalformedEventError
+from sim_backends.federates.answering import FederateService
+from sim_backends.federates.frames import PHYSICS
+from sim_backends.federates.handshake import Hello
+from sim_backends.federates.named import PythonFederate
+from sim_backends.federates.protocols import FederateError, UnansweredError
+from sim_backends.world.motion import STILL, State
+
+
+class EmaneLocations:
+    """A physics whose agents are where the last location event of their NEM says.
+
+    Simulated time passes as fast as wall time, from the first request on. The motion of the scenario's agents is not
+    simulated.
+
+    Args:
+        hello: The run; the options of its configuration are those of `EmaneOptions`.
+
+    Attributes:
+        step_ns: See `PhysicsFederate`.
+        limits_m_s2: See `PhysicsFederate`; unknown, as events may contain any location.
+        waited_s: Total time that it has waited, in seconds of wall time.
+
+    Raises:
+        ValueError: An option is invalid.
+        ConfigurationError: The channel cannot be used.
+    """
+
+    def __init__(self, hello: Hello) -> None:
+        self._options = EmaneOptions.model_validate(json.loads(hello.configuration).get("options", {}))
+        nems = self._options.nems_of(agent.name for agent in hello.agents)
+        self._agents = {nem: name for name, nem in nems.items()}
+        self._frame = LocalFrame(self._options.reference)
+        self._listener = EventListener(self._options.channel, self._options.device)
+        self._states: dict[str, State] = {}
+        self._started_s: float | None = None
+        self.step_ns = hello.step_ns
+        self.limits_m_s2 = {agent.name: math.inf for agent in hello.agents}
+        self.waited_s = 0.0
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "EmaneLocations":
+        raise FederateError("the physics emane cannot be copied: it follows events in real time")
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        """Implement `PhysicsFederate.advance`: wait until this time, and return the last locations.
+
+        Raises:
+            FederateError: An agent has a command.
+            UnansweredError: There is no location of an agent in time.
+        """
+        if commands:
+            raise FederateError(
+                f"the physics emane does not move robots, and {', '.join(commands)} has a command",
+                remedy="remove the motion of the agents from the scenario",
+            )
+        begun_s = time.monotonic()
+        if self._started_s is None:
+            self._wait_for_all(begun_s + self._options.wait)
+            self._started_s = time.monotonic()
+        while (events := self._listener.receive(self._started_s + to_ns / 1e9)) is not None:
+            self._apply(events)
+        self.waited_s += time.monotonic() - begun_s
+        return dict(self._states)
+
+    def close(self) -> None:
+        """Close the channel."""
+        self._listener.close()
+
+    def _wait_for_all(self, limit_s: float) -> None:
+        while len(self._states) < len(self._agents):
+            events = self._listener.receive(limit_s)
+            if events is None:
+                missing = ", ".join(
+                    f"{name} (NEM {nem})" for nem, name in self._agents.items() if name not in self._states
+                )
+                raise UnansweredError(
+                    f"physics emane: no location of {missing} has arrived on {self._options.channel} within "
+                    f"{self._options.wait:g} s",
+                    remedy="start the publisher of the events, or set channel, device or nems",
+                )
+            self._apply(events)
+
+    def _apply(self, events: Sequence[SerializedEvent]) -> None:
+        for event in events:
+            if event.event != LOCATION:
+                continue
+            try:
+                locations = decode_locations(event.content)
+            except MalformedEventError:
+                continue
+            for location in locations:
+                if (name := self._agents.get(location.nem)) is not None:
+                    place = (location.latitude_deg, location.longitude_deg, location.altitude_m)
+                    velocity = STILL if location.velocity is None else velocity_m_s(location.velocity)
+                    self._states[name] = State(self._frame.position_m(place), velocity)
+
+
+def _load() -> FederateService:
+    return FederateService(
+        EmaneLocations,
+        name="emane",
+        software="EMANE events",
+        is_deterministic=False,
+        forks=False,
+        commands=(),
+    )
+
+
+FEDERATE: Final = PythonFederate(PHYSICS, _load)
+"""Target of the entry point `emane`."""

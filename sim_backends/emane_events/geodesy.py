@@ -1,0 +1,91 @@
+"""Positions east, north, up of a reference point, and geodetic positions on WGS 84 (NIMA TR8350.2)."""
+
+import math
+from typing import Final
+
+from fieldkit.core.model import Vector
+from sim_backends.emane_events.events import EmaneVelocity
+
+_A_M: Final = 6_378_137.0
+_F: Final = 1 / 298.257223563
+_E2: Final = _F * (2 - _F)
+_CONVERGED_RAD: Final = 1e-15
+_ITERATIONS: Final = 20
+
+Geodetic = tuple[float, float, float]
+"""Latitude and longitude in degrees, height above the ellipsoid in metres."""
+
+
+class LocalFrame:
+    """The tangent plane at a reference point.
+
+    Args:
+        reference: The point, which has the position (0, 0, 0).
+    """
+
+    def __init__(self, reference: Geodetic) -> None:
+        latitude, longitude = math.radians(reference[0]), math.radians(reference[1])
+        sin, cos = math.sin(latitude), math.cos(latitude)
+        sin_l, cos_l = math.sin(longitude), math.cos(longitude)
+        self._origin_m = _ecef_m(latitude, longitude, reference[2])
+        self._axes = ((-sin_l, cos_l, 0.0), (-sin * cos_l, -sin * sin_l, cos), (cos * cos_l, cos * sin_l, sin))
+
+    def geodetic(self, position_m: Vector) -> Geodetic:
+        """Return the geodetic position of a position east, north, up."""
+        x, y, z = (
+            self._origin_m[axis]
+            + sum(metres * unit[axis] for metres, unit in zip(position_m, self._axes, strict=True))
+            for axis in range(3)
+        )
+        across_m = math.hypot(x, y)
+        latitude = math.atan2(z, across_m * (1 - _E2))
+        for _ in range(_ITERATIONS):
+            radius_m = _A_M / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
+            before, latitude = latitude, math.atan2(z + _E2 * radius_m * math.sin(latitude), across_m)
+            if abs(latitude - before) < _CONVERGED_RAD:
+                break
+        sin, cos = math.sin(latitude), math.cos(latitude)
+        # Valid at the poles as well as at the equator.
+        height_m = across_m * cos + z * sin - _A_M * math.sqrt(1 - _E2 * sin * sin)
+        return math.degrees(latitude), math.degrees(math.atan2(y, x)), height_m
+
+    def position_m(self, place: Geodetic) -> Vector:
+        """Return the position east, north, up of a geodetic position."""
+        ecef_m = _ecef_m(math.radians(place[0]), math.radians(place[1]), place[2])
+        offset_m = [metres - origin_m for metres, origin_m in zip(ecef_m, self._origin_m, strict=True)]
+        east_m, north_m, up_m = (
+            sum(metres * share for metres, share in zip(offset_m, unit, strict=True)) for unit in self._axes
+        )
+        return east_m, north_m, up_m
+
+
+def _ecef_m(latitude_rad: float, longitude_rad: float, height_m: float) -> Vector:
+    sin, cos = math.sin(latitude_rad), math.cos(latitude_rad)
+    radius_m = _A_M / math.sqrt(1 - _E2 * sin * sin)
+    across_m = (radius_m + height_m) * cos
+    return (
+        across_m * math.cos(longitude_rad),
+        across_m * math.sin(longitude_rad),
+        (radius_m * (1 - _E2) + height_m) * sin,
+    )
+
+
+def emane_velocity(velocity_m_s: Vector) -> EmaneVelocity:
+    """Return a velocity east, north, up as azimuth, elevation and magnitude."""
+    east, north, up = velocity_m_s
+    return EmaneVelocity(
+        math.degrees(math.atan2(east, north)) % 360,
+        math.degrees(math.atan2(up, math.hypot(east, north))),
+        math.hypot(east, north, up),
+    )
+
+
+def velocity_m_s(velocity: EmaneVelocity) -> Vector:
+    """Return a velocity as metres per second east, north, up."""
+    azimuth, elevation = math.radians(velocity.azimuth_deg), math.radians(velocity.elevation_deg)
+    level_m_s = velocity.speed_m_s * math.cos(elevation)
+    return (
+        level_m_s * math.sin(azimuth),
+        level_m_s * math.cos(azimuth),
+        velocity.speed_m_s * math.sin(elevation),
+    )

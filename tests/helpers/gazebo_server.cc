@@ -1,0 +1,400 @@
+/* A server with the services and topics of Gazebo Fortress, for tests: DART moves the models of an SDF file.
+ *
+ * It follows the loop of Fortress (ign-gazebo6, SimulationRunner): the control service answers before anything
+ * happens, the clock of a step is published before the step is made, poses are limited to a rate in wall time, a request
+ * without `pause` lets the world run, and a reset sets the time to 0 without moving the models. DART clears commands
+ * to joints after each step.
+ *
+ *     gazebo_server WORLD.sdf [--reset world] [--fault KIND@SECONDS]
+ *
+ * `--reset world` builds the world and its plugins again, as later versions do. A fault is what another program does
+ * at a simulated time: `pause`, `reset`, `step` (one more step than requested), `remove` (the first model that moves),
+ * `exit`. */
+
+#include <ignition/msgs/boolean.pb.h>
+#include <ignition/msgs/clock.pb.h>
+#include <ignition/msgs/empty.pb.h>
+#include <ignition/msgs/pose.pb.h>
+#include <ignition/msgs/pose_v.pb.h>
+#include <ignition/msgs/twist.pb.h>
+#include <ignition/msgs/world_control.pb.h>
+#include <ignition/physics/ForwardStep.hh>
+#include <ignition/physics/FrameSemantics.hh>
+#include <ignition/physics/FreeGroup.hh>
+#include <ignition/physics/GetEntities.hh>
+#include <ignition/physics/Joint.hh>
+#include <ignition/physics/RequestEngine.hh>
+#include <ignition/physics/sdf/ConstructWorld.hh>
+#include <ignition/plugin/Loader.hh>
+#include <ignition/transport/Node.hh>
+#include <sdf/sdf.hh>
+#include <unistd.h>
+
+#include <algorithm>
+#include <chrono>
+#include <csignal>
+#include <cstring>
+#include <filesystem>
+#include <iostream>
+#include <memory>
+#include <mutex>
+#include <thread>
+
+namespace physics = ignition::physics;
+namespace msgs = ignition::msgs;
+namespace transport = ignition::transport;
+using Features = physics::FeatureList<physics::sdf::ConstructSdfWorld, physics::GetEntities, physics::ForwardStep,
+                                      physics::LinkFrameSemantics, physics::GetBasicJointState,
+                                      physics::SetJointVelocityCommandFeature, physics::FindFreeGroupFeature,
+                                      physics::SetFreeGroupWorldPose, physics::SetFreeGroupWorldVelocity>;
+using SteadyClock = std::chrono::steady_clock;
+
+/* Return the path of DART's plugin; its folder depends on the architecture. */
+static std::string engine_path()
+{
+    for (const auto &folder : std::filesystem::directory_iterator("/usr/lib")) {
+        auto path = folder.path() / "ign-physics-5/engine-plugins/libignition-physics5-dartsim-plugin.so.5";
+        if (std::filesystem::exists(path))
+            return path.string();
+    }
+    return "";
+}
+
+static volatile std::sig_atomic_t is_stopped = 0;
+
+/* ignition::math::SpeedLimiter without jerk. */
+struct Limiter {
+    double speed = 1e9, acceleration = 1e9, last = 0;
+    double limit(double target, double step_s)
+    {
+        target = std::clamp(target, -speed, speed);
+        last += std::clamp(target - last, -acceleration * step_s, acceleration * step_s);
+        return last;
+    }
+};
+
+struct Model {
+    std::string name;
+    physics::Model3dPtr<Features> body;
+    physics::Link3dPtr<Features> link;
+    std::vector<physics::Joint3dPtr<Features>> left, right;
+    bool drives = false, flies = false, has_target = false;
+    double separation = 1, radius = 1, left_speed = 0, right_speed = 0;
+    Limiter linear, angular;
+    std::mutex mutex; /* for the target, which is set by the thread of reception */
+    Eigen::Vector3d target_linear = Eigen::Vector3d::Zero(), target_angular = Eigen::Vector3d::Zero();
+    Eigen::Vector3d set_linear = Eigen::Vector3d::Zero(), set_angular = Eigen::Vector3d::Zero();
+
+    void on_twist(const msgs::Twist &twist)
+    {
+        std::lock_guard<std::mutex> guard(mutex);
+        target_linear = {twist.linear().x(), twist.linear().y(), twist.linear().z()};
+        target_angular = {twist.angular().x(), twist.angular().y(), twist.angular().z()};
+    }
+
+    void pre_update()
+    {
+        if (flies) {
+            auto group = body->FindFreeGroup();
+            Eigen::Matrix3d rotation = link->FrameDataRelativeToWorld().pose.linear();
+            group->SetWorldLinearVelocity(rotation * set_linear);
+            group->SetWorldAngularVelocity(rotation * set_angular);
+        }
+        for (auto &joint : left)
+            joint->SetVelocityCommand(0, left_speed);
+        for (auto &joint : right)
+            joint->SetVelocityCommand(0, right_speed);
+    }
+
+    void post_update(double step_s)
+    {
+        std::lock_guard<std::mutex> guard(mutex);
+        set_linear = target_linear, set_angular = target_angular;
+        double forward = linear.limit(target_linear.x(), step_s), turn = angular.limit(target_angular.z(), step_s);
+        right_speed = (forward + turn * separation / 2) / radius;
+        left_speed = (forward - turn * separation / 2) / radius;
+    }
+};
+
+class Server {
+public:
+    Server(const std::string &path, bool rebuilds, std::string fault, double fault_s)
+        : rebuilds_(rebuilds), fault_(std::move(fault)), fault_ns_(std::llround(fault_s * 1e9))
+    {
+        sdf::Errors errors = root_.Load(path);
+        for (const auto &error : errors)
+            std::cerr << error.Message() << std::endl;
+        if (!errors.empty() || root_.WorldCount() != 1)
+            std::exit(2);
+        world_ = root_.WorldByIndex(0);
+        prefix_ = "/world/" + world_->Name();
+        step_ns_ = std::llround(world_->PhysicsByIndex(0)->MaxStepSize() * 1e9);
+        double factor = world_->PhysicsByIndex(0)->RealTimeFactor();
+        period_ns_ = factor > 0 ? std::llround(double(step_ns_) / factor) : 0;
+        loader_.LoadLib(engine_path());
+        build();
+        std::function<bool(const msgs::WorldControl &, msgs::Boolean &)> on_control =
+            [this](const msgs::WorldControl &request, msgs::Boolean &answer) {
+                std::lock_guard<std::mutex> guard(mutex_);
+                controls_.push_back(request);
+                answer.set_data(true);
+                return true;
+            };
+        std::function<bool(const msgs::Pose &, msgs::Boolean &)> on_pose = [this](const msgs::Pose &request,
+                                                                                  msgs::Boolean &answer) {
+            std::lock_guard<std::mutex> guard(mutex_);
+            poses_.push_back(request);
+            answer.set_data(true);
+            return true;
+        };
+        node_.Advertise(prefix_ + "/control", on_control);
+        node_.Advertise(prefix_ + "/set_pose", on_pose);
+        clock_ = node_.Advertise<msgs::Clock>(prefix_ + "/clock");
+        transport::AdvertiseMessageOptions options;
+        options.SetMsgsPerSec(pose_hertz());
+        moving_ = node_.Advertise<msgs::Pose_V>(prefix_ + "/dynamic_pose/info", options);
+    }
+
+    void run()
+    {
+        std::cout << "ready" << std::endl;
+        auto next = SteadyClock::now();
+        while (!is_stopped) {
+            iterate();
+            next = std::max(next + std::chrono::nanoseconds(period_ns_), SteadyClock::now());
+            std::this_thread::sleep_until(next);
+        }
+    }
+
+private:
+    static std::string value(sdf::ElementPtr element, const char *key)
+    {
+        return element->HasElement(key) ? element->GetElement(key)->Get<std::string>() : "";
+    }
+
+    static double number(sdf::ElementPtr element, const char *key, double otherwise)
+    {
+        return element->HasElement(key) ? std::stod(value(element, key)) : otherwise;
+    }
+
+    static void each_plugin(sdf::ElementPtr parent, const std::function<void(const std::string &, sdf::ElementPtr)> &use)
+    {
+        if (!parent->HasElement("plugin"))
+            return;
+        for (auto plugin = parent->GetElement("plugin"); plugin; plugin = plugin->GetNextElement("plugin")) {
+            std::string name = plugin->Get<std::string>("name");
+            use(name.substr(name.rfind(':') + 1), plugin);
+        }
+    }
+
+    int pose_hertz() const
+    {
+        int hertz = 60;
+        each_plugin(world_->Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
+            if (name == "SceneBroadcaster")
+                hertz = int(number(plugin, "dynamic_pose_hertz", 60));
+        });
+        return hertz;
+    }
+
+    /* Build the world and its plugins, which subscribe to their topics. */
+    void build()
+    {
+        plugins_.reset();
+        models_.clear();
+        dart_ = nullptr;
+        engine_ = nullptr;
+        engine_ = physics::RequestEngine3d<Features>::From(loader_.Instantiate("ignition::physics::dartsim::Plugin"));
+        dart_ = engine_->ConstructWorld(*world_);
+        plugins_ = std::make_unique<transport::Node>();
+        for (uint64_t i = 0; i < world_->ModelCount(); i++)
+            if (!world_->ModelByIndex(i)->Static())
+                add(*world_->ModelByIndex(i));
+        each_plugin(world_->Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
+            if (name != "TriggeredPublisher")
+                return;
+            passed_ = plugins_->Advertise<msgs::Empty>(plugin->GetElement("output")->Get<std::string>("topic"));
+            std::function<void(const msgs::Empty &)> pass = [this](const msgs::Empty &message) {
+                passed_.Publish(message);
+            };
+            plugins_->Subscribe(plugin->GetElement("input")->Get<std::string>("topic"), pass);
+        });
+    }
+
+    void add(const sdf::Model &source)
+    {
+        auto model = std::make_unique<Model>();
+        Model *pointer = model.get();
+        model->name = source.Name();
+        model->body = dart_->GetModel(source.Name());
+        model->link = model->body->GetLink(0);
+        each_plugin(source.Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
+            if (name == "DiffDrive") {
+                model->drives = true;
+                model->separation = number(plugin, "wheel_separation", 1);
+                model->radius = number(plugin, "wheel_radius", 0.2);
+                model->linear.speed = number(plugin, "max_linear_velocity", 1e9);
+                model->linear.acceleration = number(plugin, "max_linear_acceleration", 1e9);
+                model->angular.speed = number(plugin, "max_angular_velocity", 1e9);
+                model->angular.acceleration = number(plugin, "max_angular_acceleration", 1e9);
+                for (auto *side : {"left_joint", "right_joint"})
+                    for (auto joint = plugin->GetElement(side); joint; joint = joint->GetNextElement(side))
+                        (side[0] == 'l' ? model->left : model->right)
+                            .push_back(model->body->GetJoint(joint->Get<std::string>()));
+            } else if (name == "VelocityControl") {
+                model->flies = true;
+                auto initial = plugin->Get<ignition::math::Vector3d>("initial_linear", {0, 0, 0}).first;
+                model->target_linear = model->set_linear = {initial.X(), initial.Y(), initial.Z()};
+            } else {
+                return;
+            }
+            std::function<void(const msgs::Twist &)> on_twist = [pointer](const msgs::Twist &twist) {
+                pointer->on_twist(twist);
+            };
+            plugins_->Subscribe("/model/" + source.Name() + "/cmd_vel", on_twist);
+        });
+        models_.push_back(std::move(model));
+    }
+
+    void iterate()
+    {
+        if (rewinds_) {
+            rewinds_ = false;
+            time_ns_ = 0;
+            if (rebuilds_)
+                build();
+        } else if (!is_paused_) {
+            time_ns_ += step_ns_;
+        }
+        publish_clock();
+        place_models();
+        if (!is_paused_) {
+            for (auto &model : models_)
+                model->pre_update();
+            physics::ForwardStep::Output output;
+            physics::ForwardStep::State state;
+            physics::ForwardStep::Input input;
+            input.Get<std::chrono::steady_clock::duration>() = std::chrono::nanoseconds(step_ns_);
+            dart_->Step(output, state, input);
+            for (auto &model : models_)
+                model->post_update(double(step_ns_) / 1e9);
+        }
+        publish_poses();
+        if (!is_paused_ && pending_ > 0 && --pending_ == 0)
+            is_paused_ = true;
+        cause_fault();
+        std::lock_guard<std::mutex> guard(mutex_);
+        for (const msgs::WorldControl &control : controls_) {
+            is_paused_ = control.pause();
+            uint32_t steps = control.multi_step() ? control.multi_step() : control.step() ? 1 : 0;
+            if (is_paused_ && steps > 0)
+                pending_ += steps, is_paused_ = false;
+            rewinds_ = control.has_reset() && (control.reset().all() || control.reset().time_only());
+        }
+        controls_.clear();
+    }
+
+    void cause_fault()
+    {
+        if (fault_.empty() || time_ns_ < fault_ns_)
+            return;
+        if (fault_ == "pause")
+            pending_ = 0, is_paused_ = true;
+        else if (fault_ == "reset")
+            rewinds_ = true;
+        else if (fault_ == "step")
+            pending_++, is_paused_ = false;
+        else if (fault_ == "remove")
+            models_.erase(models_.begin());
+        else if (fault_ == "exit")
+            _exit(1);
+        fault_.clear();
+    }
+
+    void place_models()
+    {
+        std::vector<msgs::Pose> poses;
+        {
+            std::lock_guard<std::mutex> guard(mutex_);
+            poses.swap(poses_);
+        }
+        for (const msgs::Pose &pose : poses)
+            for (auto &model : models_)
+                if (model->name == pose.name()) {
+                    Eigen::Isometry3d target = Eigen::Isometry3d::Identity();
+                    const auto &p = pose.position();
+                    const auto &q = pose.orientation();
+                    target.translate(Eigen::Vector3d(p.x(), p.y(), p.z()));
+                    target.rotate(Eigen::Quaterniond(q.w(), q.x(), q.y(), q.z()));
+                    model->body->FindFreeGroup()->SetWorldPose(target);
+                }
+    }
+
+    void publish_clock()
+    {
+        msgs::Clock message;
+        message.mutable_sim()->set_sec(time_ns_ / 1000000000);
+        message.mutable_sim()->set_nsec(int(time_ns_ % 1000000000));
+        clock_.Publish(message);
+    }
+
+    void publish_poses()
+    {
+        if (!moving_.HasConnections())
+            return;
+        msgs::Pose_V message;
+        message.mutable_header()->mutable_stamp()->set_sec(time_ns_ / 1000000000);
+        message.mutable_header()->mutable_stamp()->set_nsec(int(time_ns_ % 1000000000));
+        for (auto &model : models_) {
+            auto pose = message.add_pose();
+            auto world = model->link->FrameDataRelativeToWorld().pose;
+            Eigen::Quaterniond rotation(world.linear());
+            pose->set_name(model->name);
+            pose->mutable_position()->set_x(world.translation().x());
+            pose->mutable_position()->set_y(world.translation().y());
+            pose->mutable_position()->set_z(world.translation().z());
+            pose->mutable_orientation()->set_w(rotation.w());
+            pose->mutable_orientation()->set_x(rotation.x());
+            pose->mutable_orientation()->set_y(rotation.y());
+            pose->mutable_orientation()->set_z(rotation.z());
+        }
+        message.add_pose()->set_name("chassis"); /* links follow the models, with poses relative to them */
+        moving_.Publish(message);
+    }
+
+    bool rebuilds_;
+    std::string fault_;
+    int64_t fault_ns_, step_ns_ = 0, period_ns_ = 0, time_ns_ = 0;
+    int64_t pending_ = 0;
+    bool is_paused_ = true, rewinds_ = false;
+    std::string prefix_;
+    sdf::Root root_;
+    const sdf::World *world_ = nullptr;
+    ignition::plugin::Loader loader_;
+    physics::Engine3dPtr<Features> engine_;
+    physics::World3dPtr<Features> dart_;
+    std::vector<std::unique_ptr<Model>> models_;
+    std::mutex mutex_; /* for the requests */
+    std::vector<msgs::WorldControl> controls_;
+    std::vector<msgs::Pose> poses_;
+    transport::Node::Publisher clock_, moving_, passed_;
+    std::unique_ptr<transport::Node> plugins_;
+    transport::Node node_;
+};
+
+int main(int count, char **words)
+{
+    std::string fault;
+    double fault_s = 0;
+    bool rebuilds = false;
+    for (int i = 2; i + 1 < count; i += 2) {
+        std::string value = words[i + 1];
+        if (std::string(words[i]) == "--reset")
+            rebuilds = value == "world";
+        else if (std::string(words[i]) == "--fault")
+            fault = value.substr(0, value.find('@')), fault_s = std::stod(value.substr(value.find('@') + 1));
+    }
+    std::signal(SIGTERM, [](int) { is_stopped = 1; });
+    Server(words[1], rebuilds, fault, fault_s).run();
+    return 0;
+}

@@ -1,0 +1,223 @@
+"""The physics federate `gazebo`, against a server like Gazebo Fortress with DART."""
+
+import re
+import shlex
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from fieldkit.cli import main
+from sim_backends.cosim import load_scenario
+from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.external import make_hello
+from sim_backends.cosim.scenario.sdf_world import scenario_sdf
+from sim_backends.federates.conformance.probe import Target
+from sim_backends.federates.conformance.suite import checks, run_check
+from sim_backends.federates.frames import PHYSICS
+from sim_backends.federates.handshake import Hello
+from sim_backends.federates.protocols import FederateError
+from sim_backends.federates.remote import RemotePhysics, open_physics
+from sim_backends.federates.session import open_session
+from sim_backends.gazebo.federate import adapter
+from sim_backends.physics.body import Twist, Velocity
+from sim_backends.world.motion import State
+from sim_backends.world.world import load_world
+from tests.helpers.gazebo_server import GazeboServer, gazebo_server, missing_libraries
+
+pytestmark = [pytest.mark.emulated, pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries())]
+
+SDF = scenario_sdf(load_scenario("convoy"))
+WINDOW_NS = 10_000_000
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GazeboServer]:
+    """A server whose resets are like those of Fortress: they set the time only."""
+    with gazebo_server(tmp_path_factory.mktemp("gazebo"), SDF) as running:
+        yield running
+
+
+def hello(running: GazeboServer, options: Mapping[str, object], changes: Mapping[str, object]) -> Hello:
+    scenario = load_scenario("convoy", {"physics.options": {**running.options, **options}, **changes})
+    world = load_world(scenario.world)
+    return make_hello(scenario, world, bodies(scenario, world), 1, PHYSICS)
+
+
+@contextmanager
+def connected(
+    running: GazeboServer,
+    options: Mapping[str, object] | None = None,
+    changes: Mapping[str, object] | None = None,
+    deadline_s: float = 30.0,
+) -> Iterator[RemotePhysics]:
+    physics = open_physics(
+        shlex.quote(str(adapter().path())), hello(running, options or {}, changes or {}), deadline_s
+    )
+    try:
+        yield physics
+    finally:
+        physics.close()
+
+
+def drive(physics: RemotePhysics, windows: int = 50) -> list[dict[str, State]]:
+    """Return the states at the ends of windows, in each of which all robots get a new command."""
+    states = [dict(physics.advance(0, {}))]
+    for window in range(1, windows + 1):
+        commands = {
+            "leader": Twist(0.01 * window),
+            "follower": Twist(0.5, 0.02 * window),
+            "drone": Velocity((0.01 * window, 0.0, 0.0), 0.5),
+        }
+        states.append(dict(physics.advance(window * WINDOW_NS, commands)))
+    return states
+
+
+def error_of(running: GazeboServer, options: Mapping[str, object], windows: int = 100) -> str:
+    with pytest.raises(FederateError) as caught, connected(running, options) as physics:
+        drive(physics, windows)
+    return str(caught.value.what)
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GazeboServer]:
+    """A server whose resets build the world again, as later versions do."""
+    with gazebo_server(tmp_path_factory.mktemp("exact"), SDF, "--reset", "world") as running:
+        running.options.update(deterministic=True, acknowledge="required")
+        yield running
+
+
+def test_it_passes_the_conformance_suite(exact: GazeboServer) -> None:
+    opener = partial(open_session, PHYSICS, shlex.quote(str(adapter().path())), deadline_s=30.0)
+    target = Target(opener, hello(exact, {}, {}), windows=200)
+    results = [
+        run_check(target, name, check)
+        for name, check in checks(is_physics=True).items()
+        # DART's last bits depend on memory addresses; two runs in one process of Gazebo are compared below.
+        if name != "determinism"
+    ]
+    assert [result for result in results if result.failure] == []
+    assert {result.name for result in results if result.skipped} == {"fork"}
+
+
+def test_commands_apply_in_their_window_and_equal_runs_are_equal(exact: GazeboServer) -> None:
+    runs = []
+    for _ in range(2):
+        with connected(exact) as physics:
+            runs.append(drive(physics))
+    for first, second in zip(*runs, strict=True):
+        for name, state in first.items():
+            assert state.position_m == pytest.approx(second[name].position_m, abs=1e-6)
+    start, last = runs[0][0], runs[0][-1]
+    # Acceleration and speed are those of the command; a turning robot with four wheels slips.
+    assert last["leader"].velocity_m_s[0] == pytest.approx(0.49, abs=0.02)
+    assert last["leader"].position_m[0] - start["leader"].position_m[0] == pytest.approx(0.125, abs=0.02)
+    assert 0.05 < (last["follower"].heading_rad or 0.0) < 0.25
+    # Gravity is compensated, and the drone turns to its direction.
+    assert last["drone"].position_m == pytest.approx((19.125, 12.0, 8.0), abs=0.02)
+    assert last["drone"].position_m[2] == pytest.approx(8.0, abs=1e-3)
+    assert last["drone"].heading_rad == pytest.approx(0.43, abs=0.05)
+
+
+def test_poses_of_an_older_time_are_not_used(exact: GazeboServer, tmp_path: Path) -> None:
+    with connected(exact) as physics:
+        expected = drive(physics, 10)
+    assert "<dynamic_pose_hertz>2000<" in SDF
+    slow = SDF.replace("<dynamic_pose_hertz>2000<", "<dynamic_pose_hertz>60<")
+    with gazebo_server(tmp_path, slow) as running, connected(running) as physics:
+        states = drive(physics, 10)
+    for name, state in states[-1].items():
+        assert state.position_m == pytest.approx(expected[-1][name].position_m, abs=1e-6)
+
+
+def test_it_reports_that_it_is_busy_if_gazebo_is_slow(tmp_path: Path) -> None:
+    assert "<real_time_factor>5<" in SDF
+    slow = SDF.replace("<real_time_factor>5<", "<real_time_factor>0.05<")
+    started_s = time.monotonic()
+    # 0.2 s until the robots are at rest take 4 s, which is longer than the deadline.
+    with gazebo_server(tmp_path, slow) as running, connected(running, deadline_s=3.0) as physics:
+        assert time.monotonic() - started_s > 3
+        assert physics.advance(0, {}).keys() == {"leader", "follower", "drone"}
+
+
+def test_a_run_starts_with_robots_at_their_starts_and_an_obstacle_stops_them(server: GazeboServer) -> None:
+    with connected(server, {"velocity": "window"}) as physics:
+        assert physics.welcome.software.startswith("Ignition Transport 11.")
+        drive(physics)
+    places = {"agents.leader.at_m": [31.8, 53], "agents.follower.heading_deg": 90}
+    with connected(server, changes=places) as physics:
+        start = physics.advance(0, {})
+        assert start["leader"].position_m[:2] == pytest.approx((31.8, 53), abs=0.01)
+        assert start["follower"].heading_rad == pytest.approx(1.5708, abs=0.01)
+        stopped = physics.advance(1_500_000_000, {"leader": Twist(0.8)})
+    # The western side of the box is at 33 m, and the Husky is 0.99 m long.
+    assert stopped["leader"].position_m[0] == pytest.approx(33 - 0.495, abs=0.02)
+
+
+def test_parallel_runs_use_it_one_after_the_other_by_its_name(
+    server: GazeboServer, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    options = ", ".join(f"{key}: {value}" for key, value in server.options.items())
+    words = ["cosim", "run", "convoy", "--physics", "gazebo", "--set", f"physics.options={{{options}}}"]
+    code = main([*words, "--duration", "500ms", "--window", "20ms", "--policy", "sliding_window", "--seeds", "2"])
+    output = capsys.readouterr()
+    assert code == 0, output.err
+    assert "2 seeds" in output.out or "leader" in output.out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"world": "moon"},
+            "no service|/world/moon/control has not been found \\(visible worlds: baylands\\) within 4 s",
+        ),
+        ({"models": {"drone": "kite"}}, "it has no moving model kite \\(models and links: leader, follower, drone"),
+        ({"speed": 1}, "physics.options has no key 'speed'; keys: acknowledge, "),
+        ({"acknowledge": "no"}, "is 'no', not auto, required or off"),
+        ({"command_topics": {"drone": "/nowhere"}}, "nothing subscribes to the commands of drone on /nowhere"),
+        (
+            {"origins_m": {"leader": [0, 0, 9]}, "place": False},
+            "the model leader is .* m away from the start of leader",
+        ),
+    ],
+)
+def test_a_world_that_does_not_fit_is_reported(
+    server: GazeboServer, options: Mapping[str, object], message: str
+) -> None:
+    with pytest.raises(FederateError, match=message), connected(server, {"timeout_s": 4, **options}):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("pause", "it has not reached Gazebo's time .* another program may have paused it within 4 s"),
+        ("reset", "it was reset; Gazebo's clock is at 0"),
+        ("step", "another program has advanced it; Gazebo's clock is at|it has advanced beyond"),
+        ("remove", "the model leader has been removed"),
+    ],
+)
+def test_another_program_that_controls_gazebo_is_reported(tmp_path: Path, fault: str, message: str) -> None:
+    with gazebo_server(tmp_path, SDF, "--fault", f"{fault}@0.3545") as running:
+        error = error_of(running, {"timeout_s": 4})
+    assert error.startswith("physics gazebo (")
+    assert "failed at the request to advance from 0.25 s to 0.26 s" in error or fault != "pause"
+    assert "Gazebo world 'baylands', whose last time is 0.2" in error
+    assert re.search(message, error), error
+
+
+def test_a_gazebo_that_ends_or_is_suspended_is_reported(tmp_path: Path) -> None:
+    with gazebo_server(tmp_path, SDF, "--fault", "exit@0.3545") as running:
+        assert "it has disappeared, or is suspended; Gazebo's clock is at 0.35" in error_of(running, {})
+    with gazebo_server(tmp_path, SDF) as running, connected(running) as physics:
+        physics.advance(WINDOW_NS, {})
+        running.suspend()
+        with pytest.raises(
+            FederateError, match=r"'baylands', whose last time is 0.01 s: it has disappeared, or is suspended"
+        ):
+            physics.advance(2 * WINDOW_NS, {})
