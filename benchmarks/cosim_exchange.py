@@ -186,7 +186,7 @@ def connected_to(program: Path, count: int) -> Iterator[Party]:
             connection, _ = server.accept()
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             with connection:
-                return subprocess.Popen((program,), stdin=connection, stdout=connection)
+                return subprocess.Popen((program,), stdin=connection.fileno(), stdout=connection.fileno())
 
         started = pool.submit(start)
         with opened("physics", f"tcp:127.0.0.1:{server.getsockname()[1]}", count) as party:
