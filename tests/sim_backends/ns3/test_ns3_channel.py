@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from fieldkit.config import schema
 from sim_backends.ns3.federate import command
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import Antenna, WorldChannel
@@ -15,52 +16,25 @@ from sim_backends.world.world import World
 # The names need escapes in JSON, which is the key of the draws, and are not in alphabetical order.
 NAMES = ("rover", "drone", 'Übung "7"')
 PLACES = 25
-WORLD = World.model_validate(
-    {
-        "name": "all",
-        "summary": "every kind of obstacle",
-        "area_m": [60, 60],
-        "obstacles": [
-            {
-                "kind": "box",
-                "name": "b",
-                "centre_m": [30, 30],
-                "size_m": [20, 9, 3],
-                "yaw_deg": 30,
-                "material": "glass",
-            },
-            {
-                "kind": "wall",
-                "name": "w",
-                "from_m": [5, 5],
-                "to_m": [50, 20],
-                "height": "3m",
-                "thickness": "0.3m",
-                "material": "metal",
-            },
-            {
-                "kind": "building",
-                "name": "h",
-                "centre_m": [15, 40],
-                "size_m": [10, 8, 4],
-                "yaw_deg": 10,
-                "thickness": "0.2m",
-                "material": "brick",
-            },
-            {
-                "kind": "tree",
-                "name": "t",
-                "at_m": [40, 45],
-                "height": "9m",
-                "crown_base": "0.5m",
-                "crown_radius": "18m",
-                "trunk_radius": "0.4m",
-            },
-            {"kind": "raised", "name": "k", "centre_m": [50, 30], "size_m": [12, 12, 1.5], "yaw_deg": 20},
-            {"kind": "ramp", "name": "r", "centre_m": [30, 10], "size_m": [12, 12, 2], "yaw_deg": -70},
-        ],
-    }
-)
+WORLD_FILE = """\
+name: all
+summary: every kind of obstacle
+area_m: [60, 60]
+obstacles:
+  - {kind: box, name: b, centre_m: [30, 30], size_m: [20, 9, 3], yaw_deg: 30, material: glass}
+  - {kind: wall, name: w, from_m: [5, 5], to_m: [50, 20], height: 3m, thickness: 0.3m, material: metal}
+  - {kind: building, name: h, centre_m: [15, 40], size_m: [10, 8, 4], yaw_deg: 10, thickness: 0.2m, material: brick}
+  - {kind: tree, name: t, at_m: [40, 45], height: 9m, crown_base: 0.5m, crown_radius: 18m, trunk_radius: 0.4m}
+  - {kind: raised, name: k, centre_m: [50, 30], size_m: [12, 12, 1.5], yaw_deg: 20}
+  - {kind: ramp, name: r, centre_m: [30, 10], size_m: [12, 12, 2], yaw_deg: -70}
+"""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> World:
+    path = tmp_path_factory.mktemp("world") / "all.yaml"
+    path.write_text(WORLD_FILE, encoding="utf-8")
+    return schema.load(path, World)
 
 
 @pytest.mark.parametrize(
@@ -72,9 +46,9 @@ WORLD = World.model_validate(
     ],
     ids=str,
 )
-def test_its_losses_are_those_of_the_built_in_radio(options: dict[str, Any]) -> None:
+def test_its_losses_are_those_of_the_built_in_radio(options: dict[str, Any], world: World) -> None:
     radio, draws = RadioOptions.model_validate(options), random.Random(3)
-    channel = WorldChannel(9, dict.fromkeys(NAMES, Antenna("802.11g", 0.0, -82.0)), radio, WORLD)
+    channel = WorldChannel(9, dict.fromkeys(NAMES, Antenna("802.11g", 0.0, -82.0)), radio, world)
     links, expected_mw = [], []
     for _ in range(PLACES):
         at_ns = draws.randrange(10**11)
@@ -89,7 +63,7 @@ def test_its_losses_are_those_of_the_built_in_radio(options: dict[str, Any]) -> 
     request = {
         "seed": 9,
         "radio": radio.model_dump(mode="json", exclude_none=True),
-        "world": WORLD.model_dump(mode="json", by_alias=True, exclude_none=True),
+        "world": world.model_dump(mode="json", by_alias=True, exclude_none=True),
         "names": NAMES,
         "links": links,
     }

@@ -148,7 +148,8 @@ def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated
 
 
 def test_losses_have_reasons(simulated: Simulated) -> None:
-    far = simulated(agents__bob__at_m=[500, 0]).run()
+    sparse = with_traffic(rate="10Hz", size_bytes=300)
+    far = simulated(agents__bob__at_m=[500, 0], traffic=sparse).run()
     assert reasons(far).keys() - {""} == {"retries exhausted"}
     assert not any(fate.arrived_ns for fate in far.fates.values())
     full = simulated(radio__mode="g6", traffic=with_traffic(rate="4kHz", size_bytes=1000)).run()
@@ -157,9 +158,10 @@ def test_losses_have_reasons(simulated: Simulated) -> None:
         {"kind": "node-loss", "agent": "bob", "from": "100ms", "to": "200ms"},
         {"kind": "link-cut", "between": ["ann", "bob"], "from": "300ms", "to": "400ms"},
     ]
-    run = simulated(faults=off, network__options__standard="802.11a").run()
+    small = with_traffic(rate="50Hz", size_bytes=300)
+    run = simulated(faults=off, traffic=small, radio__mode="g54", network__options__standard="802.11a").run()
     lost_ns = [fate.packet.sent_ns for fate in run.fates.values() if fate.reason]
-    assert len(lost_ns) == pytest.approx(20, abs=2)
+    assert len(lost_ns) == pytest.approx(10, abs=2)
     assert all(90e6 < at_ns < 200e6 or 290e6 < at_ns < 400e6 for at_ns in lost_ns)
     unassociated = simulated(
         **{key.replace(".", "__"): value for key, value in RELAYED.items()} | {"agents__bob__at_m": [500, 0]}
