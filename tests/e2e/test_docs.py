@@ -91,19 +91,18 @@ def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 
 
-@pytest.mark.emulated
-@pytest.mark.parametrize("page", [page for page in PAGES if any(commands(page))], ids=page_id)
-def test_every_command_of_a_page_runs(page: Path, tmp_path: Path) -> None:
+def run_commands(page: Path, folder: Path) -> None:
+    """Run the commands of a page in an empty folder."""
     environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     if page.name not in DEBIAN_ROS and not any(OWN_SITE.search(command.text) for command in commands(page)):
-        built_in_ros(tmp_path)
+        built_in_ros(folder)
     for command in commands(page):
         if target := re.fullmatch(r"make ([a-z]+)", command.text):
             assert target[1] in make_targets()
             continue
         process = subprocess.run(
             ("bash", "-euc", command.text),
-            cwd=tmp_path,
+            cwd=folder,
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -115,6 +114,26 @@ def test_every_command_of_a_page_runs(page: Path, tmp_path: Path) -> None:
         assert process.returncode == command.exit_code, f"$ {command.text}\n{process.stdout}"
         if command.shown and REPRODUCIBLE.search(command.text):
             assert shape(command.shown) == shape(process.stdout), f"$ {command.text}\n{process.stdout}"
+
+
+COMMAND_PAGES = sorted(
+    (page for page in PAGES if any(commands(page))), key=lambda page: len(list(commands(page))), reverse=True
+)
+
+
+# pytest-xdist runs the tests of a class in one process; two classes distribute the pages, by number of commands.
+@pytest.mark.emulated
+class TestFirstHalf:
+    @pytest.mark.parametrize("page", COMMAND_PAGES[::2], ids=page_id)
+    def test_every_command_of_a_page_runs(self, page: Path, tmp_path: Path) -> None:
+        run_commands(page, tmp_path)
+
+
+@pytest.mark.emulated
+class TestSecondHalf:
+    @pytest.mark.parametrize("page", COMMAND_PAGES[1::2], ids=page_id)
+    def test_every_command_of_a_page_runs(self, page: Path, tmp_path: Path) -> None:
+        run_commands(page, tmp_path)
 
 
 def test_a_command_keeps_its_here_document_and_its_exit_code(tmp_path: Path) -> None:
