@@ -97,7 +97,7 @@ def changes_of_start() -> Iterator[tuple[str, Any, str]]:
     yield "blksize", 64, "another datagram size"
 
 
-@pytest.mark.parametrize(("key", "value", "reason"), changes_of_start())
+@pytest.mark.parametrize(("key", "value", "reason"), list(changes_of_start()))
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_test_with_other_settings_is_a_contradiction(version: str, key: str, value: object, reason: str) -> None:
     ends = {name: document(version, "udp", name) for name in ("client", "server")}
