@@ -118,5 +118,5 @@ def _load() -> FederateService:
     )
 
 
-FEDERATE: Final = PythonFederate(PHYSICS, _load)
+FEDERATE: Final = PythonFederate(PHYSICS, _load, "positions from the location events of EMANE, in real time")
 """Target of the entry point `emane`."""

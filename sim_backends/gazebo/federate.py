@@ -43,5 +43,5 @@ def _command() -> str:
     return shlex.quote(str(adapter().path()))
 
 
-FEDERATE: Final = ProgramFederate(PHYSICS, _command)
+FEDERATE: Final = ProgramFederate(PHYSICS, _command, "a running Gazebo, in lock-step")
 """Target of the entry point `gazebo`."""

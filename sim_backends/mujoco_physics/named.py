@@ -24,4 +24,4 @@ def load() -> FederateService:
     return SERVICE
 
 
-MUJOCO = PythonFederate(PHYSICS, load)
+MUJOCO = PythonFederate(PHYSICS, load, "MuJoCo: robots with wheels and rotors, ground and contacts")

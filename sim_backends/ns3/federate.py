@@ -49,4 +49,4 @@ def command() -> str:
     return shlex.join((str(program(installed).path()), installed))
 
 
-NS3: Final = ProgramFederate(NETWORK, command)
+NS3: Final = ProgramFederate(NETWORK, command, "ns-3: its Wi-Fi, TCP and UDP, over the path loss of the world")

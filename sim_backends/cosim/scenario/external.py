@@ -147,9 +147,19 @@ def open_network(
     hello = make_hello(scenario, world, bodies, seed, NETWORK)
     federate = named(where, NETWORK)
     if isinstance(federate, PythonFederate):
-        network: NetworkFederate = _made(federate, where, hello)
-        return network
-    return remote.open_network(where, hello, deadline_s)
+        made: NetworkFederate = _made(federate, where, hello)
+        return made
+    network = remote.open_network(where, hello, deadline_s)
+    supported = network.welcome.transports
+    used = sorted({traffic.transport for traffic in scenario.traffic})
+    if supported and (missing := [transport for transport in used if transport not in supported]):
+        network.close()
+        raise ConfigurationError(
+            f"{network.session.name} does not support the transport {', '.join(missing)} of the scenario's traffic",
+            remedy=f"use a scenario whose traffic uses {', '.join(supported)}, or an option of the network: "
+            "fieldkit docs federates",
+        )
+    return network
 
 
 def _made(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
