@@ -27,6 +27,8 @@ from sim_backends.cosim.studies.intervals import mean
 from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, delay_s, mean_separation_m, outcomes
 
 REFERENCE: Final = "event_driven"
+NETWORK_OPTIONS: Final = {"ns3": {"topics": "udp"}}
+"""Best-effort topics are UDP datagrams with the headers of RTPS."""
 MS: Final = 1e3
 
 
@@ -137,6 +139,7 @@ def run(arguments: argparse.Namespace) -> None:
             "policy.window": arguments.window,
             "physics.federate": physics,
             "network.federate": network,
+            "network.options": NETWORK_OPTIONS.get(network),
         }
         results = outcomes(
             partial(make, arguments.scenario, changes), arguments.policy, range(1, arguments.seeds + 1), workers=1
