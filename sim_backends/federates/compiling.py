@@ -3,6 +3,7 @@
 import fcntl
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -20,15 +21,18 @@ _LIMIT_S: Final = 900.0
 """Longest time of a compilation, and of the wait for another process that compiles the same program."""
 _POLL_S: Final = 0.1
 _SHOWN_LINES: Final = 15
+_LIBRARY: Final = Path(__file__).parent / "cpp"
+"""Include path of the headers for federates in C++: `#include "fieldkit/frames.h"`."""
+_INCLUDE: Final = re.compile(r'^\s*#\s*include\s*"([^"]+)"', re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class CompiledProgram:
-    """A program in one C++ file and its headers.
+    """A program in one C++ file, and the headers that it includes.
 
     Attributes:
         name: Its name in messages and file names.
-        source: The file. Headers that it includes are beside it, and end in `.h`.
+        source: The file. Its own headers are beside it; those for all federates are in `sim_backends/federates/cpp`.
         packages: Names of its libraries for pkg-config.
         install: Command that installs the compiler and the libraries.
         flags: Other options of the compiler.
@@ -51,9 +55,9 @@ class CompiledProgram:
             ConfigurationError: The compiler or a library is not installed, or the compilation failed.
         """
         compiler, libraries = self._environment()
-        digest = hashlib.sha256(self.source.read_bytes())
-        for header in sorted(self.source.parent.glob("*.h")):
-            digest.update(header.read_bytes())
+        digest = hashlib.sha256()
+        for file in included_files(self.source):
+            digest.update(file.read_bytes())
         digest.update("\0".join((*self.flags, *(self.libraries or ()), compiler, *libraries)).encode())
         folder = cache_folder()
         folder.mkdir(parents=True, exist_ok=True)
@@ -92,7 +96,7 @@ class CompiledProgram:
             options = _output("pkg-config", *arguments).stdout.split() if self.packages else []
         with tempfile.TemporaryDirectory(dir=program.parent, prefix=f".{self.name}-") as folder:
             result = Path(folder) / "program"
-            words = ["g++", *self.flags, "-o", str(result), str(self.source), *options]
+            words = ["g++", *self.flags, f"-I{_LIBRARY}", "-o", str(result), str(self.source), *options]
             try:
                 done = _output(*words)
             except subprocess.TimeoutExpired as error:
@@ -105,6 +109,18 @@ class CompiledProgram:
                     remedy="report this with the versions of the compiler and of the libraries",
                 )
             result.replace(program)
+
+
+def included_files(source: Path) -> list[Path]:
+    """Return a C++ file and the headers that it includes in quotes, in order, without those of installed libraries."""
+    files = [source.resolve()]
+    for file in files:  # grows in the loop
+        for name in _INCLUDE.findall(file.read_text(encoding="utf-8")):
+            candidates = ((folder / name).resolve() for folder in (file.parent, _LIBRARY))
+            header = next((candidate for candidate in candidates if candidate.is_file()), None)
+            if header is not None and header not in files:
+                files.append(header)
+    return files
 
 
 def cache_folder() -> Path:

@@ -4,23 +4,20 @@
 //     network VERSION alone FILE      simulate the requests of a recorded run in one go, and print its processor time
 //     network VERSION losses          print the losses of links, for tests
 
+#include "fieldkit/handshake.h"
+#include "fieldkit/packets.h"
 #include "transports.h"
 
 #include "ns3/rng-seed-manager.h"
 
 #include <fstream>
 #include <iostream>
-#include <unistd.h>
 
 namespace fieldkit
 {
 
 // Headers of RTPS in the datagram of a sample: of the message, its time stamp and its data.
 constexpr uint64_t kRtpsHeaderBytes = 20 + 12 + 24;
-
-constexpr uint32_t kDeterministic = 1;
-constexpr uint32_t kNextEvent = 4;
-constexpr uint32_t kExtrapolates = 8;
 
 // Time before 0 in which stations scan, and associate with their access point.
 constexpr int64_t kAssociationNs = 1'000'000'000;
@@ -40,63 +37,34 @@ class Network
 
     std::string Hello(const std::string& body)
     {
-        Reader reader(body);
-        if (reader.Bytes(8) != "FIELDKIT" || reader.Get<uint16_t>() != kVersion)
-        {
-            throw Refusal("this is not version 1 of the protocol");
-        }
-        if (reader.Get<uint8_t>() != kNetworkRole)
-        {
-            throw Refusal("this federate is a network");
-        }
-        reader.Get<uint8_t>();
-        g_heartbeat.interval = std::chrono::milliseconds(reader.Get<uint32_t>());
-        auto seed = reader.Get<uint64_t>();
-        auto step_ns = reader.Get<int64_t>();
-        reader.Get<int64_t>(); // end_ns
-        std::string hash = reader.Bytes(32);
-        reader.Text(); // token
-        reader.Text(); // name of the scenario
-        std::vector<std::pair<std::string, Vector>> agents;
-        for (auto left = reader.Count(2 + 2 + 9 + kStateBytes); left > 0; left--)
-        {
-            std::string name = reader.Text();
-            reader.Text(); // profile
-            reader.Bytes(1 + 8 + 8); // flies, antenna_m; the state's agent and reserved
-            auto east = reader.Get<double>();
-            auto north = reader.Get<double>();
-            auto up = reader.Get<double>();
-            reader.Bytes(kStateBytes - 8 - 3 * 8);
-            agents.emplace_back(name, Vector(east, north, up));
-        }
-        std::string configuration = reader.Bytes(reader.Count(1));
-        reader.End();
+        protocol::Hello hello = protocol::ReadHello(body, protocol::kNetwork);
+        g_heartbeat.SetInterval(hello.heartbeat_ms);
         try
         {
-            Configure(seed, agents, Json::parse(configuration));
+            Configure(hello.seed, hello.agents, Json::parse(hello.configuration));
         }
         catch (const Json::exception& error)
         {
             throw Refusal(std::string("the configuration is not as expected: ") + error.what());
         }
-        Writer answer;
-        answer.Put(kVersion).Put(kNetworkRole).Put(uint8_t{0});
-        answer.Put(kDeterministic | kNextEvent | kExtrapolates).Put(step_ns).Put(NextEventNs());
-        answer.data += hash;
-        answer.PutText("ns-3").PutText("ns-3 " + m_version);
-        answer.Put(uint16_t{0}); // commands
-        answer.Put(static_cast<uint16_t>(m_carriesTopics ? 3 : 2)).PutText("udp").PutText("tcp");
+        protocol::Welcome welcome;
+        welcome.role = protocol::kNetwork;
+        welcome.capabilities = protocol::kDeterministic | protocol::kNextEvent | protocol::kExtrapolates;
+        welcome.step_ns = hello.step_ns;
+        welcome.next_event_ns = NextEventNs();
+        welcome.configuration_hash = hello.configuration_hash;
+        welcome.name = "ns-3";
+        welcome.software = "ns-3 " + m_version;
+        welcome.transports = {"udp", "tcp"};
         if (m_carriesTopics)
         {
-            answer.PutText("topic");
+            welcome.transports.push_back("topic");
         }
-        answer.Put(static_cast<uint32_t>(m_setup.relay >= 0));
         if (m_setup.relay >= 0)
         {
-            answer.Put(m_stations[m_setup.relay].agent);
+            welcome.transmitters = {m_stations[m_setup.relay].agent};
         }
-        answer.Put(uint32_t{0}); // emitters
-        return answer.data;
+        return protocol::WelcomeBody(welcome);
     }
 
     std::string Advance(const std::string& body)
@@ -106,16 +74,7 @@ class Network
         {
             RunUntil(to_ns);
         }
-        Writer answer;
-        answer.Put(to_ns).Put(NextEventNs());
-        answer.Put(m_arrivalCount);
-        answer.data += m_arrivals.data;
-        answer.Put(m_dropCount);
-        answer.data += m_drops.data;
-        m_arrivals.data.clear();
-        m_drops.data.clear();
-        m_arrivalCount = m_dropCount = 0;
-        return answer.data;
+        return m_outcomes.TakeBody(to_ns, NextEventNs());
     }
 
     // Prepare a request, and return its `to_ns`.
@@ -123,31 +82,22 @@ class Network
     // With `is_ahead`, the simulator has not reached the beginning of the window, and states are set in events.
     int64_t Schedule(const std::string& body, bool is_ahead)
     {
-        Reader reader(body);
-        auto to_ns = reader.Get<int64_t>();
-        auto since_ns = reader.Get<int64_t>();
-        auto reckoning_ns = reader.Get<int64_t>();
-        if (reader.Count(6) != 0)
+        protocol::NetworkRequest request = protocol::ReadNetworkRequest(body);
+        if (!request.new_agents.empty())
         {
             throw Refusal("an agent has appeared, which ns-3 does not support");
         }
-        if (to_ns < m_toNs)
+        if (request.to_ns < m_toNs)
         {
-            throw Refusal("time runs backwards to " + std::to_string(to_ns) + " ns");
+            throw Refusal("time runs backwards to " + std::to_string(request.to_ns) + " ns");
         }
         int64_t from_ns = m_toNs;
-        m_toNs = to_ns;
-        for (auto left = reader.Count(kStateBytes); left > 0; left--)
+        int64_t since_ns = request.since_ns;
+        int64_t reckoning_ns = request.reckoning_ns;
+        m_toNs = request.to_ns;
+        for (const protocol::State& state : request.states)
         {
-            auto agent = reader.Get<uint32_t>();
-            reader.Get<uint32_t>();
-            auto x = reader.Get<double>();
-            auto y = reader.Get<double>();
-            auto z = reader.Get<double>();
-            auto x_s = reader.Get<double>();
-            auto y_s = reader.Get<double>();
-            auto z_s = reader.Get<double>();
-            reader.Bytes(16);
+            uint32_t agent = state.agent;
             if (agent >= m_stationOf.size())
             {
                 throw Refusal("agent " + std::to_string(agent) + " was not announced");
@@ -157,8 +107,8 @@ class Network
                 continue; // it has no radio
             }
             auto mobility = m_stations[m_stationOf[agent]].mobility;
-            Vector position(x, y, z);
-            Vector velocity(x_s, y_s, z_s);
+            Vector position = VectorOf(state.position_m);
+            Vector velocity = VectorOf(state.velocity_m_s);
             if (is_ahead && from_ns > NowNs())
             {
                 Simulator::Schedule(NanoSeconds(from_ns - NowNs()), [=] {
@@ -170,22 +120,21 @@ class Network
                 mobility->Move(position, velocity, since_ns, reckoning_ns);
             }
         }
-        for (auto left = reader.Count(kPacketBytes); left > 0; left--)
+        for (const protocol::Packet& packet : request.packets)
         {
-            Enter(ReadPacket(reader));
+            Enter(Accepted(packet));
         }
-        reader.End();
-        return to_ns;
+        return request.to_ns;
     }
 
     size_t arrivals() const
     {
-        return m_arrivalCount;
+        return m_outcomes.Arrivals();
     }
 
     size_t drops() const
     {
-        return m_dropCount;
+        return m_outcomes.Drops();
     }
 
     // Sum of the times of all arrivals, which differs if one differs.
@@ -195,7 +144,7 @@ class Network
     }
 
   private:
-    void Configure(uint64_t seed, const std::vector<std::pair<std::string, Vector>>& agents, const Json& configuration)
+    void Configure(uint64_t seed, const std::vector<protocol::Agent>& agents, const Json& configuration)
     {
         const Json& scenario = configuration.at("scenario");
         const Json& radio = scenario.at("radio");
@@ -294,24 +243,24 @@ class Network
         }
     }
 
-    void AddStations(const std::vector<std::pair<std::string, Vector>>& agents, const Json& robots)
+    void AddStations(const std::vector<protocol::Agent>& agents, const Json& robots)
     {
         bool is_ht = true;
-        for (const auto& [name, position] : agents)
+        for (const protocol::Agent& agent : agents)
         {
-            const Json radio = robots.at(name).at("radio");
+            const Json radio = robots.at(agent.name).at("radio");
             m_stationOf.push_back(radio.is_null() ? -1 : static_cast<int>(m_stations.size()));
             if (radio.is_null())
             {
                 continue;
             }
             Station station;
-            station.name = name;
+            station.name = agent.name;
             station.agent = static_cast<uint32_t>(m_stationOf.size() - 1);
             station.tx_power_dbm = Number(radio.at("tx_power_dbm"));
             station.sensitivity_dbm = Number(radio.at("sensitivity_dbm"));
             station.mobility = CreateObject<AgentMobility>();
-            station.mobility->SetPosition(position);
+            station.mobility->SetPosition(VectorOf(agent.start.position_m));
             m_stations.push_back(station);
             is_ht = is_ht && radio.at("standard") == "802.11n";
         }
@@ -375,25 +324,18 @@ class Network
         }
     }
 
-    CoordinatorPacket ReadPacket(Reader& reader) const
+    // A packet between stations; it is refused if ns-3 cannot carry it.
+    CoordinatorPacket Accepted(const protocol::Packet& entering) const
     {
         CoordinatorPacket packet;
-        packet.id = reader.Get<uint64_t>();
-        packet.number = reader.Get<int64_t>();
-        packet.size_bytes = reader.Get<uint64_t>();
-        reader.Get<int64_t>(); // sent_ns
-        packet.enters_ns = reader.Get<int64_t>();
-        for (size_t* end : {&packet.source, &packet.destination})
-        {
-            auto agent = reader.Get<uint32_t>();
-            if (agent >= m_stationOf.size() || m_stationOf[agent] < 0)
-            {
-                throw Refusal("agent " + std::to_string(agent) + " has no radio");
-            }
-            *end = m_stationOf[agent];
-        }
-        packet.flow = reader.Text();
-        packet.protocol = reader.Text();
+        packet.id = entering.id;
+        packet.number = entering.number;
+        packet.size_bytes = entering.size_bytes;
+        packet.enters_ns = entering.enters_ns;
+        packet.source = StationOf(entering.source);
+        packet.destination = StationOf(entering.destination);
+        packet.flow = entering.flow;
+        packet.protocol = entering.protocol;
         if (packet.protocol != "udp" && packet.protocol != "tcp" && !(m_carriesTopics && packet.protocol == "topic"))
         {
             throw Refusal("there is no transport " + packet.protocol);
@@ -405,6 +347,15 @@ class Network
                           packet.protocol);
         }
         return packet;
+    }
+
+    size_t StationOf(uint32_t agent) const
+    {
+        if (agent >= m_stationOf.size() || m_stationOf[agent] < 0)
+        {
+            throw Refusal("agent " + std::to_string(agent) + " has no radio");
+        }
+        return m_stationOf[agent];
     }
 
     void Enter(const CoordinatorPacket& packet)
@@ -443,8 +394,7 @@ class Network
         }
         const CoordinatorPacket& packet = found->second;
         int64_t now_ns = NowNs();
-        m_arrivals.Put(id).Put(now_ns).Put(m_stations[packet.destination].agent).Put(uint32_t{0});
-        m_arrivalCount++;
+        m_outcomes.Arrive(id, now_ns, m_stations[packet.destination].agent);
         m_checksum = m_checksum * 31 + static_cast<uint64_t>(now_ns);
         if (m_parts.is_open())
         {
@@ -474,9 +424,13 @@ class Network
     {
         if (m_pending.erase(id) > 0)
         {
-            m_drops.Put(id).PutText(reason);
-            m_dropCount++;
+            m_outcomes.Drop(id, reason);
         }
+    }
+
+    static Vector VectorOf(const std::array<double, 3>& values)
+    {
+        return Vector(values[0], values[1], values[2]);
     }
 
     static int64_t NextEventNs()
@@ -498,60 +452,27 @@ class Network
     std::unique_ptr<TcpTransport> m_tcp;
     int64_t m_toNs = -1;
     std::unordered_map<uint64_t, CoordinatorPacket> m_pending;
-    Writer m_arrivals, m_drops;
-    uint32_t m_arrivalCount = 0, m_dropCount = 0;
+    protocol::Outcomes m_outcomes;
     uint64_t m_checksum = 0;
 };
 
-// Answer requests until the coordinator ends the run.
-int
-Serve(Network& network, std::FILE* output)
+// Answer a request of the coordinator.
+protocol::Answer
+AnswerTo(Network& network, const protocol::Frame& request)
 {
-    Frame frame;
-    while (ReadFrame(stdin, frame))
+    switch (request.kind)
     {
-        g_heartbeat.Begin(output, frame);
-        std::string answer;
-        uint16_t kind;
-        try
+    case protocol::kHello:
+        return {protocol::kWelcome, network.Hello(request.body)};
+    case protocol::kAdvanceNetwork:
+        if (!network.IsReady() || request.copy != 0)
         {
-            switch (frame.kind)
-            {
-            case kBye:
-                return 0;
-            case kRelease:
-                continue;
-            case kPing:
-                kind = kPong;
-                answer = Reader(frame.body).Bytes(8);
-                break;
-            case kHello:
-                kind = kWelcome;
-                answer = network.Hello(frame.body);
-                break;
-            case kAdvanceNetwork:
-                kind = kOutcomes;
-                if (!network.IsReady() || frame.copy != 0)
-                {
-                    throw Refusal("hello is missing, or there is no such copy");
-                }
-                answer = network.Advance(frame.body);
-                break;
-            default:
-                throw Refusal("the request is not supported");
-            }
+            throw Refusal("hello is missing, or there is no such copy");
         }
-        catch (const std::exception& error)
-        {
-            WriteFrame(output, frame, kError, Writer().PutText(std::string(error.what()).substr(0, 1000)).data);
-            return 1;
-        }
-        if (!WriteFrame(output, frame, kind, answer))
-        {
-            return 0; // the coordinator has closed the connection
-        }
+        return {protocol::kOutcomes, network.Advance(request.body)};
+    default:
+        throw Refusal("the request is not supported");
     }
-    return 0;
 }
 
 // Simulate the requests of a file without a coordinator.
@@ -559,17 +480,17 @@ int
 RunAlone(Network& network, const char* path)
 {
     std::FILE* stream = std::fopen(path, "rb");
-    Frame frame;
+    protocol::Frame frame;
     int64_t to_ns = -1;
     std::clock_t started = 0;
-    while (stream != nullptr && ReadFrame(stream, frame))
+    while (stream != nullptr && protocol::ReadFrame(stream, frame))
     {
-        if (frame.kind == kHello)
+        if (frame.kind == protocol::kHello)
         {
             network.Hello(frame.body);
             started = std::clock();
         }
-        else if (frame.kind == kAdvanceNetwork)
+        else if (frame.kind == protocol::kAdvanceNetwork)
         {
             to_ns = network.Schedule(frame.body, true);
         }
@@ -609,13 +530,14 @@ main(int count, char** words)
     {
         return fieldkit::PrintLosses();
     }
-    // ns-3 may print to standard output, which carries the protocol.
-    std::FILE* output = ::fdopen(::dup(1), "wb");
     fieldkit::Network network(count > 1 ? words[1] : "");
     if (task == "alone" && count > 3)
     {
         return fieldkit::RunAlone(network, words[3]);
     }
-    ::dup2(2, 1);
-    return fieldkit::Serve(network, output);
+    std::FILE* output = fieldkit::protocol::TakeStandardOutput();
+    bool is_complete = fieldkit::protocol::Serve(
+        stdin, output, fieldkit::g_heartbeat,
+        [&network](const fieldkit::protocol::Frame& request) { return fieldkit::AnswerTo(network, request); });
+    return is_complete ? 0 : 1;
 }

@@ -3,50 +3,21 @@
 #ifndef FIELDKIT_SIMULATOR_H
 #define FIELDKIT_SIMULATOR_H
 
-#include "wire.h"
+#include "fieldkit/serving.h"
 
 #include "ns3/map-scheduler.h"
 #include "ns3/nstime.h"
 #include "ns3/object-factory.h"
 #include "ns3/simulator.h"
 
-#include <chrono>
-
 namespace fieldkit
 {
 
 using namespace ns3;
 
-// Sends `busy` while a request takes longer than the heartbeat.
-class Heartbeat
-{
-  public:
-    void Begin(std::FILE* stream, const Frame& request)
-    {
-        m_stream = stream;
-        m_request = {request.kind, request.request, request.copy, {}};
-        m_last = std::chrono::steady_clock::now();
-    }
+using protocol::Refusal;
 
-    void Check(int64_t at_ns)
-    {
-        auto now = std::chrono::steady_clock::now();
-        if (m_stream != nullptr && now - m_last >= interval)
-        {
-            m_last = now;
-            WriteFrame(m_stream, m_request, kBusy, Writer().Put(at_ns).data);
-        }
-    }
-
-    std::chrono::milliseconds interval{1000};
-
-  private:
-    std::FILE* m_stream = nullptr;
-    Frame m_request;
-    std::chrono::steady_clock::time_point m_last;
-};
-
-inline Heartbeat g_heartbeat;
+inline protocol::Heartbeat g_heartbeat;
 
 // Time of ns-3 at time 0 of the co-simulation. It is above 0 because ns-3 sends nothing before it has run for the first time.
 inline int64_t g_start_ns = 1'000'000;

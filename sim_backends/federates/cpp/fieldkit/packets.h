@@ -1,0 +1,108 @@
+// Requests to a network, with the packets that enter it, and its answers, with what became of packets.
+
+#ifndef FIELDKIT_FEDERATES_PACKETS_H
+#define FIELDKIT_FEDERATES_PACKETS_H
+
+#include "states.h"
+
+namespace fieldkit::protocol
+{
+
+constexpr size_t kPacketBytes = 52;
+
+struct Packet
+{
+    uint64_t id = 0;
+    int64_t number = 0;
+    uint64_t size_bytes = 0;
+    int64_t sent_ns = 0;
+    int64_t enters_ns = 0;
+    uint32_t source = 0; // agents
+    uint32_t destination = 0;
+    std::string flow;
+    std::string protocol;
+};
+
+struct NetworkRequest
+{
+    int64_t to_ns = 0;
+    int64_t since_ns = 0;
+    int64_t reckoning_ns = 0;
+    std::vector<NewAgent> new_agents;
+    std::vector<State> states;
+    std::vector<Packet> packets;
+};
+
+inline NetworkRequest
+ReadNetworkRequest(const std::string& body)
+{
+    Reader reader(body);
+    NetworkRequest request;
+    request.to_ns = reader.Get<int64_t>();
+    request.since_ns = reader.Get<int64_t>();
+    request.reckoning_ns = reader.Get<int64_t>();
+    request.new_agents = ReadNewAgents(reader);
+    request.states = ReadStates(reader);
+    request.packets.resize(reader.Count(kPacketBytes));
+    for (Packet& packet : request.packets)
+    {
+        packet.id = reader.Get<uint64_t>();
+        packet.number = reader.Get<int64_t>();
+        packet.size_bytes = reader.Get<uint64_t>();
+        packet.sent_ns = reader.Get<int64_t>();
+        packet.enters_ns = reader.Get<int64_t>();
+        packet.source = reader.Get<uint32_t>();
+        packet.destination = reader.Get<uint32_t>();
+        packet.flow = reader.Text();
+        packet.protocol = reader.Text();
+    }
+    reader.End();
+    return request;
+}
+
+// Collects arrivals and drops, each in order of time, for the next answer.
+class Outcomes
+{
+  public:
+    void Arrive(uint64_t id, int64_t at_ns, uint32_t agent)
+    {
+        m_arrivals.Put(id).Put(at_ns).Put(agent).Put(uint32_t{0});
+        m_arrivalCount++;
+    }
+
+    void Drop(uint64_t id, const std::string& reason)
+    {
+        m_drops.Put(id).PutText(reason);
+        m_dropCount++;
+    }
+
+    uint32_t Arrivals() const
+    {
+        return m_arrivalCount;
+    }
+
+    uint32_t Drops() const
+    {
+        return m_dropCount;
+    }
+
+    // Body of the answer; the collection is empty afterwards. Without a next event, its time is -1.
+    std::string TakeBody(int64_t to_ns, int64_t next_event_ns)
+    {
+        Writer body;
+        body.Put(to_ns).Put(next_event_ns).Put(m_arrivalCount);
+        body.data += m_arrivals.data;
+        body.Put(m_dropCount);
+        body.data += m_drops.data;
+        *this = Outcomes();
+        return body.data;
+    }
+
+  private:
+    Writer m_arrivals, m_drops;
+    uint32_t m_arrivalCount = 0, m_dropCount = 0;
+};
+
+} // namespace fieldkit::protocol
+
+#endif

@@ -1,0 +1,125 @@
+// A session with the coordinator: requests and their answers on streams, and reports while a request takes long.
+
+#ifndef FIELDKIT_FEDERATES_SERVING_H
+#define FIELDKIT_FEDERATES_SERVING_H
+
+#include "frames.h"
+
+#include <algorithm>
+#include <chrono>
+#include <functional>
+#include <unistd.h>
+
+namespace fieldkit::protocol
+{
+
+// Sends `busy` while a request takes longer than the heartbeat.
+class Heartbeat
+{
+  public:
+    using Clock = std::chrono::steady_clock;
+
+    void SetInterval(uint32_t milliseconds)
+    {
+        m_interval = std::chrono::milliseconds(std::clamp<uint32_t>(milliseconds, 1, 60'000));
+    }
+
+    // A request begins, whose answer is for this stream.
+    void Begin(std::FILE* stream, const Frame& request)
+    {
+        m_stream = stream;
+        m_request = {request.kind, request.request, request.copy, {}};
+        m_last = Clock::now();
+    }
+
+    // When the next report is due.
+    Clock::time_point Due() const
+    {
+        return m_last + m_interval;
+    }
+
+    // Report the time that the run has reached, if a report is due.
+    void Check(int64_t at_ns)
+    {
+        if (Clock::now() >= Due())
+        {
+            Send(at_ns);
+        }
+    }
+
+    void Send(int64_t at_ns)
+    {
+        m_last = Clock::now();
+        if (m_stream != nullptr && !WriteFrame(m_stream, m_request, kBusy, Writer().Put(at_ns).data))
+        {
+            throw Refusal("the coordinator has closed the connection");
+        }
+    }
+
+  private:
+    std::chrono::milliseconds m_interval{1000};
+    std::FILE* m_stream = nullptr;
+    Frame m_request;
+    Clock::time_point m_last = Clock::now();
+};
+
+struct Answer
+{
+    Kind kind;
+    std::string body;
+};
+
+// The stream of the protocol. What a library prints to standard output from now on goes to standard error.
+inline std::FILE*
+TakeStandardOutput()
+{
+    std::FILE* stream = ::fdopen(::dup(STDOUT_FILENO), "wb");
+    ::dup2(STDERR_FILENO, STDOUT_FILENO);
+    return stream;
+}
+
+// Answer requests until the coordinator ends the run; false if a request was refused.
+//
+// `answer` is called with each request other than ping, release and bye; its exceptions are sent to the coordinator.
+inline bool
+Serve(std::FILE* input, std::FILE* output, Heartbeat& heartbeat, const std::function<Answer(const Frame&)>& answer)
+{
+    for (;;)
+    {
+        Frame request;
+        try
+        {
+            if (!ReadFrame(input, request) || request.kind == kBye)
+            {
+                return true;
+            }
+            if (request.kind == kRelease)
+            {
+                continue;
+            }
+            heartbeat.Begin(output, request);
+            Answer done{kPong, request.body};
+            if (request.kind != kPing)
+            {
+                done = answer(request);
+            }
+            else if (request.body.size() != 8)
+            {
+                throw MalformedFrame(kHeaderBytes + std::min<size_t>(request.body.size(), 8), "ping has 8 bytes");
+            }
+            if (!WriteFrame(output, request, done.kind, done.body))
+            {
+                return true; // the coordinator has closed the connection
+            }
+        }
+        catch (const std::exception& error)
+        {
+            WriteFrame(output, request, kError, Writer().PutText(error.what()).data);
+            return false;
+        }
+    }
+}
+
+} // namespace fieldkit::protocol
+
+#endif

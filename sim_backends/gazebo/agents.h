@@ -1,0 +1,107 @@
+// The agents of a run, which are models in Gazebo, and their commands.
+
+#ifndef FIELDKIT_GAZEBO_AGENTS_H
+#define FIELDKIT_GAZEBO_AGENTS_H
+
+#include "fieldkit/commands.h"
+#include "fieldkit/handshake.h"
+#include "libraries.h"
+#include "options.h"
+#include "pose.h"
+
+namespace fieldkit
+{
+
+struct Agent
+{
+    std::string name, model;
+    bool flies = false;
+    Vector antenna; // in the axes of the model, from its origin
+    Vector start;   // of the model
+    double start_yaw = 0;
+    protocol::Command command; // that applies
+    Pose pose;
+    Vector velocity;
+
+    Vector AntennaAt(const Pose& place) const
+    {
+        return place.position + place.Rotated(antenna);
+    }
+
+    double YawError() const
+    {
+        return std::remainder(command.values[3] - pose.Yaw(), 2 * M_PI);
+    }
+
+    // Whether it has a direction that it has not reached yet.
+    bool Turns() const
+    {
+        return flies && !std::isnan(command.values[3]) && std::fabs(YawError()) > 1e-3;
+    }
+
+    void Stop()
+    {
+        command.values = {0, 0, 0, NAN};
+    }
+};
+
+// The agents of hello, with their models and the starts of these.
+inline std::vector<Agent>
+AgentsOf(const protocol::Hello& hello, const Options& options)
+{
+    std::vector<Agent> agents;
+    for (const protocol::Agent& announced : hello.agents)
+    {
+        Agent agent;
+        agent.name = announced.name;
+        agent.flies = announced.flies;
+        agent.antenna.z = announced.antenna_m;
+        double heading = announced.start.heading_rad;
+        agent.start_yaw = std::isnan(heading) ? 0 : heading;
+        auto model = options.models.find(agent.name);
+        agent.model = model == options.models.end() ? agent.name : model->second;
+        auto origin = options.origins_m.find(agent.name);
+        if (origin != options.origins_m.end())
+        {
+            if (origin->second.size() != 3)
+            {
+                throw Refusal("physics.options.origins_m of " + agent.name + " needs three numbers");
+            }
+            agent.antenna = agent.antenna + Vector{origin->second[0], origin->second[1], origin->second[2]};
+        }
+        const auto& position_m = announced.start.position_m;
+        Vector start{position_m[0], position_m[1], position_m[2]};
+        agent.start = start - Pose::WithYaw(agent.start_yaw).Rotated(agent.antenna);
+        agents.push_back(agent);
+    }
+    return agents;
+}
+
+// The command of an agent as Gazebo's plugins expect it, in the axes of the model.
+inline msgs::Twist
+TwistOf(const Agent& agent, const Options& options, int64_t step_ns)
+{
+    msgs::Twist twist;
+    const auto& values = agent.command.values;
+    if (!agent.flies)
+    {
+        twist.mutable_linear()->set_x(values[0]);
+        twist.mutable_angular()->set_z(values[1]);
+        return twist;
+    }
+    // VelocityControl sets the velocity before each step, and gravity changes it in the step.
+    double fall_m_s = options.gravity_m_s2 * double(step_ns) / 1e9;
+    Vector velocity = agent.pose.InverseRotated({values[0], values[1], values[2] + fall_m_s});
+    twist.mutable_linear()->set_x(velocity.x);
+    twist.mutable_linear()->set_y(velocity.y);
+    twist.mutable_linear()->set_z(velocity.z);
+    if (agent.Turns())
+    {
+        twist.mutable_angular()->set_z(options.yaw_gain_per_s * agent.YawError());
+    }
+    return twist;
+}
+
+} // namespace fieldkit
+
+#endif

@@ -1,0 +1,301 @@
+// The transport to a running Gazebo: subscriptions, services and commands.
+
+#ifndef FIELDKIT_GAZEBO_CONNECTION_H
+#define FIELDKIT_GAZEBO_CONNECTION_H
+
+#include "world_lock.h"
+#include "world_monitor.h"
+
+#include <memory>
+#include <thread>
+
+namespace fieldkit
+{
+
+class Connection
+{
+  public:
+    Connection(const Options& options, const std::vector<Agent>& agents, WorldMonitor& monitor)
+        : m_options(options),
+          m_monitor(monitor)
+    {
+        for (const Agent& agent : agents)
+        {
+            m_receivers.push_back({agent.name, agent.model, options.CommandTopic(agent.name, agent.model), {}});
+        }
+    }
+
+    // Wait until the world is free, and connect to it.
+    void Open()
+    {
+        WaitForOtherRuns();
+        Subscribe();
+        Advertise();
+        std::string control = m_options.ControlService();
+        std::string poses = m_options.Name(m_options.pose_topic);
+        WorldMonitor::Lock lock(m_monitor.mutex);
+        m_monitor.Wait(
+            lock, [&] { return WorldMonitor::Unlocked(lock, [&] { return HasService(control); }); },
+            [&] { return "the service " + control + " has not been found (" + ListWorlds() + ")"; });
+        m_monitor.is_there = [this, control] { return HasService(control); };
+        m_monitor.Wait(
+            lock, [&] { return m_monitor.clock_ns >= 0; },
+            [] { return std::string("its clock has not been received"); });
+        m_monitor.Wait(
+            lock, [&] { return m_monitor.pose_ns >= 0; },
+            [&] {
+                return "no poses have been received on " + poses + "; the world needs the SceneBroadcaster plugin";
+            });
+        CheckModels();
+        WaitForSubscribers(lock);
+    }
+
+    // Wait until the plugins of all models subscribe to commands.
+    void WaitForSubscribers(WorldMonitor::Lock& lock)
+    {
+        const CommandReceiver* missing = nullptr;
+        auto all_connected = [&] {
+            for (CommandReceiver& receiver : m_receivers)
+            {
+                if (!receiver.publisher.HasConnections())
+                {
+                    missing = &receiver;
+                    return false;
+                }
+            }
+            return true;
+        };
+        m_monitor.Wait(
+            lock, [&] { return WorldMonitor::Unlocked(lock, all_connected); },
+            [&] {
+                return "nothing subscribes to the commands of " + missing->agent + " on " + missing->topic +
+                       " (its model needs the plugin DiffDrive or VelocityControl)";
+            });
+        std::vector<transport::MessagePublisher> publishers;
+        auto has_fence = [&] {
+            m_node.TopicInfo(m_options.Name(m_options.fence_answer), publishers);
+            return !publishers.empty() && m_fence.HasConnections();
+        };
+        m_usesFence = m_options.acknowledge != "off" && WorldMonitor::Unlocked(lock, has_fence);
+        if (m_options.acknowledge == "required")
+        {
+            m_monitor.Wait(
+                lock, [&] { return m_usesFence || (m_usesFence = WorldMonitor::Unlocked(lock, has_fence)); },
+                [&] {
+                    return "there is no TriggeredPublisher from " + m_options.Name(m_options.fence_topic) + " to " +
+                           m_options.Name(m_options.fence_answer);
+                });
+        }
+    }
+
+    // The answer of a service: -1 before it arrives, else 0 or 1.
+    using Answer = std::shared_ptr<int>;
+
+    template <typename Request> Answer Send(const std::string& service, const Request& request)
+    {
+        auto answer = std::make_shared<int>(-1);
+        std::function<void(const msgs::Boolean&, const bool)> on_answer = [this, answer](const msgs::Boolean& value,
+                                                                                         const bool is_valid) {
+            std::lock_guard<std::mutex> guard(m_monitor.mutex);
+            *answer = is_valid && value.data();
+            m_monitor.changed.notify_all();
+        };
+        if (!m_node.Request(service, request, on_answer))
+        {
+            m_monitor.Fail("the service " + service + " cannot be called");
+        }
+        return answer;
+    }
+
+    void Check(const Answer& answer, const std::string& service) const
+    {
+        if (*answer == 0)
+        {
+            m_monitor.Fail("the service " + service + " has refused the request");
+        }
+    }
+
+    // Send a request that may arrive twice, and wait for its answer. The first answer to a new process may be lost, as
+    // Gazebo Transport does not wait until its connection is complete; so the request is repeated.
+    template <typename Request> void Call(const std::string& service, const Request& request)
+    {
+        Answer answer = Send(service, request);
+        auto repeat_at = Clock::now() + std::chrono::seconds(1);
+        WorldMonitor::Lock lock(m_monitor.mutex);
+        auto has_answered = [&] {
+            if (*answer < 0 && Clock::now() > repeat_at)
+            {
+                repeat_at = Clock::now() + std::chrono::seconds(1);
+                lock.unlock();
+                answer = Send(service, request);
+                lock.lock();
+            }
+            return *answer >= 0;
+        };
+        m_monitor.Wait(lock, has_answered, [&] { return "the service " + service + " has not answered"; });
+        Check(answer, service);
+    }
+
+    // A request to a paused world, which makes a number of steps.
+    static msgs::WorldControl ControlRequest(uint32_t steps, bool resets = false)
+    {
+        msgs::WorldControl request;
+        request.set_pause(true); // a request without it would let the world run
+        request.set_multi_step(steps);
+        if (resets)
+        {
+            request.mutable_reset()->set_all(true);
+        }
+        return request;
+    }
+
+    // Publish a command to the agent of an index; false if that failed.
+    bool Publish(size_t agent, const msgs::Twist& twist)
+    {
+        return m_receivers[agent].publisher.Publish(twist);
+    }
+
+    const std::string& CommandTopic(size_t agent) const
+    {
+        return m_receivers[agent].topic;
+    }
+
+    // Wait until Gazebo has received all commands.
+    //
+    // Messages to a topic and requests to a service have no order between them. The plugin TriggeredPublisher answers
+    // a message that follows the commands on the same connection; without it, Gazebo's single thread of reception
+    // accepts one message and one request in turns, so that it has probably read the commands after that many requests.
+    void Acknowledge()
+    {
+        if (m_usesFence)
+        {
+            WorldMonitor::Lock lock(m_monitor.mutex);
+            uint64_t expected = m_passed + 1;
+            lock.unlock();
+            m_fence.Publish(msgs::Empty());
+            lock.lock();
+            m_monitor.Wait(
+                lock, [&] { return m_passed >= expected; },
+                [&] { return "commands have not been acknowledged on " + m_options.Name(m_options.fence_answer); });
+            return;
+        }
+        if (m_options.acknowledge != "off")
+        {
+            for (size_t i = 0; i <= m_receivers.size(); i++)
+            {
+                Call(m_options.ControlService(), ControlRequest(0));
+            }
+        }
+    }
+
+  private:
+    // What receives the commands of an agent.
+    struct CommandReceiver
+    {
+        std::string agent, model, topic;
+        transport::Node::Publisher publisher;
+    };
+
+    // Several runs may start at a time, for example those of a shootout.
+    void WaitForOtherRuns()
+    {
+        WorldLock world_lock(m_options.world);
+        auto limit = Clock::now() + std::chrono::duration<double>(50 * m_options.timeout_s);
+        while (!world_lock.Take())
+        {
+            if (Clock::now() >= limit)
+            {
+                m_monitor.Fail("another run of this machine uses it");
+            }
+            m_monitor.Beat();
+            std::this_thread::sleep_for(std::chrono::milliseconds(20));
+        }
+    }
+
+    void Subscribe()
+    {
+        std::string clock = m_options.Name(m_options.clock_topic), poses = m_options.Name(m_options.pose_topic);
+        std::function<void(const msgs::Clock&)> on_clock = [this](const msgs::Clock& message) {
+            m_monitor.Receive(message);
+        };
+        std::function<void(const msgs::Pose_V&)> on_poses = [this](const msgs::Pose_V& message) {
+            m_monitor.Receive(message);
+        };
+        std::function<void(const msgs::Empty&)> on_passed = [this](const msgs::Empty&) {
+            std::lock_guard<std::mutex> guard(m_monitor.mutex);
+            m_passed++;
+            m_monitor.changed.notify_all();
+        };
+        if (!m_node.Subscribe(clock, on_clock) || !m_node.Subscribe(poses, on_poses) ||
+            !m_node.Subscribe(m_options.Name(m_options.fence_answer), on_passed))
+        {
+            m_monitor.Fail("a topic has an invalid name: " + clock + ", " + poses);
+        }
+    }
+
+    void Advertise()
+    {
+        m_fence = m_node.Advertise<msgs::Empty>(m_options.Name(m_options.fence_topic));
+        for (CommandReceiver& receiver : m_receivers)
+        {
+            receiver.publisher = m_node.Advertise<msgs::Twist>(receiver.topic);
+            if (!receiver.publisher)
+            {
+                m_monitor.Fail("the topic " + receiver.topic + " has an invalid name");
+            }
+        }
+    }
+
+    bool HasService(const std::string& service) const
+    {
+        std::vector<transport::ServicePublisher> publishers;
+        return m_node.ServiceInfo(service, publishers) && !publishers.empty();
+    }
+
+    std::string ListWorlds() const
+    {
+        std::vector<std::string> services;
+        m_node.ServiceList(services);
+        std::string worlds;
+        for (const std::string& service : services)
+        {
+            if (service.rfind("/world/", 0) == 0 && service.size() > 15 &&
+                service.compare(service.size() - 8, 8, "/control") == 0)
+            {
+                worlds += (worlds.empty() ? "" : ", ") + service.substr(7, service.size() - 15);
+            }
+        }
+        return worlds.empty() ? "no world is visible; check IGN_PARTITION and IGN_IP (GZ_ in newer versions), or the "
+                                "options partition and ip"
+                              : "visible worlds: " + worlds;
+    }
+
+    void CheckModels() const
+    {
+        std::string missing;
+        for (const CommandReceiver& receiver : m_receivers)
+        {
+            if (!m_monitor.present.count(receiver.model))
+            {
+                missing += (missing.empty() ? "" : ", ") + receiver.model;
+            }
+        }
+        if (!missing.empty())
+        {
+            m_monitor.Fail("it has no moving model " + missing + " (models and links: " + m_monitor.names +
+                           "); write the world with `fieldkit cosim sdf`, or set physics.options.models");
+        }
+    }
+
+    const Options& m_options;
+    WorldMonitor& m_monitor;
+    std::vector<CommandReceiver> m_receivers; // by agent
+    bool m_usesFence = false;
+    uint64_t m_passed = 0; // answers to messages of the fence
+    transport::Node::Publisher m_fence;
+    transport::Node m_node; // last: its callbacks use the other members
+};
+
+} // namespace fieldkit
+
+#endif

@@ -1,0 +1,321 @@
+// Lock-step with a world of Gazebo: the beginning of a run, steps, and the motion of robots.
+
+#ifndef FIELDKIT_GAZEBO_LOCK_STEP_H
+#define FIELDKIT_GAZEBO_LOCK_STEP_H
+
+#include "connection.h"
+
+namespace fieldkit
+{
+
+class LockStep
+{
+  public:
+    LockStep(Options options, std::vector<Agent> agents, protocol::Heartbeat& heartbeat)
+        : m_options(std::move(options)),
+          m_agents(std::move(agents)),
+          m_monitor(m_options, m_agents, heartbeat),
+          m_connection(m_options, m_agents, m_monitor)
+    {
+    }
+
+    LockStep(const LockStep&) = delete;
+
+    std::vector<Agent>& Agents()
+    {
+        return m_agents;
+    }
+
+    int64_t StepNs() const
+    {
+        return m_stepNs;
+    }
+
+    // Connect, stop the robots, reset the world, place the robots, and let them come to rest: that is time 0.
+    void Begin()
+    {
+        m_connection.Open();
+        Pause();
+        MeasureStep();
+        int64_t settle_steps = StepsOf(m_options.settle_s);
+        SendCommands();
+        ComeToRest(settle_steps);
+        if (m_options.reset)
+        {
+            Reset();
+        }
+        if (m_options.place)
+        {
+            Place();
+        }
+        SendCommands();
+        Step(settle_steps);
+        m_startNs = m_nowNs;
+        m_monitor.reached_ns = 0;
+        CheckStart();
+        m_windowPoses = Poses();
+    }
+
+    // Advance to a number of steps after the start.
+    void Advance(int64_t to_step)
+    {
+        int64_t at = m_monitor.reached_ns / m_stepNs;
+        if (to_step <= at)
+        {
+            return;
+        }
+        int64_t period = StepsOf(m_options.control_period_s);
+        std::vector<Pose> before = Poses();
+        int64_t before_at = at;
+        while (at < to_step)
+        {
+            int64_t next = to_step;
+            bool turned =
+                std::any_of(m_agents.begin(), m_agents.end(), [](const Agent& agent) { return agent.Turns(); });
+            if (turned)
+            {
+                next = std::min(next, (at / period + 1) * period);
+            }
+            if (m_options.velocity == "step" && next == to_step && next - at > 1)
+            {
+                next--;
+            }
+            before = Poses();
+            before_at = at;
+            Step(next - at);
+            at = next;
+            if (turned && at % period == 0)
+            {
+                SendCommands(); // also when it has reached its direction, to stop it
+            }
+        }
+        if (m_options.velocity == "window")
+        {
+            before = m_windowPoses;
+            before_at = m_windowAt;
+        }
+        double spent_s = double((at - before_at) * m_stepNs) / 1e9;
+        for (size_t i = 0; i < m_agents.size(); i++)
+        {
+            Agent& agent = m_agents[i];
+            Vector moved = agent.AntennaAt(agent.pose) - agent.AntennaAt(before[i]);
+            agent.velocity = {moved.x / spent_s, moved.y / spent_s, moved.z / spent_s};
+        }
+        m_windowPoses = Poses();
+        m_windowAt = at;
+    }
+
+    // Publish the command of each agent, and wait until Gazebo has received them all.
+    void SendCommands()
+    {
+        for (size_t i = 0; i < m_agents.size(); i++)
+        {
+            if (!m_connection.Publish(i, TwistOf(m_agents[i], m_options, m_stepNs)))
+            {
+                m_monitor.Fail("a command to " + m_agents[i].name + " cannot be published on " +
+                               m_connection.CommandTopic(i));
+            }
+        }
+        m_connection.Acknowledge();
+    }
+
+    // Stop all robots, without waiting; the world stays paused.
+    void Stop()
+    {
+        for (size_t i = 0; i < m_agents.size(); i++)
+        {
+            m_agents[i].Stop();
+            m_connection.Publish(i, TwistOf(m_agents[i], m_options, m_stepNs));
+        }
+    }
+
+  private:
+    int64_t StepsOf(double seconds) const
+    {
+        return std::max<int64_t>(std::llround(seconds * 1e9 / double(m_stepNs)), 1);
+    }
+
+    void Pause()
+    {
+        m_connection.Call(m_options.ControlService(), Connection::ControlRequest(0));
+        WorldMonitor::Lock lock(m_monitor.mutex);
+        m_monitor.repeated_clocks = 0;
+        m_monitor.Wait(
+            lock, [&] { return m_monitor.repeated_clocks >= 3; },
+            [] { return std::string("it has not paused, another program may run it"); });
+        m_nowNs = m_monitor.clock_ns;
+    }
+
+    void MeasureStep()
+    {
+        int64_t before_ns = m_nowNs;
+        auto answer = m_connection.Send(m_options.ControlService(), Connection::ControlRequest(1));
+        WorldMonitor::Lock lock(m_monitor.mutex);
+        m_monitor.Wait(
+            lock, [&] { return m_monitor.clock_ns > before_ns; }, [] { return std::string("it has not made a step"); });
+        m_stepNs = m_monitor.clock_ns - before_ns;
+        WaitForPoses(lock, before_ns + m_stepNs, before_ns, answer);
+    }
+
+    // Advance by a number of steps: the poses are those after the last one.
+    void Step(int64_t count)
+    {
+        while (count > 0)
+        {
+            uint32_t steps = static_cast<uint32_t>(std::min<int64_t>(count, 1000000));
+            {
+                WorldMonitor::Lock lock(m_monitor.mutex);
+                if (m_monitor.clock_ns != m_nowNs)
+                {
+                    m_monitor.Fail((m_monitor.clock_ns < m_nowNs ? "it was reset" : "another program has advanced it") +
+                                   m_monitor.LastMessage());
+                }
+            }
+            int64_t before_ns = m_nowNs;
+            auto answer = m_connection.Send(m_options.ControlService(), Connection::ControlRequest(steps));
+            WorldMonitor::Lock lock(m_monitor.mutex);
+            WaitForPoses(lock, before_ns + steps * m_stepNs, before_ns, answer);
+            count -= steps;
+        }
+        for (size_t i = 0; i < m_agents.size(); i++)
+        {
+            m_agents[i].pose = m_monitor.poses[i];
+        }
+    }
+
+    // The clock of a step is published before the step is made, so only poses with its time stamp are valid.
+    void WaitForPoses(WorldMonitor::Lock& lock, int64_t target_ns, int64_t before_ns, const Connection::Answer& answer)
+    {
+        auto have_arrived = [&] {
+            m_connection.Check(answer, m_options.ControlService());
+            if (m_monitor.clock_ns > target_ns || m_monitor.pose_ns > target_ns)
+            {
+                m_monitor.Fail("it has advanced beyond Gazebo's time " + Seconds(target_ns) +
+                               ", another program may control it" + m_monitor.LastMessage());
+            }
+            if (m_monitor.clock_ns < before_ns)
+            {
+                m_monitor.Fail("it was reset" + m_monitor.LastMessage());
+            }
+            return m_monitor.pose_ns == target_ns;
+        };
+        m_monitor.Wait(lock, have_arrived, [&]() -> std::string {
+            if (m_monitor.clock_ns == target_ns)
+            {
+                return "no poses of Gazebo's time " + Seconds(target_ns) + " have arrived on " +
+                       m_options.Name(m_options.pose_topic) + " (the last ones are of " + Seconds(m_monitor.pose_ns) +
+                       "; is dynamic_pose_hertz too small?)";
+            }
+            return "it has not reached Gazebo's time " + Seconds(target_ns) + ", another program may have paused it";
+        });
+        m_nowNs = target_ns;
+        if (m_monitor.reached_ns >= 0)
+        {
+            m_monitor.reached_ns = m_nowNs - m_startNs;
+        }
+        for (const Agent& agent : m_agents)
+        {
+            if (!m_monitor.present.count(agent.model))
+            {
+                m_monitor.Fail("the model " + agent.model + " has been removed");
+            }
+        }
+    }
+
+    // Robots may still move from an earlier run, and a new position keeps the velocity.
+    void ComeToRest(int64_t steps)
+    {
+        Step(steps);
+        for (int round = 0; round < 20; round++)
+        {
+            std::vector<Pose> before = Poses();
+            Step(std::max<int64_t>(steps / 4, 1));
+            double largest = 0;
+            for (size_t i = 0; i < m_agents.size(); i++)
+            {
+                Vector moved = m_agents[i].pose.position - before[i].position;
+                double turned = std::remainder(m_agents[i].pose.Yaw() - before[i].Yaw(), 2 * M_PI);
+                largest =
+                    std::max({largest, std::fabs(moved.x), std::fabs(moved.y), std::fabs(moved.z), std::fabs(turned)});
+            }
+            if (largest < 1e-4)
+            {
+                return;
+            }
+        }
+    }
+
+    void Reset()
+    {
+        m_connection.Call(m_options.ControlService(), Connection::ControlRequest(0, true));
+        WorldMonitor::Lock lock(m_monitor.mutex);
+        m_monitor.Wait(
+            lock, [&] { return m_monitor.clock_ns == 0; },
+            [] {
+                return std::string("its clock has not returned to 0 after a reset (option reset: false avoids it)");
+            });
+        m_monitor.Wait(
+            lock, [&] { return m_monitor.pose_ns == 0; },
+            [] { return std::string("no poses have arrived after a reset"); });
+        m_nowNs = 0;
+        // Newer versions create the plugins again, which then subscribe again.
+        m_connection.WaitForSubscribers(lock);
+    }
+
+    // The service answers before it places the model, which happens at the latest before the next step.
+    void Place()
+    {
+        for (const Agent& agent : m_agents)
+        {
+            Pose start = Pose::WithYaw(agent.start_yaw);
+            msgs::Pose pose;
+            pose.set_name(agent.model);
+            pose.mutable_position()->set_x(agent.start.x);
+            pose.mutable_position()->set_y(agent.start.y);
+            pose.mutable_position()->set_z(agent.start.z);
+            pose.mutable_orientation()->set_w(start.w);
+            pose.mutable_orientation()->set_z(start.z);
+            m_connection.Call(m_options.Name(m_options.pose_service), pose);
+        }
+    }
+
+    void CheckStart() const
+    {
+        for (const Agent& agent : m_agents)
+        {
+            Vector error = agent.pose.position - agent.start;
+            double distance_m = std::sqrt(error.x * error.x + error.y * error.y + error.z * error.z);
+            if (!(distance_m <= m_options.start_error_m))
+            {
+                m_monitor.Fail(
+                    "the model " + agent.model + " is " + std::to_string(distance_m) + " m away from the start of " +
+                    agent.name +
+                    "; write the world with `fieldkit cosim sdf`, or set physics.options.place or origins_m");
+            }
+        }
+    }
+
+    std::vector<Pose> Poses() const
+    {
+        std::vector<Pose> poses;
+        for (const Agent& agent : m_agents)
+        {
+            poses.push_back(agent.pose);
+        }
+        return poses;
+    }
+
+    Options m_options;
+    std::vector<Agent> m_agents;
+    WorldMonitor m_monitor;
+    Connection m_connection;
+    int64_t m_stepNs = 0;
+    int64_t m_nowNs = -1; // Gazebo's time
+    int64_t m_startNs = 0;
+    int64_t m_windowAt = 0; // step at which the last window has ended
+    std::vector<Pose> m_windowPoses;
+};
+
+} // namespace fieldkit
+
+#endif

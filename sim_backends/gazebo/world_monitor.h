@@ -1,0 +1,193 @@
+// What a world of Gazebo has published: its clock and the poses of models; and waits for it.
+
+#ifndef FIELDKIT_GAZEBO_WORLD_MONITOR_H
+#define FIELDKIT_GAZEBO_WORLD_MONITOR_H
+
+#include "agents.h"
+#include "fieldkit/serving.h"
+
+#include <algorithm>
+#include <chrono>
+#include <condition_variable>
+#include <functional>
+#include <mutex>
+#include <set>
+
+namespace fieldkit
+{
+
+using Clock = std::chrono::steady_clock;
+
+// A time in seconds, without zeros at its end.
+inline std::string
+Seconds(int64_t time_ns)
+{
+    char text[40];
+    std::snprintf(text, sizeof text, "%.9f", static_cast<double>(time_ns) / 1e9);
+    std::string whole(text);
+    whole.erase(whole.find_last_not_of('0') + 1);
+    if (whole.back() == '.')
+    {
+        whole.pop_back();
+    }
+    return whole + " s";
+}
+
+class WorldMonitor
+{
+  public:
+    using Lock = std::unique_lock<std::mutex>;
+
+    WorldMonitor(const Options& options, const std::vector<Agent>& agents, protocol::Heartbeat& heartbeat)
+        : poses(agents.size()),
+          m_options(options),
+          m_heartbeat(heartbeat)
+    {
+        for (size_t i = 0; i < agents.size(); i++)
+        {
+            m_indices[agents[i].model] = i;
+        }
+    }
+
+    // Checks, without the lock, whether the world is still there; empty before the connection.
+    std::function<bool()> is_there;
+
+    int64_t reached_ns = -1; // time that the run has reached; -1 before its start
+
+    // What callbacks of Gazebo Transport change, with the lock.
+    std::mutex mutex;
+    std::condition_variable changed;
+    int64_t clock_ns = -1, pose_ns = -1;
+    int repeated_clocks = 0;
+    std::vector<Pose> poses;
+    std::set<std::string> present; // models that have a pose
+    std::string names;             // of models and links, for messages
+
+    void Receive(const msgs::Clock& message)
+    {
+        std::lock_guard<std::mutex> guard(mutex);
+        int64_t time_ns = message.sim().sec() * 1000000000LL + message.sim().nsec();
+        repeated_clocks = time_ns == clock_ns ? repeated_clocks + 1 : 0;
+        m_clockAt = Clock::now();
+        if (time_ns == clock_ns && repeated_clocks > 3)
+        {
+            return; // a paused world repeats its clock
+        }
+        clock_ns = time_ns;
+        changed.notify_all();
+    }
+
+    void Receive(const msgs::Pose_V& message)
+    {
+        std::lock_guard<std::mutex> guard(mutex);
+        const auto& stamp = message.header().stamp();
+        int64_t time_ns = stamp.sec() * 1000000000LL + stamp.nsec();
+        if (time_ns == pose_ns)
+        {
+            return; // a paused world repeats its poses
+        }
+        pose_ns = time_ns;
+        present.clear();
+        names.clear();
+        for (const msgs::Pose& pose : message.pose())
+        {
+            if (names.size() < 200)
+            {
+                names += (names.empty() ? "" : ", ") + pose.name();
+            }
+            auto model = m_indices.find(pose.name());
+            if (model == m_indices.end() || !present.insert(pose.name()).second)
+            {
+                continue; // a link may have the name of a model; models come first
+            }
+            const auto& p = pose.position();
+            const auto& q = pose.orientation();
+            poses[model->second] = Pose{{p.x(), p.y(), p.z()}, q.w(), q.x(), q.y(), q.z()};
+        }
+        changed.notify_all();
+    }
+
+    // Fail with the world's name and its last time; the coordinator adds the request.
+    [[noreturn]] void Fail(const std::string& what) const
+    {
+        std::string last = reached_ns >= 0 ? ", whose last time is " + Seconds(reached_ns) : ", which has not started";
+        throw Refusal("Gazebo world '" + m_options.world + "'" + last + ": " + what);
+    }
+
+    // Wait until a condition holds, with the lock. Progress of the clock extends the deadline.
+    template <typename Condition> void Wait(Lock& lock, Condition holds, const std::function<std::string()>& what)
+    {
+        auto span = std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(m_options.timeout_s));
+        auto limit = Clock::now() + span, check = Clock::now() + std::chrono::milliseconds(500);
+        int64_t progress_ns = clock_ns;
+        while (!holds())
+        {
+            auto now = Clock::now();
+            if (clock_ns != progress_ns)
+            {
+                progress_ns = clock_ns;
+                limit = now + span;
+            }
+            if (now >= limit)
+            {
+                Fail(what() + " within " + Seconds(int64_t(m_options.timeout_s * 1e9)) + LastMessage());
+            }
+            if (now >= m_heartbeat.Due())
+            {
+                lock.unlock();
+                Beat();
+                lock.lock();
+                continue;
+            }
+            if (now >= check)
+            {
+                check = now + std::chrono::milliseconds(500);
+                if (is_there && !Unlocked(lock, is_there))
+                {
+                    Fail("it has disappeared, or is suspended" + LastMessage());
+                }
+                continue;
+            }
+            changed.wait_until(lock, std::min({limit, m_heartbeat.Due(), check, now + std::chrono::milliseconds(100)}));
+        }
+    }
+
+    // Evaluate without the lock, because Gazebo Transport holds its own lock during callbacks.
+    template <typename Function> static bool Unlocked(Lock& lock, Function function)
+    {
+        lock.unlock();
+        bool result = function();
+        lock.lock();
+        return result;
+    }
+
+    // Report to the coordinator, if necessary, that the request takes long.
+    void Beat()
+    {
+        m_heartbeat.Check(std::max<int64_t>(reached_ns, 0));
+    }
+
+    // The end of a message of an error: the last time of the clock.
+    std::string LastMessage() const
+    {
+        if (clock_ns < 0)
+        {
+            return "; no message of its clock has arrived on " + m_options.Name(m_options.clock_topic);
+        }
+        double silent_s = std::chrono::duration<double>(Clock::now() - m_clockAt).count();
+        char text[120];
+        std::snprintf(text, sizeof text, "; Gazebo's clock is at %s, received %.1f s ago", Seconds(clock_ns).c_str(),
+                      silent_s);
+        return text;
+    }
+
+  private:
+    const Options& m_options;
+    protocol::Heartbeat& m_heartbeat;
+    std::map<std::string, size_t> m_indices; // of agents, by model
+    Clock::time_point m_clockAt;
+};
+
+} // namespace fieldkit
+
+#endif
