@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from docs.generator.commands import commands
+from docs.generator.federate_frames import DESCRIPTION, WITHOUT_VECTOR, example_frames
 from docs.generator.markdown import page, relative, table
 from docs.generator.models import HEAD, describe, keys_table, kinds, rows
 from fieldkit import cli
@@ -44,8 +45,15 @@ def pages() -> dict[str, str]:
         "scenario-file.md": scenario_file,
         "columns.md": columns,
         "events.md": json_events,
+        "federate-vectors.md": federate_vectors,
     }
     return {"index.md": index()} | {name: make() for name, make in makers.items()}
+
+
+def federate_vectors() -> str:
+    """Return the test vectors of the protocol of external federates."""
+    frames = [(name, f"`{frame.hex()}`") for name, frame in example_frames().items() if name not in WITHOUT_VECTOR]
+    return page("Test vectors of federates", DESCRIPTION, table(("message", "frame"), frames))
 
 
 def index() -> str:
@@ -64,6 +72,7 @@ def index() -> str:
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
         ("[JSON events](events.md)", "output of `--json`"),
+        ("[Test vectors of federates](federate-vectors.md)", "frames of the protocol of external federates"),
         ("[Errors](../errors.md)", "messages and remedies"),
     )
     return page("Reference", table(("page", "content"), entries))

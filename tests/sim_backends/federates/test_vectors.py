@@ -1,4 +1,4 @@
-"""The test vectors of docs/federates.md: what the encoder gives, and what a decoder written by hand reads in them."""
+"""The test vectors of docs/reference/federate-vectors.md: what the encoder gives, and what a decoder written by hand reads in them."""
 
 import hashlib
 import math
@@ -8,19 +8,17 @@ from typing import Any
 
 import pytest
 
+from docs.generator.federate_frames import DRONE, HELLO, START, WELCOME, WITHOUT_VECTOR, agents, example_frames
 from sim_backends.federates import exchanges
 from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import HEADER_BYTES, MessageKind, read_header
 from sim_backends.federates.handshake import Hello, Welcome, decode_join
-from tests.helpers.federate_frames import DRONE, HELLO, START, WELCOME, agents, example_frames
 from tests.helpers.paths import ROOT
 
-PAGE = (ROOT / "docs" / "federates.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "reference" / "federate-vectors.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| ([a-z ]+) \| `([0-9a-f]+)` \|$", PAGE, re.MULTILINE)
 VECTORS = {name: bytes.fromhex(text) for name, text in ROWS}
-WITHOUT_VECTOR = {"pong", "busy", "done", "release", "bye"}
-"""Messages with an empty body or that of ping."""
 UGV = (0, 0, 1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 0.25)
 
 
