@@ -1,4 +1,4 @@
-"""The test vectors of docs/reference/federate-vectors.md: what the encoder gives, and what a decoder written by hand reads in them."""
+"""The test vectors of federates: what the encoder gives, and what a decoder written by hand reads in them."""
 
 import hashlib
 import math
