@@ -10,7 +10,7 @@ import csv
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -154,8 +154,8 @@ def estimate_text(values: Sequence[float], scale: float, digits: int) -> str:
     finite = np.array([value for value in values if math.isfinite(value)]) * scale
     estimate = mean(finite)
     if math.isnan(estimate.low):
-        return "" if math.isnan(estimate.value) else f"{estimate.value:.{digits}f}"
-    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+        return "" if math.isnan(estimate.value) else f"{estimate.value:z.{digits}f}"
+    return f"{estimate.value:z.{digits}f} [{estimate.low:z.{digits}f}, {estimate.high:z.{digits}f}]"
 
 
 def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
@@ -185,31 +185,52 @@ def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
             yield f"| {' | '.join(cells)} |"
 
 
-def policy_table(rows: Sequence[StudyRow]) -> Iterator[str]:
-    """Yield a table of each policy on each pair of simulators, relative to the exact reference on the same pair."""
-    yield (
-        "| physics | network | method | mean delay added (ms) | error of delivery time (ms) | "
-        "distance from the path (mm) | other fate (%) | exchanges per s | wall time per s (s) |"
-    )
-    yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+def policy_tables(rows: Sequence[StudyRow]) -> Iterator[str]:
+    """Yield a table of each measure, with a row for each policy and a column for each pair of simulators."""
     by_pair = by_pair_and_policy(rows)
-    for (pair, policy), runs in by_pair.items():
-        if failure := next((run.failure for run in runs if run.failure), ""):
-            yield f"| {' | '.join(pair)} | `{policy}` | {failure} | | | | | |"
-            continue
-        reference = by_pair[pair, REFERENCE]
-        added_s = [run.delay_s - exact.delay_s for run, exact in zip(runs, reference, strict=True)]
-        cells = (
-            *pair,
-            f"`{policy}`",
-            estimate_text(added_s, MS, 2),
-            estimate_text([run.time_error_s for run in runs], MS, 2),
-            estimate_text([run.path_error_m for run in runs], MS, 1),
-            estimate_text([run.other_fate for run in runs], 100, 1),
-            f"{np.mean([run.exchanges_per_s for run in runs]):.0f}",
-            f"{np.median([run.wall_s for run in runs]):.2f}",
-        )
-        yield f"| {' | '.join(cells)} |"
+    pairs = [*dict.fromkeys(pair for pair, _ in by_pair)]
+    policies = [*dict.fromkeys(policy for _, policy in by_pair)]
+    for title, cell in MEASURES.items():
+        yield ""
+        yield f"{title}:"
+        yield ""
+        yield f"| method | {' | '.join(', '.join(pair) for pair in pairs)} |"
+        yield f"| --- |{' --- |' * len(pairs)}"
+        for policy in policies:
+            cells = [_cell(cell, by_pair.get((pair, policy), []), by_pair[pair, REFERENCE]) for pair in pairs]
+            yield f"| `{policy}` | {' | '.join(cells)} |"
+
+
+Cell = Callable[[Sequence[StudyRow], Sequence[StudyRow]], str]
+"""Returns the text of a cell for the runs of a policy and those of the exact reference, by seed."""
+
+
+def _cell(cell: Cell, runs: Sequence[StudyRow], reference: Sequence[StudyRow]) -> str:
+    failure = next((run.failure for run in runs if run.failure), "")
+    return failure or cell(runs, reference)
+
+
+def added_text(runs: Sequence[StudyRow], reference: Sequence[StudyRow]) -> str:
+    """Return the difference of the mean delay from that of the exact reference with the same seed."""
+    return estimate_text([run.delay_s - exact.delay_s for run, exact in zip(runs, reference, strict=True)], MS, 1)
+
+
+def path_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:
+    """Return the mean distance of agents from their positions in the exact reference."""
+    return estimate_text([run.path_error_m for run in runs], MS, 1)
+
+
+def cost_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:
+    """Return the number of exchanges and the wall time, both per simulated second."""
+    exchanges = np.mean([run.exchanges_per_s for run in runs])
+    return f"{exchanges:.0f}; {np.median([run.wall_s for run in runs]):.2f}"
+
+
+MEASURES: Final[Mapping[str, Cell]] = {
+    "Mean delay that the method adds (ms)": added_text,
+    "Distance of robots from their positions with the exact method (mm)": path_text,
+    "Exchanges and wall time (s), per simulated second": cost_text,
+}
 
 
 def by_pair_and_policy(rows: Sequence[StudyRow]) -> dict[tuple[tuple[str, str], str], list[StudyRow]]:
@@ -223,7 +244,7 @@ def by_pair_and_policy(rows: Sequence[StudyRow]) -> dict[tuple[tuple[str, str], 
 def print_tables(arguments: argparse.Namespace) -> None:
     """Print the tables of a file."""
     rows = read_rows(arguments.file)
-    for line in (*simulator_table(rows), "", *policy_table(rows)):
+    for line in (*simulator_table(rows), *policy_tables(rows)):
         print_text(line)
 
 
