@@ -1,8 +1,8 @@
 """Every sync policy on every pair of simulators: `python -m benchmarks.studies.combinations run FILE.csv`.
 
 Runs one scenario with each physics, each network, each sync policy and each seed, and appends a row per run to a CSV
-file; combinations that the file has are not run again. `table FILE.csv` prints the tables of the documentation. A
-Gazebo must be running for `gazebo`.
+file; combinations that the file has are not run again. `table FILE.csv --page docs/studies/simulators.md` writes the
+tables of the documentation. A Gazebo must be running for `gazebo`.
 """
 
 import argparse
@@ -30,6 +30,8 @@ REFERENCE: Final = "event_driven"
 NETWORK_OPTIONS: Final = {"ns3": {"topics": "udp"}}
 """Best-effort topics are UDP datagrams with the headers of RTPS."""
 MS: Final = 1e3
+BEGIN: Final = "<!-- written by benchmarks.studies.combinations: from here -->"
+END: Final = "<!-- written by benchmarks.studies.combinations: to here -->"
 
 
 class StudyRow(NamedTuple):
@@ -242,10 +244,17 @@ def by_pair_and_policy(rows: Sequence[StudyRow]) -> dict[tuple[tuple[str, str], 
 
 
 def print_tables(arguments: argparse.Namespace) -> None:
-    """Print the tables of a file."""
+    """Print the tables of a file, or write them into a page."""
     rows = read_rows(arguments.file)
-    for line in (*simulator_table(rows), *policy_tables(rows)):
-        print_text(line)
+    text = "\n".join((*simulator_table(rows), *policy_tables(rows)))
+    if arguments.page is None:
+        print_text(text)
+        return
+    before, _, rest = arguments.page.read_text(encoding="utf-8").partition(f"{BEGIN}\n")
+    _, end, after = rest.partition(END)
+    if not end:
+        raise SystemExit(f"{arguments.page} lacks the line {BEGIN} or {END}")
+    arguments.page.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{after}", encoding="utf-8")
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -261,9 +270,10 @@ def main(words: Sequence[str] | None = None) -> None:
     runs.add_argument("--seeds", type=int, default=6)
     runs.add_argument("--duration", default="10s")
     runs.add_argument("--window", default="10ms")
-    runs.set_defaults(run=run)
+    runs.set_defaults(run=run, page=None)
     tables = commands.add_parser("table")
     tables.add_argument("file", type=Path)
+    tables.add_argument("--page", type=Path, help="write the tables into this page instead")
     tables.set_defaults(run=print_tables)
     arguments = parser.parse_args(words)
     arguments.run(arguments)
