@@ -21,6 +21,7 @@ from fieldkit.core import errors, events
 from fieldkit.core.columns import Column
 from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
 from fieldkit.steps.base import Step, step_types
+from fieldkit.steps.capabilities import CAPABILITIES
 from fieldkit.trial.columns import installed
 from fieldkit.trial.procedure import Procedure
 from sim_backends.cosim.scenario.agent_plans import MotionPlan, Traffic
@@ -41,6 +42,7 @@ def pages() -> dict[str, str]:
         "robot-profile.md": lambda: page("Robot profile", describe(RobotProfile), _MARKS, keys_table(RobotProfile)),
         "procedure.md": procedure,
         "steps.md": steps,
+        "step-capabilities.md": step_capabilities,
         "campaign-file.md": lambda: page("Campaign file", describe(CampaignFile), _MARKS, keys_table(CampaignFile)),
         "scenario-file.md": scenario_file,
         "columns.md": columns,
@@ -48,6 +50,26 @@ def pages() -> dict[str, str]:
         "federate-vectors.md": federate_vectors,
     }
     return {"index.md": index()} | {name: make() for name, make in makers.items()}
+
+
+def step_capabilities() -> str:
+    """Return the page of capabilities of steps, from their classes."""
+    lines = []
+    for capability in CAPABILITIES:
+        methods = ", ".join(f"`{name}`" for name in sorted(capability.__abstractmethods__, key=_line_in(capability)))
+        meaning = class_description(capability).partition("\n\n")[0].replace("\n", " ")
+        lines.append((f"`{capability.__name__}`", meaning, methods))
+    return page(
+        "Capabilities of steps",
+        "A [kind of step](../add-a-procedure.md#add-a-kind-of-step) has a capability if its class defines the methods; "
+        "`fieldkit/steps/capabilities.py` describes each method.",
+        table(("capability", "step", "methods"), lines),
+    )
+
+
+def _line_in(capability: type) -> Callable[[str], int]:
+    """Return the function that gives the position of a method in its class."""
+    return list(vars(capability)).index
 
 
 def federate_vectors() -> str:
@@ -65,6 +87,7 @@ def index() -> str:
         ("[Robot profile](robot-profile.md)", "`robots/NAME.yaml`"),
         ("[Procedure](procedure.md)", "`procedures/NAME.yaml`"),
         ("[Steps](steps.md)", "the kinds of step of a procedure"),
+        ("[Capabilities of steps](step-capabilities.md)", "for a kind of step of your own"),
         ("[Campaign file](campaign-file.md)", "the file of `fieldkit campaign`"),
         ("[Scenario file](scenario-file.md)", "`scenarios/NAME.yaml` of the co-simulation"),
         ("[World file](../world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
