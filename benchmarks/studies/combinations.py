@@ -1,8 +1,8 @@
 """Every sync policy on every pair of simulators: `python -m benchmarks.studies.combinations run FILE.csv`.
 
 Runs one scenario with each physics, each network, each sync policy and each seed, and appends a row per run to a CSV
-file; combinations that the file has are not run again. `table FILE.csv` prints the tables of the documentation. A
-Gazebo must be running for `gazebo`.
+file; combinations that the file has are not run again. `table FILE.csv --page docs/studies/simulators.md` writes the
+tables of the documentation. A Gazebo must be running for `gazebo`.
 """
 
 import argparse
@@ -10,7 +10,7 @@ import csv
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -30,6 +30,8 @@ REFERENCE: Final = "event_driven"
 NETWORK_OPTIONS: Final = {"ns3": {"topics": "udp"}}
 """Best-effort topics are UDP datagrams with the headers of RTPS."""
 MS: Final = 1e3
+BEGIN: Final = "<!-- written by benchmarks.studies.combinations: from here -->"
+END: Final = "<!-- written by benchmarks.studies.combinations: to here -->"
 
 
 class StudyRow(NamedTuple):
@@ -154,8 +156,8 @@ def estimate_text(values: Sequence[float], scale: float, digits: int) -> str:
     finite = np.array([value for value in values if math.isfinite(value)]) * scale
     estimate = mean(finite)
     if math.isnan(estimate.low):
-        return "" if math.isnan(estimate.value) else f"{estimate.value:.{digits}f}"
-    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+        return "" if math.isnan(estimate.value) else f"{estimate.value:z.{digits}f}"
+    return f"{estimate.value:z.{digits}f} [{estimate.low:z.{digits}f}, {estimate.high:z.{digits}f}]"
 
 
 def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
@@ -164,15 +166,16 @@ def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
     Differences are those of runs with the same seed.
     """
     by_pair = by_pair_and_policy(rows)
-    built_in = by_pair[(BUILT_IN, BUILT_IN), REFERENCE]
+    built_in = by_pair.get(((BUILT_IN, BUILT_IN), REFERENCE), [])
     yield (
         "| physics | network | loss (%) | mean delay (ms) | difference (ms) | mean distance (m) | difference (mm) |"
     )
     yield "| --- | --- | --- | --- | --- | --- | --- |"
     for (pair, policy), runs in by_pair.items():
         if policy == REFERENCE:
-            delays_s = [run.delay_s - base.delay_s for run, base in zip(runs, built_in, strict=True)]
-            distances_m = [run.separation_m - base.separation_m for run, base in zip(runs, built_in, strict=True)]
+            with_base = list(zip(runs, built_in, strict=bool(built_in)))
+            delays_s = [run.delay_s - base.delay_s for run, base in with_base]
+            distances_m = [run.separation_m - base.separation_m for run, base in with_base]
             cells = (
                 *pair,
                 estimate_text([run.loss for run in runs], 100, 1),
@@ -184,31 +187,52 @@ def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
             yield f"| {' | '.join(cells)} |"
 
 
-def policy_table(rows: Sequence[StudyRow]) -> Iterator[str]:
-    """Yield a table of each policy on each pair of simulators, relative to the exact reference on the same pair."""
-    yield (
-        "| physics | network | method | mean delay added (ms) | error of delivery time (ms) | "
-        "distance from the path (mm) | other fate (%) | exchanges per s | wall time per s (s) |"
-    )
-    yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+def policy_tables(rows: Sequence[StudyRow]) -> Iterator[str]:
+    """Yield a table of each measure, with a row for each policy and a column for each pair of simulators."""
     by_pair = by_pair_and_policy(rows)
-    for (pair, policy), runs in by_pair.items():
-        if failure := next((run.failure for run in runs if run.failure), ""):
-            yield f"| {' | '.join(pair)} | `{policy}` | {failure} | | | | | |"
-            continue
-        reference = by_pair[pair, REFERENCE]
-        added_s = [run.delay_s - exact.delay_s for run, exact in zip(runs, reference, strict=True)]
-        cells = (
-            *pair,
-            f"`{policy}`",
-            estimate_text(added_s, MS, 2),
-            estimate_text([run.time_error_s for run in runs], MS, 2),
-            estimate_text([run.path_error_m for run in runs], MS, 1),
-            estimate_text([run.other_fate for run in runs], 100, 1),
-            f"{np.mean([run.exchanges_per_s for run in runs]):.0f}",
-            f"{np.median([run.wall_s for run in runs]):.2f}",
-        )
-        yield f"| {' | '.join(cells)} |"
+    pairs = [*dict.fromkeys(pair for pair, _ in by_pair)]
+    policies = [*dict.fromkeys(policy for _, policy in by_pair)]
+    for title, cell in MEASURES.items():
+        yield ""
+        yield f"{title}:"
+        yield ""
+        yield f"| method | {' | '.join(', '.join(pair) for pair in pairs)} |"
+        yield f"| --- |{' --- |' * len(pairs)}"
+        for policy in policies:
+            cells = [_cell(cell, by_pair.get((pair, policy), []), by_pair[pair, REFERENCE]) for pair in pairs]
+            yield f"| `{policy}` | {' | '.join(cells)} |"
+
+
+Cell = Callable[[Sequence[StudyRow], Sequence[StudyRow]], str]
+"""Returns the text of a cell for the runs of a policy and those of the exact reference, by seed."""
+
+
+def _cell(cell: Cell, runs: Sequence[StudyRow], reference: Sequence[StudyRow]) -> str:
+    failure = next((run.failure for run in runs if run.failure), "")
+    return failure or cell(runs, reference)
+
+
+def added_text(runs: Sequence[StudyRow], reference: Sequence[StudyRow]) -> str:
+    """Return the difference of the mean delay from that of the exact reference with the same seed."""
+    return estimate_text([run.delay_s - exact.delay_s for run, exact in zip(runs, reference, strict=True)], MS, 1)
+
+
+def path_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:
+    """Return the mean distance of agents from their positions in the exact reference."""
+    return estimate_text([run.path_error_m for run in runs], MS, 1)
+
+
+def cost_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:
+    """Return the number of exchanges and the wall time, both per simulated second."""
+    exchanges = np.mean([run.exchanges_per_s for run in runs])
+    return f"{exchanges:.0f}; {np.median([run.wall_s for run in runs]):.2f}"
+
+
+MEASURES: Final[Mapping[str, Cell]] = {
+    "Mean delay that the method adds (ms)": added_text,
+    "Distance of robots from their positions with the exact method (mm)": path_text,
+    "Exchanges and wall time (s), per simulated second": cost_text,
+}
 
 
 def by_pair_and_policy(rows: Sequence[StudyRow]) -> dict[tuple[tuple[str, str], str], list[StudyRow]]:
@@ -220,10 +244,17 @@ def by_pair_and_policy(rows: Sequence[StudyRow]) -> dict[tuple[tuple[str, str], 
 
 
 def print_tables(arguments: argparse.Namespace) -> None:
-    """Print the tables of a file."""
+    """Print the tables of a file, or write them into a page."""
     rows = read_rows(arguments.file)
-    for line in (*simulator_table(rows), "", *policy_table(rows)):
-        print_text(line)
+    text = "\n".join((*simulator_table(rows), *policy_tables(rows)))
+    if arguments.page is None:
+        print_text(text)
+        return
+    before, _, rest = arguments.page.read_text(encoding="utf-8").partition(f"{BEGIN}\n")
+    _, end, after = rest.partition(END)
+    if not end:
+        raise SystemExit(f"{arguments.page} lacks the line {BEGIN} or {END}")
+    arguments.page.write_text(f"{before}{BEGIN}\n\n{text}\n\n{END}{after}", encoding="utf-8")
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -239,9 +270,10 @@ def main(words: Sequence[str] | None = None) -> None:
     runs.add_argument("--seeds", type=int, default=6)
     runs.add_argument("--duration", default="10s")
     runs.add_argument("--window", default="10ms")
-    runs.set_defaults(run=run)
+    runs.set_defaults(run=run, page=None)
     tables = commands.add_parser("table")
     tables.add_argument("file", type=Path)
+    tables.add_argument("--page", type=Path, help="write the tables into this page instead")
     tables.set_defaults(run=print_tables)
     arguments = parser.parse_args(words)
     arguments.run(arguments)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from docs.generator.commands import commands
+from docs.generator.federate_frames import DESCRIPTION, WITHOUT_VECTOR, example_frames
 from docs.generator.markdown import page, relative, table
 from docs.generator.models import HEAD, describe, keys_table, kinds, rows
 from fieldkit import cli
@@ -20,6 +21,7 @@ from fieldkit.core import errors, events
 from fieldkit.core.columns import Column
 from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
 from fieldkit.steps.base import Step, step_types
+from fieldkit.steps.capabilities import CAPABILITIES
 from fieldkit.trial.columns import installed
 from fieldkit.trial.procedure import Procedure
 from sim_backends.cosim.scenario.agent_plans import MotionPlan, Traffic
@@ -40,12 +42,40 @@ def pages() -> dict[str, str]:
         "robot-profile.md": lambda: page("Robot profile", describe(RobotProfile), _MARKS, keys_table(RobotProfile)),
         "procedure.md": procedure,
         "steps.md": steps,
+        "step-capabilities.md": step_capabilities,
         "campaign-file.md": lambda: page("Campaign file", describe(CampaignFile), _MARKS, keys_table(CampaignFile)),
         "scenario-file.md": scenario_file,
         "columns.md": columns,
         "events.md": json_events,
+        "federate-vectors.md": federate_vectors,
     }
     return {"index.md": index()} | {name: make() for name, make in makers.items()}
+
+
+def step_capabilities() -> str:
+    """Return the page of capabilities of steps, from their classes."""
+    lines = []
+    for capability in CAPABILITIES:
+        methods = ", ".join(f"`{name}`" for name in sorted(capability.__abstractmethods__, key=_line_in(capability)))
+        meaning = class_description(capability).partition("\n\n")[0].replace("\n", " ")
+        lines.append((f"`{capability.__name__}`", meaning, methods))
+    return page(
+        "Capabilities of steps",
+        "A [kind of step](../add-a-procedure.md#add-a-kind-of-step) has a capability if its class defines the methods; "
+        "`fieldkit/steps/capabilities.py` describes each method.",
+        table(("capability", "step", "methods"), lines),
+    )
+
+
+def _line_in(capability: type) -> Callable[[str], int]:
+    """Return the function that gives the position of a method in its class."""
+    return list(vars(capability)).index
+
+
+def federate_vectors() -> str:
+    """Return the test vectors of the protocol of external federates."""
+    frames = [(name, f"`{frame.hex()}`") for name, frame in example_frames().items() if name not in WITHOUT_VECTOR]
+    return page("Test vectors of federates", DESCRIPTION, table(("message", "frame"), frames))
 
 
 def index() -> str:
@@ -57,6 +87,7 @@ def index() -> str:
         ("[Robot profile](robot-profile.md)", "`robots/NAME.yaml`"),
         ("[Procedure](procedure.md)", "`procedures/NAME.yaml`"),
         ("[Steps](steps.md)", "the kinds of step of a procedure"),
+        ("[Capabilities of steps](step-capabilities.md)", "for a kind of step of your own"),
         ("[Campaign file](campaign-file.md)", "the file of `fieldkit campaign`"),
         ("[Scenario file](scenario-file.md)", "`scenarios/NAME.yaml` of the co-simulation"),
         ("[World file](../world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
@@ -64,6 +95,7 @@ def index() -> str:
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
         ("[JSON events](events.md)", "output of `--json`"),
+        ("[Test vectors of federates](federate-vectors.md)", "frames of the protocol of external federates"),
         ("[Errors](../errors.md)", "messages and remedies"),
     )
     return page("Reference", table(("page", "content"), entries))

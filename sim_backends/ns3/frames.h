@@ -90,6 +90,11 @@ struct DelayParts
 class FrameTracker
 {
   public:
+    static constexpr size_t kNoStation = SIZE_MAX;
+
+    // Station whose access point forwards a frame before it acknowledges it, as it does without aggregates.
+    size_t relay = kNoStation;
+
     // Called with the id of a packet, one of whose frames is lost, and the reason.
     std::function<void(uint64_t, const std::string&)> on_lost;
 
@@ -148,8 +153,6 @@ class FrameTracker
     }
 
   private:
-    static constexpr size_t kNoStation = SIZE_MAX;
-
     struct HopFrame
     {
         size_t to = kNoStation;
@@ -246,6 +249,11 @@ class FrameTracker
         auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
         if (found != m_frames.end() && found->second.is_received)
         {
+            m_frames.erase(found);
+        }
+        else if (found != m_frames.end() && found->second.to == relay)
+        {
+            Lost(packet, "receiver not associated"); // the access point has neither forwarded it nor passed it to its host
             m_frames.erase(found);
         }
         else if (found != m_frames.end())

@@ -170,6 +170,10 @@ class Network
         {
             m_setup.relay = static_cast<int>(StationNamed(scenario.at("relay")));
             g_start_ns = kAssociationNs;
+            if (m_setup.ampdu_bytes == 0)
+            {
+                m_tracker.relay = m_setup.relay;
+            }
         }
         std::vector<std::string> names;
         for (const Station& station : m_stations)

@@ -39,9 +39,16 @@ def named(tmp_path: Path) -> Path:
     return tmp_path / "trials"
 
 
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trial that tests must not change."""
+    return recorded.make(tmp_path_factory.mktemp("trials"))
+
+
 @pytest.fixture
-def recorded_trial(tmp_path: Path) -> Path:
-    return recorded.make(tmp_path)
+def recorded_trial(original: Path, tmp_path: Path) -> Path:
+    """A copy of that trial, which the test may change."""
+    return Path(shutil.copytree(original, tmp_path / original.name))
 
 
 def as_csv(table: Table) -> str:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 from collections import Counter
 from dataclasses import dataclass, replace
 from ipaddress import IPv4Address
@@ -49,14 +50,21 @@ def messages(file: bytes) -> list[Read]:
     return read_messages
 
 
-@pytest.fixture
-def trial(tmp_path: Path) -> Path:
-    return recorded.make(tmp_path)
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trial that tests must not change."""
+    return recorded.make(tmp_path_factory.mktemp("trials"))
 
 
 @pytest.fixture
-def read_messages(trial: Path) -> list[Read]:
-    return messages(exported(trial))
+def trial(original: Path, tmp_path: Path) -> Path:
+    """A copy of that trial, which the test may change."""
+    return Path(shutil.copytree(original, tmp_path / original.name))
+
+
+@pytest.fixture(scope="module")
+def read_messages(original: Path) -> list[Read]:
+    return messages(exported(original))
 
 
 def of(read_messages: list[Read], topic: str) -> list[Read]:

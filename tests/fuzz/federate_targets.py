@@ -6,6 +6,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
+from docs.generator.federate_frames import example_frames
 from sim_backends.federates.channels import ClosedError
 from sim_backends.federates.frames import HEADER_BYTES, MalformedFrameError, read_header
 from sim_backends.federates.transports.datagrams import (
@@ -19,7 +20,6 @@ from sim_backends.federates.transports.samples import SampleListener
 from sim_backends.ros1.framing import PacketSplitter, pack, pack_header, unpack_header
 from tests.fuzz.harness import Target
 from tests.helpers.federate_decoders import DECODERS
-from tests.helpers.federate_frames import example_frames
 
 
 def _decode(name: str, data: bytes, _: Path) -> None:

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from docs.generator.federate_frames import agents
 from sim_backends.federates import exchanges
 from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.handshake import Hello, Welcome, decode_join
-from tests.helpers.federate_frames import agents
 
 DECODERS: Final[Mapping[str, Callable[[bytes], object]]] = {
     "join": decode_join,

@@ -1,7 +1,6 @@
 """Capabilities of steps: found by the methods that a class defines, also without deriving from them."""
 
 import inspect
-import re
 from collections.abc import Iterator
 from functools import partial
 
@@ -19,10 +18,8 @@ from fieldkit.steps.kinds.wait import WaitStep
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Need, RecordedFile, Scene
 from tests.helpers.idle_testbed import IdleTestbed
-from tests.helpers.paths import ROOT
 
 MAX_METHODS = 12
-PAGE = ROOT / "docs/add-a-procedure.md"
 
 
 class Outside(Step):
@@ -84,10 +81,3 @@ def test_step_without_listener_is_run_when_it_has_been_prepared() -> None:
     started = capabilities.prepare(step, scene, testbed := IdleTestbed({}))
     assert isinstance(started, partial)
     assert (started.func, started.args) == (step.run, (scene, testbed))
-
-
-def test_page_lists_each_capability_with_its_methods() -> None:
-    """The rows are in the order of the module."""
-    text = PAGE.read_text(encoding="utf-8").partition("| capability |")[2].partition("\n\n")[0]
-    assert re.findall(r"`([A-Z]\w+)`", text) == [capability.__name__ for capability in CAPABILITIES]
-    assert re.findall(r"`([a-z]\w+)`", text) == [name for cls in CAPABILITIES for name in public_methods(cls)]

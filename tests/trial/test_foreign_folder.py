@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import socket
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,12 +33,18 @@ def ours(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def trial(tmp_path: Path) -> Path:
-    """A trial of one repeat, with its manifest."""
-    folder = recorded.make(tmp_path / "trials")
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trial of one repeat, with its manifest; tests must not change it."""
+    folder = recorded.make(tmp_path_factory.mktemp("trials"))
     Ledger(store.read_plan(folder), folder, Stop()).summarize()
     return folder
+
+
+@pytest.fixture
+def trial(original: Path, tmp_path: Path) -> Path:
+    """A copy of that trial, which the test may change."""
+    return Path(shutil.copytree(original, tmp_path / "trials" / original.name))
 
 
 def pipe(path: Path) -> None:
@@ -210,7 +217,7 @@ def test_a_contradictory_journal_is_reported_with_its_line(
         "\x00" * 100,
         "",
     ],
-    ids=str,
+    ids=lambda line: line[:60],  # whole ids are sent between the processes of pytest-xdist
 )
 def test_an_invalid_line_is_one_error_with_its_line(trial: Path, line: str) -> None:
     with (trial / journal.JOURNAL_FILE).open("a", encoding="utf-8") as file:

@@ -68,7 +68,7 @@ def test_the_command_checks_it_by_its_name(
     assert main(["cosim", "conform", "jsbsim", "--scenario", str(SCENARIO)]) == 0, capsys.readouterr().out
 
 
-def test_a_drone_follows_its_commands() -> None:
+def test_a_drone_follows_its_commands(capfd: pytest.CaptureFixture[str]) -> None:
     scenario = load_scenario(SCENARIO, {"duration": "3s"})
     with build(scenario, policy="sliding_window") as simulation:
         expected = simulation.run()
@@ -77,6 +77,7 @@ def test_a_drone_follows_its_commands() -> None:
         states = simulation.agents.physics.advance(scenario.duration_ns, {"scout": Velocity((0.0, 2.0, 0.0))})
     assert len(run.fates) == len(expected.fates)
     assert states["guard"].position_m == pytest.approx((10.0, 10.0, 20.0), abs=0.3)
+    assert capfd.readouterr().out == ""
     assert states["scout"].velocity_m_s == pytest.approx((0.0, 2.0, 0.0), abs=0.2)
 
 

@@ -7,6 +7,7 @@ from contextlib import suppress
 
 import pytest
 
+from docs.generator.federate_frames import agents, example_frames
 from sim_backends.federates import exchanges
 from sim_backends.federates.frames import (
     HEADER_BYTES,
@@ -19,7 +20,6 @@ from sim_backends.federates.frames import (
     text_bytes,
 )
 from tests.helpers.federate_decoders import DECODERS
-from tests.helpers.federate_frames import agents, example_frames
 
 BODIES = {name: frame[HEADER_BYTES:] for name, frame in example_frames().items() if name in DECODERS}
 

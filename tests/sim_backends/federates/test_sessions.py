@@ -18,6 +18,7 @@ from types import MappingProxyType
 
 import pytest
 
+from docs.generator.federate_frames import example_frames
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.answering import FederateService, serve_channel
 from sim_backends.federates.channels import ClosedError, DeadlineError, StreamChannel
@@ -33,7 +34,6 @@ from sim_backends.federates.transports.tcp import TcpAddress
 from sim_backends.physics.body import Twist
 from sim_backends.world.motion import State
 from tests.helpers.federate_examples import EXAMPLES, carts
-from tests.helpers.federate_frames import example_frames
 from tests.helpers.federate_pairs import HELLO, Alter, Pair, channel_of, children, now_s
 
 MS = 1_000_000

@@ -12,11 +12,11 @@ from sim_backends.federates.records import VELOCITY
 from sim_backends.physics.body import GRAVITY_M_S2, Velocity
 from sim_backends.world.motion import State
 
-FOOT_M = 0.3048
-EAST_M, NORTH_M = 6_378_137.0, 6_335_439.0  # radii of WGS 84 at the equator, along it and along the meridian
+FOOT_M, EAST_M, NORTH_M = 0.3048, 6_378_137.0, 6_335_439.0  # with radii of WGS 84 at the equator, along both axes
 HOVER_S = 3.0  # before time 0, until the motors have their speed
 RATE_RAD_S = 0.75  # the model controls its turning rates, up to this one
-os.environ.setdefault("JSBSIM_DEBUG", "0")  # JSBSim prints less
+os.environ.setdefault("JSBSIM_DEBUG", "0")  # otherwise JSBSim writes to standard output
+jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
 
 
 class Drone:

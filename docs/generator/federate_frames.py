@@ -1,4 +1,4 @@
-"""An example of each message of the protocol of external federates: those of docs/federates.md."""
+"""An example of each message of the protocol of external federates: the test vectors."""
 
 from sim_backends.federates import exchanges
 from sim_backends.federates.agent_states import AgentTable
@@ -20,7 +20,7 @@ HELLO = Hello(
     end_ns=2_000_000_000,
     name="demo",
     configuration=b"{}",
-    token="s3cret",
+    token="s3cret",  # noqa: S106 (an example)
 )
 WELCOME = Welcome(
     PHYSICS,
@@ -31,6 +31,20 @@ WELCOME = Welcome(
     step_ns=1_000_000,
     commands=COMMAND_TYPES,
 )
+
+
+WITHOUT_VECTOR = {"pong", "busy", "done", "release", "bye"}
+"""Messages with an empty body or that of ping."""
+
+DESCRIPTION = """\
+A frame of each layout of the [protocol](../federates.md) in hexadecimal, without the messages that have an empty
+body or that of ping. Values: a run `demo` of 2 s, seed 7, step 1 ms, configuration `{}`, token `s3cret`; its agent
+`ugv` (`husky`, antenna at 0.5 m, limit 3 m/s^2) starts at (1, 2, 0.5) with heading 0.25. The physics `carts`,
+`carts 1.0`, is deterministic and supports both commands. From 10 to 11.1 ms `ugv` drives at 0.5 m/s and turns at
+-0.125 rad/s, and agent 1 flies at (1, 0, 0.25) m/s. Agent 1, `uav`, appears in the states at (-1.5, 0, 10) with the
+velocity (0, 0.5, -0.25). Packet 9, number 4 of `pose`, has 300 bytes, is sent at 10 ms and enters at 10.5 ms.
+"""
+"""Text of their page."""
 
 
 def agents() -> AgentTable:
