@@ -112,7 +112,7 @@ class CompiledProgram:
 
 
 def included_files(source: Path) -> list[Path]:
-    """Return a C++ file and the headers that it includes in quotes, in order, without those of installed libraries."""
+    """Return a C++ file and the headers of fieldkit that it includes, directly or through another one."""
     files = [source.resolve()]
     for file in files:  # grows in the loop
         for name in _INCLUDE.findall(file.read_text(encoding="utf-8")):
