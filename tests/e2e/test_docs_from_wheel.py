@@ -58,3 +58,8 @@ def test_search_works_from_files(python: Path) -> None:
         tab.wait_for_selector(".md-search-result__item")
         browser.close()
     assert not [url for url in requested if not url.startswith(("file:", "data:", "about:", "blob:"))]
+
+
+def test_the_sources_of_ns3_are_installed(python: Path) -> None:
+    (folder,) = (python.parents[1] / "lib").glob("python*/site-packages/sim_backends/ns3")
+    assert {"network.cc", "wire.h", "channel.h"} <= {path.name for path in folder.iterdir()}
