@@ -79,3 +79,8 @@ def test_the_example_passes(python: Path, example: Path) -> None:
     done = suites.run(example, python=str(python), beside=())
     assert (done.code, set(done.results.values()), len(done.results)) == (0, {"passed"}, 3), done.output
     assert not (example / "fieldkit-results").exists()
+
+
+def test_the_sources_of_ns3_are_installed(python: Path) -> None:
+    (folder,) = (python.parents[1] / "lib").glob("python*/site-packages/sim_backends/ns3")
+    assert {"network.cc", "wire.h", "channel.h"} <= {path.name for path in folder.iterdir()}
