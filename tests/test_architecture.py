@@ -371,7 +371,7 @@ FEDERATE_SEAMS = {
     "sim_backends/cosim/federates.py": {"protocols"},
     "sim_backends/cosim/scenario/external.py": {"frames", "handshake", "named", "protocols", "remote", "transports"},
     "sim_backends/cosim/scenario/served.py": {"frames", "handshake", "serving"},
-    "sim_backends/cosim/commands/conform.py": {"conformance", "frames", "handshake", "protocols", "session"},
+    "sim_backends/cosim/commands/conform.py": {"conformance", "frames", "handshake", "named", "protocols", "session"},
 }
 
 

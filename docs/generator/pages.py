@@ -61,8 +61,8 @@ def step_capabilities() -> str:
         lines.append((f"`{capability.__name__}`", meaning, methods))
     return page(
         "Capabilities of steps",
-        "A [kind of step](../add-a-procedure.md#add-a-kind-of-step) has a capability if its class defines the methods; "
-        "`fieldkit/steps/capabilities.py` describes each method.",
+        "A [kind of step](../add-a-procedure.md#add-a-kind-of-step) has a capability if its class defines the "
+        "methods; `fieldkit/steps/capabilities.py` describes each method.",
         table(("capability", "step", "methods"), lines),
     )
 

@@ -79,3 +79,17 @@ def test_the_example_passes(python: Path, example: Path) -> None:
     done = suites.run(example, python=str(python), beside=())
     assert (done.code, set(done.results.values()), len(done.results)) == (0, {"passed"}, 3), done.output
     assert not (example / "fieldkit-results").exists()
+
+
+def test_the_sources_of_programs_in_cpp_are_installed(python: Path) -> None:
+    (packages,) = (python.parents[1] / "lib").glob("python*/site-packages")
+    sources, installed = (
+        {
+            path.relative_to(root).as_posix()
+            for path in (root / "sim_backends").rglob("*")
+            if path.suffix in {".cc", ".h"}
+        }
+        for root in (ROOT, packages)
+    )
+    assert "sim_backends/federates/cpp/fieldkit/frames.h" in installed
+    assert installed == sources

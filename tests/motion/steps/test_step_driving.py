@@ -34,6 +34,7 @@ from tests.helpers.movers import driving_cast
 DRIVES = driving_cast(CAST)
 SCENE = Scene(Protocol.TCP, DRIVES, "f")
 LEASE_S = 0.05
+READY = '{"ended": "", "ready": true}'
 PING = "during: [{ping: {from: sender, to: receiver}}]"
 
 
@@ -170,11 +171,18 @@ def test_profile_with_drive_needs_a_fence() -> None:
 
 
 class Link:
-    """A shell that records each order, and answers with a status."""
+    """A shell that records each order, and answers with a status.
+
+    Args:
+        status: The statuses, one per order; the last one is repeated.
+        after: The first order that is answered with a status of `status`; earlier ones are answered with `READY`.
+        broken: Whether each order fails.
+    """
 
     robot = "turtlebot-2"
 
-    def __init__(self, *, status: Sequence[str] = (), broken: bool = False) -> None:
+    def __init__(self, *, status: Sequence[str] = (), after: str = "", broken: bool = False) -> None:
+        self.after = after
         self.written: list[str] = []
         self.status = iter(status)
         self.last = ""
@@ -186,7 +194,9 @@ class Link:
         if self.broken:
             raise LinkError("is out of range", where=self.robot, remedy="wait")
         self.written.append(argv[-2])
-        self.last = next(self.status, self.last)
+        if argv[-2].split()[1] == self.after:
+            self.after = ""
+        self.last = READY if self.after else next(self.status, self.last)
         return Completed(tuple(argv), 0, self.last.encode(), b"")
 
 
@@ -275,14 +285,14 @@ def driven(field: Field, body: Any) -> None:  # noqa: ANN401
 
 
 def test_robot_that_returns_is_not_brought_back(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home", "ready": true}']))
+    field = Field(Link(after="back", status=['{"ended": "home", "ready": true}']))
     driven(field, lambda: None)
     assert field.returns == [True]
     assert stopped == ["out.drive"]
 
 
 def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "no odometry for 0.5 s", "ready": true}']))
+    field = Field(Link(after="out", status=['{"ended": "no odometry for 0.5 s", "ready": true}']))
     with pytest.raises(RobotError, match="it stopped on its path: no odometry"):
         driven(field, lambda: None)
     assert field.returns == [False]
@@ -292,7 +302,7 @@ def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]
 def test_early_stop_aborts_steps_inside(stopped: list[str]) -> None:
     waits = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
     step = schema.validate(schema.parse(json.dumps(waits), source="x.yaml"), MoveStep)
-    field = Field(Link(status=['{"ended": "", "ready": true}'] * 4 + ['{"ended": "beyond the fence"}']))
+    field = Field(Link(after="out", status=[READY] * 4 + ['{"ended": "beyond the fence"}']))
     with pytest.raises(RobotError, match="it stopped on its path: beyond the fence") as caught:
         step.run(quick_scene(), field, lambda *_: None)
     assert "the wait was interrupted" in str(caught.value.__cause__)
@@ -315,7 +325,7 @@ def test_interrupted_robot_stays_where_it_is(stopped: list[str]) -> None:
 
 
 def test_robot_returns_after_error_inside(stopped: list[str]) -> None:
-    field = Field(Link(status=['{"ended": "", "ready": true}', '{"ended": "home", "ready": true}']))
+    field = Field(Link(after="back", status=['{"ended": "home", "ready": true}']))
 
     def fail() -> None:
         raise RobotError("it broke", remedy="repair it")

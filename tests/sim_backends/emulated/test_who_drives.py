@@ -47,7 +47,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ((ZENOH, ROS2), "auto", {"one", "two"}),
         ((ZENOH, ZENOH), "auto", set()),
         ((ZENOH, ZENOH | OWN_TOPICS), "auto", {"one", "two"}),
-        ((ZENOH, ZENOH | OWN_TOPICS), "auto\n  ros2: {discovery: router, router: drone}", set()),
+        ((ZENOH, ZENOH | OWN_TOPICS), "auto, ros2: {discovery: router, router: drone}", set()),
     ],
 )
 def test_robots_are_driven_by_topic_only_if_no_other_robot_subscribes_to_it(

@@ -191,9 +191,9 @@ def test_topics_of_best_effort_are_carried_as_udp_if_the_scenario_says_so(simula
     best_effort = with_traffic(protocol="topic", qos={"reliability": "best_effort"})
     run = simulated(traffic=best_effort, network__options__topics="udp").run()
     assert sum(fate.arrived_ns is not None for fate in run.fates.values()) > 40
-    with pytest.raises(FederateError, match="does not support the transport topic") as caught:
+    with pytest.raises((FederateError, ConfigurationError), match="does not support the transport topic") as caught:
         simulated(traffic=best_effort).run()
-    assert caught.value.remedy == "use one of udp, tcp"
+    assert "udp, tcp" in caught.value.remedy
 
 
 @pytest.mark.parametrize(

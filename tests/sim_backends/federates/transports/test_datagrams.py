@@ -133,15 +133,20 @@ def exchange(near: FrameChannel, far: FrameChannel, bodies: list[bytes]) -> None
         for body in bodies:
             assert far.receive(after_s(60)).body == body
             far.send(encode(MessageKind.STATES, 1, 0, body), after_s(60))
+        # The last answer is resent until it is acknowledged; the network may lose the end of the connection.
         with suppress(ClosedError):
-            far.receive(after_s(60))  # the last answer is resent until it is acknowledged
+            while not ended.is_set():
+                with suppress(DeadlineError):
+                    far.receive(after_s(0.1))
 
+    ended = threading.Event()
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
     for body in bodies:
         near.send(encode(MessageKind.PING, 1, 0, body), after_s(60))
         assert near.receive(after_s(60)).body == body
     near.close()
+    ended.set()
     thread.join(60)
     assert not thread.is_alive()
 
