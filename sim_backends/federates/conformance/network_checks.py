@@ -220,10 +220,14 @@ def check_unknown_transport(target: Target) -> None:
     if not probe.welcome.transports:
         raise NotDeclaredError("it lists no transports")
     (packet,) = _packets(probe, [_MS])
-    wrong = Packet(1, packet.source, packet.destination, 1, packet.identity, _MS, _MS, "no-such-transport")
+    protocol = "no-such-transport"
+    wrong = Packet(1, packet.source, packet.destination, 1, packet.identity, _MS, _MS, protocol)
     body = AdvanceNetwork(2 * _MS, _states(probe), [wrong]).encode(probe.agents)
     probe.expect_error(
-        MessageKind.ADVANCE_NETWORK, body, MessageKind.OUTCOMES, "a packet of a transport that is not listed"
+        MessageKind.ADVANCE_NETWORK,
+        body,
+        MessageKind.OUTCOMES,
+        f"a packet of a transport that is not listed, the protocol {protocol}",
     )
 
 

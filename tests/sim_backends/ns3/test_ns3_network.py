@@ -194,7 +194,7 @@ def test_topics_of_best_effort_are_carried_as_udp_if_the_scenario_says_so(simula
     assert sum(fate.arrived_ns is not None for fate in run.fates.values()) > 40
     with pytest.raises(FederateError, match="does not support the transport topic") as caught:
         simulated(traffic=best_effort).run()
-    assert caught.value.remedy == "use one of udp, tcp"
+    assert caught.value.remedy == "use one of udp, tcp, or list it in welcome"
 
 
 @pytest.mark.parametrize(
