@@ -16,6 +16,8 @@ from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
 
 _WINDOW_S: Final = 0.05
+_LONG_WINDOW_S: Final = 0.25
+"""Window of the checks that compare only the ends of a motion, as each window costs time."""
 _DRIVE_S: Final = 3.0
 _FLY_S: Final = 5.0
 _YAW_S: Final = 8.0
@@ -50,10 +52,12 @@ def _agents(probe: FederateProbe, command: int) -> list[str]:
     return names
 
 
-def _moved(probe: FederateProbe, commands: Mapping[str, Any], seconds: float) -> Iterator[Mapping[str, State]]:
+def _moved(
+    probe: FederateProbe, commands: Mapping[str, Any], seconds: float, window_s: float = _LONG_WINDOW_S
+) -> Iterator[Mapping[str, State]]:
     """Yield the states now, and at the ends of windows under commands."""
     step_ns = probe.welcome.step_ns
-    window_ns = max(round(_WINDOW_S * 1e9 / step_ns), 1) * step_ns
+    window_ns = max(round(window_s * 1e9 / step_ns), 1) * step_ns
     begin_ns = probe.last_ns
     yield probe.physics(begin_ns).states
     for window in range(1, math.ceil(seconds * 1e9 / window_ns) + 1):
@@ -101,7 +105,7 @@ def check_turn(target: Target) -> None:
     """A positive turn rate increases the heading, in radians, and the robot moves in the direction of its heading."""
     probe = target.open(_turned(target.hello, 0.0))
     commands = dict.fromkeys(_agents(probe, TWIST), Twist(_SPEED_M_S, _TURN_RAD_S))
-    before, *later = _moved(probe, commands, _DRIVE_S)
+    before, *later = _moved(probe, commands, _DRIVE_S, _WINDOW_S)
     turned_rad = dict.fromkeys(commands, 0.0)
     for states in later:
         for name in commands:
@@ -140,7 +144,7 @@ def check_velocity(target: Target) -> None:
             commands[agent.name] = Twist(_SPEED_M_S)
     if not commands:
         raise NotDeclaredError("it supports no type of command for these agents")
-    before, *later = _moved(probe, commands, _DRIVE_S)
+    before, *later = _moved(probe, commands, _DRIVE_S, _WINDOW_S)
     start, step_ns = before, probe.welcome.step_ns
     half_window_s = max(round(_WINDOW_S * 1e9 / step_ns), 1) * step_ns / 2e9
     expected_m = {name: [0.0, 0.0, 0.0] for name in commands}
