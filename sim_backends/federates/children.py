@@ -17,6 +17,8 @@ _EXIT_S: Final = 1.0
 """Time for a process to exit after its input was closed, and again after SIGTERM."""
 _POLL_S: Final = 0.005
 _TAIL_BYTES: Final = 4096
+_TAIL_LINES: Final = 10
+"""Lines of a stack trace that contain its cause, whether it is first or last."""
 
 
 class Child:
@@ -63,13 +65,13 @@ class Child:
         self._finalizer = weakref.finalize(self, _end, process, self.channel, self._stderr)
 
     @property
-    def last_output(self) -> str:
-        """The last line that it wrote to its standard error."""
+    def last_output(self) -> list[str]:
+        """The last lines that it wrote to its standard error, at most ten."""
         if self._stderr.closed:
-            return ""
+            return []
         size = os.fstat(self._stderr.fileno()).st_size
         tail = os.pread(self._stderr.fileno(), _TAIL_BYTES, max(size - _TAIL_BYTES, 0)).decode(errors="replace")
-        return next((line for line in reversed(tail.splitlines()) if line.strip()), "").strip()
+        return [line.rstrip() for line in tail.splitlines() if line.strip()][-_TAIL_LINES:]
 
     def exit_text(self, wait_s: float = 0.5) -> str:
         """Return a text about its end, such as `it has exited with code 1`; empty if it still runs after a time."""

@@ -60,6 +60,10 @@ class MalformedFrameError(ValueError):
         self.position = position
 
 
+class UnknownKindError(MalformedFrameError):
+    """A frame has an unknown kind: what was received may be text."""
+
+
 class Header(NamedTuple):
     """The header of a frame.
 
@@ -112,7 +116,7 @@ def read_header(data: bytes | bytearray, max_bytes: int = MAX_FRAME_BYTES) -> He
     size, kind, reserved, request, copy = _HEADER.unpack_from(data)
     known = _KINDS.get(kind)
     if known is None:
-        raise MalformedFrameError(4, f"there is no kind of message {kind}")
+        raise UnknownKindError(4, f"there is no kind of message {kind}")
     if size > max_bytes:
         raise MalformedFrameError(0, f"a size of {size} bytes is above {max_bytes}")
     if reserved:

@@ -104,5 +104,8 @@ class NetworkFederate(Protocol):
         ...
 
     def next_event_ns(self) -> int | None:
-        """Return the time of its next event, or None if nothing is scheduled."""
+        """Return a time before which nothing happens without new packets, or None if nothing will happen.
+
+        Before it, no packet arrives or is dropped, and no position is used. It may be too early.
+        """
         ...

@@ -156,7 +156,7 @@ class RemoteNetwork(_RemoteFederate):
             if packet.protocol not in transports:
                 raise FederateError(
                     f"{self.session.name} does not support the transport {packet.protocol}",
-                    remedy=f"use one of {', '.join(transports)}",
+                    remedy=f"use one of {', '.join(transports)}, or list it in welcome",
                 )
         since_ns, reckoning_ns = self._last_ns, 0
         if isinstance(states, DeadReckoned):

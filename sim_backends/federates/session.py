@@ -1,5 +1,6 @@
 """The coordinator's side of a connection to an external federate: handshake, requests, deadlines, errors."""
 
+import re
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,13 +11,21 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.channels import ClosedError, DeadlineError, FrameChannel
 from sim_backends.federates.children import Child
 from sim_backends.federates.exchanges import decode_number, decode_text
-from sim_backends.federates.frames import ROLES, Header, MalformedFrameError, MessageKind, ProtocolFrame, encode
+from sim_backends.federates.frames import (
+    ROLES,
+    Header,
+    MalformedFrameError,
+    MessageKind,
+    ProtocolFrame,
+    UnknownKindError,
+    encode,
+)
 from sim_backends.federates.handshake import Hello, Welcome
 from sim_backends.federates.named import command_line
 from sim_backends.federates.protocols import FederateError, UnansweredError, seconds_text
 from sim_backends.federates.transports.contract import read_token
 from sim_backends.federates.transports.joining import accept_federate
-from sim_backends.federates.transports.table import parse_address
+from sim_backends.federates.transports.table import FORMS, parse_address
 
 PATIENCE: Final = 20
 """A federate that reports that it computes may take this multiple of the deadline for an answer."""
@@ -24,6 +33,7 @@ _FOREVER_S: Final = 1e9
 _BYE_S: Final = 0.2
 _MAX_SHOWN: Final = 400
 _REQUESTS: Final = 1 << 32
+_LIKE_ADDRESS: Final = re.compile(r"[a-z][a-z0-9+.-]*:\S*")
 
 Answer = TypeVar("Answer")
 
@@ -134,9 +144,12 @@ class FederateSession:
                 self.fail(f"{self.name} failed at the request to {what()}: {text}")
             return decode(frame.body)
         except MalformedFrameError as error:
+            is_text = isinstance(error, UnknownKindError) and self._child is not None
             self.fail(
                 f"{self.name} answered request {self._requests}, to {what()}, with a malformed frame: {error}",
-                "compare it with the protocol: fieldkit docs federates",
+                "standard output carries only frames; print to standard error"
+                if is_text
+                else "compare it with the protocol: fieldkit docs federates",
             )
         except DeadlineError:
             self._fail_unanswered(what())
@@ -200,8 +213,10 @@ class FederateSession:
         return (f"; {exit_text}" if exit_text else "") + self._output_text()
 
     def _output_text(self) -> str:
-        output = "" if self._child is None else printable(self._child.last_output)
-        return f"; its last output: {output}" if output else ""
+        lines = [] if self._child is None else [printable(line) for line in self._child.last_output]
+        if len(lines) < 2:
+            return "".join(f"; its last output: {line.strip()}" for line in lines)
+        return "".join(("; its last output:", *(f"\n    {line}" for line in lines)))
 
     def _end(self) -> None:
         self._is_closed = True
@@ -236,6 +251,24 @@ class FederateSession:
         self._channel.close()
 
 
+def _child(where: str, role: int) -> Child:
+    """Start the federate of a name or a command.
+
+    Raises:
+        ConfigurationError: It cannot be started; `where` may be an address of a transport that does not exist.
+    """
+    command = command_line(where, role)
+    try:
+        return Child(command)
+    except ConfigurationError as error:
+        if not _LIKE_ADDRESS.fullmatch(where):
+            raise
+        raise ConfigurationError(
+            f"{where!r} is not an address, and there is no program with this name",
+            remedy=f"use {', '.join(FORMS)}, or a command, for example 'python3 carts.py'",
+        ) from error
+
+
 def open_session(
     role: int, where: str, hello: Hello, deadline_s: float | None
 ) -> tuple[FederateSession, Hello, Welcome]:
@@ -257,7 +290,7 @@ def open_session(
         # Several heartbeats per deadline, as the federate's machine may be busy.
         hello = replace(hello, heartbeat_ms=max(min(hello.heartbeat_ms, round(deadline_s * 250)), 1))
     if address is None:
-        child = Child(command_line(where, role))
+        child = _child(where, role)
         session = FederateSession(role, printable(where), child.channel, deadline_s=deadline_s, child=child)
     else:
         token = read_token(address)
@@ -266,8 +299,9 @@ def open_session(
         try:
             channel = accept_federate(address, token, limit_s) if address.listens else address.connect(limit_s)
         except DeadlineError as error:
+            during = "for" if address.listens is False else "within"
             raise UnansweredError(
-                f"{ROLES[role]} ({address}): {error} within {deadline_s:g} s",
+                f"{ROLES[role]} ({address}): {error} {during} {deadline_s:g} s",
                 remedy="start the federate, or check its address and token",
             ) from error
         session = FederateSession(role, str(address), channel, deadline_s=deadline_s)

@@ -38,6 +38,7 @@ class Carts:
         step_s, heading_rad = self.step_ns / 1e9, state.heading_rad
         if isinstance(command, Velocity):
             velocity_m_s = command.velocity_m_s
+            heading_rad = heading_rad if command.yaw_rad is None else command.yaw_rad
         else:
             heading_rad += command.turn_rad_s * step_s
             forward_m_s = command.forward_m_s

@@ -188,7 +188,7 @@ def _conform(commands: Commands) -> None:
         "federate",
         nargs="+",
         metavar="COMMAND",
-        help="its command, in one word or after --; or an address such as tcp:HOST:PORT",
+        help="its command, in one word or after --; or an address (fieldkit docs federates)",
     )
     parser.add_choice("--role", ("physics", "network"), help="its role (default: the first that it accepts)")
     parser.add_argument(
@@ -270,8 +270,8 @@ def _add_federates(parser: Parser) -> None:
         action = parser.add_argument(
             f"--{role}",
             metavar="FEDERATE",
-            help=f"{role}: a simulator of `fieldkit cosim list`, a command or an address such as tcp:HOST:PORT "
-            "(default: the scenario's)",
+            help=f"{role}: a simulator of `fieldkit cosim list`, a command, or an address of tcp, udp, dds or ros1 "
+            "(addresses: fieldkit docs federates; default: the scenario's)",
         )
         _set_completer(action, partial(_federate_names, role))
 

@@ -156,8 +156,8 @@ def open_network(
         network.close()
         raise ConfigurationError(
             f"{network.session.name} does not support the transport {', '.join(missing)} of the scenario's traffic",
-            remedy=f"use a scenario whose traffic uses {', '.join(supported)}, or an option of the network: "
-            "fieldkit docs federates",
+            remedy=f"use a scenario whose traffic uses {', '.join(supported)}, or an option of the network, or list "
+            "it in welcome: fieldkit docs federates",
         )
     return network
 

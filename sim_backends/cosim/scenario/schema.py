@@ -75,7 +75,8 @@ class PhysicsOptions(Strict):
     Attributes:
         step: Its time step.
         federate: An [external federate](federates.md) that replaces the built-in physics: the name of an installed
-            simulator, a command, or an address such as `tcp:HOST:PORT`. A command is run when the scenario is.
+            simulator, a command, or an address of `tcp`, `udp`, `dds` or `ros1` (addresses: `fieldkit docs
+            federates`). A command is run when the scenario is.
         options: Options of the federate; its page lists them.
     """
 

@@ -1,6 +1,8 @@
 """Checks of a network: times, fates of packets, window borders, reasons, determinism, forks."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import Final
 
 from sim_backends.federates.conformance.probe import CheckError, FederateProbe, NotDeclaredError, Target
@@ -16,6 +18,15 @@ _END_NS: Final = 5_000 * _MS
 """Time until which the fate of every packet must be decided."""
 _FAR_M: Final = 1e6
 _SIZE_BYTES: Final = 200
+_MAX_EVENTS: Final = 500
+_SEEDS: Final = 4
+_DISTANCES_M: Final = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0)
+"""Distances at which packets are sent, because a network may lose some packets only at a part of them."""
+_GROUP: Final = 32
+"""Packets at each distance."""
+_SPACING_NS: Final = 20 * _MS
+_RANDOM_CHANGES: Final = 4
+"""Least number of changes between arrivals and losses that a new route or association does not cause."""
 
 
 def _states(probe: FederateProbe) -> dict[str, State]:
@@ -104,10 +115,18 @@ class _Account:
         announced_ns, self._next_event_ns = self._next_event_ns, outcomes.next_event_ns
         if outcomes.next_event_ns != NO_EVENT and outcomes.next_event_ns <= to_ns:
             raise CheckError(f"after advancing to {to_ns} ns, its next event is at {outcomes.next_event_ns} ns")
-        for arrival in () if has_packets else outcomes.arrivals:
+        if has_packets:
+            return
+        for arrival in outcomes.arrivals:
             if announced_ns == NO_EVENT or arrival.at_ns < announced_ns:
                 raise CheckError(
                     f"packet {arrival.packet_id} arrived at {arrival.at_ns} ns, before the announced next event "
+                    f"({announced_ns} ns)"
+                )
+        for drop in outcomes.drops:
+            if announced_ns == NO_EVENT or to_ns < announced_ns:
+                raise CheckError(
+                    f"packet {drop.packet_id} was dropped until {to_ns} ns, before the announced next event "
                     f"({announced_ns} ns)"
                 )
 
@@ -138,6 +157,22 @@ def check_exactly_once(target: Target) -> None:
     undecided = _run(target.open(), _WINDOW_NS).undecided()
     if undecided:
         raise CheckError(f"after {_END_NS / 1e9:g} s, {len(undecided)} packets neither arrived nor were dropped")
+
+
+def check_next_event(target: Target) -> None:
+    """Nothing arrives or is dropped before the announced next event, which may be too early."""
+    probe = target.open()
+    probe.require(FederateCapability.NEXT_EVENT)
+    account, states = _Account(probe), _states(probe)
+    outcomes = account.advance(3 * _MS, states, _packets(probe, (_MS, _MS + 1, 3 * _MS)))
+    for _ in range(_MAX_EVENTS):
+        event_ns = outcomes.next_event_ns
+        if not NO_EVENT < event_ns <= _END_NS:
+            break
+        account.advance(event_ns - 1, states)
+        outcomes = account.advance(event_ns, states)
+    if outcomes.next_event_ns == NO_EVENT and (undecided := account.undecided()):
+        raise CheckError(f"it has no next event, and packets {undecided} neither arrived nor were dropped")
 
 
 def check_window_borders(target: Target) -> None:
@@ -185,10 +220,14 @@ def check_unknown_transport(target: Target) -> None:
     if not probe.welcome.transports:
         raise NotDeclaredError("it lists no transports")
     (packet,) = _packets(probe, [_MS])
-    wrong = Packet(1, packet.source, packet.destination, 1, packet.identity, _MS, _MS, "no-such-transport")
+    protocol = "no-such-transport"
+    wrong = Packet(1, packet.source, packet.destination, 1, packet.identity, _MS, _MS, protocol)
     body = AdvanceNetwork(2 * _MS, _states(probe), [wrong]).encode(probe.agents)
     probe.expect_error(
-        MessageKind.ADVANCE_NETWORK, body, MessageKind.OUTCOMES, "a packet of a transport that is not listed"
+        MessageKind.ADVANCE_NETWORK,
+        body,
+        MessageKind.OUTCOMES,
+        f"a packet of a transport that is not listed, the protocol {protocol}",
     )
 
 
@@ -202,6 +241,65 @@ def check_determinism(target: Target) -> None:
     first, second = accounts
     if first.arrivals != second.arrivals or first.reasons != second.reasons:
         raise CheckError("equal requests gave different arrivals or drops")
+
+
+def _arrivals_ns(probe: FederateProbe, every: int = 1) -> dict[int, int]:
+    """Return the times of arrivals by packet, of packets at several distances, or of every second one of them."""
+    account, states = _Account(probe), _states(probe)
+    packets = _packets(probe, [_MS + number * _SPACING_NS for number in range(len(_DISTANCES_M) * _GROUP)])
+    first, second = (agent.name for agent in probe.hello.agents[:2])
+    east_m, north_m, up_m = states[first].position_m
+    for group, distance_m in enumerate(_DISTANCES_M):
+        states[second] = State((east_m + distance_m, north_m, up_m))
+        entering = packets[group * _GROUP : (group + 1) * _GROUP : every]
+        account.advance((group + 1) * _GROUP * _SPACING_NS, states, entering)
+    account.advance(2 * _END_NS, states)
+    return {arrival.packet_id: arrival.at_ns for arrival in account.arrivals}
+
+
+def _is_random(arrivals_ns: Mapping[int, int]) -> bool:
+    """Return True if equal packets have different fates, without contention or a pattern in time."""
+    for packet_id, at_ns in arrivals_ns.items():
+        if at_ns >= _MS + packet_id * _SPACING_NS:  # when the next packet enters
+            return False
+    for first in range(1, len(_DISTANCES_M) * _GROUP, _GROUP):
+        for direction in range(2):
+            fates = [packet_id in arrivals_ns for packet_id in range(first + direction, first + _GROUP, 2)]
+            changes = sum(fate != other for fate, other in pairwise(fates))
+            repeats = any(fates[period:] == fates[:-period] for period in range(1, len(fates) // 2 + 1))
+            if changes >= _RANDOM_CHANGES and not repeats:
+                return True
+    return False
+
+
+def check_seed(target: Target) -> None:
+    """Another seed gives other random draws, if the network has any."""
+    results = []
+    for offset in range(_SEEDS):
+        probe = target.open(replace(target.hello, seed=target.hello.seed + offset))
+        probe.require(FederateCapability.DETERMINISTIC)
+        results.append(_arrivals_ns(probe))
+        if results[-1] != results[0]:
+            return
+    if _is_random(results[0]):
+        raise CheckError(f"it loses packets at random, and {_SEEDS} seeds gave the same arrivals and drops")
+    raise NotDeclaredError(f"{_SEEDS} seeds gave the same arrivals, and no random losses were seen")
+
+
+def check_removed_packets(target: Target) -> None:
+    """The fate of a packet is the same without other packets; this is recommended, so that the check never fails."""
+    results = []
+    for every in (1, 2):
+        probe = target.open()
+        probe.require(FederateCapability.DETERMINISTIC)
+        results.append(_arrivals_ns(probe, every))
+    everything, half = results
+    for packet_id in range(1, len(_DISTANCES_M) * _GROUP, 2):
+        if (packet_id in everything) != (packet_id in half):
+            raise NotDeclaredError(
+                f"packet {packet_id} had another fate without other packets: its draws depend on the order of "
+                "packets, or on contention"
+            )
 
 
 def check_new_agent(target: Target) -> None:

@@ -220,11 +220,15 @@ class Target:
         """True if a physics is tested."""
         return self.hello.role == PHYSICS
 
-    def open(self) -> FederateProbe:
-        """Return a fresh federate, after the previous one has ended: one that listens may serve one at a time."""
+    def open(self, hello: Hello | None = None) -> FederateProbe:
+        """Return a fresh federate, after the previous one has ended: one that listens may serve one at a time.
+
+        Args:
+            hello: The hello that it receives, if it is not that of the target.
+        """
         self.close()
         self.exchange |= {"request": "hello", "answer": "none"}
-        self._probe = FederateProbe(self.opener, self.hello, self.exchange)
+        self._probe = FederateProbe(self.opener, hello or self.hello, self.exchange)
         return self._probe
 
     def close(self) -> None:

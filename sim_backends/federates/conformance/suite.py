@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from fieldkit.core.errors import FieldkitError
-from sim_backends.federates.conformance import common_checks, network_checks, physics_checks
+from sim_backends.federates.conformance import common_checks, motion_checks, network_checks, physics_checks
 from sim_backends.federates.conformance.probe import CheckError, NotDeclaredError, Target
 
 Check = Callable[[Target], None]
@@ -33,7 +33,7 @@ class CheckResult:
 
 def checks(*, is_physics: bool) -> dict[str, Check]:
     """Return all checks of a role by name."""
-    modules = (common_checks, physics_checks if is_physics else network_checks)
+    modules = (common_checks, *((physics_checks, motion_checks) if is_physics else (network_checks,)))
     return {
         name.removeprefix("check_"): function
         for module in modules

@@ -16,6 +16,7 @@ from sim_backends.federates.conformance.suite import CheckResult, checks, run_ch
 from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet
+from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import DeadReckoned, State
 from tests.helpers.federate_examples import carts
 from tests.helpers.federate_pairs import HELLO, Alter, Pair
@@ -98,9 +99,78 @@ class IsNotFinite(Wrapped):
         return {name: shifted(state, math.nan * (to_ns > 0)) for name, state in states.items()}
 
 
+class SwapsAxes(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: state._replace(position_m=swapped(state.position_m)) for name, state in states.items()}
+
+
+def swapped(position_m: tuple[float, float, float]) -> tuple[float, float, float]:
+    east, north, up = position_m
+    return north, east, up
+
+
+class StandsStill(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: state._replace(velocity_m_s=(0.0, 0.0, 0.0)) for name, state in states.items()}
+
+
+class ReportsDegrees(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {
+            name: state._replace(heading_rad=math.degrees(state.heading_rad or 0.0)) for name, state in states.items()
+        }
+
+
+class ReportsOppositeTurns(Wrapped):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: state._replace(heading_rad=-(state.heading_rad or 0.0)) for name, state in states.items()}
+
+
+class ChangesCommands(Wrapped):
+    """Moves as if it had received other commands."""
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> States:
+        return super().advance(to_ns, {name: self.changed(command) for name, command in commands.items()})
+
+    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+        return command
+
+
+class TurnsRight(ChangesCommands):
+    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+        return replace(command, turn_rad_s=-command.turn_rad_s) if isinstance(command, Twist) else command
+
+
+class ReportsWrongSide(TurnsRight, ReportsOppositeTurns):
+    """Turns to the right, and reports a turn to the left."""
+
+
+class IgnoresYaw(ChangesCommands):
+    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+        return replace(command, yaw_rad=None) if isinstance(command, Velocity) else command
+
+
+class ZeroesYaw(ChangesCommands):
+    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+        return replace(command, yaw_rad=command.yaw_rad or 0.0) if isinstance(command, Velocity) else command
+
+
+class FliesForward(ChangesCommands):
+    """Flies in the frame of its body, whose heading is pi/2 in the check."""
+
+    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+        if not isinstance(command, Velocity):
+            return command
+        forward, left, up = command.velocity_m_s
+        return replace(command, velocity_m_s=(-left, forward, up))
+
+
 class IgnoresFrom(_Run):
     def _advance_physics(self, current: _FederateCopy, body: bytes) -> bytes:
         return super()._advance_physics(current, body[:8] + bytes(8) + body[16:])
+
+
+Outcome = tuple[list[Arrival], list[Drop]]
 
 
 class Net(Disc):
@@ -118,9 +188,6 @@ class Net(Disc):
 
     def broken(self, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> tuple[list[Arrival], list[Drop]]:
         return arrivals, drops
-
-
-Outcome = tuple[list[Arrival], list[Drop]]
 
 
 def net(broken: Callable[[Net, list[Arrival], list[Drop], int], Outcome]) -> type[Net]:
@@ -167,6 +234,65 @@ class AnnouncesTooLate(Net):
     def next_event_ns(self) -> int | None:
         at_ns = super().next_event_ns()
         return None if at_ns is None else at_ns + 10 * MS
+
+
+class AnnouncesDropsTooLate(Net):
+    """Drops packets 2 ms after they entered, and announces 1 ms more."""
+
+    def broken(self, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
+        return [], [Drop(arrival.packet_id, "lost") for arrival in arrivals]
+
+    def next_event_ns(self) -> int | None:
+        at_ns = super().next_event_ns()
+        return None if at_ns is None else at_ns + MS
+
+
+class AnnouncesNothing(Net):
+    """Announces no event, and never decides."""
+
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
+        return [], []
+
+    def next_event_ns(self) -> int | None:
+        return None
+
+
+class LosesByKey(Net):
+    """Loses half of the packets beyond 30 m; its draws are keyed by seed, flow and number."""
+
+    def __init__(self, hello: Any) -> None:  # noqa: ANN401
+        super().__init__(hello)
+        self.seed = hello.seed
+
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
+        distance_m = math.dist(states["ann"].position_m, states["bob"].position_m)
+        lost = [packet for packet in packets if distance_m > 30 and self.draw(packet) < 0.5]
+        arrivals, drops = super().advance(to_ns, [packet for packet in packets if packet not in lost], states)
+        return arrivals, [*drops, *(Drop(packet.packet_id, "bad luck") for packet in lost)]
+
+    def draw(self, packet: Packet) -> float:
+        return random.Random(f"{self.seed} {packet.identity}").random()
+
+
+class IgnoresSeed(LosesByKey):
+    def draw(self, packet: Packet) -> float:
+        return random.Random(f"{packet.identity}").random()
+
+
+class LosesInOrder(LosesByKey):
+    def __init__(self, hello: Any) -> None:  # noqa: ANN401
+        super().__init__(hello)
+        self.draws = random.Random(self.seed)
+
+    def draw(self, packet: Packet) -> float:
+        return self.draws.random()
+
+
+class LosesEverySecond(LosesByKey):
+    """Loses packets by a pattern, without draws."""
+
+    def draw(self, packet: Packet) -> float:
+        return packet.identity[1] // 2 % 2
 
 
 class AnnouncesThePast(Net):
@@ -247,6 +373,16 @@ PHYSICS_CASES = [
     ),
     Broken("determinism", physics(Trembles), "gave different answers"),
     Broken("fork", physics(IsShared), "the original"),
+    Broken("drive_axes", physics(SwapsAxes), "0 rad, and moved by (0, 0.6, 0) m instead of 0.6 m east"),
+    Broken("drive_axes", physics(ReportsDegrees), "the heading of ann is 90 rad at the start, not 1.57 rad"),
+    Broken("turn", physics(TurnsRight), "its heading changed by -0.9 rad"),
+    Broken("turn", physics(ReportsDegrees), "its heading changed by 51.6 rad"),
+    Broken("turn", physics(ReportsWrongSide), "ann drives forward at a heading of 0.8"),
+    Broken("velocity", physics(StandsStill), "its reported velocities give (0, 0, 0) m"),
+    Broken("flight_axes", physics(FliesForward), "of 1.57 rad, and moved by (0, 2, 1) m"),
+    Broken("flight_axes", physics(ReportsDegrees), "the heading of cy is 90 rad at the start"),
+    Broken("yaw", physics(IgnoresYaw), "the heading of cy is 0.5 rad 8 s after a command with this yaw, not 1.5"),
+    Broken("yaw", physics(ZeroesYaw), "the heading of cy is 0 rad 2 s after a command without a yaw"),
 ]
 NETWORK_CASES = [
     Broken("handshake", physics(Transmits), "KeyError: 'nobody'"),
@@ -308,6 +444,10 @@ NETWORK_CASES = [
     Broken("new_agent", physics(KnowsNoNewAgents, agents_appear=True), "KeyError"),
     Broken("dead_reckoning", physics(Reckons), "extrapolation at a velocity of 0 changed"),
     Broken("fork", physics(SharedNet), "the copy and the original"),
+    Broken("next_event", physics(AnnouncesTooLate), "before the announced next event"),
+    Broken("next_event", physics(AnnouncesDropsTooLate), "packet 2 was dropped until 4000000 ns"),
+    Broken("next_event", physics(AnnouncesNothing), "it has no next event, and packets [1, 2, 3] neither"),
+    Broken("seed", physics(IgnoresSeed), "4 seeds gave the same arrivals and drops"),
 ]
 
 
@@ -331,17 +471,46 @@ def test_a_broken_federate_fails(role: int, broken: Broken, monkeypatch: pytest.
 
 def test_each_check_has_a_broken_federate() -> None:
     assert {case.check for case in PHYSICS_CASES} == checks(is_physics=True).keys()
-    assert {case.check for case in NETWORK_CASES} == checks(is_physics=False).keys()
+    assert {case.check for case in NETWORK_CASES} == checks(is_physics=False).keys() - {"removed_packets"}
+
+
+@pytest.mark.parametrize(
+    ("make", "check", "message"),
+    [
+        (Net, "seed", "no random losses were seen"),
+        (LosesEverySecond, "seed", "no random losses were seen"),
+        (LosesInOrder, "removed_packets", "had another fate without other packets"),
+    ],
+)
+def test_draws_that_cannot_be_judged_are_skipped(make: type[Net], check: str, message: str) -> None:
+    result = run(NETWORK, Broken(check, physics(make), ""))
+    assert not result.failure
+    assert message in result.skipped
 
 
 @pytest.mark.parametrize("role", [PHYSICS, NETWORK])
 def test_the_federates_conform_before_they_are_broken(role: int) -> None:
-    make = Carts if role == PHYSICS else Net
+    make = Carts if role == PHYSICS else LosesByKey
     for name in checks(is_physics=role == PHYSICS):
         settings: dict[str, Any] = {"transports": ("udp",)} if role == NETWORK else {}
         pair = physics(make, agents_appear=True, forks=name != "fork_absence", **settings)
         result = run(role, Broken(name, pair, ""))
         assert (result.failure, result.skipped) == ("", ""), result
+
+
+@pytest.mark.parametrize(
+    ("check", "commands", "agents", "message"),
+    [
+        ("turn", (2,), slice(3), "it does not list the command twist"),
+        ("yaw", (1, 2), slice(2), "the scenario has no agent that flies"),
+    ],
+)
+def test_a_check_of_other_commands_does_not_apply(
+    check: str, commands: tuple[int, ...], agents: slice, message: str
+) -> None:
+    hello = replace(HELLO, agents=HELLO.agents[agents])
+    target = Target(physics(Carts, commands=commands), hello)
+    assert run_check(target, check, checks(is_physics=True)[check]).skipped == message
 
 
 def test_a_check_of_a_capability_that_is_not_declared_does_not_apply() -> None:

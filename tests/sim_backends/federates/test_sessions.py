@@ -191,8 +191,26 @@ def test_a_child_that_fails_shows_its_last_output(tmp_path: Path) -> None:
     program.write_text("import sys\nprint('no licence', file=sys.stderr)\nsys.exit(7)\n", encoding="utf-8")
     with pytest.raises(FederateError, match=r"it has exited with code 7; its last output: no licence"):
         open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)
+    program.write_text("import sys\nsys.exit('\\n'.join(f'at line {n}\\x1b' for n in range(20)))\n", encoding="utf-8")
+    with pytest.raises(FederateError) as caught:
+        open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)
+    lines = "".join(f"\n    at line {number} " for number in range(10, 20))
+    assert caught.value.what.endswith(f"it has exited with code 1; its last output:{lines}")
     with pytest.raises(ConfigurationError, match="the federate /nowhere/at-all cannot be started"):
         open_physics("/nowhere/at-all", HELLO, 20.0)
+
+
+def test_a_child_that_prints_to_its_standard_output_gets_a_remedy() -> None:
+    with pytest.raises(FederateError, match="byte 4: there is no kind of message") as caught:
+        open_physics("echo loading the world ...", HELLO, 20.0)
+    assert caught.value.remedy == "standard output carries only frames; print to standard error"
+
+
+def test_an_unknown_scheme_shows_the_addresses() -> None:
+    with pytest.raises(ConfigurationError, match=r"'quic:127.0.0.1:7000' is not an address") as caught:
+        open_physics("quic:127.0.0.1:7000", HELLO, 20.0)
+    assert caught.value.remedy.startswith("use tcp:HOST:PORT, tcp-listen:HOST:PORT, udp:HOST:PORT, ")
+    assert caught.value.remedy.endswith(", or a command, for example 'python3 carts.py'")
 
 
 def test_output_of_the_federates_code_does_not_reach_the_protocol(tmp_path: Path) -> None:
@@ -214,7 +232,7 @@ def test_output_of_the_federates_code_does_not_reach_the_protocol(tmp_path: Path
         for step in range(5):
             assert physics.advance(step * MS, {}).keys() == {"ann", "bob", "cy"}
         assert physics.session._child is not None
-        assert physics.session._child.last_output.startswith("raw")
+        assert "raw" in "".join(physics.session._child.last_output)
 
 
 def free_port() -> int:

@@ -118,7 +118,7 @@ def test_both_federates_of_a_run_may_use_one_transport(scheme: str, federates: F
 @pytest.mark.parametrize(
     ("scheme", "message"),
     [
-        ("udp", r"no connection to udp:127.0.0.1:\d+: .*refused"),
+        ("udp", r"no connection to udp:127.0.0.1:\d+: .*refused for 0.3 s"),
         ("dds", "no federate has been discovered at dds:"),
         ("ros1", "no federate has been discovered at ros1:"),
     ],
