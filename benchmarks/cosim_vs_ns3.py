@@ -15,7 +15,6 @@ import json
 import math
 import os
 import sys
-import tempfile
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -265,12 +264,11 @@ def main() -> None:
     parser.add_argument("--figure", type=Path, help="write goodputs and windows of both to this SVG file")
     arguments = parser.parse_args()
     measured_rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        ns3 = build(Path(folder))
-        for row in rows(ns3, arguments.links):
-            measured_rows.append(row)
-            print(line(row), file=sys.stderr if arguments.json else sys.stdout, flush=True)
-        windows = traces(ns3) if arguments.figure else {}
+    ns3 = build()
+    for row in rows(ns3, arguments.links):
+        measured_rows.append(row)
+        print(line(row), file=sys.stderr if arguments.json else sys.stdout, flush=True)
+    windows = traces(ns3) if arguments.figure else {}
     if arguments.figure:
         draw(arguments.figure, measured_rows, windows)
     if arguments.json:

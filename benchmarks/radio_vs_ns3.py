@@ -9,7 +9,6 @@ import json
 import math
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,8 @@ from typing import Final
 
 import numpy as np
 
+from sim_backends.federates.compiling import CompiledProgram
+from sim_backends.ns3.federate import standard_flag, version
 from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode, packet_error
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
@@ -58,12 +59,17 @@ class Ns3:
         return subprocess.run([self.program, *words], check=True, timeout=600, capture_output=True, text=True).stdout
 
 
-def build(folder: Path) -> Ns3:
-    """Compile the ns-3 program."""
-    program = folder / "ns3_link"
-    libraries = [f"-lns3-{name}" for name in LIBRARIES]
-    subprocess.run(["g++", "-O2", "-std=c++17", str(SOURCE), "-o", str(program), *libraries], check=True, timeout=300)
-    return Ns3(program)
+def build() -> Ns3:
+    """Return the ns-3 program, which is compiled on first use."""
+    program = CompiledProgram(
+        "ns3-link",
+        SOURCE,
+        ("ns3-core", "ns3-wifi"),
+        "apt-get install g++ libns3-dev",
+        flags=("-O2", standard_flag(version())),
+        libraries=tuple(f"-lns3-{name}" for name in LIBRARIES),
+    )
+    return Ns3(program.path())
 
 
 def packet_errors(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
@@ -155,10 +161,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print single values")
     parser.add_argument("--figure", type=Path, help="write the curves of both to this SVG file")
     arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        ns3 = build(Path(folder))
-        curves = packet_errors(ns3)
-        goodputs = rows(ns3)
+    ns3 = build()
+    curves, goodputs = packet_errors(ns3), rows(ns3)
     if arguments.json:
         json.dump({"packet_error": curves, "goodput_mbit_s": goodputs}, sys.stdout)
         return

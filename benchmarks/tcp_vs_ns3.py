@@ -8,11 +8,9 @@ the events around the first difference.
 
 import argparse
 import math
-import tempfile
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import chain, zip_longest
-from pathlib import Path
 from typing import Final, get_args
 
 import numpy as np
@@ -232,12 +230,11 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.events and (arguments.events[0] not in PATTERNS or arguments.events[1] not in get_args(Control)):
         parser.error(f"patterns: {', '.join(PATTERNS)}; controls: {', '.join(CONTROLS)}")
-    with tempfile.TemporaryDirectory() as folder:
-        ns3 = build(Path(folder))
-        tables = (pattern_lines(ns3), random_loss_lines(ns3))
-        lines = event_lines(ns3, *arguments.events) if arguments.events else chain(*tables)
-        for line in lines:
-            print(line, flush=True)
+    ns3 = build()
+    tables = (pattern_lines(ns3), random_loss_lines(ns3))
+    lines = event_lines(ns3, *arguments.events) if arguments.events else chain(*tables)
+    for line in lines:
+        print(line, flush=True)
 
 
 if __name__ == "__main__":

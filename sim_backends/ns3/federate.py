@@ -24,15 +24,20 @@ def version() -> str:
         return ""
 
 
+def standard_flag(ns3_version: str) -> str:
+    """Return the option of the compiler for the C++ standard of a version's headers."""
+    numbers = tuple(int(number) for number in re.findall(r"\d+", ns3_version)[:2])
+    return "-std=c++20" if numbers >= _CPP20_SINCE else "-std=c++17"
+
+
 def program(ns3_version: str) -> CompiledProgram:
     """Return the program for a version of ns-3."""
-    numbers = tuple(int(number) for number in re.findall(r"\d+", ns3_version)[:2])
     return CompiledProgram(
         name="ns3-network",
         source=Path(__file__).with_name("network.cc"),
         packages=("ns3-core", "ns3-wifi", "nlohmann_json"),
         install="apt-get install g++ pkg-config libns3-dev nlohmann-json3-dev",
-        flags=("-O2", "-std=c++20" if numbers >= _CPP20_SINCE else "-std=c++17"),
+        flags=("-O2", standard_flag(ns3_version)),
         # pkg-config also lists libgsl, which Debian's libns3-dev does not install, and which ns-3 itself links.
         libraries=tuple(f"-lns3-{module}" for module in _MODULES),
         duration="about 20 s",

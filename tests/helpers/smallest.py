@@ -15,7 +15,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Final
 
-from benchmarks.radio_vs_ns3 import Ns3
 from tests.helpers.labs import replace_text
 from tests.helpers.paths import ROOT
 
@@ -76,28 +75,9 @@ def replace(module: ModuleType, name: str, value: object) -> None:
     setattr(module, name, value)
 
 
-class StandInNs3(Ns3):
-    """Prints plausible output of ns-3, which is not installed in CI."""
-
-    def __call__(self, **options: object) -> str:
-        """Plausible output of `ns3_link.cc`."""
-        output = options.get("what")
-        if output == "errors":
-            return "\n".join(f"{ratio_db} {1.0 if ratio_db < 15 else 0.0}" for ratio_db in range(0, 40, 5))
-        if output == "udp":
-            return "2.0 0.0\n"
-        if output == "tcp":
-            return "1000000 window 14480\n2000000 sent 0\n20.0 0\n"
-        return "20.0\n"
-
-
-def _without_ns3(module: ModuleType, folder: Path) -> None:
-    replace(module, "build", lambda _: StandInNs3(folder))
-
-
 def _one_link(module: ModuleType, folder: Path) -> None:
     """Reduce `cosim_vs_ns3` to two measurements of a single link."""
-    _without_ns3(module, folder)
+    del folder
     replace(module, "DISTANCES_M", {("g54", False): (10,)})
     replace(module, "SECONDS", 0.2)
     replace(module, "BATCH", 2)
@@ -106,7 +86,7 @@ def _one_link(module: ModuleType, folder: Path) -> None:
 
 def _few_losses(module: ModuleType, folder: Path) -> None:
     """Reduce `tcp_vs_ns3` to one loss pattern and one loss probability."""
-    _without_ns3(module, folder)
+    del folder
     replace(module, "PATTERNS", {"1 packet": module.PATTERNS["1 packet"]})
     replace(module, "RANDOM_LOSSES", {"2 % of data": (0.02, 0.0, 1.0)})
 
@@ -302,7 +282,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     ),
     "moves": MinimalRun("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
     "pcap": MinimalRun("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 400}),
-    "radio_vs_ns3": MinimalRun("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}, shrink=_without_ns3),
+    "radio_vs_ns3": MinimalRun("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}),
     "startup": MinimalRun("--rounds 1", shrink=_two_commands),
     "stop": MinimalRun("--rounds 1", emulated=True),
     "swarm": MinimalRun("--sizes 2 --seconds 1", {"PINGS": 5}, shrink=_small_swarm, emulated=True),
