@@ -166,14 +166,14 @@ def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
     Differences are those of runs with the same seed.
     """
     by_pair = by_pair_and_policy(rows)
-    built_in = by_pair.get(((BUILT_IN, BUILT_IN), REFERENCE), [])
+    bases = {run.seed: run for run in by_pair.get(((BUILT_IN, BUILT_IN), REFERENCE), [])}
     yield (
         "| physics | network | loss (%) | mean delay (ms) | difference (ms) | mean distance (m) | difference (mm) |"
     )
     yield "| --- | --- | --- | --- | --- | --- | --- |"
     for (pair, policy), runs in by_pair.items():
         if policy == REFERENCE:
-            with_base = list(zip(runs, built_in, strict=bool(built_in)))
+            with_base = [(run, bases[run.seed]) for run in runs if run.seed in bases]
             delays_s = [run.delay_s - base.delay_s for run, base in with_base]
             distances_m = [run.separation_m - base.separation_m for run, base in with_base]
             cells = (
