@@ -9,6 +9,7 @@ Prints the microseconds of wall time and of processor time per step; the start i
 import asyncio
 import json
 import os
+import shlex
 import socket
 import subprocess
 import sys
@@ -156,8 +157,8 @@ def run_mosaik(kind: str, count: int, steps: int) -> tuple[float, float]:
 
     globals()["StatesSimulator"] = mosaik_simulator([[0.5] * _STATE_NUMBERS] * count)
     globals()["MessageSimulator"] = mosaik_simulator(MESSAGE.decode())
-    served = f"{sys.executable} -m benchmarks.cosim_peers states {count} %(addr)s"
-    states = {"cmd": served} if kind == "subprocess" else {"python": f"{__name__}:StatesSimulator"}
+    served = f"{shlex.quote(sys.executable)} -m benchmarks.cosim_peers states {count} %(addr)s"
+    states = {"cmd": served, "posix": True} if kind == "subprocess" else {"python": f"{__name__}:StatesSimulator"}
     world = mosaik.World(
         {"States": states, "Message": {"python": f"{__name__}:MessageSimulator"}},
         skip_greetings=True,

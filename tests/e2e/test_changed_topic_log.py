@@ -53,7 +53,7 @@ def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
         whole = log.read_bytes()
         for changed, why in (
             (shifted(whole, 50_000_000), "later than its capture for every sample"),
-            (shifted(whole, -5_000_000), "before their packets in its capture"),
+            (shifted(whole, -5_000_000), "earlier than their packets in its capture"),
             (whole[:-40] + struct.pack("<d", 1.5) + whole[-32:], "its checksum is wrong"),
         ):
             log.write_bytes(changed)

@@ -207,7 +207,11 @@ MCAP = "--storage mcap > {name}/{name}_0.mcap"
     [
         (MCAP, Recorder.MCAP, None),
         (MCAP, Recorder.NONE, "its record command cannot write ros2-mcap"),
-        (MCAP, Recorder.SQLITE3, "its record command writes ros2-sqlite3, but its profile has {name}/{name}_0.mcap"),
+        (
+            MCAP,
+            Recorder.SQLITE3,
+            "its record command writes ros2-sqlite3, but its profile names {name}/{name}_0.mcap",
+        ),
     ],
 )
 def test_recorder_with_wrong_format_is_refused(text: str, detected: Recorder, what: str | None) -> None:

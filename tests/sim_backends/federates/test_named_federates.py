@@ -17,6 +17,7 @@ from tests.helpers.paths import ROOT
 
 CARTS = (ROOT / "docs" / "examples" / "federates" / "carts.py").read_text(encoding="utf-8")
 KINDS = """
+import shlex
 import sys
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.answering import FederateService
@@ -31,7 +32,8 @@ def missing():
     raise ConfigurationError("airwaves needs libair", remedy="apt-get install libair")
 
 CARTS = PythonFederate(PHYSICS, load)
-PROGRAM = ProgramFederate(PHYSICS, lambda: f"{sys.executable} -m sim_backends.cosim.scenario.served physics")
+SERVED = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served", "physics"))
+PROGRAM = ProgramFederate(PHYSICS, lambda: SERVED)
 AIRWAVES = ProgramFederate(NETWORK, missing)
 """
 

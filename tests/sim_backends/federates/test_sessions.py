@@ -202,7 +202,7 @@ def test_a_child_that_fails_shows_its_last_output(tmp_path: Path) -> None:
 
 def test_a_child_that_prints_to_its_standard_output_gets_a_remedy() -> None:
     with pytest.raises(FederateError, match="byte 4: there is no kind of message") as caught:
-        open_physics("echo loading the world ...", HELLO, 20.0)
+        open_physics("sh -c 'echo loading the world ...; exec cat >/dev/null'", HELLO, 20.0)
     assert caught.value.remedy == "standard output carries only frames; print to standard error"
 
 
