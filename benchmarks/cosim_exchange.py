@@ -136,9 +136,11 @@ def floor(request_bytes: int, answer_bytes: int) -> Iterator[Party]:
         while left:
             left -= len(connection.recv(left))
 
-    yield Party(exchange, [process.pid])
-    connection.close()
-    process.wait()
+    try:
+        yield Party(exchange, [process.pid])
+    finally:
+        connection.close()
+        process.wait()
 
 
 @contextmanager
@@ -211,9 +213,11 @@ def ros_master() -> Iterator[bool]:
     process = subprocess.Popen(
         ("rosmaster", "--core", "-p", str(port)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    yield True
-    process.terminate()
-    process.wait()
+    try:
+        yield True
+    finally:
+        process.terminate()
+        process.wait()
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from sim_backends.federates.answering import FederateService, Make, serve_channe
 from sim_backends.federates.channels import DeadlineError, StreamChannel
 from sim_backends.federates.transports.contract import TransportAddress, read_token
 from sim_backends.federates.transports.joining import join
-from sim_backends.federates.transports.table import FORMS, parse_address
+from sim_backends.federates.transports.transport_table import FORMS, parse_address
 
 _CONNECT_S: Final = 60.0
 _HELLO_S: Final = 10.0
@@ -22,7 +22,7 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
     Args:
         make: Called with the `Hello` of each run; returns the federate, for example its class.
         address: None for standard input and output, which then belong to the protocol: what the federate prints goes
-            to standard error. Otherwise an address of a transport (`transports.table`).
+            to standard error. Otherwise an address of a transport (`transports.transport_table`).
         runs: Number of runs after which to return; None for one run if this side does not listen, else no limit.
         **properties: Other attributes of `FederateService`.
 

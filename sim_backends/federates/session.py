@@ -25,7 +25,7 @@ from sim_backends.federates.named import command_line
 from sim_backends.federates.protocols import FederateError, UnansweredError, seconds_text
 from sim_backends.federates.transports.contract import read_token
 from sim_backends.federates.transports.joining import accept_federate
-from sim_backends.federates.transports.table import FORMS, parse_address
+from sim_backends.federates.transports.transport_table import FORMS, parse_address
 
 PATIENCE: Final = 20
 """A federate that reports that it computes may take this multiple of the deadline for an answer."""
@@ -276,7 +276,7 @@ def open_session(
 
     Args:
         role: `PHYSICS` or `NETWORK`.
-        where: A name, a command, or an address of a transport (`transports.table`).
+        where: A name, a command, or an address of a transport (`transports.transport_table`).
         hello: The hello that it receives; the token is added, and the interval of heartbeats
             suits the deadline.
         deadline_s: Longest wait for the connection and for each frame; None for no deadline.

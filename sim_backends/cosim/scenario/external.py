@@ -13,7 +13,7 @@ from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, Hello
 from sim_backends.federates.named import PythonFederate, federates, named
 from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
-from sim_backends.federates.transports.table import parse_address
+from sim_backends.federates.transports.transport_table import parse_address
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Body
 from sim_backends.world.world import World

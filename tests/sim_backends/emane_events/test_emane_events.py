@@ -36,8 +36,8 @@ from sim_backends.emane_events.events import (
     encode_locations,
     encode_pathlosses,
 )
-from sim_backends.emane_events.federate import EmaneLocations, _load
 from sim_backends.emane_events.geodesy import LocalFrame, emane_velocity, velocity_m_s
+from sim_backends.emane_events.location_federate import EmaneLocations, _load
 from sim_backends.emane_events.protobuf import MalformedEventError, varint_bytes
 from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import run_checks

@@ -26,7 +26,7 @@ from sim_backends.federates.transports.datagrams import (
     pack_datagram,
     unpack_datagram,
 )
-from sim_backends.federates.transports.udp import UdpAddress
+from sim_backends.federates.transports.udp_transport import UdpAddress
 from tests.helpers.federate_transports import free_port
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT

@@ -15,7 +15,7 @@ from sim_backends.federates.handshake import AgentStart
 from sim_backends.federates.protocols import UnansweredError
 from sim_backends.federates.remote import open_network, open_physics
 from sim_backends.federates.transports.contract import TOKEN_VARIABLE
-from sim_backends.federates.transports.table import FORMS, TRANSPORTS, parse_address
+from sim_backends.federates.transports.transport_table import FORMS, TRANSPORTS, parse_address
 from sim_backends.world.motion import State
 from tests.helpers.faulty_federates import Federates, forked_federates
 from tests.helpers.federate_pairs import HELLO

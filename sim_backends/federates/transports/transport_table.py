@@ -4,10 +4,15 @@ from collections.abc import Sequence
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.federates.transports import dds, ros1, tcp, udp
+from sim_backends.federates.transports import dds, ros1, tcp, udp_transport
 from sim_backends.federates.transports.contract import FederateTransport, TransportAddress
 
-TRANSPORTS: Final[Sequence[FederateTransport]] = (tcp.TRANSPORT, udp.TRANSPORT, dds.TRANSPORT, ros1.TRANSPORT)
+TRANSPORTS: Final[Sequence[FederateTransport]] = (
+    tcp.TRANSPORT,
+    udp_transport.TRANSPORT,
+    dds.TRANSPORT,
+    ros1.TRANSPORT,
+)
 FORMS: Final[Sequence[str]] = [form for transport in TRANSPORTS for form in transport.forms]
 _BY_SCHEME: Final = {form.partition(":")[0]: transport for transport in TRANSPORTS for form in transport.forms}
 
