@@ -1,15 +1,20 @@
 """Federates that have a name, for example `mujoco`: installed simulators, found by their entry points."""
 
+import re
 import shlex
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
+from typing import Final
 
 from fieldkit.core import plugins
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.federates.answering import FederateService
 from sim_backends.federates.frames import ROLES
+
+_WORD: Final = re.compile(r"[\w.-]+")
 
 
 @dataclass(frozen=True)
@@ -100,4 +105,10 @@ def command_line(where: str, role: int) -> str:
     if isinstance(federate, PythonFederate):
         federate.load()
         return shlex.join((sys.executable, "-P", "-m", "sim_backends.federates", ROLES[role], where))
+    if _WORD.fullmatch(where) and shutil.which(where) is None:
+        names = [point.name for point in plugins.entry_points(plugins.FEDERATES)]
+        choices = f"simulators: {', '.join(names)}; or a command, or an address: fieldkit docs federates"
+        raise ConfigurationError(
+            f"there is no {ROLES[role]} and no program {where!r}", remedy=did_you_mean(where, names, choices)
+        )
     return where
