@@ -17,7 +17,7 @@ from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder, StateSamples
 from sim_backends.cosim.run_record import WindowObserver
-from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.build import build, captured_flows
 from sim_backends.cosim.scenario.emane import EmaneObserver, emane_observer
 from sim_backends.cosim.scenario.external import has_addresses
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -73,7 +73,10 @@ def simulate(
         progress: As for `Simulation.run`.
         deadline_s: As for `build`.
     """
-    recorder = None if folder is None else RunRecorder(folder.recording(seed), _run_settings(scenario, policy, seed))
+    recorder = None
+    if folder is not None:
+        about = RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)
+        recorder = RunRecorder(folder.recording(seed), about, flows=captured_flows(scenario.traffic))
     samples = StateSamples(recorder) if has_followers(scenario) else None
     observer: WindowObserver | None = samples or recorder
     publisher: EmaneObserver | nullcontext[None] = nullcontext()
@@ -154,7 +157,3 @@ def simulate_all(
 
 def _simulate(scenario: CosimScenario, folder: RunFolder | None, deadline_s: float | None, task: Task) -> SeedResult:
     return simulate(scenario, task.policy, task.seed, folder, deadline_s=deadline_s)
-
-
-def _run_settings(scenario: CosimScenario, policy: str, seed: int) -> RunSettings:
-    return RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)

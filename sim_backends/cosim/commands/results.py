@@ -112,12 +112,15 @@ class FlowRoundTrips:
         answered: Number of requests whose reply arrived.
         network_s: Time that request and reply together spent in the network.
         jitter_s: Mean absolute difference of successive round trips; nan if there are fewer than two.
+        times: Number of each answered request from 0, simulated time of the reply's arrival in nanoseconds, and time
+            in the network in seconds, in order of the requests.
     """
 
     sent: int
     answered: int
     network_s: FlowSpread
     jitter_s: float
+    times: tuple[tuple[int, int, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -217,16 +220,18 @@ def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) ->
 
 def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> FlowRoundTrips:
     replies_by_number = {reply.packet.identity[1]: reply for reply in replies}
-    sent, trips_s = 0, []
+    sent = 0
+    times: list[tuple[int, int, float]] = []
     for request in sorted(requests, key=lambda fate: fate.packet.identity[1]):
         reply = replies_by_number.get(request.packet.identity[1])
         reply_s = None if reply is None else _network_s(reply)
         request_s = _network_s(request)
-        if request_s is not None and reply_s is not None:
-            trips_s.append(request_s + reply_s)
+        if reply is not None and reply.arrived_ns is not None and request_s is not None and reply_s is not None:
+            times.append((request.packet.identity[1], reply.arrived_ns, request_s + reply_s))
         sent += bool(request.reason) or (reply is not None and reply.is_decided)
+    trips_s = [trip_s for _, _, trip_s in times]
     jitter_s = float(np.abs(np.diff(trips_s)).mean()) if len(trips_s) > 1 else np.nan
-    return FlowRoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s)
+    return FlowRoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s, tuple(times))
 
 
 def _network_s(fate: Fate) -> float | None:
