@@ -11,6 +11,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Topology, Vector
 from sim_backends.cosim.commands.sheets import SheetColumn, Value
 from sim_backends.cosim.programs.senders import REPLY
+from sim_backends.cosim.real_time import Lateness
 from sim_backends.cosim.run_record import Fate, Run
 from sim_backends.cosim.scenario.faults import Fault, JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -301,6 +302,7 @@ class SeedResult:
         formation: Errors of the positions of followers.
         stopped: The reason why it ended early; empty if it is complete.
         error: The error that ended it early; None if it is complete or was interrupted.
+        lateness: Lateness of its windows; None if it was not a run in real time.
     """
 
     seed: int
@@ -314,6 +316,7 @@ class SeedResult:
     formation: Formation
     stopped: str = ""
     error: FieldkitError | None = None
+    lateness: Lateness | None = None
 
     @property
     def is_interrupted(self) -> bool:
@@ -327,6 +330,8 @@ def seed_result(
     run: Run,
     states: Sequence[tuple[int, str, State]],
     ended_by: FieldkitError | KeyboardInterrupt | None = None,
+    *,
+    lateness: Lateness | None = None,
 ) -> SeedResult:
     """Return the result of a run.
 
@@ -336,6 +341,7 @@ def seed_result(
         run: The record.
         states: States of agents, as `Recording.states`, at least for time 0.
         ended_by: The exception that ended it early, or None.
+        lateness: As in the result.
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
     error = ended_by if isinstance(ended_by, FieldkitError) else None
@@ -352,4 +358,5 @@ def seed_result(
         formation=formation(scenario, tracks_of(states)),
         stopped="" if ended_by is None else stopped,
         error=error,
+        lateness=lateness,
     )
