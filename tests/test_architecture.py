@@ -225,8 +225,10 @@ def test_the_harness_does_not_name_what_motion_adds() -> None:
     assert naming == NAMING_MOTION.keys()
 
 
-# Commands of other packages declare arguments, display and draw like fieldkit's commands (docs/add-a-command.md).
+# Commands of other packages declare arguments, display and draw like fieldkit's commands (docs/add-a-command.md), and
+# measure a simulated trial like one of robots.
 COMMAND_SEAMS = (
+    "fieldkit.trial.simulated",
     "fieldkit.cli.shared_arguments",
     "fieldkit.cli.display",
     "fieldkit.cli.parser",

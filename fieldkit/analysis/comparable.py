@@ -29,6 +29,10 @@ SAME: Final = (
 VARIED: Final = frozenset({"distance_m"})
 """Columns among `SAME` that may be the variable of a comparison; another protocol or topology changes more."""
 
+_OF_SYSTEMS: Final = frozenset({"tcp_congestion_control"})
+"""Columns of the robots' operating systems. A comparison of backends includes their difference: the kernels of real
+robots, of the laptop that emulates them, or the TCP of a simulation."""
+
 _IDENTITY: Final = frozenset({"profiles_sha256", "procedure_sha256"})
 
 SIZE_TOLERANCE: Final = 0.05
@@ -135,7 +139,8 @@ def _attempts(rows: Repeats) -> set[Key]:
 def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[Concern]:
     for name in SAME:
         is_varied = name in varied and all(len(set(rows.column(name))) == 1 for rows in (a, b))
-        yield from _compare_column(name, a, b, refuses=not is_varied)
+        is_of_backends = name in _OF_SYSTEMS and not set(a.column("backend")) & set(b.column("backend"))
+        yield from _compare_column(name, a, b, refuses=not (is_varied or is_of_backends))
     yield from _file_sizes(a, b)
     yield from _datagram_sizes(a, b)
     yield from _offload_state(a, b)

@@ -159,6 +159,9 @@ def test_runs_with_different_congestion_controls_are_not_comparable() -> None:
     (refusal,) = compared(cubic, bbr).refusals
     assert str(refusal) == "tcp_congestion_control: A has cubic, B has bbr (los, master, 9.144 m, udp)"
     assert not compared(cubic, UDP).refusals, "of trials of an earlier version it is unknown"
+    simulated = compared(cubic, moved(bbr, backend="cosim"))
+    assert not simulated.refusals, "a simulation has its own TCP"
+    assert str(refusal) in map(str, simulated.concerns)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The main use, end to end: `fieldkit trial` on emulated robots, and the use of its folder."""
 
+import csv
 import hashlib
 import math
 import shutil
@@ -106,6 +107,27 @@ def test_the_rows_contain_the_results(finished: tuple[Path, Run]) -> None:
     for row in (row for row in table if row["protocol"] == "tcp"):
         assert row["hash_match"] == "true"
         assert row["ip_loss"] == "", "missing is empty"
+
+
+def test_a_simulation_of_the_same_trial_is_compared_without_options(lab_copy: Path) -> None:
+    trial = only_trial(lab_copy)
+    size_bytes = rows(trial)[0]["sent_bytes"]
+    changes = ("trial.record=2s", *(f"traffic.{number}.size_bytes={size_bytes}" for number in (0, 2)))
+    options = [word for change in changes for word in ("--set", change)]
+    simulated = run_here(lab_copy, "cosim", "run", "field_30ft", *options, "--out", "simulated")
+    assert simulated.code == 0, simulated.err
+    compared = run_here(lab_copy, "compare", "simulated", str(trial), "--format", "csv")
+    assert compared.code == 0, compared.err
+    assert "not comparable" not in compared.err
+    both = {
+        (row["protocol"], row["quantity"]): (float(row["a"]), float(row["b"]))
+        for row in csv.DictReader(compared.out.splitlines())
+        if row["a"] and row["b"]
+    }
+    for protocol in ("tcp", "udp"):
+        # The simulation has no processing time in programs and kernels.
+        assert both[protocol, "transfer_s"][0] < 1.2 * both[protocol, "transfer_s"][1]
+        assert both[protocol, "rtt_median_s"][0] < both[protocol, "rtt_median_s"][1]
 
 
 def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy: Path) -> None:

@@ -105,7 +105,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        requests = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(self._payload_bytes(scene.protocol)))
+        requests = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(self.payload_of(scene.protocol)))
         options = (*requests, "-W", str(LAST_REPLY_S))
         yield Planned(
             self.sender,
@@ -121,7 +121,8 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
             tool=Tool.PING,
         )
 
-    def _payload_bytes(self, protocol: Protocol) -> int:
+    def payload_of(self, protocol: Protocol) -> int:
+        """Return the payload of a request under a protocol, in bytes."""
         return self.payload_bytes.udp if protocol is Protocol.UDP else self.payload_bytes.tcp
 
     @override
@@ -163,7 +164,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        frame_count = 2 * self.count * fragments(self._payload_bytes(scene.protocol))
+        frame_count = 2 * self.count * fragments(self.payload_of(scene.protocol))
         yield Flow(self.sender, self.receiver, frames=frame_count)
 
     @override
@@ -182,7 +183,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
             yield f"{self._file}: ping was stopped early, its summary is missing"
         elif result.transmitted < self.count:
             yield f"{self._file}: ping sent {result.transmitted} of {self.count} requests"
-        payload_bytes, window = self._payload_bytes(view.scene.protocol), view.attempt_window(self.sender)
+        payload_bytes, window = self.payload_of(view.scene.protocol), view.attempt_window(self.sender)
         yield from (
             f"{self._file}: {why}" for why in ping_checks.check_output(result, self.count, payload_bytes, window)
         )

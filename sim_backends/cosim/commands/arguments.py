@@ -51,6 +51,17 @@ def _add_run(commands: Commands) -> None:
     )
     parser.add_argument("--emane-device", metavar="NAME", help="network interface of these events")
     parser.add_argument(
+        "--realtime",
+        metavar="FACTOR",
+        help="run at this number of simulated seconds per second, for example 1, one run after the other; a run that "
+        "cannot keep up has no results",
+    )
+    parser.add_argument(
+        "--late-bound",
+        metavar="TIME",
+        help="with --realtime: largest lateness of a window, in wall time (default 100ms)",
+    )
+    parser.add_argument(
         "--out",
         type=Path,
         metavar="FOLDER",

@@ -14,10 +14,11 @@ from sim_backends.cosim.commands.results import SeedResult, seed_result
 from sim_backends.cosim.commands.run_folder import RunFolder
 from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.real_time import Lateness, Pace
 from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder, StateSamples
 from sim_backends.cosim.run_record import WindowObserver
-from sim_backends.cosim.scenario.build import build
+from sim_backends.cosim.scenario.build import build, captured_flows
 from sim_backends.cosim.scenario.emane import EmaneObserver, emane_observer
 from sim_backends.cosim.scenario.external import has_addresses
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -62,6 +63,7 @@ def simulate(
     *,
     progress: Callable[[int, float], None] | None = None,
     deadline_s: float | None = DEADLINE_S,
+    pace: Pace | None = None,
 ) -> SeedResult:
     """Return the result of a scenario with a seed, even if the run failed or was interrupted.
 
@@ -72,8 +74,12 @@ def simulate(
         folder: The folder for recording and rows, or None.
         progress: As for `Simulation.run`.
         deadline_s: As for `build`.
+        pace: Pace of a run in real time; None to run as fast as possible.
     """
-    recorder = None if folder is None else RunRecorder(folder.recording(seed), _run_settings(scenario, policy, seed))
+    recorder = None
+    if folder is not None:
+        about = RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)
+        recorder = RunRecorder(folder.recording(seed), about, flows=captured_flows(scenario.traffic))
     samples = StateSamples(recorder) if has_followers(scenario) else None
     observer: WindowObserver | None = samples or recorder
     publisher: EmaneObserver | nullcontext[None] = nullcontext()
@@ -82,13 +88,17 @@ def simulate(
     simulation = build(scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s)
     states_at_start = [(0, name, state) for name, state in simulation.agents.states(0).items()]
     ended_by: FieldkitError | KeyboardInterrupt | None = None
+    lateness = None if pace is None else Lateness()
     try:
         with simulation, publisher, recorder or nullcontext(), between_windows(simulation.coordinator):
-            simulation.run(progress=progress)
+            if pace is None or lateness is None:
+                simulation.run(progress=progress)
+            else:
+                pace.run(simulation, lateness, progress)
     except (FieldkitError, KeyboardInterrupt) as error:
         ended_by = error
     states = states_at_start if samples is None else samples.states
-    result = seed_result(scenario, seed, simulation.coordinator.run, states, ended_by)
+    result = seed_result(scenario, seed, simulation.coordinator.run, states, ended_by, lateness=lateness)
     if folder is not None:
         try:
             folder.write_rows(result)
@@ -106,6 +116,7 @@ def simulate_all(
     *,
     sink: Sink,
     deadline_s: float | None = DEADLINE_S,
+    pace: Pace | None = None,
 ) -> tuple[list[SeedResult], bool]:
     """Return the result of a scenario for each seed, and True if Ctrl-C interrupted them.
 
@@ -119,6 +130,7 @@ def simulate_all(
         folder: The folder for all recordings and rows, or None.
         sink: Receives progress reports.
         deadline_s: As for `build`.
+        pace: As for `simulate`; the runs are then not parallel.
     """
     if len(seeds) == 1:
         report = partial(progress_reporter(sink, "s"), "simulate", scenario.duration)
@@ -130,6 +142,7 @@ def simulate_all(
             folder,
             progress=lambda now_ns, _: report(round(now_ns / 1e9, 1)),
             deadline_s=deadline_s,
+            pace=pace,
         )
         return [result], result.is_interrupted
     report = partial(progress_reporter(sink), "simulate", len(seeds))
@@ -138,9 +151,9 @@ def simulate_all(
     tasks = [Task(policy, seed) for seed in seeds]
     interrupted = False
     try:
-        # A federate with an address serves one run at a time.
-        workers = 1 if has_addresses(scenario) else None
-        work = partial(_simulate, scenario, folder, deadline_s)
+        # A federate with an address serves one run at a time, and parallel runs would delay each other.
+        workers = 1 if has_addresses(scenario) or pace is not None else None
+        work = partial(_simulate, scenario, folder, deadline_s, pace)
         for number, result in as_completed_tasks(work, tasks, workers=workers):
             results[number] = result
             report(len(results))
@@ -152,9 +165,7 @@ def simulate_all(
     return [results[number] for number in sorted(results)], interrupted
 
 
-def _simulate(scenario: CosimScenario, folder: RunFolder | None, deadline_s: float | None, task: Task) -> SeedResult:
-    return simulate(scenario, task.policy, task.seed, folder, deadline_s=deadline_s)
-
-
-def _run_settings(scenario: CosimScenario, policy: str, seed: int) -> RunSettings:
-    return RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)
+def _simulate(
+    scenario: CosimScenario, folder: RunFolder | None, deadline_s: float | None, pace: Pace | None, task: Task
+) -> SeedResult:
+    return simulate(scenario, task.policy, task.seed, folder, deadline_s=deadline_s, pace=pace)

@@ -11,6 +11,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Topology, Vector
 from sim_backends.cosim.commands.sheets import SheetColumn, Value
 from sim_backends.cosim.programs.senders import REPLY
+from sim_backends.cosim.real_time import Lateness
 from sim_backends.cosim.run_record import Fate, Run
 from sim_backends.cosim.scenario.faults import Fault, JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -112,12 +113,15 @@ class FlowRoundTrips:
         answered: Number of requests whose reply arrived.
         network_s: Time that request and reply together spent in the network.
         jitter_s: Mean absolute difference of successive round trips; nan if there are fewer than two.
+        times: Number of each answered request from 0, simulated time of the reply's arrival in nanoseconds, and time
+            in the network in seconds, in order of the requests.
     """
 
     sent: int
     answered: int
     network_s: FlowSpread
     jitter_s: float
+    times: tuple[tuple[int, int, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -217,16 +221,18 @@ def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) ->
 
 def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> FlowRoundTrips:
     replies_by_number = {reply.packet.identity[1]: reply for reply in replies}
-    sent, trips_s = 0, []
+    sent = 0
+    times: list[tuple[int, int, float]] = []
     for request in sorted(requests, key=lambda fate: fate.packet.identity[1]):
         reply = replies_by_number.get(request.packet.identity[1])
         reply_s = None if reply is None else _network_s(reply)
         request_s = _network_s(request)
-        if request_s is not None and reply_s is not None:
-            trips_s.append(request_s + reply_s)
+        if reply is not None and reply.arrived_ns is not None and request_s is not None and reply_s is not None:
+            times.append((request.packet.identity[1], reply.arrived_ns, request_s + reply_s))
         sent += bool(request.reason) or (reply is not None and reply.is_decided)
+    trips_s = [trip_s for _, _, trip_s in times]
     jitter_s = float(np.abs(np.diff(trips_s)).mean()) if len(trips_s) > 1 else np.nan
-    return FlowRoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s)
+    return FlowRoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s, tuple(times))
 
 
 def _network_s(fate: Fate) -> float | None:
@@ -296,6 +302,7 @@ class SeedResult:
         formation: Errors of the positions of followers.
         stopped: The reason why it ended early; empty if it is complete.
         error: The error that ended it early; None if it is complete or was interrupted.
+        lateness: Lateness of its windows; None if it was not a run in real time.
     """
 
     seed: int
@@ -309,6 +316,7 @@ class SeedResult:
     formation: Formation
     stopped: str = ""
     error: FieldkitError | None = None
+    lateness: Lateness | None = None
 
     @property
     def is_interrupted(self) -> bool:
@@ -322,6 +330,8 @@ def seed_result(
     run: Run,
     states: Sequence[tuple[int, str, State]],
     ended_by: FieldkitError | KeyboardInterrupt | None = None,
+    *,
+    lateness: Lateness | None = None,
 ) -> SeedResult:
     """Return the result of a run.
 
@@ -331,6 +341,7 @@ def seed_result(
         run: The record.
         states: States of agents, as `Recording.states`, at least for time 0.
         ended_by: The exception that ended it early, or None.
+        lateness: As in the result.
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
     error = ended_by if isinstance(ended_by, FieldkitError) else None
@@ -347,4 +358,5 @@ def seed_result(
         formation=formation(scenario, tracks_of(states)),
         stopped="" if ended_by is None else stopped,
         error=error,
+        lateness=lateness,
     )

@@ -13,6 +13,7 @@ from sim_backends.cosim.commands.execution import simulate_all
 from sim_backends.cosim.commands.results import FORMATION, SeedResult, formation_values
 from sim_backends.cosim.commands.run_folder import RunFolder
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, number_text, show_all
+from sim_backends.cosim.real_time import RealTimeError
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -46,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     seeds = settings.seeds(arguments, scenario)
     if scenario.emane is not None and len(seeds) > 1:
         raise ConfigurationError("only one run can publish events of EMANE", remedy="add --seed 1")
+    pace = settings.pace(arguments)
     text = settings.policy_text(policy, scenario)
     build(
         without_federates(scenario), policy=policy
@@ -54,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings.note_commensurate_events(scenario, [policy], [scenario.policy.window], len(seeds))
     with showing_progress() as sink:
         results, interrupted = simulate_all(
-            scenario, policy, seeds, folder, sink=sink, deadline_s=settings.deadline_s(arguments.deadline)
+            scenario, policy, seeds, folder, sink=sink, deadline_s=settings.deadline_s(arguments.deadline), pace=pace
         )
     if results:
         show_results(arguments.format, f"{scenario.name}, {text}, {scenario.topology}", scenario, results)
@@ -76,16 +78,22 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         scenario: The scenario.
         results: The results.
     """
-    sheets = {"flows": _flow_sheet(title, results)}
-    if any(result.recoveries for result in results):
-        sheets["recoveries"] = _recovery_sheet(scenario, results)
-    if has_followers(scenario):
-        sheets["followers"] = _formation_sheet(results)
+    # A run that could not keep up with real time has no results, only its lateness.
+    kept_up = [result for result in results if not isinstance(result.error, RealTimeError)]
+    sheets = {"flows": _flow_sheet(title, kept_up)} if kept_up else {}
+    if any(result.recoveries for result in kept_up):
+        sheets["recoveries"] = _recovery_sheet(scenario, kept_up)
+    if kept_up and has_followers(scenario):
+        sheets["followers"] = _formation_sheet(kept_up)
+    if any(result.lateness is not None for result in results):
+        sheets["lateness"] = _lateness_sheet(results)
     show_all(sheets, form)
-    if form == "table":
-        print_text(_cost_text(results))
+    if form == "table" and kept_up:
+        print_text(_cost_text(kept_up))
     for result in results:
-        if result.stopped:
+        if isinstance(result.error, RealTimeError):
+            show_note(f"seed {result.seed}: it could not keep up with real time, so it has no results")
+        elif result.stopped:
             # The command reports the full error when it ends.
             why = result.stopped if result.error is None else f"stopped at {result.simulated_s:g} s"
             show_note(f"seed {result.seed}: {why}; its numbers are those until then")
@@ -138,6 +146,23 @@ def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> S
     ]
     hidden = {"seed"} if len(results) == 1 else set()
     return Sheet(columns, rows, [SheetPart("recovery", {column.name for column in columns} - hidden)])
+
+
+def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
+    columns = (
+        SheetColumn("seed", "seed", ""),
+        SheetColumn("late_up_to_s", "late up to (ms)", "lateness of a window against real time; 0: in time", 1e3),
+        SheetColumn("windows", "windows", "number of windows with this lateness, and more than in the row before"),
+        SheetColumn("share", "share (%)", "share of all windows", 100),
+    )
+    rows = [
+        (result.seed, limit_ns / 1e9, count, count / result.lateness.windows.total())
+        for result in results
+        if result.lateness is not None
+        for limit_ns, count in sorted(result.lateness.windows.items())
+    ]
+    hidden = {"seed"} if len(results) == 1 else set()
+    return Sheet(columns, rows, [SheetPart("lateness", {column.name for column in columns} - hidden)])
 
 
 def _formation_sheet(results: Sequence[SeedResult]) -> Sheet:

@@ -1,139 +1,17 @@
 """The folder of runs: recordings, each with a trial.csv that fieldkit reads like that of a trial."""
 
-import hashlib
-import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from fieldkit.config import schema
 from fieldkit.core import files
-from fieldkit.core.columns import SCHEMA_VERSION, Value, csv_text
+from fieldkit.core.columns import csv_text
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import Topology, Vector
-from sim_backends.cosim.commands.results import FlowResult, SeedResult
+from sim_backends.cosim.commands.flow_rows import flow_rows
+from sim_backends.cosim.commands.reproduced_rows import ReproducedRows
+from sim_backends.cosim.commands.results import SeedResult
 from sim_backends.cosim.scenario.schema import CosimScenario
-
-BACKEND: Final = "cosim"
-
-_NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration"})
-"""Keys of a scenario that do not change the procedure: the compared policy, the number of runs, their duration."""
-
-
-def table(trial: str, scenario: CosimScenario, policy: str, number: int, result: SeedResult) -> str:
-    """Return a trial.csv with a row for each flow of a run.
-
-    Args:
-        trial: Name of the folder of all runs.
-        scenario: The scenario.
-        policy: The sync policy, as text.
-        number: Number of the run, from 1.
-        result: The result of the run.
-    """
-    rows = [
-        _identity(trial, scenario, policy, result, flow)
-        | {"repeat": number}
-        | {name: value for name, value in _measured(flow).items() if not _is_missing(value)}
-        for flow in result.flows
-    ]
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    return csv_text(names, ([row.get(name) for name in names] for row in rows))
-
-
-def _identity(
-    trial: str, scenario: CosimScenario, policy: str, result: SeedResult, flow: FlowResult
-) -> dict[str, Value]:
-    distance_m = _distance_m(flow, scenario, result.starts_m)
-    dumped = scenario.model_dump(mode="json", by_alias=True)
-    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "trial": f"{trial}/{flow.name}",
-        "procedure": f"{scenario.name} {flow.name} ({policy})",
-        "scenario": str(scenario.line),
-        "topology": str(scenario.topology),
-        "backend": BACKEND,
-        "distance_m": distance_m,
-        "distance": f"{distance_m:g}m",
-        "protocol": flow.protocol,
-        "attempt": 1,
-        "status": "failed" if result.stopped else "valid",
-        "reason": result.stopped,
-        "seed": result.seed,
-        "sender": flow.source,
-        "receiver": flow.destination,
-        "relay": scenario.relay or "",
-        "profiles_sha256": _digest(dumped["agents"]),
-        "procedure_sha256": _digest(procedure),
-    }
-
-
-def _measured(flow: FlowResult) -> dict[str, Value]:
-    delay_s, distances_m = flow.delay_s, flow.distances_m
-    datagrams: dict[str, Value] = {}
-    if flow.protocol == "udp":
-        datagrams = {"datagrams_sent": flow.sent, "datagrams_received": flow.arrived, "datagram_loss": flow.loss}
-    return (
-        datagrams
-        | _ping_columns(flow)
-        | {
-            "byte_loss": 1 - flow.arrived_bytes / flow.sent_bytes if flow.sent_bytes else math.nan,
-            "transfer_s": flow.first_to_last_s,
-            "transfer_from": "receiver",
-            "one_way_min_s": delay_s.minimum,
-            "one_way_median_s": delay_s.median,
-            "one_way_mean_s": delay_s.mean,
-            "one_way_p95_s": delay_s.p95,
-            "one_way_error_s": 0.0,
-            "delay_variation_median_s": delay_s.median - delay_s.minimum,
-            "delay_variation_p95_s": delay_s.p95 - delay_s.minimum,
-            "jitter_s": flow.jitter_s,
-            "delay_s": delay_s.mean,
-            "delay_packets": flow.arrived,
-            "transfer_distance_start_m": distances_m[0],
-            "transfer_distance_min_m": distances_m[1],
-            "transfer_distance_mean_m": distances_m[2],
-            "transfer_distance_max_m": distances_m[3],
-            "transfer_sender_speed_m_s": flow.sender_m_s,
-            "transfer_relative_speed_m_s": flow.relative_m_s,
-        }
-    )
-
-
-def _ping_columns(flow: FlowResult) -> dict[str, Value]:
-    """Return the columns of a ping; payload sizes are comparable, as UDP and ICMP have headers of 8 bytes."""
-    trips = flow.round_trips
-    if trips is None:
-        return {}
-    return {
-        "rtt_sent": trips.sent,
-        "rtt_received": trips.answered,
-        "rtt_loss": 1 - trips.answered / trips.sent if trips.sent else math.nan,
-        "rtt_payload_bytes": flow.sent_bytes // flow.sent if flow.sent else math.nan,
-        "rtt_min_s": trips.network_s.minimum,
-        "rtt_median_s": trips.network_s.median,
-        "rtt_mean_s": trips.network_s.mean,
-        "rtt_p95_s": trips.network_s.p95,
-        "rtt_max_s": trips.network_s.maximum,
-        "rtt_jitter_s": trips.jitter_s,
-    }
-
-
-def _is_missing(value: Value) -> bool:
-    return isinstance(value, float) and math.isnan(value)
-
-
-def _distance_m(flow: FlowResult, scenario: CosimScenario, starts_m: Mapping[str, Vector]) -> float:
-    """Return the distance of a flow at time 0, to the millimetre; with a relay, the distance to it, as in trials."""
-    is_relayed = scenario.topology is Topology.MASTER and scenario.relay is not None
-    peer = scenario.relay if is_relayed and scenario.relay else flow.destination
-    return round(math.dist(starts_m[flow.source], starts_m[peer]), 3)
-
-
-def _digest(value: object) -> str:
-    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
-
 
 TRIAL_CSV: Final = "trial.csv"
 
@@ -151,7 +29,8 @@ class RunFolder:
         path: The folder.
 
     Raises:
-        ConfigurationError: The folder is not empty, or cannot be created.
+        ConfigurationError: The folder is not empty, or cannot be created, or the scenario does not agree with the
+            procedure of the trial that it reproduces.
     """
 
     def __init__(self, path: Path, scenario: CosimScenario, policy: str, seeds: Sequence[int]) -> None:
@@ -159,6 +38,7 @@ class RunFolder:
         self._scenario = scenario
         self._policy = policy
         self._seeds = tuple(seeds)
+        self._reproduced = None if scenario.trial is None else ReproducedRows(scenario, scenario.trial, policy)
         try:
             path.mkdir(parents=True, exist_ok=True)
             if next(path.iterdir(), None) is not None:
@@ -185,10 +65,16 @@ class RunFolder:
             ConfigurationError: They cannot be written.
         """
         number = self._seeds.index(result.seed) + 1
-        rows_text = table(self.path.resolve().name, self._scenario, self._policy, number, result)
         path = self.recording(result.seed) / TRIAL_CSV
+        trial = self.path.resolve().name
+        reproduced = self._reproduced
+        trial_rows = [] if reproduced is None else list(reproduced.rows(trial, number, result, path.parent))
+        without = () if reproduced is None else reproduced.flows
+        other_rows = flow_rows(trial, self._scenario, self._policy, number, result, without=without)
+        rows = [*trial_rows, *other_rows]
+        names = list(dict.fromkeys(name for row in rows for name in row))
         try:
-            files.write(path, rows_text.encode())
+            files.write(path, csv_text(names, ([row.get(name) for name in names] for row in rows)).encode())
         except OSError as error:
             raise ConfigurationError(
                 f"cannot be written: {error.strerror}", where=str(path), remedy="free some space and run it again"

@@ -2,6 +2,7 @@
 
 import argparse
 import inspect
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from fieldkit.core.units import format_count, parse_duration_s
 from fieldkit.report.theme import Format, format_of
 from sim_backends.cosim.policies import registry
 from sim_backends.cosim.policies.registry import make_policy
+from sim_backends.cosim.real_time import LATE_BOUND_S, Pace
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.phases import commensurate_events, incommensurate_window_s
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -160,6 +162,29 @@ def deadline_s(text: str | None) -> float:
     if seconds <= 0:
         raise ConfigurationError(f"--deadline: {text} is not above 0", remedy="write for example --deadline 30s")
     return seconds
+
+
+def pace(arguments: argparse.Namespace) -> Pace | None:
+    """Return the pace of runs in real time, or None if they run as fast as possible.
+
+    Raises:
+        ConfigurationError: A value is invalid, or there is a bound without a pace.
+    """
+    text, bound = arguments.realtime, arguments.late_bound
+    if text is None:
+        if bound is not None:
+            raise ConfigurationError("--late-bound needs --realtime", remedy="add --realtime 1")
+        return None
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = math.nan
+    if not 0 < factor < math.inf:
+        raise ConfigurationError(f"--realtime: {text!r} is not a number above 0", remedy="--realtime 1")
+    bound_s = LATE_BOUND_S if bound is None else parse_duration_s(bound)
+    if bound_s <= 0:
+        raise ConfigurationError(f"--late-bound: {bound} is not above 0", remedy="--late-bound 100ms")
+    return Pace(factor, bound_s)
 
 
 def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:

@@ -2,10 +2,12 @@
 
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from io import FileIO
 from ipaddress import IPv4Address
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from sim_backends.network.ip import HEADER_BYTES, Fragment
@@ -13,7 +15,7 @@ from sim_backends.network.tcp.connection import ConnectionName
 from sim_backends.network.tcp.segments import Segment
 from sim_backends.network.wire import IpPacket
 
-_TCP, _UDP = 6, 17
+_ICMP, _TCP, _UDP = 1, 6, 17
 _FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
 _MULTICAST: Final = IPv4Address("239.255.0.1").packed
 """Destination of packets for all hosts: the multicast group of DDS discovery (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
@@ -29,6 +31,8 @@ _PORTS: Final = 9_000
 _IP: Final = struct.Struct(">BBHHHBBH4s4s")
 _UDP_HEADER: Final = struct.Struct(">HHHH")
 _TCP_HEADER: Final = struct.Struct(">HHIIBBHHH")
+_ECHO_HEADER: Final = struct.Struct(">BBHHH")
+"""Type, code, checksum, identifier and sequence number (RFC 792)."""
 _SYN, _PUSH, _ACK = 0x02, 0x08, 0x10
 _MORE_FRAGMENTS: Final = 0x2000
 _WINDOW_SCALE: Final = 7
@@ -36,15 +40,48 @@ _WINDOW_SCALE: Final = 7
 _MSS: Final = 1460
 
 
+@dataclass(frozen=True)
+class CapturedFlow:
+    """Headers of the packets of a flow, where they are not the default ones.
+
+    Attributes:
+        port: Destination port; None for a free one.
+        ping: Name of the ping whose echo requests or replies (ICMP) the packets are; empty for UDP and TCP.
+        is_reply: True for its replies.
+    """
+
+    port: int | None = None
+    ping: str = ""
+    is_reply: bool = False
+
+
+_ECHO_REPLY, _ECHO_REQUEST = 0, 8
+"""ICMP types (RFC 792)."""
+
+_DEFAULT: Final = CapturedFlow()
+NO_FLOWS: Final[Mapping[str, CapturedFlow]] = MappingProxyType({})
+
+
+def addresses(names: Sequence[str]) -> dict[str, IPv4Address]:
+    """Return the addresses of robots in captures: the first is 10.0.0.1, each further one has the next address.
+
+    Args:
+        names: The robots, in the order of their names.
+    """
+    return {name: IPv4Address(_FIRST_HOST + number) for number, name in enumerate(names)}
+
+
 class IpEncoder:
     """Encodes fragments as the bytes of IP packets.
 
     Args:
-        names: The hosts; the first is 10.0.0.1, each further one has the next address.
+        names: The hosts, see `addresses`.
+        flows: Flows with special headers, by name.
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self.addresses = {name: IPv4Address(_FIRST_HOST + number) for number, name in enumerate(names)}
+    def __init__(self, names: Sequence[str], flows: Mapping[str, CapturedFlow] = NO_FLOWS) -> None:
+        self.addresses = addresses(names)
+        self._special_flows = flows
         self._packed: dict[str | None, bytes] = {name: address.packed for name, address in self.addresses.items()}
         self._packed[None] = _MULTICAST
         self._flows: dict[object, int] = {}
@@ -78,6 +115,13 @@ class IpEncoder:
     def _transport(self, packet: IpPacket) -> tuple[int, bytes]:
         """Return the number of the transport protocol, and the transport header."""
         length = packet.size_bytes - HEADER_BYTES
+        flow = self._captured_flow(packet.identity[0])
+        if flow.ping:
+            kind = _ECHO_REPLY if flow.is_reply else _ECHO_REQUEST
+            numbers = self._flow_number((flow.ping,)) + 1, (packet.identity[1] + 1) & 0xFFFF
+            # The checksum of ICMP includes no pseudo header.
+            checksum = _checksum(_ECHO_HEADER.pack(kind, 0, 0, *numbers))
+            return _ICMP, _ECHO_HEADER.pack(kind, 0, checksum, *numbers)
         if isinstance(packet.body, tuple):
             name, segment = packet.body
             protocol, header = _TCP, self._tcp(packet, name, segment)
@@ -90,6 +134,9 @@ class IpEncoder:
         checksum = _checksum(pseudo + header) or 0xFFFF
         return protocol, header[:checksum_offset] + struct.pack(">H", checksum) + header[checksum_offset + 2 :]
 
+    def _captured_flow(self, name: object) -> CapturedFlow:
+        return self._special_flows.get(name, _DEFAULT) if isinstance(name, str) else _DEFAULT
+
     def _flow_number(self, flow: object) -> int:
         return self._flows.setdefault(flow, len(self._flows)) % _PORTS
 
@@ -98,12 +145,13 @@ class IpEncoder:
             return _TOPIC_PORT, _DISCOVERY_PORT if packet.destination is None else _TOPIC_PORT
         # Only the identity of a UDP packet contains the name of a flow; other transports number their packets.
         ends = packet.transport, packet.source, packet.destination
-        number = self._flow_number(packet.identity[0] if packet.transport == "udp" else ends)
-        return _FIRST_EPHEMERAL_PORT + number, _FIRST_PORT + number
+        name = packet.identity[0] if packet.transport == "udp" else ends
+        number = self._flow_number(name)
+        return _FIRST_EPHEMERAL_PORT + number, self._captured_flow(name).port or _FIRST_PORT + number
 
     def _tcp(self, packet: IpPacket, name: ConnectionName, segment: Segment) -> bytes:
         number = self._flow_number(name)
-        ports = _FIRST_EPHEMERAL_PORT + number, _FIRST_PORT + number
+        ports = _FIRST_EPHEMERAL_PORT + number, self._captured_flow(name.flow).port or _FIRST_PORT + number
         options = _syn_options(segment) if segment.syn else _options(segment)
         flags = (_SYN if segment.syn else 0) | (_PUSH if segment.length else 0)
         flags |= 0 if segment.acknowledges is None else _ACK
@@ -169,12 +217,15 @@ class Captures:
         folder: Folder of the files; it is created for the first packet.
         names: The robots.
         snap_bytes: Number of bytes kept of each packet, like tcpdump's `-s`.
+        flows: Flows with special headers, by name.
     """
 
-    def __init__(self, folder: Path, names: Sequence[str], snap_bytes: int) -> None:
+    def __init__(
+        self, folder: Path, names: Sequence[str], snap_bytes: int, flows: Mapping[str, CapturedFlow] = NO_FLOWS
+    ) -> None:
         self._folder = folder
         self._snap_bytes = snap_bytes
-        self._encoder = IpEncoder(names)
+        self._encoder = IpEncoder(names, flows)
         self._pending: dict[str, bytearray] = {}
         self._files: dict[str, FileIO] = {}
         self._written_bytes: dict[str, int] = {}
@@ -212,3 +263,25 @@ class Captures:
             # The position is explicit, so that an interrupt before the count is updated does not duplicate data.
             done += os.pwrite(descriptor, bytes(pending[done:]), at + done)
         self._written_bytes[name], self._pending[name] = at + done, bytearray()
+
+
+def between(capture: bytes, begin_ns: int, end_ns: int) -> bytes:
+    """Return the packets of a capture of `Captures` with times from `begin_ns` until before `end_ns`, as a capture.
+
+    Args:
+        capture: The content of the file.
+        begin_ns: First simulated time.
+        end_ns: Simulated time after the last one.
+    """
+    records = (capture[begin:end] for at_ns, begin, end in _records(capture) if begin_ns <= at_ns < end_ns)
+    return capture[: _FILE_HEADER.size] + b"".join(records)
+
+
+def _records(capture: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield the time of each packet in nanoseconds, and the range of its record in the file."""
+    begin = _FILE_HEADER.size
+    while begin < len(capture):
+        seconds, nanoseconds, captured_bytes, _ = _RECORD_HEADER.unpack_from(capture, begin)
+        end = begin + _RECORD_HEADER.size + captured_bytes
+        yield seconds * 10**9 + nanoseconds, begin, end
+        begin = end

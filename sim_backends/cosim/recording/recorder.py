@@ -12,7 +12,7 @@ from typing import Final, Self
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.recording import packet_tables
-from sim_backends.cosim.recording.captures import Captures
+from sim_backends.cosim.recording.captures import NO_FLOWS, CapturedFlow, Captures
 from sim_backends.cosim.recording.manifest import (
     RunEnding,
     RunManifest,
@@ -85,6 +85,8 @@ class StateSamples:
 _MAX_WINDOWS: Final = 50_000
 """Largest number of windows in a part, because a part is in memory until it is written."""
 _DISK_FULL_ERRORS: Final = {errno.ENOSPC, errno.EDQUOT}
+CAPTURES: Final = "captures"
+"""Folder of the captures in a recording, with a file for each robot, `ROBOT.pcap`."""
 _RESERVE: Final = ".reserve"
 _RESERVE_BYTES: Final = 1 << 20
 """Disk space that is allocated in advance for the last windows and the manifest, in case the disk becomes full."""
@@ -109,6 +111,7 @@ class RunRecorder:
         part_every_s: Interval at which parts are written, in seconds of wall time.
         snap_bytes: Number of bytes kept of each IP packet in `captures/`, which has a file for each robot if the
             network is given `log_ip`.
+        flows: Flows with special headers in the captures, by name.
     """
 
     def __init__(
@@ -119,8 +122,10 @@ class RunRecorder:
         states_every_ns: int = EVERY_NS,
         part_every_s: float = 2.0,
         snap_bytes: int = 128,
+        flows: Mapping[str, CapturedFlow] = NO_FLOWS,
     ) -> None:
         self._folder = folder
+        self._flows = flows
         self._part_every_s = part_every_s
         self._sampling = Sampling(states_every_ns)
         self._snap_bytes = snap_bytes
@@ -159,7 +164,9 @@ class RunRecorder:
     def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
         """Add an IP packet that a robot sent or that arrived at it; see `RadioNetwork.log_ip`."""
         if self._captures is None:
-            self._captures = Captures(self._folder / "captures", sorted(self._first_states), self._snap_bytes)
+            self._captures = Captures(
+                self._folder / CAPTURES, sorted(self._first_states), self._snap_bytes, self._flows
+            )
         self._captures.log(at_ns, name, fragment)
 
     def window(self, window: Window) -> None:

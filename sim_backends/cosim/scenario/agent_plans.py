@@ -296,11 +296,13 @@ class FileTraffic(_Traffic):
         kind: `file`.
         size_bytes: Size of the file.
         piece_bytes: Size of each write to the transport: netcat uses 8192 bytes.
+        port: Destination port in captures; a free one if omitted.
     """
 
     kind: Literal["file"]
     size_bytes: Annotated[Int, Field(gt=0, le=10**9)]
     piece_bytes: Bytes = 8192
+    port: Annotated[Int | None, Field(ge=1, le=65_535, exclude_if=schema.is_empty)] = None
 
     @property
     @override

@@ -3,7 +3,7 @@
 The network consists of antennas, a radio model and transports, with the faults of radios.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,8 +15,10 @@ from sim_backends.cosim.coordinator import Coordinator, Progress
 from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.programs.senders import REPLY
+from sim_backends.cosim.recording.captures import CapturedFlow
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
-from sim_backends.cosim.scenario.agent_plans import QosOptions, Traffic
+from sim_backends.cosim.scenario.agent_plans import FileTraffic, PingTraffic, QosOptions, Traffic
 from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.external import open_network, open_physics
@@ -74,6 +76,18 @@ def radio_network(
     if isinstance(observer, IpObserver):
         network.log_ip(observer.log_ip)
     return network
+
+
+def captured_flows(traffic: Iterable[Traffic]) -> dict[str, CapturedFlow]:
+    """Return the flows of a scenario whose packets have special headers in captures: pings, and given ports."""
+    flows: dict[str, CapturedFlow] = {}
+    for entry in traffic:
+        for flow in entry.flows:
+            if isinstance(entry, PingTraffic) and entry.protocol == "udp":
+                flows |= {flow: CapturedFlow(ping=flow), flow + REPLY: CapturedFlow(ping=flow, is_reply=True)}
+            elif isinstance(entry, FileTraffic) and entry.port is not None:
+                flows[flow] = CapturedFlow(port=entry.port)
+    return flows
 
 
 def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFactory]:

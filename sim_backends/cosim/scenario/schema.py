@@ -13,6 +13,7 @@ from sim_backends.cosim.policies.registry import policies, unknown_policy_remedy
 from sim_backends.cosim.programs.way_points import PERIOD_NS
 from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
+from sim_backends.cosim.scenario.reproduced_trial import ReproducedTrial
 from sim_backends.emane_events.options import EmaneOptions
 from sim_backends.network.tcp.tcp_options import Congestion
 from sim_backends.radio.radio_options import RadioOptions
@@ -188,6 +189,7 @@ class CosimScenario(Named):
         agents: The agents by name.
         traffic: The traffic between them.
         faults: The faults.
+        trial: The trial of robots that it reproduces.
     """
 
     world: str
@@ -205,6 +207,7 @@ class CosimScenario(Named):
     agents: Annotated[dict[Name, AgentPlan], Field(min_length=1)]
     traffic: tuple[Traffic, ...] = ()
     faults: tuple[Fault, ...] = ()
+    trial: Annotated[ReproducedTrial | None, Field(exclude_if=schema.is_empty)] = None
 
     @property
     def duration_ns(self) -> int:
@@ -259,6 +262,12 @@ class CosimScenario(Named):
                     number,
                 )
             titles.add(traffic.title)
+        return self
+
+    @schema.model_validator(mode="after")
+    def _trial_has_its_traffic(self) -> "CosimScenario":
+        for message, location in () if self.trial is None else self.trial.problems(self.traffic):
+            raise schema.validation_error(message, "trial", *location)
         return self
 
     @schema.model_validator(mode="after")

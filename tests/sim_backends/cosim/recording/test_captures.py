@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from scapy.layers.inet import IP, TCP, UDP
+from scapy.layers.inet import ICMP, IP, TCP, UDP
 from scapy.packet import Packet
 from scapy.utils import PcapReader
 
@@ -19,7 +19,7 @@ from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.programs.senders import Periodic
-from sim_backends.cosim.recording.captures import Captures, IpEncoder
+from sim_backends.cosim.recording.captures import CapturedFlow, Captures, IpEncoder, between
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.network.ip import Fragment
@@ -232,3 +232,32 @@ def test_a_capture_that_is_interrupted_after_a_write_has_no_packet_twice(
     captures.close()
     frames = PcapReader(str(tmp_path / "captures" / f"{name}.pcap"))
     assert [frame[IP].id for frame in frames] == [1, 2]
+
+
+def test_pings_are_icmp_and_a_given_port_is_used(tmp_path: Path) -> None:
+    flows = {
+        "file": CapturedFlow(port=1234),
+        "ask": CapturedFlow(ping="ask"),
+        "ask/reply": CapturedFlow(ping="ask", is_reply=True),
+        "again": CapturedFlow(ping="again"),
+    }
+    captures = Captures(tmp_path / "captures", NAMES, snap_bytes=65535, flows=flows)
+    packets = [("file", 0, "alpha", "bravo"), ("ask", 4, "alpha", "bravo"), ("ask/reply", 4, "bravo", "alpha")]
+    packets.append(("again", 0, "alpha", "bravo"))
+    for number, (flow, index, source, destination) in enumerate(packets):
+        packet = IpPacket(source, destination, "udp", 84, (flow, index), number)
+        captures.log(number * MS, "alpha", Fragment(packet, number, 0, 1, 0, 84))
+    captures.flush()
+    captures.close()
+    content = (tmp_path / "captures" / "alpha.pcap").read_bytes()
+    (tmp_path / "part.pcap").write_bytes(between(content, MS, 3 * MS))
+    frames = list(PcapReader(str(tmp_path / "captures" / "alpha.pcap")))
+    assert frames[0][UDP].dport == 1234
+    request, reply, other = (frame[ICMP] for frame in frames[1:])
+    assert [(echo.type, echo.seq) for echo in (request, reply, other)] == [(8, 5), (0, 5), (8, 1)]
+    assert request.id == reply.id != other.id
+    for frame in frames[1:]:
+        checksum = frame[ICMP].chksum
+        frame[ICMP].chksum = None
+        assert IP(bytes(frame))[ICMP].chksum == checksum
+    assert [frame.time for frame in PcapReader(str(tmp_path / "part.pcap"))] == [frame.time for frame in frames[1:3]]

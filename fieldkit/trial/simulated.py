@@ -1,0 +1,191 @@
+"""Trials that a simulation reproduces: its evidence is measured by the same steps as that of robots.
+
+The simulation writes captures of both ends and the output of ping as files of an attempt. Columns whose evidence it
+does not write are missing.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from fieldkit.backends.protocols import Robot
+from fieldkit.config.profiles import load_profile
+from fieldkit.core.columns import Value
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Distance, Protocol, RepeatId, Role, Scenario, Status, Topology
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.steps.kinds.ping import PingStep
+from fieldkit.steps.kinds.transfer import TransferStep
+from fieldkit.steps.view import capture_around
+from fieldkit.trial import gates, rows
+from fieldkit.trial.columns import Row
+from fieldkit.trial.journal import Attempt
+from fieldkit.trial.procedure import load_procedure
+from fieldkit.trial.request import TrialRequest, make_plan
+
+KINDS: Final = ("capture", "ping", "record", "transfer")
+"""Kinds of step that a simulation can reproduce; what `record` records is only a size."""
+
+
+@dataclass(frozen=True)
+class SimulatedRobot:
+    """A robot of a simulation.
+
+    Attributes:
+        name: Its name.
+        profile: Name of its robot profile.
+        address: Its IPv4 address in the captures.
+    """
+
+    name: str
+    profile: str
+    address: str
+
+
+@dataclass(frozen=True)
+class PlannedExchange:
+    """What the procedure sends under one protocol.
+
+    Attributes:
+        sender: Role that sends the file and the echo requests.
+        receiver: Role that receives them.
+        port: Port of the transfer.
+        requests: Number of echo requests.
+        interval_s: Time between them.
+        payload_bytes: Their payload.
+    """
+
+    sender: Role
+    receiver: Role
+    port: int
+    requests: int
+    interval_s: float
+    payload_bytes: int
+
+
+@dataclass(frozen=True)
+class SimulatedRepeat:
+    """A repeat of a simulation.
+
+    Attributes:
+        repeat: Its protocol and number.
+        status: Its status.
+        reason: The reason why it is not valid; empty if it is.
+        captures: Contents of the captures of sender and receiver; empty if the simulation has none.
+        ping: Output of ping.
+        values: Columns that the simulation knows without evidence.
+    """
+
+    repeat: RepeatId
+    status: Status
+    reason: str
+    captures: Mapping[Role, bytes]
+    ping: str
+    values: Mapping[str, Value]
+
+
+class SimulatedTrial:
+    """A trial that a simulation reproduces.
+
+    Args:
+        procedure: Name of the procedure.
+        robots: The robot in each role.
+        topology: The topology.
+        distance: The distance.
+        record_s: Duration of every recording, in seconds; None for that of the procedure.
+        backend: Name of the simulation, for the column `backend`.
+        seed: Seed of the simulation.
+
+    Raises:
+        ConfigurationError: There is no such procedure, or a simulation cannot reproduce it.
+    """
+
+    def __init__(
+        self,
+        procedure: str,
+        *,
+        robots: Mapping[Role, SimulatedRobot],
+        topology: Topology,
+        distance: Distance,
+        record_s: float | None,
+        backend: str,
+        seed: int,
+    ) -> None:
+        loaded = load_procedure(procedure)
+        kinds = sorted({placed.kind for placed in loaded.walk()})
+        if other_kinds := set(kinds) - set(KINDS):
+            raise ConfigurationError(
+                f"a simulation cannot reproduce the procedure {procedure}: it has {', '.join(sorted(other_kinds))}",
+                remedy=f"name a procedure that has only {', '.join(KINDS)}",
+            )
+        cast = {
+            role: Robot(name=robot.name, address=robot.address, profile=load_profile(robot.profile))
+            for role, robot in robots.items()
+        }
+        request = TrialRequest(loaded, distance, topology, record_s=record_s, seed=seed)
+        # The time is only a part of the trial's name, which rows of simulations do not contain.
+        self._plan = make_plan(request, backend=backend, cast=cast, now=datetime.fromtimestamp(0, UTC))
+
+    @property
+    def procedure(self) -> str:
+        """Name of the procedure."""
+        return self._plan.procedure.name
+
+    @property
+    def scenario(self) -> Scenario:
+        """Scenario of the procedure: with or without an obstacle."""
+        return self._plan.procedure.scenario
+
+    def exchange(self, protocol: Protocol) -> PlannedExchange:
+        """Return what the procedure sends under a protocol.
+
+        Raises:
+            ConfigurationError: The procedure has not exactly one transfer and one ping between the same robots, or no
+                capture of both.
+        """
+        transfers = [placed for placed in self._plan.procedure.walk() if isinstance(placed.step, TransferStep)]
+        pings = [placed.step for placed in self._plan.procedure.walk() if isinstance(placed.step, PingStep)]
+        if len(transfers) == len(pings) == 1:
+            (placed,), (ping_step,) = transfers, pings
+            step = placed.step
+            assert isinstance(step, TransferStep)
+            ends = step.sender, step.receiver
+            captured = all(capture_around(placed.within, role) for role in ends)
+            if captured and ends == (ping_step.sender, ping_step.receiver):
+                payload_bytes = ping_step.payload_of(protocol)
+                return PlannedExchange(*ends, step.port, ping_step.count, ping_step.interval, payload_bytes)
+        raise ConfigurationError(
+            f"a simulation cannot reproduce the procedure {self._plan.procedure.name}",
+            remedy="it needs one transfer and one ping between two robots, and a capture of both around the transfer",
+        )
+
+    def row(self, simulated: SimulatedRepeat, identity: Mapping[str, Value]) -> Row:
+        """Return the row of a repeat.
+
+        Args:
+            simulated: The repeat.
+            identity: Columns that replace those of the plan, for example the name of the trial.
+        """
+        with TemporaryDirectory(prefix="fieldkit-simulated-") as name:
+            folder = Path(name)
+            self._write(simulated, folder)
+            measured = gates.judge(self._plan, simulated.repeat, AttemptEvidence(folder)).measured
+        attempt = Attempt(simulated.repeat, 1, 0, simulated.status, simulated.reason)
+        row = rows.build(self._plan, attempt, measured)
+        return {key: value for key, value in {**row, **simulated.values, **identity}.items() if key not in _NO_CLOCK}
+
+    def _write(self, simulated: SimulatedRepeat, folder: Path) -> None:
+        """Write the evidence of a repeat."""
+        for placed in self._plan.procedure.walk():
+            if isinstance(placed.step, TransferStep):
+                for role, content in simulated.captures.items():
+                    (folder / str(capture_around(placed.within, role))).write_bytes(content)
+            if isinstance(placed.step, PingStep):
+                (folder / placed.step.pinging().file).write_text(simulated.ping, encoding="ascii")
+
+
+_NO_CLOCK: Final = frozenset({"started_utc_ns"})
+"""Columns of a trial's clock, which a simulation does not have."""

@@ -1,0 +1,150 @@
+"""Rows of trial.csv for the flows of a run: one row per flow."""
+
+import hashlib
+import json
+import math
+from collections.abc import Collection, Iterator, Mapping
+from typing import Final
+
+from fieldkit.core.columns import SCHEMA_VERSION, Value
+from fieldkit.core.model import Topology, Vector
+from sim_backends.cosim.commands.results import FlowResult, SeedResult
+from sim_backends.cosim.scenario.schema import CosimScenario
+
+BACKEND: Final = "cosim"
+
+_NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration", "trial"})
+"""Keys of a scenario that do not change the procedure: the compared policy, the number of runs, their duration,
+and the trial that it reproduces."""
+
+
+def flow_rows(
+    trial: str,
+    scenario: CosimScenario,
+    policy: str,
+    number: int,
+    result: SeedResult,
+    *,
+    without: Collection[str] = (),
+) -> Iterator[dict[str, Value]]:
+    """Yield a row for each flow of a run; values that are not known are missing.
+
+    Args:
+        trial: Name of the folder of all runs.
+        scenario: The scenario.
+        policy: The sync policy, as text.
+        number: Number of the run, from 1.
+        result: The result of the run.
+        without: Names of flows that get no row.
+    """
+    for flow in result.flows:
+        if flow.name not in without:
+            measured = {name: value for name, value in _measured(flow).items() if not _is_missing(value)}
+            yield _identity(trial, scenario, policy, result, flow) | {"repeat": number} | measured
+
+
+def _identity(
+    trial: str, scenario: CosimScenario, policy: str, result: SeedResult, flow: FlowResult
+) -> dict[str, Value]:
+    distance_m = _distance_m(flow, scenario, result.starts_m)
+    dumped = scenario.model_dump(mode="json", by_alias=True)
+    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "trial": f"{trial}/{flow.name}",
+        "procedure": f"{scenario.name} {flow.name} ({policy})",
+        "scenario": str(scenario.line),
+        "topology": str(scenario.topology),
+        "backend": BACKEND,
+        "distance_m": distance_m,
+        "distance": f"{distance_m:g}m",
+        "protocol": flow.protocol,
+        "attempt": 1,
+        "status": "failed" if result.stopped else "valid",
+        "reason": result.stopped,
+        "seed": result.seed,
+        "sender": flow.source,
+        "receiver": flow.destination,
+        "relay": scenario.relay or "",
+        "profiles_sha256": _digest(dumped["agents"]),
+        "procedure_sha256": _digest(procedure),
+    }
+
+
+def _measured(flow: FlowResult) -> dict[str, Value]:
+    delay_s = flow.delay_s
+    datagrams: dict[str, Value] = {}
+    if flow.protocol == "udp":
+        datagrams = {"datagrams_sent": flow.sent, "datagrams_received": flow.arrived, "datagram_loss": flow.loss}
+    return (
+        datagrams
+        | _ping_columns(flow)
+        | {
+            "byte_loss": 1 - flow.arrived_bytes / flow.sent_bytes if flow.sent_bytes else math.nan,
+            "transfer_s": flow.first_to_last_s,
+            "transfer_from": "receiver",
+            "one_way_min_s": delay_s.minimum,
+            "one_way_median_s": delay_s.median,
+            "one_way_mean_s": delay_s.mean,
+            "one_way_p95_s": delay_s.p95,
+            "one_way_error_s": 0.0,
+            "delay_variation_median_s": delay_s.median - delay_s.minimum,
+            "delay_variation_p95_s": delay_s.p95 - delay_s.minimum,
+            "jitter_s": flow.jitter_s,
+            "delay_s": delay_s.mean,
+            "delay_packets": flow.arrived,
+        }
+        | motion_columns("transfer", flow)
+    )
+
+
+def _ping_columns(flow: FlowResult) -> dict[str, Value]:
+    """Return the columns of a ping; payload sizes are comparable, as UDP and ICMP have headers of 8 bytes."""
+    trips = flow.round_trips
+    if trips is None:
+        return {}
+    return {
+        "rtt_sent": trips.sent,
+        "rtt_received": trips.answered,
+        "rtt_loss": 1 - trips.answered / trips.sent if trips.sent else math.nan,
+        "rtt_payload_bytes": flow.sent_bytes // flow.sent if flow.sent else math.nan,
+        "rtt_min_s": trips.network_s.minimum,
+        "rtt_median_s": trips.network_s.median,
+        "rtt_mean_s": trips.network_s.mean,
+        "rtt_p95_s": trips.network_s.p95,
+        "rtt_max_s": trips.network_s.maximum,
+        "rtt_jitter_s": trips.jitter_s,
+    }
+
+
+def motion_columns(step: str, flow: FlowResult) -> dict[str, Value]:
+    """Return the columns of distances and speeds during a flow.
+
+    Args:
+        step: Prefix of the columns, `transfer` or `rtt`.
+        flow: The flow.
+    """
+    start_m, min_m, mean_m, max_m = flow.distances_m
+    return {
+        f"{step}_distance_start_m": start_m,
+        f"{step}_distance_min_m": min_m,
+        f"{step}_distance_mean_m": mean_m,
+        f"{step}_distance_max_m": max_m,
+        f"{step}_sender_speed_m_s": flow.sender_m_s,
+        f"{step}_relative_speed_m_s": flow.relative_m_s,
+    }
+
+
+def _is_missing(value: Value) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def _distance_m(flow: FlowResult, scenario: CosimScenario, starts_m: Mapping[str, Vector]) -> float:
+    """Return the distance of a flow at time 0, to the millimetre; with a relay, the distance to it, as in trials."""
+    is_relayed = scenario.topology is Topology.MASTER and scenario.relay is not None
+    peer = scenario.relay if is_relayed and scenario.relay else flow.destination
+    return round(math.dist(starts_m[flow.source], starts_m[peer]), 3)
+
+
+def _digest(value: object) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,182 @@
+"""Rows of trial.csv for a scenario that reproduces a trial of robots: one row per protocol, as in that trial."""
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.columns import Value
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Distance, Protocol, RepeatId, Role, Status, Topology
+from fieldkit.trial.simulated import PlannedExchange, SimulatedRepeat, SimulatedRobot, SimulatedTrial
+from sim_backends.cosim.commands.flow_rows import BACKEND, motion_columns
+from sim_backends.cosim.commands.results import FlowResult, FlowRoundTrips, SeedResult
+from sim_backends.cosim.programs.senders import REPLY
+from sim_backends.cosim.recording.captures import addresses, between
+from sim_backends.cosim.recording.recorder import CAPTURES
+from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.reproduced_trial import ReproducedRepeat, ReproducedTrial
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.world.world import load_world
+
+_TTL: Final = 64
+
+
+class ReproducedRows:
+    """Rows of the trial that a scenario reproduces.
+
+    Args:
+        scenario: The scenario.
+        trial: Its section on that trial.
+        policy: The sync policy, as text.
+
+    Attributes:
+        flows: Names of the flows whose packets the rows include.
+
+    Raises:
+        ConfigurationError: The scenario does not agree with the procedure.
+    """
+
+    def __init__(self, scenario: CosimScenario, trial: ReproducedTrial, policy: str) -> None:
+        self._scenario = scenario
+        self._policy = policy
+        self._repeats = trial.repeats(scenario.traffic, scenario.duration_ns)
+        first = self._repeats[0]
+        self._agents = {Role.SENDER: first.transfer.source, Role.RECEIVER: first.transfer.to[0]}
+        if scenario.topology is Topology.MASTER and scenario.relay is not None:
+            self._agents[Role.RELAY] = scenario.relay
+        self._addresses = {name: str(address) for name, address in addresses(sorted(scenario.agents)).items()}
+        self._trial = SimulatedTrial(
+            trial.procedure,
+            robots={
+                role: SimulatedRobot(name, scenario.agents[name].robot, self._addresses[name])
+                for role, name in self._agents.items()
+            },
+            topology=scenario.topology,
+            distance=self._distance(),
+            record_s=trial.record,
+            backend=BACKEND,
+            seed=0,
+        )
+        self._check(trial)
+        self.flows = frozenset(name for repeat in self._repeats for name in _flow_names(repeat))
+
+    def _distance(self) -> Distance:
+        """Return the horizontal distance of the sender from the relay, or from the receiver without one."""
+        starts = bodies(self._scenario, load_world(self._scenario.world))
+        other = self._agents.get(Role.RELAY, self._agents[Role.RECEIVER])
+        points_m = [starts[name].place_m[:2] for name in (self._agents[Role.SENDER], other)]
+        metres = round(math.dist(*points_m), 3)
+        return Distance(metres, f"{metres:g}m")
+
+    def _check(self, trial: ReproducedTrial) -> None:
+        procedure = trial.procedure
+        remedy = "change the scenario, or remove `trial` from it"
+        if self._trial.scenario != self._scenario.line:
+            raise ConfigurationError(
+                f"the procedure {procedure} is for {self._trial.scenario}, and the line of the scenario is "
+                f"{self._scenario.line}",
+                where=f"scenario {self._scenario.name}: trial.procedure",
+                remedy=remedy,
+            )
+        for repeat in self._repeats:
+            for what, planned, simulated in _settings(self._trial.exchange(repeat.protocol), repeat):
+                if planned != simulated:
+                    raise ConfigurationError(
+                        f"{what} is {simulated}, and {planned} in the procedure {procedure}",
+                        where=f"scenario {self._scenario.name}: trial.{repeat.protocol}",
+                        remedy=remedy,
+                    )
+
+    def rows(self, trial: str, number: int, result: SeedResult, recording: Path) -> Iterator[Mapping[str, Value]]:
+        """Yield the row of each protocol whose transfer has sent a packet.
+
+        Args:
+            trial: Name of the folder of all runs.
+            number: Number of the run, from 1.
+            result: The result of the run.
+            recording: The folder of its recording.
+        """
+        flows = {flow.name: flow for flow in result.flows}
+        identity: dict[str, Value] = {
+            "trial": trial,
+            "procedure": f"{self._trial.procedure} ({self._scenario.name}, {self._policy})",
+            "seed": result.seed,
+        }
+        for repeat in self._repeats:
+            transfer_name, ping_name, _ = _flow_names(repeat)
+            if (transfer := flows.get(transfer_name)) is None:
+                continue
+            ping = flows.get(ping_name)
+            reason = result.stopped or ("the run ended before the transfer" if transfer.under_way else "")
+            simulated = SimulatedRepeat(
+                repeat=RepeatId(repeat.protocol, number),
+                status=Status.FAILED if reason else Status.VALID,
+                reason=reason,
+                captures=self._captures(repeat, recording),
+                ping="" if ping is None or ping.round_trips is None else self._ping_text(repeat, ping.round_trips),
+                values=self._values(repeat, transfer, ping),
+            )
+            yield self._trial.row(simulated, identity)
+
+    def _captures(self, repeat: ReproducedRepeat, recording: Path) -> dict[Role, bytes]:
+        """Return the captures of both ends; an external network has none of IP packets as they were sent."""
+        if self._scenario.network.federate is not None:
+            return {}
+        paths = {role: recording / CAPTURES / f"{self._agents[role]}.pcap" for role in (Role.SENDER, Role.RECEIVER)}
+        return {
+            role: between(path.read_bytes(), repeat.begin_ns, repeat.end_ns)
+            for role, path in paths.items()
+            if path.exists()
+        }
+
+    def _ping_text(self, repeat: ReproducedRepeat, trips: FlowRoundTrips) -> str:
+        """Return the round trips of a ping as output of iputils `ping -n -D`."""
+        address, payload_bytes = self._addresses[repeat.ping.to[0]], repeat.ping.size_bytes
+        lines = [f"PING {address} ({address}) {payload_bytes}({payload_bytes + 28}) bytes of data."]
+        for sequence, at_ns, trip_s in trips.times:
+            seconds, microseconds = divmod(at_ns // 1000, 10**6)
+            lines.append(
+                f"[{seconds}.{microseconds:06}] {payload_bytes + 8} bytes from {address}: icmp_seq={sequence + 1} "
+                f"ttl={_TTL} time={1e3 * trip_s:.6f} ms"
+            )
+        lost = 1 - trips.answered / trips.sent if trips.sent else 0.0
+        summary = (
+            f"{trips.sent} packets transmitted, {trips.answered} received, {100 * lost:g}% packet loss, time 0ms"
+        )
+        return "\n".join((*lines, "", f"--- {address} ping statistics ---", summary, ""))
+
+    def _values(self, repeat: ReproducedRepeat, transfer: FlowResult, ping: FlowResult | None) -> dict[str, Value]:
+        """Return the columns that the simulation knows without evidence."""
+        sent_bytes = repeat.transfer.size_bytes
+        values: dict[str, Value] = {
+            "sent_bytes": sent_bytes,
+            "received_bytes": transfer.arrived_bytes,
+            "file_loss": 1 - transfer.arrived_bytes / sent_bytes,
+            **motion_columns("transfer", transfer),
+        }
+        if ping is not None:
+            values |= motion_columns("rtt", ping)
+        if repeat.protocol is Protocol.TCP and self._scenario.network.federate is None:
+            values["tcp_congestion_control"] = self._scenario.tcp.congestion
+        if repeat.protocol is Protocol.UDP:
+            values |= {
+                "datagrams_sent": transfer.sent,
+                "datagrams_received": transfer.arrived,
+                "datagram_loss": transfer.loss,
+            }
+        return values
+
+
+def _flow_names(repeat: ReproducedRepeat) -> tuple[str, str, str]:
+    """Return the names of the flows of the transfer, of the echo requests and of the replies."""
+    (transfer,), (ping,) = repeat.transfer.flows, repeat.ping.flows
+    return transfer, ping, ping + REPLY
+
+
+def _settings(planned: PlannedExchange, repeat: ReproducedRepeat) -> Iterator[tuple[str, float | None, float | None]]:
+    """Yield each setting of a repeat, with its value in the procedure and in the scenario."""
+    yield "the port of the transfer", planned.port, repeat.transfer.port
+    yield "the number of echo requests", planned.requests, repeat.ping.count
+    yield "the interval of echo requests in seconds", planned.interval_s, repeat.ping.interval
+    yield "the payload of an echo request in bytes", planned.payload_bytes, repeat.ping.size_bytes

@@ -1,0 +1,100 @@
+"""Runs in real time: each window ends at an absolute deadline of the wall clock, and lateness is counted.
+
+Sleeping for the length of each window would add the time of every computation to the duration of the run. A window
+that is late is therefore followed by windows without a pause until the run has caught up.
+"""
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Final
+
+from fieldkit.core.errors import EvidenceError
+from sim_backends.cosim.coordinator import Progress
+from sim_backends.cosim.federates import seconds_text
+from sim_backends.cosim.scenario.build import Simulation
+
+LATE_BOUND_S: Final = 0.1
+"""Default of the largest lateness, as `late_bound` of emulated robots."""
+
+
+class RealTimeError(EvidenceError):
+    """A run could not keep up with real time, so that its results are not those of a real-time run."""
+
+
+@dataclass
+class Lateness:
+    """Lateness of the windows of a run: wall time from the deadline of a window until its end was computed.
+
+    Attributes:
+        windows: Number of windows by the upper limit of their lateness in nanoseconds: 0 for windows in time,
+            otherwise 1, 2 or 5 times a power of ten.
+        largest_ns: Largest lateness, in nanoseconds.
+    """
+
+    windows: Counter[int] = field(default_factory=Counter)
+    largest_ns: int = 0
+
+    def add(self, late_ns: int) -> None:
+        """Count a window; a negative lateness is the time left until its deadline."""
+        self.windows[_limit_ns(late_ns)] += 1
+        self.largest_ns = max(self.largest_ns, late_ns)
+
+
+_SHORTEST_NS: Final = 100_000
+"""Smallest limit above 0; a sleeping process is woken up with about this lateness."""
+
+
+def _limit_ns(late_ns: int) -> int:
+    if late_ns <= 0:
+        return 0
+    decade_ns = _SHORTEST_NS
+    while late_ns > 5 * decade_ns:
+        decade_ns *= 10
+    return next(factor * decade_ns for factor in (1, 2, 5) if late_ns <= factor * decade_ns)
+
+
+@dataclass(frozen=True)
+class Pace:
+    """The pace of a run.
+
+    Attributes:
+        factor: Simulated seconds per second of wall time, above 0.
+        late_bound_s: Largest lateness, in seconds of wall time; a run with a later window is stopped.
+    """
+
+    factor: float
+    late_bound_s: float = LATE_BOUND_S
+
+    def run(self, simulation: Simulation, lateness: Lateness, progress: Progress | None = None) -> None:
+        """Run a simulation until its end; the deadline of the time t is the start of the run plus t / factor.
+
+        Args:
+            simulation: The simulation at time 0.
+            lateness: Receives the lateness of each window.
+            progress: As for `Simulation.run`, but called after every window.
+
+        Raises:
+            RealTimeError: A window was later than the bound.
+            FieldkitError: As `Simulation.run`.
+        """
+        coordinator, end_ns = simulation.coordinator, simulation.scenario.duration_ns
+        bound_ns = round(self.late_bound_s * 1e9)
+        started_ns = time.monotonic_ns()
+        while (now_ns := coordinator.situation.now_ns) < end_ns:
+            coordinator.advance(end_ns, max_windows=1)
+            ended_ns, wall_ns = coordinator.situation.now_ns, time.monotonic_ns()
+            if ended_ns == now_ns:
+                continue  # an empty window has the deadline of the one before
+            late_ns = wall_ns - started_ns - round(ended_ns / self.factor)
+            lateness.add(late_ns)
+            if progress is not None:
+                progress(ended_ns, (wall_ns - started_ns) / 1e9)
+            if late_ns > bound_ns:
+                raise RealTimeError(
+                    f"the run could not keep up with real time: the window that ends at {seconds_text(ended_ns)} was "
+                    f"{late_ns / 1e9:.3f} s late, and the bound is {self.late_bound_s:g} s",
+                    remedy="use a lower --realtime, a longer window, or a less busy machine",
+                )
+            if late_ns < 0:
+                time.sleep(-late_ns / 1e9)

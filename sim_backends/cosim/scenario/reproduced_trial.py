@@ -1,0 +1,115 @@
+"""The trial of robots that a scenario reproduces, so that both can be compared: its section of a scenario file."""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Annotated, NamedTuple
+
+from fieldkit.config import schema
+from fieldkit.config.schema import Duration, Field, Location, Strict
+from fieldkit.core.errors import did_you_mean
+from fieldkit.core.model import Protocol
+from sim_backends.cosim.scenario.agent_plans import FileTraffic, Name, PingTraffic, Traffic
+
+
+class ReproducedFlows(Strict):
+    """The traffic that reproduces the steps of a procedure under one protocol.
+
+    Attributes:
+        transfer: Name of the traffic of kind `file` that is the transfer.
+        ping: Name of the traffic of kind `ping` that is the ping.
+    """
+
+    transfer: Name
+    ping: Name
+
+
+class ReproducedTrial(Strict):
+    """The trial of robots that a scenario reproduces.
+
+    A run with `--out` has a row for each protocol, with the columns of this trial, measured from captures as in a
+    trial of robots. The traffic must agree with the procedure: port of the transfer, number, interval and size of
+    the echo requests. Topology, line, robots and distance are those of the scenario.
+
+    Attributes:
+        procedure: Name of the procedure.
+        record: Duration of every recording, as by `--record` of `fieldkit trial`; omitted, that of the procedure.
+        tcp: The traffic under TCP.
+        udp: The traffic under UDP.
+    """
+
+    procedure: str
+    record: Annotated[Duration | None, Field(gt=0)] = None
+    tcp: ReproducedFlows | None = None
+    udp: ReproducedFlows | None = None
+
+    @schema.model_validator(mode="after")
+    def _has_a_protocol(self) -> "ReproducedTrial":
+        if not self.flows:
+            raise schema.validation_error(
+                "name the traffic of at least one protocol: udp: {transfer: ..., ping: ...}"
+            )
+        return self
+
+    @property
+    def flows(self) -> dict[Protocol, ReproducedFlows]:
+        """The traffic by protocol."""
+        flows = {Protocol.TCP: self.tcp, Protocol.UDP: self.udp}
+        return {protocol: chosen for protocol, chosen in flows.items() if chosen is not None}
+
+    def problems(self, traffic: Sequence[Traffic]) -> Iterator[tuple[str, Location]]:
+        """Yield each contradiction to the traffic of its scenario, with the keys of the wrong value."""
+        by_name = {entry.title: entry for entry in traffic}
+        ends: set[tuple[str, ...]] = set()
+        for protocol, flows in self.flows.items():
+            chosen = {"transfer": (flows.transfer, "file", protocol.value), "ping": (flows.ping, "ping", "udp")}
+            for key, (name, kind, transport) in chosen.items():
+                entry = by_name.get(name)
+                if entry is None:
+                    hint = did_you_mean(name, by_name, f"traffic: {', '.join(by_name)}")
+                    yield f"there is no traffic {name!r}; {hint}", (protocol.value, key)
+                    return
+                ends.add((entry.source, *entry.to))
+                if (entry.kind, entry.protocol) != (kind, transport) or len(entry.to) > 1 or len(ends) > 1:
+                    yield f"{name} is not a {kind} by {transport} between the same two agents", (protocol.value, key)
+                    return
+        spans = [
+            sorted(by_name[name].start for name in (flows.transfer, flows.ping)) for flows in self.flows.values()
+        ]
+        spans.sort()
+        if any(earlier[-1] >= later[0] for earlier, later in pairwise(spans)):
+            yield "the traffic of one protocol starts before that of the other has started completely", ()
+
+    def repeats(self, traffic: Sequence[Traffic], duration_ns: int) -> tuple["ReproducedRepeat", ...]:
+        """Return the part of a run for each protocol, in order of time.
+
+        Args:
+            traffic: The traffic of the scenario.
+            duration_ns: Its duration.
+        """
+        by_name = {entry.title: entry for entry in traffic}
+        chosen = [(protocol, by_name[flows.transfer], by_name[flows.ping]) for protocol, flows in self.flows.items()]
+        begins_ns = [round(min(transfer.start, ping.start) * 1e9) for _, transfer, ping in chosen]
+        ends_ns = [min((later for later in begins_ns if later > begin), default=duration_ns) for begin in begins_ns]
+        return tuple(
+            ReproducedRepeat(protocol, transfer, ping, begin_ns, end_ns)
+            for (protocol, transfer, ping), begin_ns, end_ns in zip(chosen, begins_ns, ends_ns, strict=True)
+            if isinstance(transfer, FileTraffic) and isinstance(ping, PingTraffic)  # guaranteed by `problems`
+        )
+
+
+class ReproducedRepeat(NamedTuple):
+    """The part of a run that reproduces the repeat of one protocol.
+
+    Attributes:
+        protocol: The protocol.
+        transfer: The traffic that is the transfer.
+        ping: The traffic that is the ping.
+        begin_ns: Simulated time at which the first of them starts.
+        end_ns: Simulated time at which the next repeat starts, or the run ends.
+    """
+
+    protocol: Protocol
+    transfer: FileTraffic
+    ping: PingTraffic
+    begin_ns: int
+    end_ns: int

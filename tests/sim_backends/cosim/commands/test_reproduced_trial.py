@@ -1,0 +1,82 @@
+"""A scenario that reproduces a trial of robots: its rows against scapy's counts of its captures, and its errors."""
+
+from pathlib import Path
+
+import pytest
+from scapy.layers.inet import ICMP, IP, TCP, UDP
+from scapy.utils import PcapReader
+
+from fieldkit.core.model import Topology
+from sim_backends.cosim import load_scenario
+from sim_backends.cosim.commands.reproduced_rows import ReproducedRows
+from tests.helpers.runs import Run, rows, run_here
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
+    """Return the folder of a run of the shipped scenario, and its output."""
+    folder = tmp_path_factory.mktemp("field")
+    ran = run_here(folder, "cosim", "run", "field_30ft", "--out", "simulated")
+    assert ran.code == 0, ran.err
+    return folder / "simulated", ran
+
+
+def test_rows_have_the_identity_and_the_columns_of_the_trial(run: tuple[Path, Run]) -> None:
+    folder, _ = run
+    tcp, udp = rows(folder)
+    assert [row["protocol"] for row in (tcp, udp)] == ["tcp", "udp"], "the order of a trial"
+    for row in (udp, tcp):
+        identity = [row[name] for name in ("scenario", "topology", "distance_m", "backend", "status")]
+        assert identity == ["los", "master", "9.144", "cosim", "valid"]
+        assert row["sent_bytes"] == row["received_bytes"] == "230989"
+    assert "started_utc_ns" not in udp
+
+    frames = list(PcapReader(str(folder / "captures" / "sender.pcap")))
+    segments = sum(TCP in frame and frame[TCP].dport == 1234 for frame in frames)
+    assert int(tcp["ip_packets_sent"]) == int(tcp["paper_packets"]) == segments
+    fragments = [frame for frame in frames if frame[IP].proto == 17]
+    assert int(udp["ip_packets_sent"]) == len(fragments)
+    assert int(udp["datagrams_sent"]) == sum(UDP in frame for frame in fragments) == 29
+
+    for row, payload_bytes in ((udp, 8192), (tcp, 502)):
+        requests = {
+            frame[ICMP].seq: frame.time
+            for frame in frames
+            if ICMP in frame and frame[ICMP].type == 8 and row["rtt_payload_bytes"] == str(payload_bytes)
+        }
+        assert int(row["rtt_sent"]) == len(requests) == 10
+
+
+def test_a_part_of_the_run_has_the_rows_of_what_was_sent(tmp_path: Path) -> None:
+    ran = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "short", "--duration", "600ms")
+    assert ran.code == 0, ran.err
+    (row,) = rows(tmp_path / "short")
+    assert (row["protocol"], row["status"], row["reason"]) == ("udp", "failed", "the run ended before the transfer")
+    assert "rtt_loss" not in row
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"line": "nlos"}, "the procedure los is for los, and the line of the scenario is nlos"),
+        ({"traffic.1.count": "5"}, "the number of echo requests is 5, and 10 in the procedure los"),
+        ({"traffic.0.port": "1235"}, "the port of the transfer is 1235, and 1234 in the procedure los"),
+        ({"trial.procedure": "topics"}, "a simulation cannot reproduce the procedure"),
+        ({"trial.udp.ping": "ping"}, "there is no traffic 'ping'; did you mean"),
+        ({"trial.udp.ping": "scan-udp"}, "scan-udp is not a ping by udp"),
+        ({"traffic.2.start": "6s"}, "the traffic of one protocol starts before that of the other"),
+    ],
+)
+def test_a_contradiction_to_the_procedure_is_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+    options = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
+    ran = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "run", "--duration", "10ms", *options)
+    assert ran.code == 2
+    assert message in ran.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_distance_is_that_of_the_trial_in_each_topology() -> None:
+    for topology, distance_m in ((Topology.MASTER, 9.144), (Topology.MASTERLESS, 18.288)):
+        scenario = load_scenario("field_30ft", {"topology": topology})
+        assert scenario.trial is not None
+        assert ReproducedRows(scenario, scenario.trial, "event_driven")._distance().metres == distance_m
