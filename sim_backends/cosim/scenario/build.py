@@ -111,6 +111,15 @@ def _qos(traffic: Traffic) -> Qos:
 
 
 def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:
+    """Yield the disturbances by faults; the radio of an agent that is absent is off."""
+    stations = antennas(scenario)
+    for name, lifetime in scenario.lifetimes.items():
+        if name not in stations:
+            continue
+        if lifetime.appears_ns:
+            yield NodeLoss(name, 0, lifetime.appears_ns)
+        if lifetime.disappears_ns is not None:
+            yield NodeLoss(name, lifetime.disappears_ns)
     for fault in scenario.faults:
         match fault:
             case NodeLossFault():
@@ -212,7 +221,7 @@ def build(
         if network is None and (network := open_network(*details)) is not None:
             federates.callback(getattr(network, "close", _nothing_to_close))
         if physics is None:
-            physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
+            physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns, lifetimes=scenario.lifetimes)
         if network is None:
             network = radio_network(scenario, world, seed, recorder)
         for fault in scenario.faults:
@@ -225,7 +234,9 @@ def build(
         scenario_programs = programs(
             scenario, seed, controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
         )
-        agents = Agents(physics, scenario_programs)
+        lifetimes = scenario.lifetimes
+        starts = Bodies(scenario_bodies, world, lifetimes=lifetimes).start_states() if lifetimes else {}
+        agents = Agents(physics, scenario_programs, lifetimes, starts)
         coordinator = Coordinator(
             agents, network, policy, scenario.pairs, observer=recorder, measures_all=measures_all
         )

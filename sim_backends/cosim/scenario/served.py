@@ -32,7 +32,7 @@ def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or
     scenario = CosimScenario.model_validate(configuration["scenario"])
     world = World.model_validate(configuration["world"])
     if role == PHYSICS:
-        return Bodies(bodies(scenario, world), world, step_ns=hello.step_ns)
+        return Bodies(bodies(scenario, world), world, step_ns=hello.step_ns, lifetimes=scenario.lifetimes)
     return radio_network(scenario, world, hello.seed)
 
 
