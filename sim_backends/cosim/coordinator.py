@@ -23,8 +23,8 @@ from sim_backends.world.motion import DeadReckoned, State
 _MAX_EMPTY_WINDOWS: Final = 1000
 """Number of successive windows of length 0 after which the policy has failed."""
 _PROGRESS_EVERY_S: Final = 0.2
-_NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate]]] = (), (), ()
-"""A window without packets: the fates of packets that enter, these packets, and the fates decided in it."""
+_NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate], Sequence[Fate]]] = (), (), (), ()
+"""A window without packets, see `Coordinator._enter`, and the fates decided in it."""
 
 Progress = Callable[[int, float], None]
 """Called with the simulated nanoseconds so far, and the wall seconds since the start of `advance`."""
@@ -177,9 +177,9 @@ class Coordinator:
                 assumed = states if uses_end_states else situation.states
                 if agents.has_changed:
                     assumed = agents.with_changes(assumed, end=states)
-            entered, packets, ended = _NOTHING
+            entered, packets, dropped, ended = _NOTHING
             if sent or self._deferred:
-                entered, packets = self._enter(sent, begin_ns, assumed)
+                entered, packets, dropped = self._enter(sent, begin_ns, assumed)
                 lap("exchange")
             try:
                 arrivals, drops = network.advance(last_ns, packets, assumed)
@@ -189,8 +189,9 @@ class Coordinator:
             lap("network")
             self.is_committing = is_observed
             if entered or arrivals or drops or agents.absent:
-                ended = self._record_outcomes(arrivals, drops, begin_ns, last_ns, end_ns)
-                ended += self._drop_absent(entered)
+                ended = [*dropped, *self._record_outcomes(arrivals, drops, begin_ns, last_ns, end_ns)]
+                if agents.absent:
+                    ended += self._ledger.withdraw(agents.absent)
                 self._digest.add_window(end_ns, entered, ended)
             else:
                 quiet_ends_ns.append(end_ns)
@@ -292,8 +293,12 @@ class Coordinator:
 
     def _enter(
         self, sent: Sequence[Sent], begin_ns: int, assumed: Mapping[str, State]
-    ) -> tuple[Sequence[Fate], Sequence[Packet]]:
-        """Record packets that enter in a window: those sent in it or, if sends are deferred, in the one before."""
+    ) -> tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate]]:
+        """Record packets that enter in a window: those sent in it or, if sends are deferred, in the one before.
+
+        Returns:
+            Their fates; the packets that the network must carry; the fates of the others, which are dropped.
+        """
         if self.policy.defers_sends:
             sent, self._deferred = self._deferred, sent
         elif self._deferred:
@@ -304,7 +309,8 @@ class Coordinator:
             source, destination = fate.packet.source, fate.packet.destination
             if source not in self._active or destination not in self._active:
                 self._add_active(source, destination)
-        return entered, [fate.packet for fate in entered if not fate.reason]
+        carried = [fate.packet for fate in entered if not fate.reason]
+        return entered, carried, [] if len(carried) == len(entered) else [fate for fate in entered if fate.reason]
 
     def _add_active(self, *names: str) -> None:
         """Add agents that send or receive but are not in `pairs`, so that policies that look ahead include them."""
@@ -317,9 +323,9 @@ class Coordinator:
         situation = self.situation
         situation.pairs, situation.other_agents = self._pairs, self._other_agents
         if self._agents.has_changed:
-            present = situation.states.keys()
+            present = set(situation.states)
             if situation.assumed is not None:
-                present = present & situation.assumed.keys()
+                present &= situation.assumed.keys()
             situation.pairs = tuple(pair for pair in self._pairs if present >= {*pair})
             situation.other_agents = tuple(name for name in self._other_agents if name in present)
 
@@ -350,13 +356,6 @@ class Coordinator:
                 fate.reason = ABSENT
             ended.append(fate)
         return ended
-
-    def _drop_absent(self, entered: Sequence[Fate]) -> list[Fate]:
-        """Return the fates of packets from or to absent agents: those that entered, and those under way."""
-        dropped = [fate for fate in entered if fate.reason]
-        if absent := self._agents.absent:
-            dropped += self._ledger.withdraw(absent)
-        return dropped
 
     def _notify(
         self,
