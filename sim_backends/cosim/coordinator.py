@@ -174,9 +174,7 @@ class Coordinator:
                 last_ns = end_ns if uses_end_states else end_ns - 1
                 sent, states = agents.advance(begin_ns, last_ns, end_ns)
                 lap("agents")
-                assumed = states if uses_end_states else situation.states
-                if agents.has_changed:
-                    assumed = agents.with_changes(assumed, end=states)
+                assumed = agents.with_changes(states if uses_end_states else situation.states, end=states)
             entered, packets, dropped, ended = _NOTHING
             if sent or self._deferred:
                 entered, packets, dropped = self._enter(sent, begin_ns, assumed)
@@ -190,15 +188,12 @@ class Coordinator:
             self.is_committing = is_observed
             if entered or arrivals or drops or agents.absent:
                 ended = [*dropped, *self._record_outcomes(arrivals, drops, begin_ns, last_ns, end_ns)]
-                if agents.absent:
-                    ended += self._ledger.withdraw(agents.absent)
                 self._digest.add_window(end_ns, entered, ended)
             else:
                 quiet_ends_ns.append(end_ns)
             windows_ns.append(end_ns)
             situation.now_ns, situation.states = end_ns, states
-            if agents.has_changed:
-                self._select_present()
+            self._select_present()
             if is_observed:
                 lap("exchange")
                 self._notify(begin_ns, entered, ended, assumed, report=report)
@@ -272,8 +267,7 @@ class Coordinator:
         """Set the situation to a time within a window that the agents have reached before the network."""
         situation = self.situation
         situation.now_ns, situation.states, situation.assumed = now_ns, states, assumed
-        if self._agents.has_changed:
-            self._select_present()
+        self._select_present()
         is_pending = sent or self._deferred or self._agents.has_undelivered
         situation.next_send_ns = now_ns if is_pending else self._agents.next_send_ns()
 
@@ -315,24 +309,27 @@ class Coordinator:
     def _add_active(self, *names: str) -> None:
         """Add agents that send or receive but are not in `pairs`, so that policies that look ahead include them."""
         self._active.update(names)
-        self._other_agents = tuple(sorted({*self._other_agents, *names}))
+        self.situation.other_agents = self._other_agents = tuple(sorted({*self._other_agents, *names}))
         self._select_present()
 
     def _select_present(self) -> None:
-        """Set the pairs and the other agents of the situation to those that are present."""
+        """Set the pairs and the other agents of the situation to those that are present, if some have been absent."""
+        if not self._agents.has_changed:
+            return
         situation = self.situation
-        situation.pairs, situation.other_agents = self._pairs, self._other_agents
-        if self._agents.has_changed:
-            present = set(situation.states)
-            if situation.assumed is not None:
-                present &= situation.assumed.keys()
-            situation.pairs = tuple(pair for pair in self._pairs if present >= {*pair})
-            situation.other_agents = tuple(name for name in self._other_agents if name in present)
+        present = set(situation.states)
+        if situation.assumed is not None:
+            present &= situation.assumed.keys()
+        situation.pairs = tuple(pair for pair in self._pairs if present >= {*pair})
+        situation.other_agents = tuple(name for name in self._other_agents if name in present)
 
     def _record_outcomes(
         self, arrivals: Sequence[Arrival], drops: Sequence[Drop], begin_ns: int, last_ns: int, end_ns: int
     ) -> list[Fate]:
-        """Record the arrivals and drops of a window, and deliver the datagrams that arrived."""
+        """Record the arrivals and drops of a window, and deliver the datagrams that arrived.
+
+        Packets from and to agents that are absent at the end of the window are dropped.
+        """
         ended, agents, ledger = [], self._agents, self._ledger
         for arrival in arrivals:
             if ledger.is_withdrawn(arrival.packet_id):
@@ -355,6 +352,8 @@ class Coordinator:
             if agents.absent and agents.is_absent((fate.packet.source, fate.packet.destination), end_ns):
                 fate.reason = ABSENT
             ended.append(fate)
+        if agents.absent:
+            ended += ledger.withdraw(agents.absent)
         return ended
 
     def _notify(

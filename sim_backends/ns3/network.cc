@@ -49,7 +49,8 @@ class Network
         }
         protocol::Welcome welcome;
         welcome.role = protocol::kNetwork;
-        welcome.capabilities = protocol::kDeterministic | protocol::kNextEvent | protocol::kExtrapolates;
+        welcome.capabilities = protocol::kDeterministic | protocol::kNextEvent | protocol::kExtrapolates |
+                               protocol::kAgentsDisappear;
         welcome.step_ns = hello.step_ns;
         welcome.next_event_ns = NextEventNs();
         welcome.configuration_hash = hello.configuration_hash;
@@ -95,6 +96,7 @@ class Network
         int64_t since_ns = request.since_ns;
         int64_t reckoning_ns = request.reckoning_ns;
         m_toNs = request.to_ns;
+        std::vector<bool> present(m_stations.size());
         for (const protocol::State& state : request.states)
         {
             uint32_t agent = state.agent;
@@ -106,6 +108,7 @@ class Network
             {
                 continue; // it has no radio
             }
+            present[m_stationOf[agent]] = true;
             auto mobility = m_stations[m_stationOf[agent]].mobility;
             Vector position = VectorOf(state.position_m);
             Vector velocity = VectorOf(state.velocity_m_s);
@@ -118,6 +121,23 @@ class Network
             else
             {
                 mobility->Move(position, velocity, since_ns, reckoning_ns);
+            }
+        }
+        for (size_t number = 0; number < m_stations.size(); number++)
+        {
+            if (present[number] == m_stations[number].is_present)
+            {
+                continue;
+            }
+            m_stations[number].is_present = present[number];
+            int by = present[number] ? -1 : 1;
+            if (is_ahead && from_ns > NowNs())
+            {
+                Simulator::Schedule(NanoSeconds(from_ns - NowNs()), [this, number, by] { SwitchOff(number, by); });
+            }
+            else
+            {
+                SwitchOff(number, by);
             }
         }
         for (const protocol::Packet& packet : request.packets)
@@ -193,7 +213,43 @@ class Network
         {
             AddFault(fault);
         }
+        for (size_t number = 0; number < m_stations.size(); number++)
+        {
+            AddLifetime(number, scenario.at("agents").at(m_stations[number].name));
+        }
         RunUntil(-1);
+    }
+
+    // Switch the radio of a station off (1), or on again (-1).
+    void SwitchOff(size_t station, int by)
+    {
+        for (size_t other = 0; other < m_stations.size(); other++)
+        {
+            if (other != station)
+            {
+                m_channel->Cut(station, other, by);
+            }
+        }
+        m_stations[station].off += by;
+    }
+
+    static Time At(const Json& seconds)
+    {
+        return NanoSeconds(g_start_ns + std::llround(Number(seconds) * 1e9));
+    }
+
+    // The radio of an agent is off before it appears, and after it has disappeared.
+    void AddLifetime(size_t station, const Json& plan)
+    {
+        if (plan.contains("appears") && Number(plan["appears"]) > 0)
+        {
+            SwitchOff(station, 1);
+            Simulator::Schedule(At(plan["appears"]), [this, station] { SwitchOff(station, -1); });
+        }
+        if (plan.contains("disappears"))
+        {
+            Simulator::Schedule(At(plan["disappears"]), [this, station] { SwitchOff(station, 1); });
+        }
     }
 
     void ReadOptions(uint64_t seed, const Json& options, const Json& scenario)
@@ -293,38 +349,25 @@ class Network
         {
             throw Refusal("ns-3 has no jammers: remove the fault");
         }
-        std::vector<std::pair<size_t, size_t>> pairs;
-        int off = -1;
+        std::function<void(int)> change;
         if (kind == "link-cut")
         {
-            pairs.emplace_back(StationNamed(fault.at("between")[0]), StationNamed(fault.at("between")[1]));
+            size_t first = StationNamed(fault.at("between")[0]), second = StationNamed(fault.at("between")[1]);
+            change = [this, first, second](int by) { m_channel->Cut(first, second, by); };
         }
         else if (kind == "node-loss")
         {
-            off = static_cast<int>(StationNamed(fault.at("agent")));
-            for (size_t other = 0; other < m_stations.size(); other++)
-            {
-                if (other != static_cast<size_t>(off))
-                {
-                    pairs.emplace_back(off, other);
-                }
-            }
+            size_t station = StationNamed(fault.at("agent"));
+            change = [this, station](int by) { SwitchOff(station, by); };
         }
-        auto change = [this, pairs, off](int by) {
-            for (const auto& [a, b] : pairs)
-            {
-                m_channel->Cut(a, b, by);
-            }
-            if (off >= 0)
-            {
-                m_stations[off].off += by;
-            }
-        };
-        auto at = [](const Json& seconds) { return NanoSeconds(g_start_ns + std::llround(Number(seconds) * 1e9)); };
-        Simulator::Schedule(at(fault.at("from")), [change] { change(1); });
+        else
+        {
+            return; // not a fault of radios
+        }
+        Simulator::Schedule(At(fault.at("from")), [change] { change(1); });
         if (fault.contains("to"))
         {
-            Simulator::Schedule(at(fault.at("to")), [change] { change(-1); });
+            Simulator::Schedule(At(fault.at("to")), [change] { change(-1); });
         }
     }
 

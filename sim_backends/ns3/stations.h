@@ -119,7 +119,8 @@ struct Station
     uint32_t agent = 0;
     double tx_power_dbm = 0;
     double sensitivity_dbm = 0;
-    int off = 0; // number of faults that have switched it off
+    int off = 0; // number of faults and absences that have switched it off
+    bool is_present = true; // in the last states
     Ptr<Node> node;
     Ptr<AgentMobility> mobility;
     Ptr<WifiNetDevice> device;

@@ -73,22 +73,26 @@ def simulate(
         progress: As for `Simulation.run`.
         deadline_s: As for `build`.
     """
-    recorder = None if folder is None else RunRecorder(folder.recording(seed), _run_settings(scenario, policy, seed))
+    recorder = None
+    if folder is not None:
+        settings = _run_settings(scenario, policy, seed)
+        recorder = RunRecorder(folder.recording(seed), settings, agents=scenario.lifetimes)
     samples = StateSamples(recorder) if has_followers(scenario) else None
     observer: WindowObserver | None = samples or recorder
     publisher: EmaneObserver | nullcontext[None] = nullcontext()
     if scenario.emane is not None:
         observer = publisher = emane_observer(scenario, seed, observer)
     simulation = build(scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s)
-    states_at_start = [(0, name, state) for name, state in simulation.agents.states(0).items()]
+    agents = simulation.agents
+    starts = {name: absence.state for name, absence in agents.absent.items()} | dict(agents.states(0).items())
     ended_by: FieldkitError | KeyboardInterrupt | None = None
     try:
         with simulation, publisher, recorder or nullcontext(), between_windows(simulation.coordinator):
             simulation.run(progress=progress)
     except (FieldkitError, KeyboardInterrupt) as error:
         ended_by = error
-    states = states_at_start if samples is None else samples.states
-    result = seed_result(scenario, seed, simulation.coordinator.run, states, ended_by)
+    states = [] if samples is None else samples.states
+    result = seed_result(scenario, seed, simulation.coordinator.run, states, ended_by=ended_by, starts=starts)
     if folder is not None:
         try:
             folder.write_rows(result)
