@@ -179,6 +179,11 @@ class Network
         RngSeedManager::SetSeed(1);
         RngSeedManager::SetRun(seed);
         AddStations(agents, configuration.at("robots"));
+        if (!m_setup.pcap.empty() && !m_stations.empty())
+        {
+            std::ofstream first; // ns-3 aborts if it cannot open a file
+            OpenNew(first, m_setup.pcap + m_stations[0].name + ".pcap", "pcap");
+        }
         m_setup.mode = radio.value("mode", "");
         if (m_setup.mode.substr(0, 1) == "n" && m_setup.standard != "802.11n")
         {
@@ -271,24 +276,18 @@ class Network
             }
             else if (name == "delay_parts" && value.is_string())
             {
-                std::string path = value;
-                auto place = path.find("{seed}");
-                if (place != std::string::npos)
-                {
-                    path.replace(place, 6, std::to_string(seed));
-                }
-                m_parts.open(path, std::ios::trunc);
-                if (!m_parts)
-                {
-                    throw Refusal("the file of delay_parts cannot be written: " + path);
-                }
+                OpenNew(m_parts, OutputPath(value, seed), name);
                 m_parts << "flow,number,delay_ns,processing_ns,queueing_ns,transmission_ns,propagation_ns\n";
+            }
+            else if (name == "pcap" && value.is_string())
+            {
+                m_setup.pcap = OutputPath(value, seed);
             }
             else
             {
                 throw Refusal("the option " + name + ": " + value.dump() +
                               " is not one of standard: 802.11a, 802.11g or 802.11n; ampdu_bytes: 0 to 65535; topics: "
-                              "udp; delay_parts: FILE");
+                              "udp; delay_parts: FILE; pcap: BEGINNING OF FILES");
             }
         }
         for (const Json& traffic : scenario.at("traffic"))
@@ -300,6 +299,26 @@ class Network
                 throw Refusal("topics: udp carries best_effort topics only, and those of " +
                               traffic.at("from").get<std::string>() + " are reliable");
             }
+        }
+    }
+
+    // A path in which {seed} is replaced by the seed.
+    static std::string OutputPath(std::string path, uint64_t seed)
+    {
+        auto place = path.find("{seed}");
+        if (place != std::string::npos)
+        {
+            path.replace(place, 6, std::to_string(seed));
+        }
+        return path;
+    }
+
+    static void OpenNew(std::ofstream& file, const std::string& path, const std::string& option)
+    {
+        file.open(path, std::ios::trunc);
+        if (!file)
+        {
+            throw Refusal("the file of " + option + " cannot be written: " + path);
         }
     }
 

@@ -15,6 +15,7 @@ from sim_backends.cosim.coordinator import Coordinator, Progress
 from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.recording.captures import PacketObserver
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import QosOptions, Traffic
 from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
@@ -198,7 +199,8 @@ def build(
         scenario: The scenario.
         policy: A sync policy or the name of one; None for the scenario's.
         seed: Seed of all random draws; None for the scenario's first.
-        recorder: Receives every window, and every IP packet if it has `log_ip`; or None.
+        recorder: Receives every window, and every IP packet if it has `log_ip`; or None. With another network it
+            receives the programs' packets as IP packets.
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         physics: Replaces the scenario's physics, and receives the commands to bodies.
         network: Replaces the scenario's network; faults of the radio are then its responsibility.
@@ -224,6 +226,8 @@ def build(
             physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns, lifetimes=scenario.lifetimes)
         if network is None:
             network = radio_network(scenario, world, seed, recorder)
+        elif isinstance(recorder, IpObserver):
+            recorder = PacketObserver(recorder, recorder.log_ip)
         for fault in scenario.faults:
             if isinstance(fault, StalledFederateFault):
                 stall = Stall(fault.begin_ns, fault.stall, deadline_s)
