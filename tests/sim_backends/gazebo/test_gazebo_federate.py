@@ -226,6 +226,6 @@ def test_a_gazebo_that_ends_or_is_suspended_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize("lifetime", ["appears", "disappears"])
 def test_robots_that_appear_or_disappear_are_refused_before_the_run(lifetime: str, server: GazeboServer) -> None:
     changes = {f"agents.leader.{lifetime}": "3s"}
-    with pytest.raises(FederateError, match="remove appears and disappears of leader"):
-        with connected(server, {}, changes):
-            pass
+    refusal = pytest.raises(FederateError, match="remove appears and disappears of leader")
+    with refusal, connected(server, {}, changes):
+        pass
