@@ -63,6 +63,9 @@ class PhysicsFederate(Protocol):
     If an attribute `agents_disappear` is True, an agent may be missing in the states: it has disappeared, and may
     appear again. Otherwise that ends the run.
 
+    If it has an attribute `path_losses_db`, with mean losses in dB by transmitter and receiver, the radio of the
+    built-in network uses these instead of the losses of the world.
+
     Attributes:
         step_ns: Time step; there are states at whole steps only.
         limits_m_s2: Largest change of each agent's velocity per second, in m/s^2. The mapping is read once; its

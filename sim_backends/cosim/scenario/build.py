@@ -37,7 +37,7 @@ from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.udp import Udp
 from sim_backends.physics.bodies import Bodies
 from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.model import PathLosses, RadioModel, WifiInWorld
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.world import World, load_world
 
@@ -47,7 +47,11 @@ so would all retransmissions."""
 
 
 def radio_network(
-    scenario: CosimScenario, world: World, seed: int, observer: WindowObserver | None = None
+    scenario: CosimScenario,
+    world: World,
+    seed: int,
+    observer: WindowObserver | None = None,
+    path_losses_db: PathLosses | None = None,
 ) -> RadioNetwork:
     """Return the network that carries the packets of a scenario, which must have passed `checks`.
 
@@ -56,12 +60,13 @@ def radio_network(
         world: Its world.
         seed: Seed of all random draws.
         observer: Receives all IP packets if it has `log_ip`.
+        path_losses_db: As for `WifiInWorld`; fixed links ignore them.
     """
     stations = antennas(scenario)
     radio: RadioModel[Fragment] = (
         UniformLinks(seed, scenario.radio)
         if scenario.radio.fixed
-        else WifiInWorld(seed, scenario.radio, stations, world)
+        else WifiInWorld(seed, scenario.radio, stations, world, path_losses_db=path_losses_db)
     )
     network = RadioNetwork(
         radio,
@@ -225,7 +230,8 @@ def build(
         if physics is None:
             physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns, lifetimes=scenario.lifetimes)
         if network is None:
-            network = radio_network(scenario, world, seed, recorder)
+            losses_db = partial(getattr, physics, "path_losses_db") if hasattr(physics, "path_losses_db") else None
+            network = radio_network(scenario, world, seed, recorder, losses_db)
         elif isinstance(recorder, IpObserver):
             recorder = PacketObserver(recorder, recorder.log_ip)
         for fault in scenario.faults:
