@@ -1,8 +1,11 @@
 """The agents of a co-simulation: the bodies that the physics moves, and the programs that run on them."""
 
 import heapq
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
+
+from typing_extensions import override
 
 from sim_backends.cosim.federates import (
     FederateError,
@@ -13,7 +16,7 @@ from sim_backends.cosim.federates import (
     seconds_text,
 )
 from sim_backends.network.packets import Datagram, Received
-from sim_backends.world.motion import State
+from sim_backends.world.motion import Lifetime, State
 
 
 class Sent(NamedTuple):
@@ -32,15 +35,58 @@ class Sent(NamedTuple):
     states: Mapping[str, State]
 
 
+class Absence(NamedTuple):
+    """The absence of an agent, before it appears or after it has disappeared.
+
+    Attributes:
+        since_ns: Time from which on it is absent.
+        state: The last state of its body, at rest, or its start.
+    """
+
+    since_ns: int
+    state: State
+
+
+class _PresentStates(Mapping[str, State]):
+    """States without those of absent agents."""
+
+    def __init__(self, states: Mapping[str, State], names: Mapping[str, None]) -> None:
+        self._states = states
+        self._names = names
+
+    def __getitem__(self, name: str) -> State:
+        if name not in self._names:
+            raise KeyError(name)
+        return self._states[name]
+
+    @override
+    def keys(self) -> KeysView[str]:
+        return self._names.keys()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
 _MAX_WAKES_AT_ONE_TIME: Final = 1000
+_ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
+_CHANGE: Final = ""
+"""Name in the queue of the next time at which a lifetime begins or ends; it is before all names of agents."""
 
 
 class Agents:
     """Advances bodies and programs together. A program reads the state of its body at the current time in any window.
 
+    An agent is absent outside of its lifetime, and while the physics, if its attribute `agents_disappear` is True,
+    returns no state of it. Its program then does not wake.
+
     Args:
         physics: Moves the bodies.
         programs: The program of each agent; an agent may have none.
+        lifetimes: The agents that do not exist during the whole run.
+        starts: The states of agents that are not there at time 0.
 
     Raises:
         FederateError: A program failed.
@@ -48,27 +94,46 @@ class Agents:
     Attributes:
         physics: The physics.
         programs: The programs by agent name, sorted.
-        new_agents: Agents that the physics has added since the last call of `with_new_agents`.
+        absent: The agents that are absent now.
+        has_changed: True if an agent has ever been absent, or was added by the physics.
     """
 
-    def __init__(self, physics: PhysicsFederate, programs: Mapping[str, Program]) -> None:
+    def __init__(
+        self,
+        physics: PhysicsFederate,
+        programs: Mapping[str, Program],
+        lifetimes: Mapping[str, Lifetime] = _ALWAYS,
+        starts: Mapping[str, State] | None = None,
+    ) -> None:
         self.physics = physics
         self.programs = dict(sorted(programs.items()))
-        self.new_agents: frozenset[str] = frozenset()
-        self._names = frozenset(programs)
+        self._lifetimes = dict(lifetimes)
+        self.absent = {
+            name: Absence(0, (starts or {})[name])
+            for name, lifetime in self._lifetimes.items()
+            if not lifetime.contains(0)
+        }
+        self.has_changed = bool(self._lifetimes)
+        self._new_agents: frozenset[str] = frozenset()
+        self._lost: dict[str, State] = {}
+        self._names = frozenset(programs) - self.absent.keys()
+        self._states: Mapping[str, State] = {}
+        self._hidden = frozenset(self.absent)
+        self._changes_ns = sorted({at_ns for lifetime in lifetimes.values() for at_ns in lifetime.changes_ns})[::-1]
         self._at_ns = 0
         self._received: dict[str, list[Received]] = {}
         self._commands: dict[str, Any] = {}
         self._wake_times_ns: dict[str, int] = {}
         self._queue: list[tuple[int, str]] = []
         self._next_ns: int | None = None
-        self._schedule(self.programs)
+        self._schedule(name for name in self.programs if name not in self.absent)
+        self._schedule_change()
 
     def states(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states of all agents at the last physics step that is not after `now_ns`.
+        """Return the states of the present agents at the last physics step that is not after `now_ns`.
 
         Raises:
-            FederateError: The physics failed, did not answer in time, or has lost an agent.
+            FederateError: The physics failed, did not answer in time, or has lost an agent and may not.
         """
         commands = self._commands
         if commands:
@@ -78,7 +143,10 @@ class Agents:
         except Exception as error:
             request = f"advance from {seconds_text(self._at_ns)} to {seconds_text(now_ns)}"
             raise federate_error(error, "physics", request) from error
+        self._at_ns = now_ns
         try:
+            if self._lifetimes:
+                states = self._without_hidden(states, now_ns)
             if states.keys() != self._names:
                 self._update_names(states, now_ns)
         except AttributeError:
@@ -86,23 +154,65 @@ class Agents:
                 f"physics, requested to advance to {seconds_text(now_ns)}, returned {states!r}, which is not a "
                 "mapping of states"
             ) from None
-        self._at_ns = now_ns
+        self._states = states
         return states
 
-    def _update_names(self, states: Mapping[str, State], now_ns: int) -> None:
-        """Update the names of the agents; agents may appear during a run, but must not disappear."""
-        if lost := self._names - states.keys():
-            names = ", ".join(sorted(lost))
-            raise FederateError(f"physics, requested to advance to {seconds_text(now_ns)}, has no state of {names}")
-        self.new_agents |= states.keys() - self._names
-        self._names = frozenset(states)
+    def _without_hidden(self, states: Mapping[str, State], now_ns: int) -> Mapping[str, State]:
+        """Return the states without those of agents outside of their lifetimes, which a physics may still move."""
+        if self._changes_ns and self._changes_ns[-1] <= now_ns:
+            while self._changes_ns and self._changes_ns[-1] <= now_ns:
+                self._changes_ns.pop()
+            self._schedule_change()
+            self._hidden = frozenset(
+                name for name, lifetime in self._lifetimes.items() if not lifetime.contains(now_ns)
+            )
+        if self._hidden.isdisjoint(states.keys()):
+            return states
+        return _PresentStates(states, dict.fromkeys(name for name in states if name not in self._hidden))
 
-    def with_new_agents(self, begin: Mapping[str, State], end: Mapping[str, State]) -> Mapping[str, State]:
-        """Return the states at the beginning of a window; agents that appeared in it have their state at its end."""
-        if not self.new_agents:
+    def _update_names(self, states: Mapping[str, State], now_ns: int) -> None:
+        """Update the names of the present agents.
+
+        Raises:
+            FederateError: An agent has disappeared, neither by its lifetime nor by a physics that may remove it.
+        """
+        lost = self._names - states.keys()
+        missing = lost - self._hidden
+        if missing and not (self._states and getattr(self.physics, "agents_disappear", False)):
+            names = ", ".join(sorted(missing))
+            raise FederateError(f"physics, requested to advance to {seconds_text(now_ns)}, has no state of {names}")
+        for name in sorted(lost):
+            state = self._states[name]
+            lifetime = self._lifetimes.get(name)
+            ended_ns = None if lifetime is None or lifetime.contains(now_ns) else lifetime.disappears_ns
+            self.absent[name] = Absence(now_ns if ended_ns is None else ended_ns, State(state.position_m))
+            self._lost[name] = state
+            self._received.pop(name, None)
+            self._commands.pop(name, None)
+            self._wake_times_ns.pop(name, None)
+        new = states.keys() - self._names
+        self._new_agents |= new
+        for name in new:
+            self.absent.pop(name, None)
+        self.has_changed |= bool(lost or new)
+        self._names = frozenset(states)
+        self._schedule((name for name in sorted(new) if name in self.programs), now_ns)
+
+    def with_changes(self, begin: Mapping[str, State], *, end: Mapping[str, State]) -> Mapping[str, State]:
+        """Return states that the network assumes in a window, with those of all agents that were present in it.
+
+        Agents that appeared in it have their state at its end, and agents that disappeared their last state.
+
+        Args:
+            begin: States for the window, at its beginning or end.
+            end: States at its end.
+        """
+        if not (self._new_agents or self._lost):
             return begin
-        new_agents, self.new_agents = self.new_agents, frozenset()
-        return {**{name: end[name] for name in new_agents}, **begin}
+        new_agents, self._new_agents = self._new_agents, frozenset()
+        lost, self._lost = self._lost, {}
+        added = {name: end.get(name) or lost[name] for name in sorted(new_agents | lost.keys()) if name not in begin}
+        return {**added, **begin} if added else begin
 
     def next_wake_ns(self) -> int | None:
         """Return the next time at which a program's timer wakes it, or None if no timer is set."""
@@ -116,6 +226,8 @@ class Agents:
         """
         earliest_ns: int | None = None
         for name, program in self.programs.items():
+            if name in self.absent:
+                continue
             try:
                 at_ns = next_send_ns(program)
             except Exception as error:
@@ -125,8 +237,13 @@ class Agents:
                 earliest_ns = at_ns
         return earliest_ns
 
-    def _schedule(self, names: Iterable[str]) -> None:
-        """Read the next wake times of programs, which change only when a program wakes, and update the queue."""
+    def _schedule(self, names: Iterable[str], earliest_ns: int | None = None) -> None:
+        """Read the next wake times of programs, which change only when a program wakes, and update the queue.
+
+        Args:
+            names: Their agents.
+            earliest_ns: Time before which none of them wakes, for agents that have appeared; None if there is none.
+        """
         for name in names:
             try:
                 wake_ns = self.programs[name].next_wake_ns()
@@ -135,9 +252,22 @@ class Agents:
                 raise federate_error(error, f"the program of {name}", request) from error
             if wake_ns is None:
                 self._wake_times_ns.pop(name, None)
-            elif wake_ns != self._wake_times_ns.get(name):
+                continue
+            if earliest_ns is not None:
+                wake_ns = max(wake_ns, earliest_ns)
+            if wake_ns != self._wake_times_ns.get(name):
                 self._wake_times_ns[name] = wake_ns
                 heapq.heappush(self._queue, (wake_ns, name))
+        self._update_next()
+
+    def _schedule_change(self) -> None:
+        """Add the next time at which a lifetime begins or ends to the queue, so that states are read then."""
+        if self._changes_ns:
+            self._wake_times_ns[_CHANGE] = self._changes_ns[-1]
+            heapq.heappush(self._queue, (self._changes_ns[-1], _CHANGE))
+        self._update_next()
+
+    def _update_next(self) -> None:
         # Entries that a program has replaced stay in the heap until they are at its top.
         queue = self._queue
         while queue and self._wake_times_ns.get(queue[0][1]) != queue[0][0]:
@@ -146,8 +276,17 @@ class Agents:
 
     def deliver(self, receiver: str, received: Received) -> None:
         """Store a datagram for the program of an agent; the next call of `advance` delivers it."""
-        if receiver in self.programs:
+        if receiver in self.programs and receiver not in self.absent:
             self._received.setdefault(receiver, []).append(received)
+
+    def is_absent(self, names: Iterable[str], at_ns: int) -> bool:
+        """Return True if one of some agents is absent now, and was absent at a time before."""
+        absent = self.absent
+        return any(name in absent and absent[name].since_ns <= at_ns for name in names)
+
+    def next_change_ns(self) -> int | None:
+        """Return the next time at which a lifetime begins or ends, or None."""
+        return self._changes_ns[-1] if self._changes_ns else None
 
     @property
     def has_undelivered(self) -> bool:
@@ -193,6 +332,8 @@ class Agents:
 
     def _wake(self, now_ns: int, received: Mapping[str, Sequence[Received]]) -> list[Sent]:
         states = self.states(now_ns)
+        if self.absent or _CHANGE in received:
+            received = {name: received[name] for name in received if name in states and name in self.programs}
         sent: list[Sent] = []
         for name in sorted(received):
             try:

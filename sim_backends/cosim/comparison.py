@@ -73,8 +73,8 @@ def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Err
     Args:
         reference: The run by an exact policy.
         run: A run of the same scenario and seed, of the same duration.
-        path_errors_m: Distance of each agent from its position in the reference, at equal times, any shape; None if
-            positions were not sampled.
+        path_errors_m: Distance of each agent from its position in the reference, at equal times, any shape, nan if it
+            was absent; None if positions were not sampled.
     """
     fate_pairs = [(fate, run.fates[identity]) for identity, fate in reference.fates.items() if identity in run.fates]
     decided = [(expected, actual) for expected, actual in fate_pairs if expected.is_decided and actual.is_decided]
@@ -91,7 +91,7 @@ def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Err
         packets=len(decided),
         delivery_error_s=_spread([abs(expected_ns - actual_ns) / 1e9 for expected_ns, actual_ns in counted_ns]),
         position_error_m=_spread([position_error_m(fate) for fate in run.fates.values()]),
-        path_error_m=_spread([] if path_errors_m is None else path_errors_m.ravel()),
+        path_error_m=_spread([] if path_errors_m is None else path_errors_m[~np.isnan(path_errors_m)]),
         fate_disagreement=len(differing) / len(decided) if decided else math.nan,
         first_disagreement=None if first is None else first.identity,
         first_disagreement_s=math.nan if first is None else first.sent_ns / 1e9,

@@ -13,7 +13,7 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents, Sent
 from sim_backends.cosim.federates import NetworkFederate, check_physics, check_states, federate_error, seconds_text
-from sim_backends.cosim.packet_ledger import PacketLedger, fixed_emitters_m, transmitters
+from sim_backends.cosim.packet_ledger import ABSENT, PacketLedger, fixed_emitters_m, transmitters
 from sim_backends.cosim.policies.sync_policy import LookingAhead, Pair, PolicyError, Situation, SyncPolicy
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
 from sim_backends.cosim.wall_time import WallTime
@@ -23,8 +23,8 @@ from sim_backends.world.motion import DeadReckoned, State
 _MAX_EMPTY_WINDOWS: Final = 1000
 """Number of successive windows of length 0 after which the policy has failed."""
 _PROGRESS_EVERY_S: Final = 0.2
-_NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate]]] = (), (), ()
-"""A window without packets: the fates of packets that enter, these packets, and the fates decided in it."""
+_NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate], Sequence[Fate]]] = (), (), (), ()
+"""A window without packets, see `Coordinator._enter`, and the fates decided in it."""
 
 Progress = Callable[[int, float], None]
 """Called with the simulated nanoseconds so far, and the wall seconds since the start of `advance`."""
@@ -82,6 +82,7 @@ class Coordinator:
             self.run.fates, agents.physics.step_ns, measured, has_fixed_emitters=bool(emitters_m)
         )
         self._active = in_pairs | {*other_agents}
+        self._pairs, self._other_agents = tuple(pairs), other_agents
         self._deferred: Sequence[Sent] = ()
         self._stalled_ns = self._empty_windows = 0
         self._digest = EventDigest()
@@ -102,11 +103,12 @@ class Coordinator:
             fixed_emitters_m=emitters_m,
         )
         check_states(self.situation.states)
-        missing = self._active - self.situation.states.keys()
+        missing = self._active - self.situation.states.keys() - agents.absent.keys()
         if missing:
             raise ConfigurationError(
                 f"{', '.join(sorted(missing))} may send, receive or interfere, but the physics does not move it"
             )
+        self._select_present()
         if observer is not None:
             observer.begin(self.situation.states)
 
@@ -172,10 +174,10 @@ class Coordinator:
                 last_ns = end_ns if uses_end_states else end_ns - 1
                 sent, states = agents.advance(begin_ns, last_ns, end_ns)
                 lap("agents")
-                assumed = states if uses_end_states else agents.with_new_agents(situation.states, states)
-            entered, packets, ended = _NOTHING
+                assumed = agents.with_changes(states if uses_end_states else situation.states, end=states)
+            entered, packets, dropped, ended = _NOTHING
             if sent or self._deferred:
-                entered, packets = self._enter(sent, begin_ns, assumed)
+                entered, packets, dropped = self._enter(sent, begin_ns, assumed)
                 lap("exchange")
             try:
                 arrivals, drops = network.advance(last_ns, packets, assumed)
@@ -184,13 +186,14 @@ class Coordinator:
                 raise federate_error(error, "network", request) from error
             lap("network")
             self.is_committing = is_observed
-            if entered or arrivals or drops:
-                ended = self._record_outcomes(arrivals, drops, begin_ns, last_ns, end_ns)
+            if entered or arrivals or drops or agents.absent:
+                ended = [*dropped, *self._record_outcomes(arrivals, drops, begin_ns, last_ns, end_ns)]
                 self._digest.add_window(end_ns, entered, ended)
             else:
                 quiet_ends_ns.append(end_ns)
             windows_ns.append(end_ns)
             situation.now_ns, situation.states = end_ns, states
+            self._select_present()
             if is_observed:
                 lap("exchange")
                 self._notify(begin_ns, entered, ended, assumed, report=report)
@@ -223,6 +226,8 @@ class Coordinator:
         """
         agents, situation = self._agents, self.situation
         begin = situation.states
+        # The network gets the states of other agents after one has appeared or disappeared.
+        to_ns = min(to_ns, agents.next_change_ns() or to_ns)
         # A network without dead reckoning assumes that agents do not move.
         moving = begin if self._extrapolates else {name: State(state.position_m) for name, state in begin.items()}
         step_ns = situation.physics_step_ns
@@ -250,8 +255,8 @@ class Coordinator:
             lap("agents")
             sent += later_sent
             end_ns = later_ns
-        if agents.new_agents:
-            begin = agents.with_new_agents(begin, states)
+        if agents.has_changed and (changed := agents.with_changes(begin, end=states)) is not begin:
+            begin = changed
             stationary = {name: State(state.position_m) for name, state in begin.items()}
             assumed = DeadReckoned({**stationary, **moving}, since_ns, reckoning_step_ns)
         return end_ns, sent, states, assumed if self._extrapolates else begin
@@ -262,6 +267,7 @@ class Coordinator:
         """Set the situation to a time within a window that the agents have reached before the network."""
         situation = self.situation
         situation.now_ns, situation.states, situation.assumed = now_ns, states, assumed
+        self._select_present()
         is_pending = sent or self._deferred or self._agents.has_undelivered
         situation.next_send_ns = now_ns if is_pending else self._agents.next_send_ns()
 
@@ -281,39 +287,73 @@ class Coordinator:
 
     def _enter(
         self, sent: Sequence[Sent], begin_ns: int, assumed: Mapping[str, State]
-    ) -> tuple[Sequence[Fate], Sequence[Packet]]:
-        """Record packets that enter in a window: those sent in it or, if sends are deferred, in the one before."""
+    ) -> tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate]]:
+        """Record packets that enter in a window: those sent in it or, if sends are deferred, in the one before.
+
+        Returns:
+            Their fates; the packets that the network must carry; the fates of the others, which are dropped.
+        """
         if self.policy.defers_sends:
             sent, self._deferred = self._deferred, sent
         elif self._deferred:
             sent, self._deferred = [*self._deferred, *sent], ()
-        entered = [self._ledger.enter(datagram, max(datagram.at_ns, begin_ns), assumed) for datagram in sent]
+        absent = self._agents.absent if self._agents.has_changed else None
+        entered = [self._ledger.enter(datagram, max(datagram.at_ns, begin_ns), assumed, absent) for datagram in sent]
         for fate in entered:
             source, destination = fate.packet.source, fate.packet.destination
             if source not in self._active or destination not in self._active:
                 self._add_active(source, destination)
-        return entered, [fate.packet for fate in entered]
+        carried = [fate.packet for fate in entered if not fate.reason]
+        return entered, carried, [] if len(carried) == len(entered) else [fate for fate in entered if fate.reason]
 
     def _add_active(self, *names: str) -> None:
         """Add agents that send or receive but are not in `pairs`, so that policies that look ahead include them."""
         self._active.update(names)
-        other_agents = {*self.situation.other_agents, *names}
-        self.situation.other_agents = tuple(sorted(other_agents))
+        self.situation.other_agents = self._other_agents = tuple(sorted({*self._other_agents, *names}))
+        self._select_present()
+
+    def _select_present(self) -> None:
+        """Set the pairs and the other agents of the situation to those that are present, if some have been absent."""
+        if not self._agents.has_changed:
+            return
+        situation = self.situation
+        present = set(situation.states)
+        if situation.assumed is not None:
+            present &= situation.assumed.keys()
+        situation.pairs = tuple(pair for pair in self._pairs if present >= {*pair})
+        situation.other_agents = tuple(name for name in self._other_agents if name in present)
 
     def _record_outcomes(
         self, arrivals: Sequence[Arrival], drops: Sequence[Drop], begin_ns: int, last_ns: int, end_ns: int
     ) -> list[Fate]:
-        """Record the arrivals and drops of a window, and deliver the datagrams that arrived."""
-        ended = []
+        """Record the arrivals and drops of a window, and deliver the datagrams that arrived.
+
+        Packets from and to agents that are absent at the end of the window are dropped.
+        """
+        ended, agents, ledger = [], self._agents, self._ledger
         for arrival in arrivals:
-            fate, payload = self._ledger.arrive(arrival, begin_ns, last_ns)
+            if ledger.is_withdrawn(arrival.packet_id):
+                continue
+            fate, payload = ledger.arrive(arrival, begin_ns, last_ns)
             packet = fate.packet
+            if agents.absent and agents.is_absent((packet.source, packet.destination), arrival.at_ns):
+                fate.arrived_ns, fate.reason = None, ABSENT
+                ended.append(fate)
+                continue
             fate.counted_ns = end_ns if self.policy.defers_arrivals else arrival.at_ns
             fate.late_ns = end_ns - fate.counted_ns
             received = Received(packet.source, payload, packet.sent_ns, fate.counted_ns)
-            self._agents.deliver(packet.destination, received)
+            agents.deliver(packet.destination, received)
             ended.append(fate)
-        ended.extend(map(self._ledger.drop, drops))
+        for drop in drops:
+            if ledger.is_withdrawn(drop.packet_id):
+                continue
+            fate = ledger.drop(drop)
+            if agents.absent and agents.is_absent((fate.packet.source, fate.packet.destination), end_ns):
+                fate.reason = ABSENT
+            ended.append(fate)
+        if agents.absent:
+            ended += ledger.withdraw(agents.absent)
         return ended
 
     def _notify(

@@ -1,17 +1,20 @@
 """Tracks each packet from sending to delivery or drop, and the errors of the positions that the network assumed."""
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Mapping, Sequence
 from itertools import combinations
-from typing import Any
+from typing import Any, Final
 
 from fieldkit.core.model import Vector
-from sim_backends.cosim.agents import Sent
+from sim_backends.cosim.agents import Absence, Sent
 from sim_backends.cosim.federates import FederateError, seconds_text
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import STILL, DeadReckoned, State, extrapolate
+
+ABSENT: Final = "agent absent"
+"""Reason of a packet whose source or destination has not appeared yet, or has disappeared before it arrived."""
 
 
 def transmitters(network: object) -> tuple[str, ...]:
@@ -89,15 +92,23 @@ class PacketLedger:
         self._measured = frozenset(measured)
         self._has_fixed_emitters = has_fixed_emitters
         self._under_way: dict[int, tuple[Fate, Any]] = {}
+        self._withdrawn: set[int] = set()
         self._packets = 0
 
-    def enter(self, sent: Sent, enters_ns: int, assumed: Mapping[str, State]) -> Fate:
-        """Record a datagram as a packet that enters the network.
+    def enter(
+        self,
+        sent: Sent,
+        enters_ns: int,
+        assumed: Mapping[str, State],
+        absent: Mapping[str, Absence] | None = None,
+    ) -> Fate:
+        """Record a datagram as a packet that enters the network; it is dropped if one of its ends is absent.
 
         Args:
             sent: The datagram, as its program sent it.
             enters_ns: Time when it enters the network.
             assumed: States that the network assumes throughout the window, or at its beginning (`DeadReckoned`).
+            absent: The agents that are absent at the end of the window; None if all have always been present.
 
         Raises:
             FederateError: Its destination is not an agent, or its flow already has a packet of this number.
@@ -106,6 +117,13 @@ class PacketLedger:
         destination = datagram.destination
         if isinstance(assumed, DeadReckoned):
             assumed = assumed.at(enters_ns)
+        is_dropped = False
+        if absent is not None:
+            is_dropped = destination not in true or any(
+                name in absent and absent[name].since_ns <= enters_ns for name in (source, destination)
+            )
+            last = {name: absence.state for name, absence in absent.items()}
+            assumed, true = {**true, **last, **assumed}, {**assumed, **last, **true}
         if destination not in assumed:
             raise FederateError(f"the program of {source} sent to {destination}, which is not an agent")
         identity = datagram.flow, datagram.number
@@ -129,8 +147,31 @@ class PacketLedger:
                 assumed, states, names, has_fixed_emitters=self._has_fixed_emitters
             )
         self._fates[identity] = fate
-        self._under_way[self._packets] = fate, datagram.payload
+        if is_dropped:
+            fate.reason = ABSENT
+        else:
+            self._under_way[self._packets] = fate, datagram.payload
         return fate
+
+    def withdraw(self, names: Container[str]) -> list[Fate]:
+        """Drop all packets from and to some agents that are under way, and return their fates."""
+        packet_ids = [
+            packet_id
+            for packet_id, (fate, _) in self._under_way.items()
+            if fate.packet.source in names or fate.packet.destination in names
+        ]
+        self._withdrawn.update(packet_ids)
+        fates = [self._under_way.pop(packet_id)[0] for packet_id in packet_ids]
+        for fate in fates:
+            fate.reason = ABSENT
+        return fates
+
+    def is_withdrawn(self, packet_id: int) -> bool:
+        """Return True once for a packet that was withdrawn, whose fate the network now reports."""
+        if packet_id not in self._withdrawn:
+            return False
+        self._withdrawn.remove(packet_id)
+        return True
 
     def arrive(self, arrival: Arrival, begin_ns: int, last_ns: int) -> tuple[Fate, Any]:
         """Record an arrival in a window, and return the packet's fate and payload.

@@ -1,13 +1,23 @@
-"""The physics federate `emane`: agents that have the locations of EMANE's events, in real time."""
+"""The physics federate `emane`: agents that have the locations and path losses of EMANE's events, in real time."""
 
 import json
 import math
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 from sim_backends.emane_events.channel import EventListener
-from sim_backends.emane_events.events import LOCATION, SerializedEvent, decode_locations
+from sim_backends.emane_events.events import (
+    ALL_NEMS,
+    LOCATION,
+    PATHLOSS,
+    NemLocation,
+    NemPathloss,
+    SerializedEvent,
+    decode_locations,
+    decode_pathlosses,
+)
 from sim_backends.emane_events.geodesy import LocalFrame, velocity_m_s
 from sim_backends.emane_events.options import EmaneOptions
 from sim_backends.emane_events.protobuf import MalformedEventError
@@ -32,6 +42,8 @@ class EmaneLocations:
         step_ns: See `PhysicsFederate`.
         limits_m_s2: See `PhysicsFederate`; unknown, as events may contain any location.
         waited_s: Total time that it has waited, in seconds of wall time.
+        path_losses_db: See `PhysicsFederate`; as EMANE's receivers do, it uses the forward loss of the events for a
+            NEM, which is that from the other NEM to it, and ignores the reverse loss.
 
     Raises:
         ValueError: An option is invalid.
@@ -49,6 +61,7 @@ class EmaneLocations:
         self.step_ns = hello.step_ns
         self.limits_m_s2 = {agent.name: math.inf for agent in hello.agents}
         self.waited_s = 0.0
+        self.path_losses_db: dict[tuple[str, str], float] = {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "EmaneLocations":
         raise FederateError("the physics emane cannot be copied: it follows events in real time")
@@ -94,17 +107,26 @@ class EmaneLocations:
 
     def _apply(self, events: Sequence[SerializedEvent]) -> None:
         for event in events:
-            if event.event != LOCATION:
-                continue
-            try:
-                locations = decode_locations(event.content)
-            except MalformedEventError:
-                continue
-            for location in locations:
-                if (name := self._agents.get(location.nem)) is not None:
-                    place = (location.latitude_deg, location.longitude_deg, location.altitude_m)
-                    velocity = STILL if location.velocity is None else velocity_m_s(location.velocity)
-                    self._states[name] = State(self._frame.position_m(place), velocity)
+            with suppress(MalformedEventError):
+                if event.event == LOCATION:
+                    self._apply_locations(decode_locations(event.content))
+                elif event.event == PATHLOSS and self._options.pathloss:
+                    self._apply_losses(event.nem, decode_pathlosses(event.content))
+
+    def _apply_locations(self, locations: Sequence[NemLocation]) -> None:
+        for location in locations:
+            if (name := self._agents.get(location.nem)) is not None:
+                place = (location.latitude_deg, location.longitude_deg, location.altitude_m)
+                velocity = STILL if location.velocity is None else velocity_m_s(location.velocity)
+                self._states[name] = State(self._frame.position_m(place), velocity)
+
+    def _apply_losses(self, nem: int, losses: Sequence[NemPathloss]) -> None:
+        receivers = self._agents.values() if nem == ALL_NEMS else filter(None, [self._agents.get(nem)])
+        for receiver in receivers:
+            for loss in losses:
+                transmitter = self._agents.get(loss.nem, receiver)
+                if transmitter != receiver and math.isfinite(loss.forward_db):
+                    self.path_losses_db[transmitter, receiver] = loss.forward_db
 
 
 def _load() -> FederateService:
@@ -118,5 +140,5 @@ def _load() -> FederateService:
     )
 
 
-FEDERATE: Final = PythonFederate(PHYSICS, _load, "positions from the location events of EMANE, in real time")
+FEDERATE: Final = PythonFederate(PHYSICS, _load, "positions and path losses from the events of EMANE, in real time")
 """Target of the entry point `emane`."""

@@ -40,7 +40,8 @@ class EmaneOptions(Strict):
         nems: NEM identifiers of agents; if empty, 1, 2, ... in the order of the agents.
         reference: Latitude and longitude in degrees, and height above the ellipsoid in metres, of the world's origin.
         interval: Smallest time between two events of a run, in simulated time.
-        pathloss: Publish the mean path loss between all agents, with obstacles, for `precomputed` propagation.
+        pathloss: Publish the mean path loss between all agents, with obstacles, for `precomputed` propagation; or, if
+            the run follows events, use the path losses in them.
         real_time: Let the run wait for the wall clock, as EMANE's time is that of the wall clock.
         wait: Longest wait for the first location of each agent, if the run follows events.
     """

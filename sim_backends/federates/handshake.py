@@ -1,6 +1,7 @@
 """The handshake of the wire protocol: join, hello, welcome (docs/federates.md)."""
 
 import hashlib
+import json
 import math
 import struct
 from collections.abc import Sequence
@@ -9,6 +10,7 @@ from enum import IntFlag
 from typing import Any, Final
 
 from fieldkit.core.model import Vector
+from fieldkit.core.units import parse_duration_s
 from sim_backends.federates.agent_states import STATE, AgentTable, read_states, states_bytes
 from sim_backends.federates.frames import (
     MAGIC,
@@ -23,7 +25,7 @@ from sim_backends.federates.frames import (
     short_count_bytes,
     text_bytes,
 )
-from sim_backends.world.motion import State
+from sim_backends.world.motion import Lifetime, State
 
 NO_EVENT: Final = -1
 """Time that means that there is no next event."""
@@ -98,6 +100,9 @@ class AgentStart:
     limit_m_s2: float = math.inf
 
 
+_LIFETIME_KEYS: Final = ("appears", "disappears")
+
+
 @dataclass(frozen=True)
 class Hello:
     """The first message to a federate: the run, its agents and its configuration.
@@ -128,6 +133,17 @@ class Hello:
     def configuration_hash(self) -> bytes:
         """SHA-256 of the configuration."""
         return hashlib.sha256(self.configuration).digest()
+
+    @property
+    def lifetimes(self) -> dict[str, Lifetime]:
+        """The lifetimes in the configuration of agents that do not exist during the whole run."""
+        plans = json.loads(self.configuration).get("scenario", {}).get("agents", {})
+        times_ns = {
+            name: [round(parse_duration_s(plan[key]) * 1e9) if key in plan else None for key in _LIFETIME_KEYS]
+            for name, plan in plans.items()
+        }
+        lifetimes = {name: Lifetime(appears or 0, disappears) for name, (appears, disappears) in times_ns.items()}
+        return {name: lifetime for name, lifetime in lifetimes.items() if lifetime != Lifetime()}
 
     def encode(self) -> bytes:
         """Return the body of the message.

@@ -60,6 +60,12 @@ def seconds_text(time_ns: int) -> str:
 class PhysicsFederate(Protocol):
     """Moves the agents.
 
+    If an attribute `agents_disappear` is True, an agent may be missing in the states: it has disappeared, and may
+    appear again. Otherwise that ends the run.
+
+    If it has an attribute `path_losses_db`, with mean losses in dB by transmitter and receiver, the radio of the
+    built-in network uses these instead of the losses of the world.
+
     Attributes:
         step_ns: Time step; there are states at whole steps only.
         limits_m_s2: Largest change of each agent's velocity per second, in m/s^2. The mapping is read once; its
@@ -99,7 +105,8 @@ class NetworkFederate(Protocol):
         Args:
             to_ns: Time to advance to.
             packets: Packets that enter the network up to then, in order of `enters_ns`.
-            states: Positions and velocities of the agents that the network assumes from now on.
+            states: Positions and velocities of the agents that the network assumes from now on. An agent without a
+                state is absent, and neither sends nor receives; the coordinator drops its packets.
         """
         ...
 

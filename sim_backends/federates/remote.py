@@ -81,11 +81,13 @@ class RemotePhysics(_RemoteFederate):
     Attributes:
         step_ns: See `PhysicsFederate`.
         limits_m_s2: See `PhysicsFederate`.
+        agents_disappear: See `PhysicsFederate`.
     """
 
     def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
         super().__init__(session, hello, welcome)
         self.step_ns = welcome.step_ns
+        self.agents_disappear = bool(welcome.capabilities & FederateCapability.AGENTS_DISAPPEAR)
         self._limits_m_s2 = {agent.name: agent.limit_m_s2 for agent in hello.agents}
         self.limits_m_s2: Mapping[str, float] = self._limits_m_s2
         self._states: Mapping[str, State] = {}
@@ -126,6 +128,8 @@ class RemotePhysics(_RemoteFederate):
 class RemoteNetwork(_RemoteFederate):
     """A network in another process.
 
+    If it does not support that agents disappear, it receives the last states of absent agents, or their starts.
+
     Args:
         session: The session.
         hello: The hello that the federate received.
@@ -146,6 +150,9 @@ class RemoteNetwork(_RemoteFederate):
         self.fixed_emitters_m = tuple(welcome.emitters_m)
         self._next_event_ns = welcome.next_event_ns
         self._last_ns = 0
+        self._last_states: Mapping[str, State] | None = None
+        if not welcome.capabilities & FederateCapability.AGENTS_DISAPPEAR:
+            self._last_states = {agent.name: agent.start for agent in hello.agents}
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
@@ -161,6 +168,12 @@ class RemoteNetwork(_RemoteFederate):
         since_ns, reckoning_ns = self._last_ns, 0
         if isinstance(states, DeadReckoned):
             since_ns, reckoning_ns = states.since_ns, states.step_ns
+        if self._last_states is not None:
+            # Absent agents are at rest, so that they are not extrapolated.
+            absent = [name for name in self._last_states if name not in states]
+            if absent:
+                states = {**states, **{name: State(self._last_states[name].position_m) for name in absent}}
+            self._last_states = states
         from_ns, self._last_ns = self._last_ns, to_ns
         outcomes = self.session.request(
             MessageKind.ADVANCE_NETWORK,

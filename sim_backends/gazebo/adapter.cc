@@ -50,6 +50,7 @@ class Federate
         protocol::Hello hello = protocol::ReadHello(body, protocol::kPhysics);
         m_heartbeat.SetInterval(hello.heartbeat_ms);
         Json configuration = Json::parse(hello.configuration);
+        CheckLifetimes(configuration);
         Options options(configuration.value("options", Json::object()));
         if (options.world.empty())
         {
@@ -78,6 +79,21 @@ class Federate
         welcome.software = FIELDKIT_GAZEBO_SOFTWARE;
         welcome.commands = {protocol::kTwist, protocol::kVelocity};
         return protocol::WelcomeBody(welcome);
+    }
+
+    // Models are neither created nor removed during a run.
+    static void CheckLifetimes(const Json& configuration)
+    {
+        Json scenario = configuration.value("scenario", Json::object());
+        Json plans = scenario.value("agents", Json::object());
+        for (const auto& [name, plan] : plans.items())
+        {
+            if (plan.contains("disappears") || std::strtod(plan.value("appears", "0").c_str(), nullptr) > 0)
+            {
+                throw Refusal("robots cannot appear or disappear in Gazebo: remove appears and disappears of " + name +
+                              ", or use another physics");
+            }
+        }
     }
 
     std::string Advance(const std::string& body)

@@ -5,7 +5,7 @@ import json
 import math
 import re
 from collections.abc import Iterator, KeysView, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import mujoco
 from typing_extensions import override
@@ -23,15 +23,22 @@ from sim_backends.mujoco_physics.controllers import (
     WheelController,
 )
 from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, Model, model_xml, quaternion
+from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.quadrotor import QuadrotorLimits
 from sim_backends.physics.robot_limits import BODIES, quadrotor
-from sim_backends.world.motion import State
+from sim_backends.world.motion import Lifetime, State
 from sim_backends.world.world import World
 
 _LONGEST_STEP_NS: Final = 1_000_000
 """Longest step of MuJoCo: with longer ones, tires that slide sideways hop."""
+
+
+_PARKED_M: Final = 10_000.0
+"""Distance east and north at which absent agents are, at most 1 um of rounding error."""
+_PARKED_APART_M: Final = 10.0
+_PARKED_UP_M: Final = 0.0
 
 
 class SensedStates(Mapping[str, State]):
@@ -73,7 +80,7 @@ class MujocoPhysics:
     """Moves the agents of a run in MuJoCo.
 
     Its time is a number of steps. A command applies at the first step that is not before it. The result does not
-    depend on how the time is divided into calls.
+    depend on how the time is divided into calls. Agents that are absent are parked far away from the others.
 
     Args:
         hello: The run: agents, step, and configuration with `world` and `robots`, both optional.
@@ -108,16 +115,22 @@ class MujocoPhysics:
         self._controllers = [
             self._controller(row, robot, limit) for row, (robot, limit) in enumerate(zip(robots, limits, strict=True))
         ]
+        self._stops = [Velocity() if isinstance(limit, QuadrotorLimits) else Twist() for limit in limits]
         self._active = set(range(len(robots)))
         self._due: set[int] = set()
         self._ticked_steps = [-self._tick_steps] * len(robots)
         self._use(mujoco.MjData(self.model))
+        lifetimes = {self._rows[name]: lifetime for name, lifetime in hello.lifetimes.items() if name in self._rows}
+        self._absent = {row for row, lifetime in lifetimes.items() if lifetime.appears_ns >= self.step_ns}
+        self._changes = sorted(_changes(lifetimes, self.step_ns), reverse=True)
+        for row in self._absent:
+            self._place(row, parked=True)
         mujoco.mj_step1(self.model, self.data)
         self._pending: dict[str, Any] = {}
         self._commands_step = 0
         self._last_to_ns = 0
         self._step = 0
-        self._states = SensedStates(self._rows, self._sensors.tolist())
+        self._states = SensedStates(self._present_rows(), self._sensors.tolist())
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
         """Implement `PhysicsFederate.advance`.
@@ -137,6 +150,36 @@ class MujocoPhysics:
         if step != self._step:
             self._advance_steps(step)
         return self._states
+
+    def _present_rows(self) -> Mapping[str, int]:
+        if not self._absent:
+            return self._rows
+        return {name: row for name, row in self._rows.items() if row not in self._absent}
+
+    def _place(self, row: int, *, parked: bool) -> None:
+        """Place an agent at its start, or far away on flat ground, at rest."""
+        model, data = self.model, self.data
+        body = model.body(f"a{row}")
+        first = int(model.jnt_qposadr[body.jntadr[0]])
+        pose = model.qpos0[first : first + 7].copy()
+        if parked:
+            pose[:3] = (_PARKED_M + _PARKED_APART_M * row, _PARKED_M, _PARKED_UP_M)
+        data.qpos[first : first + 7] = pose
+        data.qvel[model.body_rootid[model.dof_bodyid] == body.id] = 0
+
+    def _change_presence(self) -> None:
+        """Place the agents that appear at the present step, and park those that disappear."""
+        while self._changes and self._changes[-1].step <= self._step:
+            _, row, appears = self._changes.pop()
+            self._place(row, parked=not appears)
+            if appears:
+                self._absent.discard(row)
+                continue
+            self._absent.add(row)
+            self._controllers[row].command(self._stops[row])
+            self._active.add(row)
+            self._due.add(row)
+        mujoco.mj_step1(self.model, self.data)
 
     def run_controllers(self) -> None:
         """Let the controllers that are due at the present step set their motors."""
@@ -187,6 +230,8 @@ class MujocoPhysics:
                 remedy = did_you_mean(name, self._rows, f"agents: {', '.join(self._rows)}")
                 raise ConfigurationError(f"a command is for {name}, which is not an agent", remedy=remedy)
             row = self._rows[name]
+            if row in self._absent:
+                continue
             self._controllers[row].command(command)
             self._active.add(row)
             self._due.add(row)
@@ -197,15 +242,17 @@ class MujocoPhysics:
             return
         while self._step < step:
             self.run_controllers()
-            until = step
+            until = min(step, self._changes[-1].step) if self._changes else step
             if self._active:
-                until = min(step, (self._step // self._tick_steps + 1) * self._tick_steps)
+                until = min(until, (self._step // self._tick_steps + 1) * self._tick_steps)
             self._integrate((until - self._step) * self._substeps)
             self._step = until
+            if self._changes and self._changes[-1].step <= until:
+                self._change_presence()
         numbers = self._sensors.tolist()
         if _WARNINGS or not math.isfinite(sum(numbers)):
             self._raise_unstable(numbers)
-        self._states = SensedStates(self._rows, numbers)
+        self._states = SensedStates(self._present_rows(), numbers)
 
     def _integrate(self, count: int) -> None:
         """Take steps of MuJoCo, from derived quantities of the state to those of the new state."""
@@ -235,6 +282,23 @@ class MujocoPhysics:
             f"{' '.join(text.split())}",
             remedy="start robots apart from each other and from obstacles, or use a shorter step",
         )
+
+
+class _PresenceChange(NamedTuple):
+    """The step at which an agent appears or disappears."""
+
+    step: int
+    row: int
+    appears: bool
+
+
+def _changes(lifetimes: Mapping[int, Lifetime], step_ns: int) -> Iterator[_PresenceChange]:
+    """Yield the changes after step 0; an agent is at least as long there as its lifetime."""
+    for row, lifetime in lifetimes.items():
+        if lifetime.appears_ns >= step_ns:
+            yield _PresenceChange(lifetime.appears_ns // step_ns, row, appears=True)
+        if lifetime.disappears_ns is not None:
+            yield _PresenceChange(-(-lifetime.disappears_ns // step_ns), row, appears=False)
 
 
 _OF_MUJOCO: Final = {"model", "data", "_sensors", "_registers"}
@@ -280,4 +344,6 @@ _WARNINGS: Final[list[str]] = []
 """Warnings of MuJoCo, which it would otherwise write to `MUJOCO_LOG.TXT` in the current folder."""
 mujoco.set_mju_user_warning(_WARNINGS.append)
 
-SERVICE: Final = FederateService(MujocoPhysics, name="mujoco", software=f"MuJoCo {mujoco.__version__}")
+SERVICE: Final = FederateService(
+    MujocoPhysics, name="mujoco", software=f"MuJoCo {mujoco.__version__}", agents_disappear=True
+)

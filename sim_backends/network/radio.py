@@ -17,7 +17,7 @@ from sim_backends.network.wire import IpPacket, Transport, Wire
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.links import RADIO_OFF
 from sim_backends.radio.model import RadioModel
-from sim_backends.world.motion import DeadReckoned, State
+from sim_backends.world.motion import STILL, DeadReckoned, State
 
 TransportFactory = Callable[[Wire], Transport]
 
@@ -37,7 +37,7 @@ class RadioNetwork:
     The radio receives the positions of stations when an event is processed, not at every window, so the result does
     not depend on earlier updates. It receives no velocities: for the radio, stations stay at the coordinator's
     positions, or move in steps if the coordinator passes dead-reckoned states. The position error is therefore
-    decided by the policy alone.
+    decided by the policy alone. A station without a state is absent: its radio is off.
 
     `Transport.lost` is called for packets with a single destination only, because each host may miss a broadcast.
 
@@ -79,6 +79,8 @@ class RadioNetwork:
         self.fixed_emitters_m = tuple(jammer.place_m for jammer in jammers if jammer.place_m is not None)
         self._changes_ns = changes_ns(disturbances)[::-1]
         self._off: set[str] = set()
+        self._absent: frozenset[str] = frozenset()
+        self._places_m: dict[str, Vector] = {}
         self._jammers: dict[str, Jammer] = {}
         self._states: Mapping[str, State] = {}
         self._placed_states: Mapping[str, State] | None = None
@@ -180,7 +182,7 @@ class RadioNetwork:
             if self._radio.next_event_ns() != at_ns:
                 if self._changes_ns and self._changes_ns[-1] == at_ns:
                     self._changes_ns.pop()
-                    self._disturb()
+                    self._disturb(at_ns)
                 else:
                     self._fire_timer()
             self._collect()
@@ -204,7 +206,18 @@ class RadioNetwork:
         if states is self._placed_states:
             return
         self._placed_states = states
-        self._radio.place(self.now_ns, {name: states[name].position_m for name in self._names}, self._relay)
+        absent: frozenset[str] = frozenset()
+        try:
+            self._places_m = {name: states[name].position_m for name in self._names}
+        except KeyError:
+            absent = frozenset(name for name in self._names if name not in states)
+            present_m = {name: states[name].position_m for name in self._names if name not in absent}
+            self._places_m = dict.fromkeys(self._names, STILL) | self._places_m | present_m
+        self._radio.place(self.now_ns, self._places_m, self._relay)
+        if absent != self._absent:
+            self._absent = absent
+            if self._off_now() != self._off:
+                self._disturb(at_ns)
         if self._jammers:
             self._jam()
 
@@ -230,10 +243,19 @@ class RadioNetwork:
         if packet.destination == host:
             self._transports[packet.transport].lost(packet, reason)
 
-    def _disturb(self) -> None:
-        """Apply the disturbances that are active now, after one has started or ended."""
+    def _off_now(self) -> set[str]:
+        """Return the stations whose radios are off now."""
         active_now = active(self._disturbances, self.now_ns)
-        off = {disturbance.name for disturbance in active_now if isinstance(disturbance, NodeLoss)}
+        return {disturbance.name for disturbance in active_now if isinstance(disturbance, NodeLoss)} | self._absent
+
+    def _disturb(self, resume_ns: int) -> None:
+        """Apply the disturbances that are active now, after one has started or ended, or a station is absent.
+
+        Args:
+            resume_ns: Time from which the suspended timers of hosts that are on again fire.
+        """
+        active_now = active(self._disturbances, self.now_ns)
+        off = self._off_now()
         cut = {(link.first, link.second) for link in active_now if isinstance(link, LinkCut)}
         newly_off, self._off = off - self._off, off
         self._radio.disturb(self.now_ns, off, cut)
@@ -241,21 +263,22 @@ class RadioNetwork:
             self._reassembly.discard(host, RADIO_OFF)
         suspended, self._suspended = self._suspended, []
         for host, call in suspended:
-            self._schedule(self.now_ns, host, call)
+            self._schedule(resume_ns, host, call)
         jammers = {f"jammer {jammer}": jammer for jammer in active_now if isinstance(jammer, Jammer)}
         if jammers or self._jammers:
             self._jammers = jammers
             self._jam()
 
     def _jam(self) -> None:
-        emitters = [
-            Emitter(name, self._position_m(jammer), jammer.power_dbm) for name, jammer in self._jammers.items()
-        ]
-        self._radio.jam(self.now_ns, emitters)
-
-    def _position_m(self, jammer: Jammer) -> Vector:
         states = self._states if self._placed_states is None else self._placed_states
-        return states[jammer.agent].position_m if jammer.place_m is None else jammer.place_m
+        places_m = {
+            name: states[jammer.agent].position_m if jammer.place_m is None else jammer.place_m
+            for name, jammer in self._jammers.items()
+            if jammer.place_m is not None or jammer.agent in states
+        }
+        self._radio.jam(
+            self.now_ns, [Emitter(name, place_m, self._jammers[name].power_dbm) for name, place_m in places_m.items()]
+        )
 
     def _transport(self, name: str) -> Transport:
         if name not in self._transports:

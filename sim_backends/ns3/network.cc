@@ -49,7 +49,8 @@ class Network
         }
         protocol::Welcome welcome;
         welcome.role = protocol::kNetwork;
-        welcome.capabilities = protocol::kDeterministic | protocol::kNextEvent | protocol::kExtrapolates;
+        welcome.capabilities = protocol::kDeterministic | protocol::kNextEvent | protocol::kExtrapolates |
+                               protocol::kAgentsDisappear;
         welcome.step_ns = hello.step_ns;
         welcome.next_event_ns = NextEventNs();
         welcome.configuration_hash = hello.configuration_hash;
@@ -95,6 +96,7 @@ class Network
         int64_t since_ns = request.since_ns;
         int64_t reckoning_ns = request.reckoning_ns;
         m_toNs = request.to_ns;
+        std::vector<bool> present(m_stations.size());
         for (const protocol::State& state : request.states)
         {
             uint32_t agent = state.agent;
@@ -106,6 +108,7 @@ class Network
             {
                 continue; // it has no radio
             }
+            present[m_stationOf[agent]] = true;
             auto mobility = m_stations[m_stationOf[agent]].mobility;
             Vector position = VectorOf(state.position_m);
             Vector velocity = VectorOf(state.velocity_m_s);
@@ -118,6 +121,23 @@ class Network
             else
             {
                 mobility->Move(position, velocity, since_ns, reckoning_ns);
+            }
+        }
+        for (size_t number = 0; number < m_stations.size(); number++)
+        {
+            if (present[number] == m_stations[number].is_present)
+            {
+                continue;
+            }
+            m_stations[number].is_present = present[number];
+            int by = present[number] ? -1 : 1;
+            if (is_ahead && from_ns > NowNs())
+            {
+                Simulator::Schedule(NanoSeconds(from_ns - NowNs()), [this, number, by] { SwitchOff(number, by); });
+            }
+            else
+            {
+                SwitchOff(number, by);
             }
         }
         for (const protocol::Packet& packet : request.packets)
@@ -159,6 +179,11 @@ class Network
         RngSeedManager::SetSeed(1);
         RngSeedManager::SetRun(seed);
         AddStations(agents, configuration.at("robots"));
+        if (!m_setup.pcap.empty() && !m_stations.empty())
+        {
+            std::ofstream first; // ns-3 aborts if it cannot open a file
+            OpenNew(first, m_setup.pcap + m_stations[0].name + ".pcap", "pcap");
+        }
         m_setup.mode = radio.value("mode", "");
         if (m_setup.mode.substr(0, 1) == "n" && m_setup.standard != "802.11n")
         {
@@ -193,7 +218,43 @@ class Network
         {
             AddFault(fault);
         }
+        for (size_t number = 0; number < m_stations.size(); number++)
+        {
+            AddLifetime(number, scenario.at("agents").at(m_stations[number].name));
+        }
         RunUntil(-1);
+    }
+
+    // Switch the radio of a station off (1), or on again (-1).
+    void SwitchOff(size_t station, int by)
+    {
+        for (size_t other = 0; other < m_stations.size(); other++)
+        {
+            if (other != station)
+            {
+                m_channel->Cut(station, other, by);
+            }
+        }
+        m_stations[station].off += by;
+    }
+
+    static Time At(const Json& seconds)
+    {
+        return NanoSeconds(g_start_ns + std::llround(Number(seconds) * 1e9));
+    }
+
+    // The radio of an agent is off before it appears, and after it has disappeared.
+    void AddLifetime(size_t station, const Json& plan)
+    {
+        if (plan.contains("appears") && Number(plan["appears"]) > 0)
+        {
+            SwitchOff(station, 1);
+            Simulator::Schedule(At(plan["appears"]), [this, station] { SwitchOff(station, -1); });
+        }
+        if (plan.contains("disappears"))
+        {
+            Simulator::Schedule(At(plan["disappears"]), [this, station] { SwitchOff(station, 1); });
+        }
     }
 
     void ReadOptions(uint64_t seed, const Json& options, const Json& scenario)
@@ -215,24 +276,18 @@ class Network
             }
             else if (name == "delay_parts" && value.is_string())
             {
-                std::string path = value;
-                auto place = path.find("{seed}");
-                if (place != std::string::npos)
-                {
-                    path.replace(place, 6, std::to_string(seed));
-                }
-                m_parts.open(path, std::ios::trunc);
-                if (!m_parts)
-                {
-                    throw Refusal("the file of delay_parts cannot be written: " + path);
-                }
+                OpenNew(m_parts, OutputPath(value, seed), name);
                 m_parts << "flow,number,delay_ns,processing_ns,queueing_ns,transmission_ns,propagation_ns\n";
+            }
+            else if (name == "pcap" && value.is_string())
+            {
+                m_setup.pcap = OutputPath(value, seed);
             }
             else
             {
                 throw Refusal("the option " + name + ": " + value.dump() +
                               " is not one of standard: 802.11a, 802.11g or 802.11n; ampdu_bytes: 0 to 65535; topics: "
-                              "udp; delay_parts: FILE");
+                              "udp; delay_parts: FILE; pcap: BEGINNING OF FILES");
             }
         }
         for (const Json& traffic : scenario.at("traffic"))
@@ -244,6 +299,26 @@ class Network
                 throw Refusal("topics: udp carries best_effort topics only, and those of " +
                               traffic.at("from").get<std::string>() + " are reliable");
             }
+        }
+    }
+
+    // A path in which {seed} is replaced by the seed.
+    static std::string OutputPath(std::string path, uint64_t seed)
+    {
+        auto place = path.find("{seed}");
+        if (place != std::string::npos)
+        {
+            path.replace(place, 6, std::to_string(seed));
+        }
+        return path;
+    }
+
+    static void OpenNew(std::ofstream& file, const std::string& path, const std::string& option)
+    {
+        file.open(path, std::ios::trunc);
+        if (!file)
+        {
+            throw Refusal("the file of " + option + " cannot be written: " + path);
         }
     }
 
@@ -293,38 +368,25 @@ class Network
         {
             throw Refusal("ns-3 has no jammers: remove the fault");
         }
-        std::vector<std::pair<size_t, size_t>> pairs;
-        int off = -1;
+        std::function<void(int)> change;
         if (kind == "link-cut")
         {
-            pairs.emplace_back(StationNamed(fault.at("between")[0]), StationNamed(fault.at("between")[1]));
+            size_t first = StationNamed(fault.at("between")[0]), second = StationNamed(fault.at("between")[1]);
+            change = [this, first, second](int by) { m_channel->Cut(first, second, by); };
         }
         else if (kind == "node-loss")
         {
-            off = static_cast<int>(StationNamed(fault.at("agent")));
-            for (size_t other = 0; other < m_stations.size(); other++)
-            {
-                if (other != static_cast<size_t>(off))
-                {
-                    pairs.emplace_back(off, other);
-                }
-            }
+            size_t station = StationNamed(fault.at("agent"));
+            change = [this, station](int by) { SwitchOff(station, by); };
         }
-        auto change = [this, pairs, off](int by) {
-            for (const auto& [a, b] : pairs)
-            {
-                m_channel->Cut(a, b, by);
-            }
-            if (off >= 0)
-            {
-                m_stations[off].off += by;
-            }
-        };
-        auto at = [](const Json& seconds) { return NanoSeconds(g_start_ns + std::llround(Number(seconds) * 1e9)); };
-        Simulator::Schedule(at(fault.at("from")), [change] { change(1); });
+        else
+        {
+            return; // not a fault of radios
+        }
+        Simulator::Schedule(At(fault.at("from")), [change] { change(1); });
         if (fault.contains("to"))
         {
-            Simulator::Schedule(at(fault.at("to")), [change] { change(-1); });
+            Simulator::Schedule(At(fault.at("to")), [change] { change(-1); });
         }
     }
 

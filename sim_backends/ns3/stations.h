@@ -119,7 +119,8 @@ struct Station
     uint32_t agent = 0;
     double tx_power_dbm = 0;
     double sensitivity_dbm = 0;
-    int off = 0; // number of faults that have switched it off
+    int off = 0; // number of faults and absences that have switched it off
+    bool is_present = true; // in the last states
     Ptr<Node> node;
     Ptr<AgentMobility> mobility;
     Ptr<WifiNetDevice> device;
@@ -134,6 +135,7 @@ struct WifiSetup
     uint32_t queue_packets = 1000;
     uint32_t ampdu_bytes = 0;
     int relay = -1; // station with the access point; -1 if stations send directly
+    std::string pcap; // beginning of the names of capture files; empty for none
 };
 
 // ns-3's name of a mode of fieldkit.
@@ -223,6 +225,11 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
                         "BE_MaxAmpduSize", ampdu);
         }
         auto devices = wifi.Install(phy, mac, station.node);
+        if (!setup.pcap.empty())
+        {
+            phy.SetPcapDataLinkType(WifiPhyHelper::DLT_IEEE802_11_RADIO);
+            phy.EnablePcap(setup.pcap + station.name + ".pcap", devices.Get(0), true, true);
+        }
         wifi.AssignStreams(devices, 1000 * static_cast<int64_t>(number));
         station.device = DynamicCast<WifiNetDevice>(devices.Get(0));
         station.device->SetMtu(1500);

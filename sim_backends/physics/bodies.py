@@ -8,19 +8,22 @@ anything until the list expires.
 """
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import NEVER, Body, Pose, Snapshot, Track
-from sim_backends.physics.collisions import cylinder_footprint, move, overlaps
+from sim_backends.physics.collisions import Footprint, cylinder_footprint, move, overlaps
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.neighbours import HORIZON_S, CellGrid, ContactCandidates, Neighbours
 from sim_backends.physics.paths import STEP_NS
-from sim_backends.world.motion import State
+from sim_backends.world.motion import Lifetime, State
 from sim_backends.world.world import World
+
+_ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,8 @@ class Bodies:
         bodies: The bodies, by the name of their agent.
         world: Ground and obstacles; None for open flat ground.
         step_ns: Time step; states are those at whole steps.
+        lifetimes: Bodies that do not exist during the whole run; from the step in which a body appears, and until the
+            one in which it disappears, it is at least as long there as its lifetime.
 
     Attributes:
         step_ns: Time step.
@@ -53,17 +58,24 @@ class Bodies:
         collisions: The starts of all contacts so far, in order of time.
 
     Raises:
-        ConfigurationError: A body overlaps something at time 0, or the step is not positive.
+        ConfigurationError: A body overlaps something at its start, or the step is not positive.
     """
 
     def __init__(
-        self, bodies: Mapping[str, Body[Any]], world: World | None = None, *, step_ns: int = STEP_NS
+        self,
+        bodies: Mapping[str, Body[Any]],
+        world: World | None = None,
+        *,
+        step_ns: int = STEP_NS,
+        lifetimes: Mapping[str, Lifetime] = _ALWAYS,
     ) -> None:
         if step_ns <= 0:
             raise ConfigurationError(f"a step of {step_ns} ns is not positive", remedy="use for example 1000000 ns")
         self.step_ns = step_ns
         self.collisions: list[Collision] = []
         self._bodies = dict(sorted(bodies.items()))
+        self._present = self._bodies
+        self._lifetimes = dict(lifetimes)
         self.names = tuple(self._bodies)
         grades = {name: None if body.flies else body.max_grade for name, body in self._bodies.items()}
         grounds = {max_grade: Ground(world, max_grade) for max_grade in set(grades.values())}
@@ -80,14 +92,23 @@ class Bodies:
         self._courses_end_step = NEVER
         self._touching: Mapping[str, Collection[str]] = {}
         self._tracks: dict[str, Track] = {}
-        self._replace_tracks({name: self._track(name, self._initial_pose(name), 0) for name in self._bodies})
         self._list_step = 0
-        self._check_no_overlap()
-        self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
+        self._change_steps = sorted(
+            {step for lifetime in lifetimes.values() for step in self._change_steps_of(lifetime)}, reverse=True
+        )
+        self._check_starts(self._bodies)
+        self._update_present()
         self._states = Snapshot(self._tracks, 0)
 
+    def start_states(self) -> dict[str, State]:
+        """Return the states of all bodies at their starts, also of those that are not there yet."""
+        return {name: self._track(name, self._initial_pose(name), 0).state(0) for name in self.names}
+
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of one body, see `limits_m_s2`."""
+        """Return the limit of one body, see `limits_m_s2`; if it is not there, the limit at its start."""
+        if name not in self._present:
+            start_limit_m_s2: float = self._bodies[name].limit_m_s2(self._initial_pose(name))
+            return start_limit_m_s2
         pose = self._tracks[name].pose(self._step)
         speed_m_s = math.hypot(*pose.velocity_m_s)
         limit_m_s2: float = self._bodies[name].limit_m_s2(pose)
@@ -123,12 +144,20 @@ class Bodies:
             if name not in self._bodies:
                 remedy = did_you_mean(name, self._bodies, f"bodies: {', '.join(self._bodies)}")
                 raise ConfigurationError(f"a command is for {name}, which is not a body", remedy=remedy)
-            if command != self._commands[name]:
+            if command != self._commands[name] and name in self._present:
                 self._commands[name] = command
                 tracks[name] = self._track(name, self._tracks[name].pose(self._step), self._step)
         self._replace_tracks(tracks)
 
     def _advance_steps(self, step: int) -> None:
+        while self._change_steps and self._change_steps[-1] <= step:
+            self._move(self._change_steps.pop())
+            self._update_present()
+        self._move(step)
+        self._states = Snapshot(self._tracks, step)
+
+    def _move(self, step: int) -> None:
+        """Move the bodies that are there up to a step."""
         while self._step < step:
             until = step
             candidates: Mapping[str, ContactCandidates] = {}
@@ -141,13 +170,42 @@ class Bodies:
             if candidates:
                 self._resolve_contacts(candidates, until)
             self._step = until
-        self._states = Snapshot(self._tracks, step)
+
+    def _change_steps_of(self, lifetime: Lifetime) -> Iterator[int]:
+        """Yield the step in which a body appears, and the first one in which it is not there any more."""
+        if lifetime.appears_ns >= self.step_ns:
+            yield lifetime.appears_ns // self.step_ns
+        if lifetime.disappears_ns is not None:
+            yield -(-lifetime.disappears_ns // self.step_ns)
+
+    def _is_there(self, name: str) -> bool:
+        lifetime = self._lifetimes.get(name)
+        if lifetime is None:
+            return True
+        first_step = lifetime.appears_ns // self.step_ns
+        ended = lifetime.disappears_ns is not None and -(-lifetime.disappears_ns // self.step_ns) <= self._step
+        return first_step <= self._step and not ended
+
+    def _update_present(self) -> None:
+        """Add the bodies that appear at the present step, and remove those that disappear.
+
+        Raises:
+            ConfigurationError: A body that appears overlaps another one.
+        """
+        present = {name: body for name, body in self._bodies.items() if self._is_there(name)}
+        new = [name for name in present if name not in self._tracks]
+        added = {name: self._track(name, self._initial_pose(name), self._step) for name in new}
+        self._present = present
+        self._use_tracks({name: added.get(name) or self._tracks[name] for name in present})
+        self._check_no_overlap(new)
+        self._list_step = self._step
+        self._neighbours = Neighbours(present, self._poses(), self._grounds, self._horizon * self._step_s)
 
     def _current_neighbours(self) -> Neighbours:
         """Return the neighbour list, rebuilt if it has expired."""
         if self._step >= self._list_step + self._horizon:
             self._list_step = self._step
-            self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
+            self._neighbours = Neighbours(self._present, self._poses(), self._grounds, self._horizon * self._step_s)
         return self._neighbours
 
     def _extend_courses(self, step: int) -> None:
@@ -199,9 +257,12 @@ class Bodies:
     def _replace_tracks(self, tracks: Mapping[str, Track]) -> None:
         if tracks:
             # A new mapping is created, because snapshots keep the mapping from which they were made.
-            self._tracks = {**self._tracks, **tracks}
-            self._any_moves = any(track.course.moves for track in self._tracks.values())
-            self._courses_end_step = min(track.end_step for track in self._tracks.values())
+            self._use_tracks({**self._tracks, **tracks})
+
+    def _use_tracks(self, tracks: dict[str, Track]) -> None:
+        self._tracks = tracks
+        self._any_moves = any(track.course.moves for track in tracks.values())
+        self._courses_end_step = min((track.end_step for track in tracks.values()), default=NEVER)
 
     def _track(self, name: str, pose: Pose, step: int) -> Track:
         body = self._bodies[name]
@@ -218,22 +279,35 @@ class Bodies:
     def _poses(self) -> dict[str, Pose]:
         return {name: track.pose(self._step) for name, track in self._tracks.items()}
 
-    def _check_no_overlap(self) -> None:
-        places_m = {name: pose.place_m for name, pose in self._poses().items()}
-        grid = CellGrid(2 * max((body.radius_m for body in self._bodies.values()), default=0.0))
-        for number, (name, body) in enumerate(self._bodies.items()):
-            place_m = places_m[name]
+    def _check_starts(self, names: Iterable[str]) -> None:
+        """Check that no body starts within an obstacle."""
+        for name in names:
+            place_m = self._initial_pose(name).place_m
             if not all(map(math.isfinite, place_m)):
                 raise ConfigurationError(f"{name} starts at {place_m}", remedy="use finite coordinates in metres")
-            others = [self.names[other] for other in grid.near(place_m)]
+            self._check_free(name, place_m, self._grounds[name].around)
+
+    def _check_no_overlap(self, new: Collection[str]) -> None:
+        """Check that bodies that appear now overlap no other body."""
+        places_m = {name: pose.place_m for name, pose in self._poses().items()}
+        names = [*(name for name in places_m if name not in new), *new]
+        grid = CellGrid(2 * max((body.radius_m for body in self._present.values()), default=0.0))
+        for number, name in enumerate(names):
+            place_m = places_m[name]
+            others = [names[other] for other in grid.near(place_m)] if name in new else []
             footprints = [cylinder_footprint(other, places_m[other], self._bodies[other]) for other in others]
-            for footprint in (*self._grounds[name].around, *footprints):
-                if overlaps(footprint, body, place_m):
-                    raise ConfigurationError(
-                        f"{name} starts within {footprint.name}, at {_metres(place_m)} m",
-                        remedy=f"start it at least {body.radius_m:g} m away from obstacles and other bodies",
-                    )
+            self._check_free(name, place_m, footprints)
             grid.add(number, place_m)
+
+    def _check_free(self, name: str, place_m: Vector, footprints: Iterable[Footprint]) -> None:
+        body = self._bodies[name]
+        for footprint in footprints:
+            if overlaps(footprint, body, place_m):
+                appears = f" when it appears at {self._step * self._step_s:g} s" if self._step else ""
+                raise ConfigurationError(
+                    f"{name} starts within {footprint.name}, at {_metres(place_m)} m{appears}",
+                    remedy=f"start it at least {body.radius_m:g} m away from obstacles and other bodies",
+                )
 
 
 def _metres(place_m: Vector) -> str:

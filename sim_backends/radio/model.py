@@ -14,6 +14,9 @@ from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import Antenna, WorldChannel
 from sim_backends.world.world import World
 
+PathLosses = Callable[[], Mapping[Pair, float]]
+"""Returns path losses in dB, by transmitter and receiver."""
+
 
 class RadioModel(Protocol[Payload]):
     """A radio model: it delivers packets at computed times, in ns; the caller passes non-decreasing times."""
@@ -117,13 +120,22 @@ class WifiInWorld(Wifi[Payload]):
         options: Radio options.
         antennas: The stations.
         world: Obstacles between the stations; None for open ground.
+        path_losses_db: Returns the mean losses that replace those of the world, by transmitter and receiver; None if
+            there are none.
     """
 
     def __init__(
-        self, seed: int, options: RadioOptions, antennas: Mapping[str, Antenna], world: World | None
+        self,
+        seed: int,
+        options: RadioOptions,
+        antennas: Mapping[str, Antenna],
+        world: World | None,
+        *,
+        path_losses_db: PathLosses | None = None,
     ) -> None:
         self._world_channel = WorldChannel(seed, antennas, options, world)
         self._names = tuple(antennas)
+        self._path_losses_db = path_losses_db
         super().__init__(self._world_channel, seed, queue_packets=options.queue_packets)
 
     def place(
@@ -135,6 +147,8 @@ class WifiInWorld(Wifi[Payload]):
     ) -> None:
         """Implement `RadioModel.place`."""
         self.advance(now_ns)
+        if self._path_losses_db is not None:
+            self._world_channel.use_path_losses(self._path_losses_db())
         self._world_channel.move(now_ns, places_m, velocities_m_s)
         self.set_relay(relay)
 

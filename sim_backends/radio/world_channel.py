@@ -160,6 +160,7 @@ class WorldChannel(RadioChannel):
         self._velocities: list[Vector] = [STILL] * count
         self._in_motion = False
         self._cut = np.zeros((count, count), dtype=bool)
+        self._given_db: Floats | None = None
         self._present = np.zeros(count, dtype=bool)
         self._places_m, self._velocities_m_s = np.zeros((2, count, 3))
         self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
@@ -208,6 +209,27 @@ class WorldChannel(RadioChannel):
         self._revision += 1
         self._stale |= (cut != self._cut)[tuple(self._ends)]
         self._cut = cut
+
+    def use_path_losses(self, losses_db: Mapping[tuple[str, str], float]) -> None:
+        """Set the mean losses of some paths, from transmitter to receiver, which replace path loss and obstacles.
+
+        Args:
+            losses_db: The losses in dB; others are computed from the positions.
+        """
+        count = len(self.names)
+        index = {name: number for number, name in enumerate(self.names)}
+        given_db, before_db = np.full((count, count), np.nan), self._given_db
+        for (transmitter, receiver), loss_db in losses_db.items():
+            if transmitter in index and receiver in index:
+                given_db[index[transmitter], index[receiver]] = loss_db
+        if before_db is None:
+            before_db = np.full((count, count), np.nan)
+        same = (given_db == before_db) | (np.isnan(given_db) & np.isnan(before_db))
+        if same.all():
+            return
+        self._given_db = given_db
+        self._revision += 1
+        self._stale |= ~(same & same.T)[tuple(self._ends)]
 
     def received_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
         """Return the mean received power at each station, by index, of another transmitter at a position."""
@@ -281,12 +303,16 @@ class WorldChannel(RadioChannel):
         first, second = self._ends[:, stale]
         start, end = self._places_m[first], self._places_m[second]
         obstacles_db = self._obstacles_db(start, end)
-        loss_db = self._open_db(start, end) + obstacles_db
-        loss_db[~(self._present[first] & self._present[second]) | self._cut[first, second]] = np.inf
+        loss_db = reverse_db = self._open_db(start, end) + obstacles_db
+        if self._given_db is not None:
+            given_db = self._given_db[first, second], self._given_db[second, first]
+            loss_db, reverse_db = (np.where(np.isnan(values), loss_db, values) for values in given_db)
+        out_of_range = ~(self._present[first] & self._present[second]) | self._cut[first, second]
+        loss_db[out_of_range] = reverse_db[out_of_range] = np.inf
         # Any obstacle on the path adds loss and removes the constant component.
         k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
-        for table, values in ((self._loss_db, loss_db), (self._k, k)):
-            table[first, second] = table[second, first] = values
+        self._loss_db[first, second], self._loss_db[second, first] = loss_db, reverse_db
+        self._k[first, second] = self._k[second, first] = k
         self._stale[stale] = False
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
@@ -328,7 +354,7 @@ class WorldChannel(RadioChannel):
         """Use mean powers, so that a deep fade breaks no association."""
         row = self._row(transmitter)
         if row.linked is None:
-            reverse_mw = _milliwatts(self._tx_powers_dbm - self._loss_db[transmitter])
+            reverse_mw = _milliwatts(self._tx_powers_dbm - self._loss_db[:, transmitter])
             sensitivity_mw = self.sensitivity_mw[transmitter]
             row.linked = ((row.mean_mw >= self.sensitivity_mw) & (reverse_mw >= sensitivity_mw)).tolist()
         return row.linked[receiver]

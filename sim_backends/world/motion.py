@@ -28,6 +28,27 @@ class State(NamedTuple):
     heading_rad: float | None = None
 
 
+class Lifetime(NamedTuple):
+    """The time in which a robot exists.
+
+    Attributes:
+        appears_ns: Its beginning.
+        disappears_ns: Its end, at which the robot does not exist any more; None for never.
+    """
+
+    appears_ns: int = 0
+    disappears_ns: int | None = None
+
+    @property
+    def changes_ns(self) -> tuple[int, ...]:
+        """The times after 0 at which the robot appears or disappears."""
+        return tuple(at_ns for at_ns in self if at_ns)
+
+    def contains(self, at_ns: int) -> bool:
+        """Return True if the robot exists at a time."""
+        return self.appears_ns <= at_ns and (self.disappears_ns is None or at_ns < self.disappears_ns)
+
+
 class Motion(Protocol):
     """Robots that move. Time is in integer nanoseconds since the start of the motion."""
 

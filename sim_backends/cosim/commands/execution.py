@@ -79,14 +79,17 @@ def simulate(
     recorder = None
     if folder is not None:
         about = RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)
-        recorder = RunRecorder(folder.recording(seed), about, flows=captured_flows(scenario.traffic))
+        recorder = RunRecorder(
+            folder.recording(seed), about, agents=scenario.lifetimes, flows=captured_flows(scenario.traffic)
+        )
     samples = StateSamples(recorder) if has_followers(scenario) else None
     observer: WindowObserver | None = samples or recorder
     publisher: EmaneObserver | nullcontext[None] = nullcontext()
     if scenario.emane is not None:
         observer = publisher = emane_observer(scenario, seed, observer)
     simulation = build(scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s)
-    states_at_start = [(0, name, state) for name, state in simulation.agents.states(0).items()]
+    agents = simulation.agents
+    starts = {name: absence.state for name, absence in agents.absent.items()} | dict(agents.states(0).items())
     ended_by: FieldkitError | KeyboardInterrupt | None = None
     lateness = None if pace is None else Lateness()
     try:
@@ -97,8 +100,16 @@ def simulate(
                 pace.run(simulation, lateness, progress)
     except (FieldkitError, KeyboardInterrupt) as error:
         ended_by = error
-    states = states_at_start if samples is None else samples.states
-    result = seed_result(scenario, seed, simulation.coordinator.run, states, ended_by, lateness=lateness)
+    states = [] if samples is None else samples.states
+    result = seed_result(
+        scenario,
+        seed,
+        simulation.coordinator.run,
+        states,
+        ended_by=ended_by,
+        starts=starts,
+        lateness=lateness,
+    )
     if folder is not None:
         try:
             folder.write_rows(result)

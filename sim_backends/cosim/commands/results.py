@@ -297,7 +297,7 @@ class SeedResult:
         windows: Number of windows.
         wall_s: Wall time by part.
         digest: Hash over all events.
-        starts_m: Position of each agent at time 0, metres east, north, up.
+        starts_m: Position of each agent at its start, metres east, north, up.
         recoveries: Recoveries of flows after faults.
         formation: Errors of the positions of followers.
         stopped: The reason why it ended early; empty if it is complete.
@@ -329,8 +329,9 @@ def seed_result(
     seed: int,
     run: Run,
     states: Sequence[tuple[int, str, State]],
-    ended_by: FieldkitError | KeyboardInterrupt | None = None,
     *,
+    ended_by: FieldkitError | KeyboardInterrupt | None = None,
+    starts: Mapping[str, State] | None = None,
     lateness: Lateness | None = None,
 ) -> SeedResult:
     """Return the result of a run.
@@ -341,6 +342,7 @@ def seed_result(
         run: The record.
         states: States of agents, as `Recording.states`, at least for time 0.
         ended_by: The exception that ended it early, or None.
+        starts: States of all agents at their starts; None for the first ones in `states`.
         lateness: As in the result.
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
@@ -353,7 +355,8 @@ def seed_result(
         windows=len(run.windows_ns),
         wall_s=dict(run.wall_s),
         digest=run.digest,
-        starts_m={agent: state.position_m for at_ns, agent, state in states if at_ns == 0},
+        starts_m={agent: state.position_m for _, agent, state in reversed(states)}
+        | {agent: state.position_m for agent, state in (starts or {}).items()},
         recoveries=recoveries(scenario, run),
         formation=formation(scenario, tracks_of(states)),
         stopped="" if ended_by is None else stopped,

@@ -1,4 +1,7 @@
-"""A pcap file per robot, with the internet headers of its packets."""
+"""A pcap file per robot, with the internet headers of its packets.
+
+A network in another process reports no IP packets; `PacketObserver` makes them from the programs' packets.
+"""
 
 import os
 import struct
@@ -6,14 +9,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import FileIO
 from ipaddress import IPv4Address
+from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
+from sim_backends.cosim.run_record import Window, WindowObserver
 from sim_backends.network.ip import HEADER_BYTES, Fragment
+from sim_backends.network.radio import IpLog
 from sim_backends.network.tcp.connection import ConnectionName
 from sim_backends.network.tcp.segments import Segment
 from sim_backends.network.wire import IpPacket
+from sim_backends.world.motion import State
 
 _ICMP, _TCP, _UDP = 1, 6, 17
 _FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
@@ -285,3 +292,38 @@ def _records(capture: bytes) -> Iterator[tuple[int, int, int]]:
         end = begin + _RECORD_HEADER.size + captured_bytes
         yield seconds * 10**9 + nanoseconds, begin, end
         begin = end
+
+
+class PacketObserver:
+    """An observer that passes the packets of programs to the log of IP packets, and all calls to a recorder.
+
+    Each packet of a program is one UDP datagram without fragments, whatever its transport: at its source when it
+    enters the network, and at its destination when it arrives.
+
+    Args:
+        recorder: The recorder, which accepts IP packets.
+        log: Its method `log_ip`.
+    """
+
+    def __init__(self, recorder: WindowObserver, log: IpLog) -> None:
+        self._recorder = recorder
+        self._log = log
+        self._sent = 0
+
+    def begin(self, states: Mapping[str, State]) -> None:
+        """Implement `WindowObserver.begin`."""
+        self._recorder.begin(states)
+
+    def window(self, window: Window) -> None:
+        """Log the packets of a window in order of time, and pass it on."""
+        events = [(fate.packet.enters_ns, fate.packet.source, fate.packet) for fate in window.entered]
+        events += [
+            (fate.arrived_ns, fate.packet.destination, fate.packet)
+            for fate in window.ended
+            if fate.arrived_ns is not None
+        ]
+        for at_ns, name, packet in sorted(events, key=itemgetter(0)):
+            size_bytes = HEADER_BYTES + _UDP_HEADER.size + packet.size_bytes
+            datagram = IpPacket(packet.source, packet.destination, "udp", size_bytes, packet.identity, None)
+            self._log(at_ns, name, Fragment(datagram, packet.packet_id, 0, 1, 0, size_bytes))
+        self._recorder.window(window)

@@ -3,7 +3,7 @@
 import errno
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +111,7 @@ class RunRecorder:
         part_every_s: Interval at which parts are written, in seconds of wall time.
         snap_bytes: Number of bytes kept of each IP packet in `captures/`, which has a file for each robot if the
             network is given `log_ip`.
+        agents: The agents that are absent at time 0, whose packets `captures/` must have, too.
         flows: Flows with special headers in the captures, by name.
     """
 
@@ -122,6 +123,7 @@ class RunRecorder:
         states_every_ns: int = EVERY_NS,
         part_every_s: float = 2.0,
         snap_bytes: int = 128,
+        agents: Iterable[str] = (),
         flows: Mapping[str, CapturedFlow] = NO_FLOWS,
     ) -> None:
         self._folder = folder
@@ -129,6 +131,7 @@ class RunRecorder:
         self._part_every_s = part_every_s
         self._sampling = Sampling(states_every_ns)
         self._snap_bytes = snap_bytes
+        self._agents = frozenset(agents)
         self._captures: Captures | None = None
         self._first_states = _NO_STATES
         self._windows: list[Window] = []
@@ -164,9 +167,8 @@ class RunRecorder:
     def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
         """Add an IP packet that a robot sent or that arrived at it; see `RadioNetwork.log_ip`."""
         if self._captures is None:
-            self._captures = Captures(
-                self._folder / CAPTURES, sorted(self._first_states), self._snap_bytes, self._flows
-            )
+            names = sorted({*self._first_states, *self._agents})
+            self._captures = Captures(self._folder / CAPTURES, names, self._snap_bytes, self._flows)
         self._captures.log(at_ns, name, fragment)
 
     def window(self, window: Window) -> None:

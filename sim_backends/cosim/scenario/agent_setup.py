@@ -116,7 +116,8 @@ def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: 
         seed: Seed of the phases that the scenario does not set; controllers of different robots are not synchronous.
     """
     programs = {
-        name: _controller(plan, bodies[name], _phase_ns(name, plan, seed)) for name, plan in scenario.agents.items()
+        name: _controller(plan, bodies[name], plan.lifetime.appears_ns, _phase_ns(name, plan, seed))
+        for name, plan in scenario.agents.items()
     }
     return {name: program for name, program in programs.items() if program is not None}
 
@@ -127,21 +128,22 @@ def _phase_ns(name: str, plan: AgentPlan, seed: int) -> int:
     return int(RandomStream(seed, name, "controller's phase").draw(0) * PERIOD_NS)
 
 
-def _controller(plan: AgentPlan, body: Body[Any], phase_ns: int) -> Program | None:
+def _controller(plan: AgentPlan, body: Body[Any], appears_ns: int, phase_ns: int) -> Program | None:
     motion = plan.motion
+    first_ns = appears_ns + phase_ns
     match motion:
         case StandingPlan():
             return None
         case WayPointsPlan():
-            begin_ns = round(motion.wait * 1e9) + phase_ns
+            begin_ns = round(motion.wait * 1e9) + first_ns
             return _waypoint_program(path_points_m(motion, body.place_m), motion.speed, body, begin_ns)
         case StationKeepingPlan():
-            return _waypoint_program([body.place_m], STATION_M_S, body, phase_ns)
+            return _waypoint_program([body.place_m], STATION_M_S, body, first_ns)
         case VelocityProfilePlan():
             heading_rad = math.radians(plan.heading_deg)
-            return VelocityProfile([_leg(leg, body, heading_rad) for leg in motion.legs])
+            return VelocityProfile([_leg(leg, body, heading_rad) for leg in motion.legs], begin_ns=appears_ns)
         case FollowPlan():
-            return _follower(motion, body, phase_ns)
+            return _follower(motion, body, first_ns)
 
 
 def _leg(leg: LegPlan, body: Body[Any], heading_rad: float) -> ProfileLeg:
@@ -201,7 +203,10 @@ def programs(
     for name, controller in controllers.items():
         programs_by_agent[name].append(controller)
     for traffic in scenario.traffic:
-        programs_by_agent[traffic.source] += [_sender(traffic, flow, to, seed) for flow, to in traffic.flows.items()]
+        begin_s = max(traffic.start, scenario.agents[traffic.source].appears)
+        programs_by_agent[traffic.source] += [
+            _sender(traffic, flow, to, begin_s, seed) for flow, to in traffic.flows.items()
+        ]
     for name in {to for traffic in scenario.traffic if isinstance(traffic, PingTraffic) for to in traffic.to}:
         programs_by_agent[name].append(EchoResponder())
     combined: dict[str, Program] = {
@@ -212,9 +217,9 @@ def programs(
     return dict(_with_faults(scenario, combined, stops))
 
 
-def _sender(traffic: Traffic, flow: str, to: str, seed: int) -> Program:
+def _sender(traffic: Traffic, flow: str, to: str, begin_s: float, seed: int) -> Program:
     phase = RandomStream(seed, flow, "phase").draw(0)
-    begin_ns = _ns(traffic.start + phase * (traffic.period_s or START_INTERVAL_S))
+    begin_ns = _ns(begin_s + phase * (traffic.period_s or START_INTERVAL_S))
     match traffic:
         case StreamTraffic():
             return Periodic(

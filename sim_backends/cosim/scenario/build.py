@@ -16,7 +16,7 @@ from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.recording.captures import CapturedFlow
+from sim_backends.cosim.recording.captures import CapturedFlow, PacketObserver
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import FileTraffic, PingTraffic, QosOptions, Traffic
 from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
@@ -38,7 +38,7 @@ from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.udp import Udp
 from sim_backends.physics.bodies import Bodies
 from sim_backends.radio.fixed_links import UniformLinks
-from sim_backends.radio.model import RadioModel, WifiInWorld
+from sim_backends.radio.model import PathLosses, RadioModel, WifiInWorld
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.world import World, load_world
 
@@ -48,7 +48,11 @@ so would all retransmissions."""
 
 
 def radio_network(
-    scenario: CosimScenario, world: World, seed: int, observer: WindowObserver | None = None
+    scenario: CosimScenario,
+    world: World,
+    seed: int,
+    observer: WindowObserver | None = None,
+    path_losses_db: PathLosses | None = None,
 ) -> RadioNetwork:
     """Return the network that carries the packets of a scenario, which must have passed `checks`.
 
@@ -57,12 +61,13 @@ def radio_network(
         world: Its world.
         seed: Seed of all random draws.
         observer: Receives all IP packets if it has `log_ip`.
+        path_losses_db: As for `WifiInWorld`; fixed links ignore them.
     """
     stations = antennas(scenario)
     radio: RadioModel[Fragment] = (
         UniformLinks(seed, scenario.radio)
         if scenario.radio.fixed
-        else WifiInWorld(seed, scenario.radio, stations, world)
+        else WifiInWorld(seed, scenario.radio, stations, world, path_losses_db=path_losses_db)
     )
     network = RadioNetwork(
         radio,
@@ -125,6 +130,15 @@ def _qos(traffic: Traffic) -> Qos:
 
 
 def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:
+    """Yield the disturbances by faults; the radio of an agent that is absent is off."""
+    stations = antennas(scenario)
+    for name, lifetime in scenario.lifetimes.items():
+        if name not in stations:
+            continue
+        if lifetime.appears_ns:
+            yield NodeLoss(name, 0, lifetime.appears_ns)
+        if lifetime.disappears_ns is not None:
+            yield NodeLoss(name, lifetime.disappears_ns)
     for fault in scenario.faults:
         match fault:
             case NodeLossFault():
@@ -203,7 +217,8 @@ def build(
         scenario: The scenario.
         policy: A sync policy or the name of one; None for the scenario's.
         seed: Seed of all random draws; None for the scenario's first.
-        recorder: Receives every window, and every IP packet if it has `log_ip`; or None.
+        recorder: Receives every window, and every IP packet if it has `log_ip`; or None. With another network it
+            receives the programs' packets as IP packets.
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         physics: Replaces the scenario's physics, and receives the commands to bodies.
         network: Replaces the scenario's network; faults of the radio are then its responsibility.
@@ -226,9 +241,12 @@ def build(
         if network is None and (network := open_network(*details)) is not None:
             federates.callback(getattr(network, "close", _nothing_to_close))
         if physics is None:
-            physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns)
+            physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns, lifetimes=scenario.lifetimes)
         if network is None:
-            network = radio_network(scenario, world, seed, recorder)
+            losses_db = partial(getattr, physics, "path_losses_db") if hasattr(physics, "path_losses_db") else None
+            network = radio_network(scenario, world, seed, recorder, losses_db)
+        elif isinstance(recorder, IpObserver):
+            recorder = PacketObserver(recorder, recorder.log_ip)
         for fault in scenario.faults:
             if isinstance(fault, StalledFederateFault):
                 stall = Stall(fault.begin_ns, fault.stall, deadline_s)
@@ -239,7 +257,9 @@ def build(
         scenario_programs = programs(
             scenario, seed, controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
         )
-        agents = Agents(physics, scenario_programs)
+        lifetimes = scenario.lifetimes
+        starts = Bodies(scenario_bodies, world, lifetimes=lifetimes).start_states() if lifetimes else {}
+        agents = Agents(physics, scenario_programs, lifetimes, starts)
         coordinator = Coordinator(
             agents, network, policy, scenario.pairs, observer=recorder, measures_all=measures_all
         )

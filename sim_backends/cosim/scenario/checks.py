@@ -224,7 +224,7 @@ def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
                 f"name one of {', '.join(plan.motion.leader)}",
             )
     try:
-        Bodies(bodies(scenario, world), world)
+        Bodies(bodies(scenario, world), world, lifetimes=scenario.lifetimes)
     except ConfigurationError as error:
         agent = error.what.partition(" ")[0]  # the message begins with the name of the agent
         yield ScenarioProblem(("agents", agent), error.what, error.remedy)

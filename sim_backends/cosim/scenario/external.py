@@ -50,8 +50,8 @@ def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[
         seed: Seed of all random draws.
         role: `PHYSICS` or `NETWORK`.
     """
-    built_in = Bodies(bodies, world, step_ns=scenario.physics.step_ns)
-    states = built_in.advance(0, {})
+    built_in = Bodies(bodies, world, step_ns=scenario.physics.step_ns, lifetimes=scenario.lifetimes)
+    states = built_in.start_states()
     agents = [
         AgentStart(
             name,

@@ -17,6 +17,7 @@ from sim_backends.cosim.scenario.reproduced_trial import ReproducedTrial
 from sim_backends.emane_events.options import EmaneOptions
 from sim_backends.network.tcp.tcp_options import Congestion
 from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.motion import Lifetime
 from sim_backends.world.obstacles import Place, Real
 
 BUILT_IN: Final = "builtin"
@@ -131,6 +132,8 @@ class AgentPlan(Strict):
         radio: Its radio, instead of that of its robot profile.
         motion: Its motion.
         phase: Time of its controller's first command, within the 50 ms between commands; if omitted, it is random.
+        appears: Time when it appears at its start. Its motion begins then, and its traffic not before.
+        disappears: Time when it disappears; never if omitted.
     """
 
     robot: str
@@ -142,6 +145,21 @@ class AgentPlan(Strict):
     radio: AgentRadio | None = None
     motion: MotionPlan = StandingPlan.defaults()
     phase: Annotated[Duration | None, Field(lt=PERIOD_NS / 1e9)] = None
+    appears: Duration = 0.0
+    disappears: Duration | None = None
+
+    @property
+    def lifetime(self) -> Lifetime:
+        """The time in which it exists."""
+        return Lifetime(round(self.appears * 1e9), None if self.disappears is None else round(self.disappears * 1e9))
+
+    @schema.model_validator(mode="after")
+    def _disappears_after_it_appears(self) -> "AgentPlan":
+        if self.disappears is not None and self.disappears <= self.appears:
+            raise schema.validation_error(
+                f"it disappears at {self.disappears:g} s, not after it appears at {self.appears:g} s", "disappears"
+            )
+        return self
 
     @schema.model_validator(mode="after")
     def _one_start(self) -> "AgentPlan":
@@ -213,6 +231,12 @@ class CosimScenario(Named):
     def duration_ns(self) -> int:
         """Its duration in nanoseconds of simulated time."""
         return round(self.duration * 1e9)
+
+    @property
+    def lifetimes(self) -> dict[str, Lifetime]:
+        """The lifetimes of the agents that do not exist during the whole run."""
+        lifetimes = {name: plan.lifetime for name, plan in self.agents.items()}
+        return {name: lifetime for name, lifetime in lifetimes.items() if lifetime != Lifetime()}
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:

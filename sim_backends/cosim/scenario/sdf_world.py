@@ -19,7 +19,7 @@ def scenario_sdf(scenario: CosimScenario, version: Version = "fortress") -> str:
     """
     world = load_world(scenario.world)
     scenario_bodies = bodies(scenario, world)
-    states = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns).advance(0, {})
+    states = Bodies(scenario_bodies, world, lifetimes=scenario.lifetimes).start_states()
     robots = {}
     for name, plan in scenario.agents.items():
         east_m, north_m, up_m = states[name].position_m

@@ -32,14 +32,14 @@ def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or
     scenario = CosimScenario.model_validate(configuration["scenario"])
     world = World.model_validate(configuration["world"])
     if role == PHYSICS:
-        return Bodies(bodies(scenario, world), world, step_ns=hello.step_ns)
+        return Bodies(bodies(scenario, world), world, step_ns=hello.step_ns, lifetimes=scenario.lifetimes)
     return radio_network(scenario, world, hello.seed)
 
 
 def main(role_name: str, address: str | None = None) -> None:
     """Serve the built-in federate of a role: `physics` or `network`."""
     role = PHYSICS if role_name == ROLES[PHYSICS] else NETWORK
-    serve(partial(make_federate, role), address=address, name=f"fieldkit {ROLES[role]}")
+    serve(partial(make_federate, role), address=address, name=f"fieldkit {ROLES[role]}", agents_disappear=True)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -38,7 +38,7 @@ class Tracks:
 
 
 def tracks_of(states: Iterable[tuple[int, str, State]]) -> Tracks:
-    """Return the tracks of recorded states; each time must have the states of all agents.
+    """Return the tracks of recorded states; an agent without a state at a time has the position nan.
 
     Args:
         states: Time in nanoseconds, agent, state, in the order of time.
@@ -50,8 +50,10 @@ def tracks_of(states: Iterable[tuple[int, str, State]]) -> Tracks:
 
 
 def _tracks(times_s: Floats, samples: Sequence[Mapping[str, State]]) -> Tracks:
-    names = tuple(samples[0]) if samples else ()
-    places_m = [[states[name].position_m for name in names] for states in samples]
+    names = tuple(dict.fromkeys(name for states in samples for name in states))
+    places_m = [
+        [states[name].position_m if name in states else (math.nan,) * 3 for name in names] for states in samples
+    ]
     return Tracks(names, times_s, np.array(places_m, dtype=np.float64).reshape(len(samples), len(names), 3))
 
 
@@ -70,6 +72,7 @@ class SampledPhysics:
         self._samples: list[Mapping[str, State]] = []
         self.step_ns = physics.step_ns
         self.limits_m_s2 = physics.limits_m_s2
+        self.agents_disappear = getattr(physics, "agents_disappear", False)
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
         """Advance the physics, and store the samples that are due."""
@@ -191,6 +194,9 @@ class Formation:
     amplification: float
 
 
+_MIN_SAMPLES: Final = 2
+"""Number of samples that a speed needs."""
+
 NO_FORMATION = Formation(*(math.nan,) * 5)
 """The formation of a scenario without followers."""
 
@@ -207,23 +213,26 @@ def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
         scenario: The scenario with the followers.
         tracks: The positions of the agents.
     """
-    if len(tracks.times_s) < 2:
+    if len(tracks.times_s) < _MIN_SAMPLES:
         return NO_FORMATION
     spacing: list[Floats] = []
     station: list[Floats] = []
     ratios: list[float] = []
     for name, plan in scenario.agents.items():
-        if not isinstance(plan.motion, FollowPlan):
+        if not isinstance(plan.motion, FollowPlan) or not {name, *plan.motion.leader} <= {*tracks.names}:
             continue
-        leaders = _places_m(tracks, plan.motion.leader)
-        follower = _places_m(tracks, [name])
+        row = _places_m(tracks, [*plan.motion.leader, name])
+        present = ~np.isnan(row).any(axis=(1, 2))
+        if np.count_nonzero(present) < _MIN_SAMPLES:
+            continue
+        times_s, leaders, follower = tracks.times_s[present], row[present, :-1], row[present, -1:]
         if isinstance(limits(plan.robot), QuadrotorLimits):
             station.append(station_errors_m(leaders, follower[:, 0], plan.motion.distance))
         else:
-            row = np.concatenate([leaders, follower], axis=1)
-            errors_m = spacing_errors_m(tracks.times_s, row, plan.motion.distance, plan.motion.headway)
+            row = row[present]
+            errors_m = spacing_errors_m(times_s, row, plan.motion.distance, plan.motion.headway)
             spacing.append(errors_m[:, 0])
-            ratios += _ratios(tracks.times_s, row)
+            ratios += _ratios(times_s, row)
     return Formation(*_mean_and_max(spacing), *_mean_and_max(station), max(ratios, default=math.nan))
 
 

@@ -171,7 +171,9 @@ def _differences(start_ns: int, end_ns: int, exact: _Outcome, actual: _Outcome) 
             differences["delivery_s"].append(abs(fate.counted_ns - other.counted_ns) / 1e9)
             differences["late_s"].append(other.late_ns / 1e9)
     differences["path_m"] = [
-        math.dist(state.position_m, actual.states[name].position_m) for name, state in exact.states.items()
+        math.dist(state.position_m, actual.states[name].position_m)
+        for name, state in exact.states.items()
+        if name in actual.states
     ]
     return differences
 

@@ -133,7 +133,7 @@ def mean_separation_m(outcome: RunOutcome) -> float:
     first, second = np.triu_indices(places_m.shape[1], k=1)
     if not len(first):
         return math.nan
-    return float(np.linalg.norm(places_m[:, first] - places_m[:, second], axis=2).mean())
+    return float(np.nanmean(np.linalg.norm(places_m[:, first] - places_m[:, second], axis=2)))
 
 
 MEASURES: Final[Mapping[str, Callable[[RunOutcome], float]]] = {
@@ -232,7 +232,7 @@ def rows(outcomes: Outcomes, formation: Callable[[Tracks], Formation] = lambda _
 
 def _growth_m(outcomes: Outcomes, policy: str) -> tuple[Floats, Floats]:
     pairs = [(outcomes.reference[seed].tracks, outcome.tracks) for seed, outcome in outcomes.runs[policy].items()]
-    largest_m = [tracks.distances_m(reference).max(axis=1) for reference, tracks in pairs]
+    largest_m = [np.fmax.reduce(tracks.distances_m(reference), axis=1) for reference, tracks in pairs]
     length = min(map(len, largest_m), default=0)
     if not length:
         return np.zeros(0), np.zeros(0)

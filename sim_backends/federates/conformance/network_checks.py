@@ -318,6 +318,23 @@ def check_new_agent(target: Target) -> None:
         raise CheckError("a packet to an agent that has appeared neither arrived nor was dropped")
 
 
+def check_absent_agent(target: Target) -> None:
+    """Nothing arrives at an agent without a state, if the federate declares that agents may disappear."""
+    probe = target.open()
+    probe.require(FederateCapability.AGENTS_DISAPPEAR)
+    account, states = _Account(probe), _states(probe)
+    packets = _packets(probe, [2 * _MS, 3 * _MS, 4 * _MS])[::2]
+    receiver = packets[0].destination
+    present = {name: state for name, state in states.items() if name != receiver}
+    account.advance(_MS, states)
+    account.advance(1_000 * _MS, present, packets)
+    if account.arrivals:
+        raise CheckError(f"a packet arrived at {receiver}, which has disappeared")
+    account.advance(_END_NS, states)
+    if account.undecided():
+        raise CheckError("a packet to an agent that has disappeared neither arrived nor was dropped")
+
+
 def check_dead_reckoning(target: Target) -> None:
     """Extrapolation at a velocity of 0 changes nothing, if the federate declares that it extrapolates."""
     arrivals = []

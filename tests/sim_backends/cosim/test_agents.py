@@ -1,4 +1,4 @@
-"""Wake times of programs, for any sequence of planned times, and agents that appear during a run."""
+"""Wake times of programs, for any sequence of planned times, and agents that appear and disappear during a run."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
+from sim_backends.cosim.packet_ledger import ABSENT
 from sim_backends.cosim.policies.registry import BUILTIN, make_policy
 from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.network.disc import Disc
@@ -105,3 +106,35 @@ def test_an_agent_that_appears_during_a_run_can_receive_with_every_policy(policy
     assert len(to_late) >= 5
     assert all(fate.assumed[1].position_m == (3.0, 4.0, 0.0) for fate in to_late)
     assert not any(fate.reason for fate in run.fates.values())
+
+
+class Visited(Still):
+    """Physics in which an agent disappears within a window, and is there again later."""
+
+    agents_disappear = True
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+        states = super().advance(to_ns, commands)
+        return {name: state for name, state in states.items() if name != "b" or not 12 * MS <= to_ns < 32 * MS}
+
+
+@pytest.mark.parametrize("extrapolates", [False, True])
+@pytest.mark.parametrize("policy", BUILTIN)
+def test_an_agent_that_the_physics_removes_is_absent_with_every_policy(policy: str, *, extrapolates: bool) -> None:
+    physics = Visited()
+    physics.step_ns = MS
+    programs = {
+        "a": Periodic("to b", "b", period_ns=MS, first_ns=MS // 2),
+        "b": Periodic("to a", "a", period_ns=MS, first_ns=MS // 2),
+    }
+    network = Disc(10.0, 2 * MS, extrapolates=extrapolates)
+    make = make_policy(policy, window_s=0.005, longest_s=0.02)
+    run = Coordinator(Agents(physics, programs), network, make, [("a", "b"), ("b", "a")]).advance(60 * MS)
+    fates = {name: [fate for (flow, _), fate in run.fates.items() if flow == name] for name in ("to a", "to b")}
+    assert len(fates["to b"]) >= 55
+    assert 30 < len(fates["to a"]) <= 60 - 15, "its program sends nothing while the agent is absent"
+    assert {fate.reason for name in fates for fate in fates[name]} == {"", ABSENT}
+    lost = [fate.packet.sent_ns for fate in fates["to b"] if fate.reason]
+    assert {*range(15, 30)} <= {at_ns // MS for at_ns in lost}
+    assert all(4 * MS <= at_ns < 37 * MS for at_ns in lost)
+    assert any(fate.arrived_ns is not None and fate.arrived_ns > 40 * MS for fate in fates["to a"])

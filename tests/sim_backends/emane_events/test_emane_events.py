@@ -4,9 +4,10 @@ import json
 import math
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,6 +45,8 @@ from sim_backends.federates.conformance.suite import run_checks
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.protocols import FederateError, UnansweredError
 from sim_backends.physics.body import Twist
+from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.radio.world_channel import Antenna, WorldChannel
 from sim_backends.world.world import load_world
 from tests.helpers.federate_pairs import Pair
 from tests.helpers.host import separate_namespaces
@@ -285,8 +288,8 @@ traffic:
 
 
 @contextmanager
-def publishing(*positions_m: tuple[float, float, float]) -> Iterator[None]:
-    """Publish locations of NEM 1, 2, ... repeatedly, with a malformed datagram before them."""
+def publishing(*positions_m: tuple[float, float, float], losses: Sequence[SerializedEvent] = ()) -> Iterator[None]:
+    """Publish path losses and locations of NEM 1, 2, ... repeatedly, with a malformed datagram before them."""
     publisher = EventPublisher(CHANNEL, "lo")
     frame, ended = LocalFrame(TURIN), threading.Event()
     velocity = EmaneVelocity(90.0, 0.0, 2.0)
@@ -295,7 +298,7 @@ def publishing(*positions_m: tuple[float, float, float]) -> Iterator[None]:
     def publish() -> None:
         while not ended.is_set():
             publisher.publish([SerializedEvent(ALL_NEMS, LOCATION, b"\x0a\x05")])
-            publisher.publish([SerializedEvent(ALL_NEMS, LOCATION, encode_locations(locations))])
+            publisher.publish([*losses, SerializedEvent(ALL_NEMS, LOCATION, encode_locations(locations))])
             ended.wait(0.05)
 
     thread = threading.Thread(target=publish)
@@ -324,6 +327,60 @@ def test_agents_follow_events(network: None, tmp_path: Path) -> None:
     assert states["one"].position_m == pytest.approx((12.0, 20.0, 0.5), abs=1e-6)
     assert states["one"].velocity_m_s == pytest.approx((2.0, 0.0, 0.0), abs=1e-9)
     assert run.wall_s["wait"] > 0.3  # it runs in real time
+
+
+def loss_event(messages: dict[str, Any], to_nem: int, **losses_db: tuple[float, float]) -> SerializedEvent:
+    """Return an event for a NEM with the bytes of protobuf: forward and reverse losses by the other NEM."""
+    event = messages["PathlossEvent"]()
+    for nem, (forward_db, reverse_db) in losses_db.items():
+        event.pathlosses.add(nemId=int(nem[1:]), forwardPathlossdB=forward_db, reversePathlossdB=reverse_db)
+    return SerializedEvent(to_nem, PATHLOSS, event.SerializeToString())
+
+
+@pytest.mark.emulated
+@pytest.mark.parametrize(
+    ("follows", "expected"), [(True, {"two": False, "far": True}), (False, {"two": True, "far": False})]
+)
+def test_path_losses_of_events_replace_those_of_the_world(
+    network: None, tmp_path: Path, messages: dict[str, Any], expected: dict[str, bool], *, follows: bool
+) -> None:
+    """As in EMANE, a receiver uses the forward loss from each transmitter, and no reverse loss."""
+    path = tmp_path / "pair.yaml"
+    path.write_text(STANDING, encoding="utf-8")
+    changes = {
+        "agents.far": {"robot": "husky", "at_m": [10, 50], "radio": {}},
+        "traffic": [{"kind": "stream", "name": "state", "from": "one", "to": ["two", "far"], "rate": "20Hz"}],
+        "physics.federate": "emane",
+        "physics.options": {"device": "lo", "reference": list(TURIN), "pathloss": follows},
+    }
+    losses = [
+        loss_event(messages, 1, n2=(150.0, 60.0), n3=(70.0, 150.0), n77=(1.0, 1.0)),
+        loss_event(messages, 2, n1=(150.0, 60.0)),
+        loss_event(messages, 3, n1=(70.0, 150.0)),
+        SerializedEvent(1, PATHLOSS, b"\x0a\x05"),
+    ]
+    places_m = (12.0, 20.0, 0.5), (32.0, 20.0, 0.5), (9_000.0, 20.0, 0.5)
+    with publishing(*places_m, losses=losses), build(load_scenario(path, changes), policy="scheduled") as simulation:
+        run = simulation.run()
+    for name, arrives in expected.items():
+        outcomes = {fate.arrived_ns is not None for fate in run.fates.values() if fate.packet.destination == name}
+        assert outcomes == {arrives}
+
+
+def test_given_path_losses_have_a_direction() -> None:
+    antennas = {name: Antenna("802.11g", 17.0, -82.0) for name in ("a", "b", "c")}
+    channel = WorldChannel(1, antennas, RadioOptions.model_validate({"fading": False}))
+    channel.move(0, {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 1.0), "c": (20.0, 0.0, 1.0)})
+    before_db = {(first, second): channel.snr_db(first, second) for first, second in permutations(range(3), 2)}
+    noise_dbm = 10 * math.log10(channel.noise_mw[0])
+    channel.use_path_losses({("a", "b"): 90.0, ("b", "a"): 100.0, ("a", "unknown"): 1.0})
+    assert channel.snr_db(0, 1) == pytest.approx(17 - 90 - noise_dbm)
+    assert channel.snr_db(1, 0) == pytest.approx(17 - 100 - noise_dbm)
+    assert channel.snr_db(1, 2) == before_db[1, 2]
+    assert not channel.linked(0, 1)
+    assert not channel.linked(1, 0), "at -83 dBm, below the sensitivity"
+    channel.use_path_losses({})
+    assert {pair: channel.snr_db(*pair) for pair in before_db} == before_db
 
 
 @pytest.mark.emulated

@@ -217,6 +217,11 @@ class KnowsNoNewAgents(Net):
         return super().advance(to_ns, packets, {name: states[name] for name in ("ann", "bob", "cy")})
 
 
+class DeliversToAll(Net):
+    def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
+        return super().advance(to_ns, packets, {name: State((0.0, 0.0, 0.0)) for name in ("ann", "bob", "cy")})
+
+
 class Reckons(Net):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
         later = MS if isinstance(states, DeadReckoned) else 0
@@ -442,6 +447,7 @@ NETWORK_CASES = [
     ),
     Broken("determinism", physics(net(random_delay)), "gave different arrivals or drops"),
     Broken("new_agent", physics(KnowsNoNewAgents, agents_appear=True), "KeyError"),
+    Broken("absent_agent", physics(DeliversToAll, agents_disappear=True), "a packet arrived at bob, which has"),
     Broken("dead_reckoning", physics(Reckons), "extrapolation at a velocity of 0 changed"),
     Broken("fork", physics(SharedNet), "the copy and the original"),
     Broken("next_event", physics(AnnouncesTooLate), "before the announced next event"),
@@ -493,7 +499,7 @@ def test_the_federates_conform_before_they_are_broken(role: int) -> None:
     make = Carts if role == PHYSICS else LosesByKey
     for name in checks(is_physics=role == PHYSICS):
         settings: dict[str, Any] = {"transports": ("udp",)} if role == NETWORK else {}
-        pair = physics(make, agents_appear=True, forks=name != "fork_absence", **settings)
+        pair = physics(make, agents_appear=True, agents_disappear=True, forks=name != "fork_absence", **settings)
         result = run(role, Broken(name, pair, ""))
         assert (result.failure, result.skipped) == ("", ""), result
 

@@ -24,7 +24,8 @@ CASES = [(role, name) for role in (PHYSICS, NETWORK) for name in checks(is_physi
 
 @pytest.mark.parametrize(("role", "name"), CASES, ids=str)
 def test_the_built_in_federates_conform(role: int, name: str) -> None:
-    target = Target(Pair(FederateService(partial(make_federate, role))), replace(HELLO, role=role), windows=500)
+    service = FederateService(partial(make_federate, role), agents_disappear=True)
+    target = Target(Pair(service), replace(HELLO, role=role), windows=500)
     result = run_check(target, name, checks(is_physics=role == PHYSICS)[name])
     assert not result.failure, result
     assert bool(result.skipped) == (name in {"fork_absence", "unknown_transport", "new_agent"})

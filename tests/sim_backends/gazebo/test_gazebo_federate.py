@@ -221,3 +221,11 @@ def test_a_gazebo_that_ends_or_is_suspended_is_reported(tmp_path: Path) -> None:
             FederateError, match=r"'baylands', whose last time is 0.01 s: it has disappeared, or is suspended"
         ):
             physics.advance(2 * WINDOW_NS, {})
+
+
+@pytest.mark.parametrize("lifetime", ["appears", "disappears"])
+def test_robots_that_appear_or_disappear_are_refused_before_the_run(lifetime: str, server: GazeboServer) -> None:
+    changes = {f"agents.leader.{lifetime}": "3s"}
+    refusal = pytest.raises(FederateError, match="remove appears and disappears of leader")
+    with refusal, connected(server, {}, changes):
+        pass

@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from scapy.layers.dot11 import Dot11, RadioTap
+from scapy.layers.inet import IP
+from scapy.utils import PcapReader
 
 from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
@@ -208,6 +211,7 @@ def test_topics_of_best_effort_are_carried_as_udp_if_the_scenario_says_so(simula
         ({"radio__loss": "1%"}, "fixed links are not Wi-Fi"),
         ({"faults": [{"kind": "jammer", "power_dbm": 10, "at_m": [3, 3]}]}, "ns-3 has no jammers"),
         ({"network__options__delay_parts": "/no/such/folder"}, "delay_parts cannot be written"),
+        ({"network__options__pcap": "/no/such/folder/"}, "pcap cannot be written: /no/such/folder/ann.pcap"),
     ],
 )
 def test_what_it_does_not_support_is_refused_with_the_reason(
@@ -257,3 +261,14 @@ def test_the_command_line_runs_it_and_writes_the_tables(
     assert row["flow"] == "state/bob"
     assert 48 <= int(row["sent"]) <= 50  # those whose fate is decided
     assert (tmp_path / "run" / "trial.csv").is_file()
+
+
+def test_it_captures_frames_with_radiotap_headers(simulated: Simulated, tmp_path: Path) -> None:
+    simulation = simulated(network__options__pcap=str(tmp_path / "air-{seed}-"))
+    simulation.run()
+    simulation.close()
+    frames = {name: list(PcapReader(str(tmp_path / f"air-1-{name}.pcap"))) for name in ("ann", "bob")}
+    for captured in frames.values():
+        assert len([frame for frame in captured if IP in frame]) >= 100, "two fragments of each datagram"
+        assert all(frame.haslayer(RadioTap) for frame in captured)
+    assert any(frame[Dot11].type == 1 for frame in frames["ann"]), "an ACK"

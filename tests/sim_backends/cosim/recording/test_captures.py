@@ -22,7 +22,10 @@ from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.recording.captures import CapturedFlow, Captures, IpEncoder, between
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
+from sim_backends.network.disc import Disc
 from sim_backends.network.ip import Fragment
+from sim_backends.network.packets import Arrival, Drop
+from sim_backends.network.packets import Packet as NetworkPacket
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.network.tcp.connection import ConnectionName, Tcp
 from sim_backends.network.tcp.segments import Segment
@@ -31,7 +34,7 @@ from sim_backends.network.wire import IpPacket
 from sim_backends.physics.paths import Paths
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.world.motion import WayPoints
+from sim_backends.world.motion import State, WayPoints
 from tests.helpers.passing_robots import ABOUT, MS
 
 NAMES = ("alpha", "bravo", "carol")
@@ -176,6 +179,43 @@ def test_the_robots_of_a_scenario_capture_the_packets_of_their_network(tmp_path:
     assert captured.keys() == scenario.agents.keys()
     arrived = sum(fate.arrived_ns is not None for fate in run.fates.values())
     assert sum(captured.values()) >= len(run.fates) + arrived > 10, "each packet at its sender, and at its receiver"
+
+
+class LosesEveryThird(Disc):
+    def advance(
+        self, to_ns: int, packets: Sequence[NetworkPacket], states: Mapping[str, State]
+    ) -> tuple[list[Arrival], list[Drop]]:
+        lost = [packet for packet in packets if packet.packet_id % 3 == 0]
+        arrivals, _ = super().advance(to_ns, [packet for packet in packets if packet not in lost], states)
+        return arrivals, [Drop(packet.packet_id, "third") for packet in lost]
+
+
+def test_packets_of_another_network_are_captured_as_datagrams_at_both_ends(tmp_path: Path) -> None:
+    scenario = load_scenario("baylands", {"duration": "2s"})
+    with RunRecorder(tmp_path / "run", ABOUT) as recorder:
+        run = build(scenario, policy="scheduled", recorder=recorder, network=LosesEveryThird(1e6, 3 * MS)).run()
+    assert read_recording(tmp_path / "run").run == run
+    assert any(fate.reason for fate in run.fates.values())
+    for number, name in enumerate(sorted(scenario.agents), start=1):
+        expected = [
+            (fate.packet.enters_ns, fate.packet.size_bytes + 28, fate.packet.identity[0])
+            for fate in run.fates.values()
+            if fate.packet.source == name
+        ]
+        expected += [
+            (fate.arrived_ns, fate.packet.size_bytes + 28, fate.packet.identity[0])
+            for fate in run.fates.values()
+            if fate.packet.destination == name and fate.arrived_ns is not None
+        ]
+        path = tmp_path / "run" / "captures" / f"{name}.pcap"
+        frames = list(PcapReader(str(path))) if path.exists() else []
+        times_ns = [round(frame.time * 10**9) for frame in frames]
+        assert times_ns == sorted(times_ns)
+        assert sorted(zip(times_ns, (frame.wirelen for frame in frames), strict=True)) == sorted(
+            (at_ns, size_bytes) for at_ns, size_bytes, _ in expected
+        )
+        assert all(f"10.0.0.{number}" in (frame[IP].src, frame[IP].dst) for frame in frames)
+        assert len({frame[UDP].dport for frame in frames}) == len({flow for *_, flow in expected})
 
 
 def test_truncated_packets_have_their_original_length(tmp_path: Path) -> None:
