@@ -279,30 +279,6 @@ def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) ->
         assert not autopilot.vehicle.body.on_ground
 
 
-def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The guard can observe the suspended pilot before the heartbeat that reports the new mode."""
-
-    def send_signal() -> None:
-        pilot, advance = agent_of(shell, "fly"), autopilot.vehicle.advance
-
-        def suspend_and_take_over(now_ns: int) -> None:
-            monkeypatch.undo()
-            os.kill(pilot, signal.SIGSTOP)
-            autopilot.vehicle.change_mode(Mode.LOITER)
-            advance(now_ns)
-
-        monkeypatch.setattr(autopilot.vehicle, "advance", suspend_and_take_over)
-
-    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
-        with pytest.raises(RobotError, match="ended with exit code 137"):
-            fly(shell, port, "60min", send_signal)
-        wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
-        assert autopilot.vehicle.mode is Mode.LOITER
-        assert not autopilot.vehicle.body.on_ground
-
-
 def test_arducopter_returns_after_its_lease_expired(shell: Shell) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         for name, centimetres in (("RTL_ALT", 100.0), ("WPNAV_RADIUS", 10.0)):
