@@ -239,7 +239,7 @@ robots:
 roles:
   masterless: {sender: turtlebot-1, receiver: turtlebot-2}
   master: {sender: turtlebot-1, receiver: turtlebot-2, relay: duckiedrone-1}
-emulated: {ros: builtin, radio: {loss: LOSS}}
+emulated: {ros: builtin, late_bound: 2s, radio: {loss: LOSS}}
 """
 
 
