@@ -27,7 +27,7 @@ settings.register_profile("nightly", settings.get_profile("fieldkit"), print_blo
 settings.load_profile("fieldkit")
 
 # Files that take long, the longest first, because a long file that starts late would run alone at the end. Those that
-# run several trials in parallel (`known_loss`, `strangers`, `load_steps`) are separated, so that they do not compete.
+# run several trials in parallel (`known_loss`) are separated, so that they do not compete.
 _LONG: Final = (
     "test_docs",
     "test_drive",

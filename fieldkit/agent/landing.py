@@ -109,6 +109,7 @@ def _wait_for_mode(session: AutopilotSession, each_iteration: Callable[[], None]
     while session.drone.armed and time.monotonic() - start_s < min(session.drone.heartbeat_age_s, _MODE_WAIT_S):
         each_iteration()
         session.exchange(_POLL_S)
+    session.exchange(0.0)  # a heartbeat may have arrived while this program did not run
 
 
 def alarm(drone: AutopilotState) -> str:

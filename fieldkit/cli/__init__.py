@@ -102,7 +102,10 @@ def _run_guarded(top: Parser, argv: Sequence[str] | None, options: hints.CliOpti
         _show_error(str(error))
         return error.exit_code
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has exited, so an error message cannot be delivered
+        # The reader of our output has exited, so an error message cannot be delivered. Python writes the rest of the
+        # buffer when it exits, and would change the exit code.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.stderr.close()
         return 0
     except OSError as error:
         # Library functions wrap the errors that they expect. A full disk can make any write fail.

@@ -1,6 +1,7 @@
 """A drone lands if its pilot can no longer write, or receives no answers."""
 
 import json
+import signal
 import subprocess
 import sys
 import threading
@@ -13,11 +14,12 @@ import pytest
 
 from fieldkit.agent import flight, landing
 from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
-from fieldkit.agent.flying import loop
+from fieldkit.agent.flying import liveness, loop
 from fieldkit.agent.mavlink_frames import LOCAL_POSITION_NED, parse_frame
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot
+from sim_backends.emulated.autopilot.modes import Mode
 from tests.helpers import drones
 from tests.helpers.sshd import wait_until
 
@@ -155,3 +157,51 @@ def test_drone_with_stopped_motors_is_released(tmp_path: Path) -> None:
         assert process.wait(60) == landing.TAKEN_OVER
         assert process.stderr is not None
         assert b"its motors have stopped" in process.stderr.read()
+
+
+SLOW_MACHINE = """\
+import sys
+from fieldkit.agent import landing
+from fieldkit.agent.flying import guard, liveness, loop
+landing._MODE_WAIT_S = guard.GAP_S = loop.GAP_S = liveness.SILENCE_TIMEOUT_S = 60.0
+from fieldkit.agent.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+"""The program with time limits that a busy machine does not exceed."""
+
+
+@contextmanager
+def patient_agent(flight_plan: FlightPlan) -> Iterator["subprocess.Popen[bytes]"]:
+    words = (sys.executable, "-c", SLOW_MACHINE, "fly", json.dumps(asdict(flight_plan)))
+    process = subprocess.Popen(words)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(60)
+
+
+def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(tmp_path: Path) -> None:
+    """The guard observes the suspended pilot before the heartbeat that reports the new mode."""
+    order(tmp_path, 1, CLIMB)
+    silent, life = threading.Event(), tmp_path / "life"
+
+    def guard_iterations() -> int:
+        return liveness.entries(life.read_bytes())[liveness.GUARD].iterations
+
+    with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame], ARDUCOPTER) as (port, autopilot):
+        pilot_plan = replace(plan(tmp_path, port), liveness=str(life))
+        with patient_agent(replace(pilot_plan, guards=True)) as guard:
+            wait_until(lambda: life.exists() and guard_iterations() > 0, Deadline.after(60))
+            with patient_agent(pilot_plan) as pilot:
+                wait_until_up(autopilot)
+                silent.set()
+                autopilot.vehicle.change_mode(Mode.LOITER)
+                received = guard_iterations() + 2
+                wait_until(lambda: guard_iterations() >= received, Deadline.after(60))
+                pilot.send_signal(signal.SIGSTOP)
+                assert pilot.wait(60) == -signal.SIGKILL
+                silent.clear()
+                assert guard.wait(60) == landing.TAKEN_OVER
+        assert autopilot.vehicle.mode is Mode.LOITER
+        assert not autopilot.vehicle.body.on_ground

@@ -1,12 +1,13 @@
 """The harness works without `fieldkit.motion` and `fieldkit.ros`: its tests pass in a copy without them."""
 
+import json
 import os
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -16,6 +17,7 @@ from fieldkit.config import schema
 from tests.helpers.casts import PLAIN, los_plan
 from tests.helpers.outside_packages import write_package
 from tests.helpers.paths import ROOT
+from tests.helpers.runs import Run
 from tests.helpers.texts import procedure
 
 PACKAGES: Final = ("fieldkit.motion", "fieldkit.ros")
@@ -29,7 +31,6 @@ HARNESS_TESTS: Final = (
     "tests/backends/test_backend_registry.py",
     "tests/campaign/test_campaign_plan.py",
     "tests/config/test_misplaced.py",
-    "tests/config/test_site_file.py",
     "tests/core/test_columns.py",
     "tests/core/test_plugins.py",
     "tests/export/test_export_table.py",
@@ -90,11 +91,46 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(copy: Path, *words: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run a module of Python with the copy's packages."""
-    return subprocess.run(
-        (sys.executable, "-m", *words),
-        cwd=folder or copy,
+RUNNER: Final = """
+import json, sys
+from pathlib import Path
+from tests.helpers.runs import run_here
+for line in sys.stdin:
+    folder, words = json.loads(line)
+    run = run_here(Path(folder), *words)
+    print(json.dumps([run.code, run.out, run.err]), flush=True)
+"""
+"""Runs commands of the copy in one process, which imports the packages only once."""
+Fieldkit = Callable[..., Run]
+
+
+@pytest.fixture(scope="module")
+def run_in(copy: Path) -> Iterator[Fieldkit]:
+    """A function that runs `fieldkit` of the copy in a folder."""
+    with subprocess.Popen(
+        (sys.executable, "-c", RUNNER),
+        env=os.environ | {"PYTHONPATH": str(copy)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as runner:
+
+        def run(folder: Path, *words: str) -> Run:
+            assert runner.stdin is not None
+            assert runner.stdout is not None
+            runner.stdin.write(json.dumps([str(folder), words]) + "\n")
+            runner.stdin.flush()
+            return Run(*json.loads(runner.stdout.readline()))
+
+        yield run
+
+
+def test_tests_of_the_harness_pass_without_the_products(copy: Path) -> None:
+    chosen = "not motion and not ros and not emulated and not quiet and not nightly"
+    options = ("-q", "-p", "no:cacheprovider", "--hypothesis-profile", "ci", "-m", chosen)
+    done = subprocess.run(
+        (sys.executable, "-m", "pytest", *options, *HARNESS_TESTS),
+        cwd=copy,
         env=os.environ | {"PYTHONPATH": str(copy)},
         stdin=subprocess.DEVNULL,
         capture_output=True,
@@ -102,71 +138,67 @@ def run(copy: Path, *words: str, folder: Path | None = None) -> subprocess.Compl
         timeout=LIMIT_S,
         check=False,
     )
-
-
-def test_tests_of_the_harness_pass_without_the_products(copy: Path) -> None:
-    chosen = "not motion and not ros and not emulated and not quiet and not nightly"
-    options = ("-q", "-p", "no:cacheprovider", "--hypothesis-profile", "ci", "-m", chosen)
-    done = run(copy, "pytest", *options, *HARNESS_TESTS)
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
 
 
-def test_a_trial_is_planned_without_the_products(copy: Path, tmp_path: Path) -> None:
+def test_a_trial_is_planned_without_the_products(run_in: Fieldkit, tmp_path: Path) -> None:
     write_procedure(tmp_path, "plain", PLAIN)
-    done = run(copy, "fieldkit", "trial", "plain", "30ft", "--dry-run", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    listed = run(copy, "fieldkit", "columns", folder=tmp_path)
-    assert listed.returncode == 0, listed.stderr
-    assert "rtt_sent" in listed.stdout
+    done = run_in(tmp_path, "trial", "plain", "30ft", "--dry-run")
+    assert done.code == 0, done.err
+    listed = run_in(tmp_path, "columns")
+    assert listed.code == 0, listed.err
+    assert "rtt_sent" in listed.out
 
 
 @pytest.mark.parametrize(("kind", "step"), STEPS_OF_PRODUCTS.items())
-def test_a_kind_of_a_removed_package_is_reported(copy: Path, tmp_path: Path, kind: str, step: str) -> None:
+def test_a_kind_of_a_removed_package_is_reported(run_in: Fieldkit, tmp_path: Path, kind: str, step: str) -> None:
     write_procedure(tmp_path, kind, PROCEDURE.replace("KIND", kind).replace("STEP", step))
-    done = run(copy, "fieldkit", "trial", kind, "5m", "--dry-run", folder=tmp_path)
-    assert done.returncode == 2
-    assert f"unknown key {kind}" in done.stderr
-    assert "other kinds of step need a package that is not installed" in " ".join(done.stderr.split())
+    done = run_in(tmp_path, "trial", kind, "5m", "--dry-run")
+    assert done.code == 2
+    assert f"unknown key {kind}" in done.err
+    assert "other kinds of step need a package that is not installed" in " ".join(done.err.split())
 
 
 # The robots of the default lab.
 @pytest.mark.parametrize(("profile", "key"), [("turtlebot3_burger", "drive"), ("duckiedrone", "mavlink")])
 def test_a_profile_with_a_section_of_the_removed_package_is_refused(
-    copy: Path, tmp_path: Path, profile: str, key: str
+    run_in: Fieldkit, tmp_path: Path, profile: str, key: str
 ) -> None:
     (tmp_path / "robots").mkdir()
     shutil.copy(ROOT / "robots" / f"{profile}.yaml", tmp_path / "robots")
     write_procedure(tmp_path, "plain", PLAIN)
-    done = run(copy, "fieldkit", "trial", "plain", "30ft", "--dry-run", folder=tmp_path)
-    assert done.returncode == 2, done.stdout
+    done = run_in(tmp_path, "trial", "plain", "30ft", "--dry-run")
+    assert done.code == 2, done.out
     message = f"unknown key {key}; it needs the package fieldkit.motion, which is not installed"
-    assert message in " ".join(done.stderr.split())
+    assert message in " ".join(done.err.split())
 
 
-def test_a_stored_trial_with_such_a_profile_is_refused(copy: Path, tmp_path: Path) -> None:
+def test_a_stored_trial_with_such_a_profile_is_refused(run_in: Fieldkit, tmp_path: Path) -> None:
     plan = los_plan()
     trial = tmp_path / plan.trial
     trial.mkdir()
     (trial / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
     for words in (("resume",), ("rebuild",)):
-        done = run(copy, "fieldkit", *words, str(trial), folder=tmp_path)
-        assert done.returncode == 2, done.stdout
-        assert "it needs the package fieldkit.motion" in " ".join(done.stderr.split())
+        done = run_in(tmp_path, *words, str(trial))
+        assert done.code == 2, done.out
+        assert "it needs the package fieldkit.motion" in " ".join(done.err.split())
 
 
-def test_a_procedure_with_a_section_of_the_removed_package_is_refused(copy: Path, tmp_path: Path) -> None:
+def test_a_procedure_with_a_section_of_the_removed_package_is_refused(run_in: Fieldkit, tmp_path: Path) -> None:
     (tmp_path / "procedures").mkdir()
     text = (ROOT / "procedures" / "los.yaml").read_text(encoding="utf-8").replace("name: los", "name: guarded")
     (tmp_path / "procedures" / "guarded.yaml").write_text(f"{text}on_abort: {{receiver: land}}\n", encoding="utf-8")
-    done = run(copy, "fieldkit", "trial", "guarded", "5m", "--dry-run", folder=tmp_path)
-    assert done.returncode == 2, done.stdout
+    done = run_in(tmp_path, "trial", "guarded", "5m", "--dry-run")
+    assert done.code == 2, done.out
     message = "unknown key on_abort; it needs the package fieldkit.motion, which is not installed"
-    assert message in " ".join(done.stderr.split())
+    assert message in " ".join(done.err.split())
 
 
 @pytest.mark.parametrize("command", ["trial", "resume", "campaign"])
-def test_the_permissions_of_the_removed_package_are_not_options(copy: Path, tmp_path: Path, command: str) -> None:
-    shown = run(copy, "fieldkit", command, "--help", folder=tmp_path).stdout
+def test_the_permissions_of_the_removed_package_are_not_options(
+    run_in: Fieldkit, tmp_path: Path, command: str
+) -> None:
+    shown = run_in(tmp_path, command, "--help").out
     assert "--yes" in shown
     assert "--allow-" not in shown
 
@@ -176,8 +208,8 @@ def write_procedure(folder: Path, name: str, text: str) -> None:
     (folder / "procedures" / f"{name}.yaml").write_text(text.replace("name: los", f"name: {name}"), encoding="utf-8")
 
 
-def test_the_commands_of_the_removed_packages_are_not_listed(copy: Path, tmp_path: Path) -> None:
-    lines = run(copy, "fieldkit", "--help", folder=tmp_path).stdout.splitlines()
+def test_the_commands_of_the_removed_packages_are_not_listed(run_in: Fieldkit, tmp_path: Path) -> None:
+    lines = run_in(tmp_path, "--help").out.splitlines()
     names = {line.split()[0] for line in lines if line.startswith("    ") and line.split()}
     assert "abort" in names
     assert not names & {"bag", "bridge", "middleware", "stop"}

@@ -10,6 +10,7 @@ from fieldkit.core.columns import Measured
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
 from fieldkit.trial.plan import Plan
+from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import only_trial, run_here
 from tests.helpers.texts import procedure
 
@@ -41,6 +42,7 @@ NEEDS_CAPTURES = {"topic_delay_median_s", "topic_delay_error_s", "topic_age_mean
 @pytest.fixture(scope="module")
 def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journal.Attempt]:
     home = tmp_path_factory.mktemp("drops")
+    built_in_ros(home)
     (home / "procedures").mkdir()
     (home / "procedures" / "stream.yaml").write_text(STREAM, encoding="utf-8")
     run = run_here(home, "trial", "stream", "5m", "--yes")

@@ -15,7 +15,7 @@ from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import Holder
 from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.field_robots import FieldRobots, start_field_robots
-from tests.helpers.labs import copy_shipped
+from tests.helpers.labs import built_in_ros, copy_shipped
 from tests.helpers.runs import LIMIT_S, Run, run_here
 
 pytestmark = pytest.mark.emulated
@@ -186,6 +186,7 @@ def test_a_trial_reports_warnings_and_stops_at_failures(lab: Path) -> None:
 
 def test_a_machine_without_a_hosts_file_is_sufficient(tmp_path: Path) -> None:
     """Like a minimal Debian; its `/etc` is in a separate mount namespace."""
+    built_in_ros(tmp_path)
     script = 'cp -a /etc "$0" && rm -f "$0/hosts" && mount --bind "$0" /etc && test ! -e /etc/hosts && exec "$@"'
     argv = ("unshare", "--mount", "sh", "-c", script, str(tmp_path / "etc"), sys.executable, "-m", "fieldkit", *CHECK)
     done = subprocess.run(argv, check=False, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT_S)

@@ -328,8 +328,9 @@ def is_loss_row(row: dict[str, str]) -> bool:
 
 def test_a_closed_pipe_ends_the_run_silently(lab: Path) -> None:
     command = f"set -o pipefail; '{sys.executable}' -m fieldkit cosim run pass.yaml --window 11ms | true"
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
     run = subprocess.run(
-        ("bash", "-c", command), cwd=lab, capture_output=True, text=True, check=False, timeout=LIMIT_S
+        ("bash", "-c", command), cwd=lab, capture_output=True, text=True, check=False, timeout=LIMIT_S, env=buffered
     )
     assert (run.returncode, run.stderr) == (0, "")
 

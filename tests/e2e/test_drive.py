@@ -317,6 +317,7 @@ def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(field_robots: FieldRob
     assert text.index("stopping: rover-1") < text.index("rover-1: stopped (stationary)")
 
 
+@pytest.mark.nightly  # CI stops a robot on its way out
 def test_ctrl_c_while_the_robot_drives_back_stops_it(field_robots: FieldRobots) -> None:
     (field_robots.folder / "procedures" / "drive.yaml").write_text(SHORT, encoding="utf-8")
     home_m = place_m(field_robots)

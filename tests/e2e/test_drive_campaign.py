@@ -105,6 +105,7 @@ def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_applies_to_all_tria
     assert lab.place_m == pytest.approx(home_m, abs=0.1)
 
 
+@pytest.mark.nightly  # CI moves a robot out of the fence of a single trial, in test_drive
 def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaign(lab: RoverLab) -> None:
     out, site = "outside", ("--site", RECEIVER_SITE)
     lab.write_procedure(Role.RECEIVER, 0.4)

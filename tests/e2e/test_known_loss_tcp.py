@@ -1,8 +1,10 @@
 """A radio with known loss, measured by complete trials over TCP: every byte arrives; retransmissions count."""
 
+from collections.abc import Sequence
+
 import pytest
 
-from tests.helpers.known_radio import LOSSES_PERCENT, REPEATS, make_lab, run_all
+from tests.helpers.known_radio import EACH_LOSS, LOSSES_PERCENT, REPEATS, LossyTables, Table, make_lab, run_all
 from tests.helpers.runs import total
 
 pytestmark = pytest.mark.emulated
@@ -20,17 +22,22 @@ def lossy_tcp(
     base = tmp_path_factory.mktemp("tcp")
     # At 30 % a small bag also limits the duration.
     topics = dict.fromkeys(LOSSES_PERCENT, "/imu") | {30: "/battery_state"}
-    radios = {loss: f"{{loss: {loss}%, rate: 50Mbit/s}}" for loss in LOSSES_PERCENT}
     repeats = {loss: int(share * request.param) for loss, share in SHARE_AT.items()}
-    labs = [
-        make_lab(base / str(loss), radio, topic=topics[loss], repeats=repeats[loss]) for loss, radio in radios.items()
-    ]
-    tables = run_all(labs, "--protocol", "tcp")
-    assert {name: len(table) for name, table in tables.items()} == {str(loss): of for loss, of in repeats.items()}
-    return tables
+
+    def measure(losses: Sequence[int]) -> dict[str, Table]:
+        radios = {loss: f"{{loss: {loss}%, rate: 50Mbit/s}}" for loss in losses}
+        labs = [
+            make_lab(base / str(loss), radio, topic=topics[loss], repeats=repeats[loss])
+            for loss, radio in radios.items()
+        ]
+        tables = run_all(labs, "--protocol", "tcp")
+        assert {name: len(table) for name, table in tables.items()} == {str(loss): repeats[loss] for loss in losses}
+        return tables
+
+    return LossyTables(measure)
 
 
-@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+@pytest.mark.parametrize("percent", EACH_LOSS)
 def test_tcp_delivers_every_byte_and_retransmissions_are_counted(
     lossy_tcp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
@@ -44,7 +51,7 @@ def test_tcp_delivers_every_byte_and_retransmissions_are_counted(
         assert sum(float(row["tcp_byte_loss"]) for row in table) > 0
 
 
-@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+@pytest.mark.parametrize("percent", EACH_LOSS)
 def test_packets_received_twice_are_those_that_tcp_sent_twice(
     lossy_tcp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:

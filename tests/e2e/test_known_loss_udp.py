@@ -1,12 +1,13 @@
 """A radio with known loss, measured by complete trials over UDP: the measured loss must be the configured loss."""
 
 import math
+from collections.abc import Sequence
 from statistics import median
 
 import pytest
 from scipy.stats import binomtest
 
-from tests.helpers.known_radio import LOSSES_PERCENT, REPEATS, make_lab, run_all
+from tests.helpers.known_radio import EACH_LOSS, REPEATS, LossyTables, Table, make_lab, run_all
 from tests.helpers.runs import total
 
 pytestmark = pytest.mark.emulated
@@ -21,14 +22,18 @@ def lossy_udp(
     tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
 ) -> dict[str, list[dict[str, str]]]:
     base = tmp_path_factory.mktemp("udp")
+
     # 200 messages a second make a bag of some 80 kB: 60 packets a repeat.
-    labs = [make_lab(base / str(loss), f"{{loss: {loss}%, rate: 50Mbit/s}}", topic="/imu") for loss in LOSSES_PERCENT]
-    tables = run_all(labs, "--protocol", "udp", "--repeats", str(request.param))
-    assert {name: len(table) for name, table in tables.items()} == {lab.name: request.param for lab in labs}
-    return tables
+    def measure(losses: Sequence[int]) -> dict[str, Table]:
+        labs = [make_lab(base / str(loss), f"{{loss: {loss}%, rate: 50Mbit/s}}", topic="/imu") for loss in losses]
+        tables = run_all(labs, "--protocol", "udp", "--repeats", str(request.param))
+        assert {name: len(table) for name, table in tables.items()} == {lab.name: request.param for lab in labs}
+        return tables
+
+    return LossyTables(measure)
 
 
-@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+@pytest.mark.parametrize("percent", EACH_LOSS)
 def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str, str]]], percent: int) -> None:
     table = lossy_udp[str(percent)]
     sent, received = total(table, "ip_packets_sent"), total(table, "ip_packets_received")
@@ -37,7 +42,7 @@ def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str,
     assert interval.low <= percent / 100 <= interval.high, (sent, received)
 
 
-@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+@pytest.mark.parametrize("percent", EACH_LOSS)
 def test_runs_of_independent_losses_have_the_lengths_of_the_closed_form(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
@@ -63,7 +68,7 @@ def test_the_radio_is_a_queue_that_copies_nothing(lossy_udp: dict[str, list[dict
             assert total(table, name) == 0, name
 
 
-@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+@pytest.mark.parametrize("percent", EACH_LOSS)
 def test_datagram_loss_is_larger_as_six_fragments_predict(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
@@ -80,7 +85,7 @@ def test_datagram_loss_is_larger_as_six_fragments_predict(
         assert (sent - received) / sent > 2 * packet_loss
 
 
-@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+@pytest.mark.parametrize("percent", EACH_LOSS)
 def test_the_air_delay_is_that_of_packets_that_arrived(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
@@ -105,7 +110,7 @@ def test_the_parts_of_the_delay_are_those_of_a_link_of_50_mbit_s(lossy_udp: dict
     assert queuing_s > transmission_s, "the six fragments of a datagram arrive together"
 
 
-@pytest.mark.parametrize("percent", LOSSES_PERCENT)
+@pytest.mark.parametrize("percent", EACH_LOSS)
 def test_the_papers_loss_counts_first_fragments_only(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:

@@ -24,7 +24,8 @@ from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.ros.interfaces.types import shipped
 from tests.helpers.host import Untouched, descendants, wait_for_end
-from tests.helpers.runs import fieldkit, start
+from tests.helpers.nightly import mark_nightly
+from tests.helpers.runs import fieldkit, run_here, start
 
 pytestmark = pytest.mark.emulated
 
@@ -47,7 +48,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (lab_folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     up = fieldkit(lab_folder, "lab", "up")
     assert up.code == 0, up.err
-    (lab_folder / "ssh.conf").write_text(fieldkit(lab_folder, "lab", "ssh-config").out, encoding="utf-8")
+    (lab_folder / "ssh.conf").write_text(run_here(lab_folder, "lab", "ssh-config").out, encoding="utf-8")
     try:
         yield lab_folder
     finally:
@@ -75,13 +76,13 @@ def process_of(lab_folder: Path) -> int:
 
 
 def test_ps_shows_robots_roles_addresses_positions_and_programs(lab: Path) -> None:
-    assert fieldkit(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
-    lines = fieldkit(lab, "lab", "ps").out.splitlines()
+    assert run_here(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
+    lines = run_here(lab, "lab", "ps").out.splitlines()
     ground, air = (" ".join(next(line for line in lines if name in line).split()) for name in ("ground-1", "air-1"))
     assert ground == "ground-1 turtlebot3_burger sender (masterless) 10.42.0.1 197.5, 197.5, 0.2 sshd, sensors"
     assert air == "air-1 duckiedrone receiver (masterless) 10.42.0.2 202.5, 197.5, 0.2 sshd, sensors, autopilot"
     assert lines[-1].startswith("up for ")
-    lab_state = json.loads(fieldkit(lab, "lab", "ps", "--json").out)
+    lab_state = json.loads(run_here(lab, "lab", "ps", "--json").out)
     assert lab_state["pid"] == process_of(lab)
     assert lab_state["up_s"] > 0
     ground_1, air_1 = lab_state["robots"]
@@ -118,15 +119,15 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
         jobs.install(shells["ground-1"], Deadline.after(WITHIN_S))
         evidence.begin(shells["ground-1"], attempt, "sender", "lo")
         jobs.start(shells["ground-1"], driver)
-        stopped = fieldkit(lab, "stop", "--all", "--backend", "emulated")
+        stopped = run_here(lab, "stop", "--all", "--backend", "emulated")
         assert (stopped.code, sorted(stopped.out.splitlines())) == (
             0,
             ["air-1: no program of fieldkit moves it; nothing was sent to it", "ground-1: stopped (stationary)"],
         )
         assert not jobs.list_running(shells["ground-1"], Deadline.after(WITHIN_S))
-    again = fieldkit(lab, "stop", "ground-1", "--backend", "emulated")
+    again = run_here(lab, "stop", "ground-1", "--backend", "emulated")
     assert (again.code, again.out) == (0, "ground-1: no program of fieldkit moves it; nothing was sent to it\n")
-    unknown = fieldkit(lab, "stop", "ground-2", "--backend", "emulated")
+    unknown = run_here(lab, "stop", "ground-2", "--backend", "emulated")
     assert (unknown.code, "did you mean 'ground-1'?" in unknown.err) == (2, True)
 
 
@@ -157,16 +158,16 @@ def test_robots_reach_each_other_over_their_radio(lab: Path) -> None:
 def test_a_robot_that_is_moved_away_is_unreachable_until_it_is_back(lab: Path) -> None:
     """With exponent 3 and 17 dBm, the weakest detectable frame of -82 dBm comes from 91 m."""
     lab_folder = folder.of_directory(lab)
-    assert fieldkit(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
-    moved = fieldkit(lab, "lab", "move", "air-1", "--by", "-100m", "-0.1km", "100m")
+    assert run_here(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
+    moved = run_here(lab, "lab", "move", "air-1", "--by", "-100m", "-0.1km", "100m")
     assert moved.out == "air-1 is at 102.5, 97.5, 100.2 (m east, north, up)\n"
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "3", "-i", "0.2", "-W", "1", "air-1").code == 1
     above = requests.overview(lab_folder)
     assert above.robots == {"ground-1": (197.5, 197.5), "air-1": (102.5, 97.5)}
     assert not above.links[0].linked
-    assert fieldkit(lab, "lab", "plot").out == "lab.svg\n"
+    assert run_here(lab, "lab", "plot").out == "lab.svg\n"
     assert f">{above.links[0].snr_db:.0f} dB<" in (lab / "lab.svg").read_text(encoding="utf-8")
-    assert fieldkit(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
+    assert run_here(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
     assert requests.state(lab_folder).robots[1].place_m == (207.5, 197.5, 0.2)
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "1", "-w", "30", "-i", "0.2", "air-1").code == 0
 
@@ -186,10 +187,10 @@ def ahead_m(lab: Path) -> float:
 def test_another_robot_reflects_the_laser_and_the_range_follows_it(lab: Path) -> None:
     """The cylinder of a Duckiedrone has a radius of 0.2 m; beam 0 points east, like the robot."""
     for east_m in (199.5, 200.5):
-        assert fieldkit(lab, "lab", "move", "air-1", "--to", f"{east_m}m", "197.5m").code == 0
+        assert run_here(lab, "lab", "move", "air-1", "--to", f"{east_m}m", "197.5m").code == 0
         # Standard error of the median of 8 or more scans with noise of 0.015 m.
         assert ahead_m(lab) == pytest.approx(east_m - 197.5 - 0.2, abs=0.05)
-    assert fieldkit(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
+    assert run_here(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
     assert ahead_m(lab) == math.inf
 
 
@@ -259,11 +260,11 @@ def test_a_second_lab_in_a_directory_is_rejected(lab: Path) -> None:
     second = fieldkit(lab, "lab", "up")
     assert second.code == 2
     assert "this directory has a lab that is up\n  remedy: fieldkit lab down" in second.err
-    assert "air-1" in fieldkit(lab, "lab", "ps").out
+    assert "air-1" in run_here(lab, "lab", "ps").out
 
 
 def test_an_unknown_robot_is_rejected(lab: Path) -> None:
-    shell = fieldkit(lab, "lab", "shell", "groud-1")
+    shell = run_here(lab, "lab", "shell", "groud-1")
     assert shell.code == 2
     assert "there is no robot 'groud-1' in this lab\n  remedy: did you mean 'ground-1'?" in shell.err
 
@@ -280,18 +281,18 @@ def test_an_invalid_request_gets_no_response(lab: Path, request_: str) -> None:
 def test_a_silent_client_does_not_block_others_for_long(lab: Path) -> None:
     with socket.socket(socket.AF_UNIX) as silent:
         silent.connect(str(folder.of_directory(lab).socket))
-        assert "air-1" in fieldkit(lab, "lab", "ps").out
+        assert "air-1" in run_here(lab, "lab", "ps").out
 
 
 def test_down_leaves_nothing(tmp_path: Path, untouched: Untouched) -> None:
     (tmp_path / "fieldkit.yaml").write_text("emulated: {ros: builtin}\nrobots: {}\nroles: {}\n", encoding="utf-8")
-    up = fieldkit(tmp_path, "lab", "up", "--robots", "4", "--profile", "duckiedrone")
+    up = fieldkit(tmp_path, "lab", "up", "--robots", "2", "--profile", "duckiedrone")
     assert up.code == 0, up.err
     process = process_of(tmp_path)
     lived = {process} | descendants(process)
-    assert len(lived) > 4 * 3
+    assert len(lived) > 2 * 3
     state = requests.state(folder.of_directory(tmp_path))
-    assert [robot.name for robot in state.robots] == ["robot-1", "robot-2", "robot-3", "robot-4"]
+    assert [robot.name for robot in state.robots] == ["robot-1", "robot-2"]
     assert {robot.profile for robot in state.robots} == {"duckiedrone"}
     assert fieldkit(tmp_path, "lab", "down").out == "the robots are down\n"
     wait_for_end(lived, within_s=0.0)
@@ -307,7 +308,7 @@ def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Pat
     os.kill(process, 9)
     wait_for_end(lived | {process}, within_s=WITHIN_S)
     untouched()
-    gone = fieldkit(tmp_path, "lab", "ps")
+    gone = run_here(tmp_path, "lab", "ps")
     assert (gone.code, "remedy: fieldkit lab up" in gone.err) == (2, True)
     assert fieldkit(tmp_path, "lab", "up").code == 0
     assert fieldkit(tmp_path, "lab", "down").code == 0
@@ -324,7 +325,7 @@ def test_a_lab_in_the_foreground_ends_with_ctrl_c(tmp_path: Path) -> None:
     wait_for_end(lived, within_s=0.0)
 
 
-@pytest.mark.parametrize("robots", [(), ("--robots", "1")])
+@pytest.mark.parametrize("robots", mark_nightly([("--robots", "1"), ()]))
 def test_a_lab_rejects_control_over_the_radio(tmp_path: Path, robots: tuple[str, ...]) -> None:
     (tmp_path / "fieldkit.yaml").write_text(f"control: radio\n{SITE}", encoding="utf-8")
     up = fieldkit(tmp_path, "lab", "up", *robots)
@@ -332,7 +333,7 @@ def test_a_lab_rejects_control_over_the_radio(tmp_path: Path, robots: tuple[str,
     try:
         assert "note: control: radio applies to trials; in a lab SSH bypasses the radio" in up.err
         name = requests.state(folder.of_directory(tmp_path)).robots[0].name
-        assert fieldkit(tmp_path, "lab", "move", name, "--to", "0m", "0m").code == 0
+        assert run_here(tmp_path, "lab", "move", name, "--to", "0m", "0m").code == 0
         assert fieldkit(tmp_path, "lab", "shell", name, "hostname").out == f"{name}\n"
     finally:
         assert fieldkit(tmp_path, "lab", "down").code == 0
@@ -343,4 +344,4 @@ def test_a_lab_that_cannot_start_reports_the_reason_in_the_terminal(tmp_path: Pa
     up = fieldkit(tmp_path, "lab", "up")
     assert up.code == 2
     assert "there is no robot profile 'nodrone'" in up.err
-    assert fieldkit(tmp_path, "lab", "down").code == 2
+    assert run_here(tmp_path, "lab", "down").code == 2

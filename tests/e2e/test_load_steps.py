@@ -1,17 +1,19 @@
 """iperf3, soak and run on emulated robots without ROS: results compared with captures, and errors."""
 
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
 
+from fieldkit.config.locations import SITE_FILE
+from tests.helpers.field_robots import start_field_robots
 from tests.helpers.labs import BOX, write_procedure
-from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here
+from tests.helpers.runs import Run, only_trial, rows, run_here
 from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
-SITE = site({"box-1": "box", "box-2": "box"}, emulated="radio: RADIO")
+SITE = site({"box-1": "box", "box-2": "box"}, emulated="late_bound: 2s, radio: RADIO")
 HEAD = procedure(
     "own",
     """\
@@ -43,17 +45,6 @@ def load(protocol: str, rate: str) -> str:
     return TEST.replace("PROTOCOL", protocol).replace("RATE", rate)
 
 
-def trials(labs: dict[str, Path]) -> dict[str, Run]:
-    with ThreadPoolExecutor(4) as pool:
-        return dict(
-            zip(
-                labs,
-                pool.map(lambda lab_folder: fieldkit(lab_folder, "trial", "own", "5m"), labs.values()),
-                strict=True,
-            )
-        )
-
-
 FLOWS = {
     "udp-lossy": ("udp", "4Mbit/s", "false", "{loss: 10%, delay: 2ms, rate: 20Mbit/s}"),
     "udp-reverse": ("udp", "4Mbit/s", "true", "{loss: 5%, delay: 2ms, rate: 20Mbit/s}"),
@@ -73,7 +64,8 @@ def flows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]
         )
         for name, (protocol, rate, reverse, radio) in FLOWS.items()
     }
-    for run in trials(labs).values():
+    for lab_folder in labs.values():
+        run = run_here(lab_folder, "trial", "own", "5m")
         assert run.code == 0, run.err + run.out
     return {name: rows(only_trial(lab_folder))[-1] for name, lab_folder in labs.items()}
 
@@ -132,9 +124,15 @@ REASONS = {
 
 @pytest.fixture(scope="module")
 def wrong(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Run, Path]]:
+    """Trials that go wrong, in order on the same robots."""
     base = tmp_path_factory.mktemp("wrong")
     labs = {name: lab(base / name, steps) for name, steps in WRONG.items()}
-    return {name: (run, labs[name]) for name, run in trials(labs).items()}
+    first = labs["code"]
+    with chdir(first), start_field_robots(first, site=first / SITE_FILE) as robots:
+        site_text = (robots.folder / SITE_FILE).read_text(encoding="utf-8")
+        for folder in labs.values():
+            (folder / SITE_FILE).write_text(site_text, encoding="utf-8")
+        return {name: (run_here(folder, "trial", "own", "5m", "--yes"), folder) for name, folder in labs.items()}
 
 
 @pytest.mark.parametrize("name", REASONS)

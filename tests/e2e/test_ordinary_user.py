@@ -35,6 +35,7 @@ robots:
 roles:
   masterless: {{sender: robot-1, receiver: robot-2}}
 emulated:
+  ros: builtin
   mesh: {{daemon: babeld, hello: 0.5s}}
 EOF
 "$@" lab up

@@ -31,30 +31,46 @@ steps:
 Fieldkit = Callable[..., subprocess.CompletedProcess[str]]
 
 
-@pytest.fixture
-def fieldkit(tmp_path: Path) -> Fieldkit:
-    """Return a function that runs fieldkit with the page's example installed."""
+def install(folder: Path) -> Fieldkit:
+    """Install the page's example in a folder; return a function that runs fieldkit there."""
     page = PAGE.read_text(encoding="utf-8")
     (source,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (entry,) = re.findall(r'^    \[project\.entry-points\."(.*)"\]\n    (\w+) = "(.*)"$', page, re.MULTILINE)
     group, kind, target = entry
-    installed = tmp_path / "installed"
+    installed = folder / "installed"
     about = installed / "route_step-1.0.dist-info"
     about.mkdir(parents=True)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: route-step\nVersion: 1.0\n", encoding="utf-8")
     (about / "entry_points.txt").write_text(f"[{group}]\n{kind} = {target}\n", encoding="utf-8")
     (installed / f"{target.partition(':')[0]}.py").write_text(source, encoding="utf-8")
-    (tmp_path / "procedures").mkdir()
-    (tmp_path / "procedures" / "busy.yaml").write_text(PROCEDURE, encoding="utf-8")
-    environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}", "TMPDIR": str(tmp_path)}
+    (folder / "procedures").mkdir()
+    (folder / "procedures" / "busy.yaml").write_text(PROCEDURE, encoding="utf-8")
+    environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}", "TMPDIR": str(folder)}
 
     def run(*words: str) -> subprocess.CompletedProcess[str]:
         command = (sys.executable, "-m", "fieldkit", *words)
         return subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=300
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=300
         )
 
     return run
+
+
+@pytest.fixture
+def fieldkit(tmp_path: Path) -> Fieldkit:
+    """Return a function that runs fieldkit with the page's example installed."""
+    return install(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fieldkit]:
+    """Return a folder with a trial of the example, which tests may change in this order, and the function there."""
+    folder = tmp_path_factory.mktemp("busy")
+    fieldkit = install(folder)
+    built_in_ros(folder)
+    done = fieldkit("trial", "busy", "5m", "--json")
+    assert done.returncode == 0, done.stderr
+    return folder, fieldkit
 
 
 def test_its_columns_and_commands_are_available(fieldkit: Fieldkit) -> None:
@@ -74,11 +90,9 @@ def test_an_unknown_kind_is_rejected_with_the_available_ones(fieldkit: Fieldkit,
 
 
 @pytest.mark.emulated
-def test_the_step_runs_and_is_judged_measured_and_reported(fieldkit: Fieldkit, tmp_path: Path) -> None:
-    built_in_ros(tmp_path)
-    done = fieldkit("trial", "busy", "5m", "--json")
-    assert done.returncode == 0, done.stderr
-    folder = only_trial(tmp_path)
+def test_the_step_runs_and_is_judged_measured_and_reported(finished: tuple[Path, Fieldkit]) -> None:
+    lab, fieldkit = finished
+    folder = only_trial(lab)
     (row,) = rows(folder)
     (route,) = json.loads((folder / "repeats" / "tcp-01" / "route.txt").read_text(encoding="ascii"))
     assert (row["status"], row["route_device"]) == ("valid", route["dev"])
@@ -169,16 +183,15 @@ def test_a_step_that_raises_in_every_call_is_an_error_before_the_trial(
 
 
 @pytest.mark.emulated
-def test_the_package_of_a_step_is_part_of_the_trial(fieldkit: Fieldkit, tmp_path: Path) -> None:
-    built_in_ros(tmp_path)
-    assert fieldkit("trial", "busy", "5m").returncode == 0
-    folder = only_trial(tmp_path)
-    installed = tmp_path / "installed"
+def test_the_package_of_a_step_is_part_of_the_trial(finished: tuple[Path, Fieldkit]) -> None:
+    lab, fieldkit = finished
+    folder = only_trial(lab)
+    installed = lab / "installed"
     with (installed / "route_step.py").open("a", encoding="utf-8") as module:
         module.write("\nCHANGED = True\n")
     changed = fieldkit("resume", str(folder))
     assert "the code of the step route (route-step 1.0) has changed since the trial started" in changed.stdout
-    installed.rename(tmp_path / "elsewhere")
+    installed.rename(lab / "elsewhere")
     refused = fieldkit("rebuild", str(folder))
     assert (refused.returncode, "mend" in refused.stderr) == (2, False)
     assert "step kind `route` from route-step 1.0 is not installed" in refused.stderr

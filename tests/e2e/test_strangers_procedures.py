@@ -10,7 +10,6 @@ import io
 import json
 import re
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +17,8 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.helpers.labs import BOX, write_procedure
-from tests.helpers.runs import fieldkit, rows, run_here
+from tests.helpers.runs import rows, run_here
+from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
@@ -33,6 +33,7 @@ robots:
 roles:
   masterless: {sender: box-1, receiver: box-2, talker: box-3, hearer: box-4}
 """
+TWO_ROBOTS = site({"box-1": "box", "box-2": "box"})
 
 PROCEDURES = {
     "asymmetric": """\
@@ -116,14 +117,14 @@ def run_trial(folder: Path, name: str) -> str:
     """Run a trial in a new lab; return its output."""
     (folder / "robots").mkdir(parents=True)
     (folder / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
-    (folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
+    (folder / "fieldkit.yaml").write_text(SITE if "talker" in PROCEDURES[name] else TWO_ROBOTS, encoding="utf-8")
     (folder / "answers.txt").write_text(ANSWERS, encoding="utf-8")
     (folder / "tools").mkdir()
     (folder / "tools" / "probe.sh").write_text(PROBE, encoding="utf-8")
     (folder / "tools" / "probe.sh").chmod(0o755)
     write_procedure(folder, HEAD.replace("NAME", name) + PROCEDURES[name])
 
-    run = fieldkit(folder, "trial", name, *DISTANCES[name], "--answers", "answers.txt")
+    run = run_here(folder, "trial", name, *DISTANCES[name], "--answers", "answers.txt")
     assert run.code == (1 if "expect:" in PROCEDURES[name] else 0), run.err + run.out
     return run.out
 
@@ -151,9 +152,7 @@ def analyse(folder: Path, trial_output: str) -> LabResults:
 @pytest.fixture(scope="module")
 def lab_results(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, LabResults]:
     base = tmp_path_factory.mktemp("strangers")
-    with ThreadPoolExecutor(3) as pool:
-        trial_outputs = list(pool.map(lambda name: run_trial(base / name, name), PROCEDURES))
-    return {name: analyse(base / name, out) for name, out in zip(PROCEDURES, trial_outputs, strict=True)}
+    return {name: analyse(base / name, run_trial(base / name, name)) for name in PROCEDURES}
 
 
 def test_each_procedure_has_about_ten_lines_of_steps() -> None:

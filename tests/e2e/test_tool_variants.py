@@ -70,7 +70,7 @@ def trial(lab: Path, pair: Pair, *words: str) -> Run:
             "netcat: openbsd, userland: busybox, ssh: dropbear",
             ros="debian",
         ),
-        Pair("netcat: ncat", "netcat: openbsd"),
+        pytest.param(Pair("netcat: ncat", "netcat: openbsd"), marks=pytest.mark.nightly),
     ],
     ids=lambda pair: f"{pair.sender} to {pair.receiver}",
 )

@@ -150,22 +150,16 @@ def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy
     assert "repeats/tcp-02/receiver.pcap: changed" in broken.err
 
 
-def test_json_events_are_one_object_per_line(tmp_path: Path) -> None:
+def test_a_masterless_trial_behind_the_wall_prints_one_json_object_per_line(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
-    run = fieldkit(
-        tmp_path, "trial", "los", "30ft", "--repeats", "1", "--record", "1s", "--protocol", "tcp", "--json"
-    )
+    words = ("--topology", "masterless", "--repeats", "1", "--record", "1s", "--protocol", "tcp", "--json")
+    run = run_here(tmp_path, "trial", "nlos", "5m", *words)
     assert run.code == 0, run.err
     (ended,) = run.events("repeat_ended")
     assert (ended["repeat"], ended["status"], ended["done"], ended["total"]) == ("tcp-01", "valid", 1, 1)
     (over,) = run.events("trial_ended")
     assert Path(tmp_path / over["folder"]) == only_trial(tmp_path)
     assert {event["name"] for event in run.events("phase_started")} >= {"record", "transfer", "ping"}
-
-
-def test_a_masterless_trial_behind_the_wall(tmp_path: Path) -> None:
-    run = run_here(tmp_path, "trial", "nlos", "5m", "--topology", "masterless", "--repeats", "1", "--record", "1s")
-    assert run.code == 0, run.err
     assert {
         (row["scenario"], row["topology"], row["relay"], row["receiver"]) for row in rows(only_trial(tmp_path))
     } == {("nlos", "masterless", "", "duckiedrone-1")}
@@ -183,6 +177,7 @@ def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path, untou
 
 
 def test_a_silent_topic_makes_every_attempt_void_and_the_trial_invalid(tmp_path: Path) -> None:
+    built_in_ros(tmp_path)
     copy_shipped(
         tmp_path,
         "procedures",

@@ -10,6 +10,7 @@ from fieldkit.remote import jobs
 from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import wait_for_end
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.runs import only_trial, rows, run_here, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.emulated
 QUICK = ("--repeats", "1", "--record", "1s", "--yes", "--backend", "field")
 
 
-@pytest.mark.parametrize("topology", Topology)
+@pytest.mark.parametrize("topology", mark_nightly(Topology, in_ci=(Topology.MASTER,)))
 def test_a_trial_of_the_field_backend_ends_valid(tmp_path: Path, topology: Topology) -> None:
     with start_field_robots(tmp_path, topology=topology, site=DEFAULT_SITE) as field_robots:
         run = run_here(tmp_path, "trial", "los", "5m", "--topology", topology, *QUICK)

@@ -1,11 +1,13 @@
 """Labs whose radio has a known loss and delay, and complete trials in them."""
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from tests.helpers.labs import write_procedure
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.runs import Run, fieldkit, only_trial, rows
 from tests.helpers.texts import procedure, site
 
@@ -14,6 +16,29 @@ IN_CI, AT_NIGHT = 5, 20
 """Number of repeats of each trial."""
 REPEATS = [IN_CI, pytest.param(AT_NIGHT, marks=pytest.mark.nightly)]
 """Parameters of a module fixture, so that each test that uses it runs with both numbers."""
+LOSSES_IN_CI = (0, 10, 30)
+"""In few repeats, a loss of 1 % can hardly be distinguished from no loss."""
+EACH_LOSS = mark_nightly(LOSSES_PERCENT, in_ci=LOSSES_IN_CI)
+"""Parameters of a test."""
+
+Table = list[dict[str, str]]
+
+
+class LossyTables(dict[str, Table]):
+    """Rows by loss in percent; losses that CI does not test are measured when they are needed.
+
+    Args:
+        measure: Measures rows of some losses in parallel.
+    """
+
+    def __init__(self, measure: Callable[[Sequence[int]], dict[str, Table]]) -> None:
+        super().__init__(measure(LOSSES_IN_CI))
+        self._measure = measure
+
+    def __missing__(self, percent: str) -> Table:
+        self.update(self._measure((int(percent),)))
+        return self[percent]
+
 
 SITE = site(emulated="ros: builtin, radio: RADIO")
 

@@ -11,9 +11,12 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.remote.command import printable
 from fieldkit.remote.shell import Completed
+from tests.helpers.nightly import mark_nightly
 
 USERLANDS = ("debian", "busybox", "bash")
 """dash with coreutils and util-linux; BusyBox alone with its ash as sh; bash as sh."""
+USERLANDS_OF_LONG_TESTS = mark_nightly(USERLANDS, in_ci=("debian", "busybox"))
+"""Parameters of a fixture of many tests; CI runs the script of jobs with bash in the tests of locks."""
 
 
 def userland_path(userland: str, folder: Path) -> str:

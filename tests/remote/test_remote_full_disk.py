@@ -17,7 +17,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import Holder, locked
 from tests.helpers.sshd import wait_until
-from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, userland_path
+from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, LocalSession, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -36,7 +36,7 @@ class SmallShell(LocalShell):
         return super().begin((*enter, *argv), deadline=deadline, until=until)
 
 
-@pytest.fixture(params=USERLANDS)
+@pytest.fixture(params=USERLANDS_OF_LONG_TESTS)
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[SmallShell]:
     home = tmp_path / "home"
     home.mkdir()

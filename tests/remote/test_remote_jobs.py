@@ -28,14 +28,14 @@ from fieldkit.remote.shell import Completed
 from tests.helpers.host import ENDED
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import free_port, wait_until
-from tests.helpers.userlands import USERLANDS, LocalSession, LocalShell, userland_path
+from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, LocalSession, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 
-@pytest.fixture(params=USERLANDS)
+@pytest.fixture(params=USERLANDS_OF_LONG_TESTS)
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
     home = tmp_path / "home"
     home.mkdir()

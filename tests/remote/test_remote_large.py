@@ -14,7 +14,7 @@ from fieldkit.core.errors import EvidenceError, LinkError, RobotError
 from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.fetching import PIECE_BYTES, FetchProgress, NoFolderError
 from fieldkit.remote.shell import Completed
-from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
+from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -40,7 +40,7 @@ class Flaky(LocalShell):
         return super().fetch(argv, to, deadline=deadline, limit_bytes=limit_bytes)
 
 
-@pytest.fixture(params=USERLANDS)
+@pytest.fixture(params=USERLANDS_OF_LONG_TESTS)
 def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Flaky]:
     home = tmp_path / "home"
     home.mkdir()

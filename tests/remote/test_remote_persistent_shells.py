@@ -28,7 +28,7 @@ from fieldkit.remote.shell import Completed
 from fieldkit.remote.ssh import SshSession, SshShell
 from tests.helpers.host import wait_for_end
 from tests.helpers.sshd import Server, sshd, wait_until
-from tests.helpers.userlands import USERLANDS, userland_path
+from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, userland_path
 
 SOON: Final = 60.0
 
@@ -88,7 +88,7 @@ def robot(folder: Path, userland: str = "debian", *, script: bytes = OBEYS, **op
         yield Robot(shell, server, home)
 
 
-@pytest.fixture(params=USERLANDS)
+@pytest.fixture(params=USERLANDS_OF_LONG_TESTS)
 def userland_robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Robot]:
     with robot(tmp_path, request.param) as started_robot:
         yield started_robot

@@ -20,14 +20,14 @@ from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote import evidence, fetching, jobs, script
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import wait_until
-from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
+from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 
-@pytest.fixture(params=USERLANDS)
+@pytest.fixture(params=USERLANDS_OF_LONG_TESTS)
 def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
     home = tmp_path / "home"
     home.mkdir()

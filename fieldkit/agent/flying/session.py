@@ -40,14 +40,17 @@ class AutopilotSession:
         self._next_heartbeat_s = 0.0
 
     def exchange(self, duration_s: float) -> None:
-        """Receive and send messages for this time in seconds."""
+        """Receive and send messages for this time in seconds; at least receive those that have arrived."""
         end_s = time.monotonic() + duration_s
         if time.monotonic() > self._next_heartbeat_s:
             self._next_heartbeat_s = time.monotonic() + _HEARTBEAT_INTERVAL_S
             self.drone.commands.send_heartbeat()
-        while (remaining_s := end_s - time.monotonic()) > 0:
-            if self._selector.select(remaining_s):
+        while True:
+            remaining_s = end_s - time.monotonic()
+            if self._selector.select(max(remaining_s, 0.0)):
                 self.drone.receive()
+            if remaining_s <= 0:
+                break
         self._on_state(self.drone)
 
     def close(self) -> None:

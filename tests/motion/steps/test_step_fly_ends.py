@@ -103,6 +103,7 @@ def log(shell: Shell) -> str:
     return (shell.home / FOLDER / "fly.log").read_text(encoding="utf-8")
 
 
+@pytest.mark.nightly  # CI has the takeover of an ArduCopter
 def test_takeover_by_a_person_aborts_steps_inside(shell: Shell) -> None:
     with drones.autopilot_at_udp() as (port, autopilot):
         with pytest.raises(RobotError, match="here: its flight ended early: another party flies it") as caught:
@@ -221,7 +222,7 @@ def test_flight_continues_after_serial_device_was_missing_for_two_seconds(shell:
     ("firmware", "number"),
     [
         (PX4, signal.SIGSTOP),
-        (ARDUCOPTER, signal.SIGKILL),
+        pytest.param(ARDUCOPTER, signal.SIGKILL, marks=pytest.mark.nightly),
         pytest.param(PX4, signal.SIGKILL, marks=pytest.mark.nightly),
         pytest.param(ARDUCOPTER, signal.SIGSTOP, marks=pytest.mark.nightly),
     ],
@@ -271,35 +272,12 @@ def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) ->
         with pytest.raises(RobotError, match=r"another party flies it \(mode LOITER") as caught:
             fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LOITER))
         assert "MAY STILL BE IN THE AIR" in str(caught.value)
+        assert "the wait was interrupted" in str(caught.value.__cause__)
         assert "MODE LOITER" in log(shell)
         evidence.end_jobs(shell, FOLDER)
         wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
         assert autopilot.vehicle.mode is Mode.LOITER
         assert autopilot.vehicle.armed
-        assert not autopilot.vehicle.body.on_ground
-
-
-def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(
-    shell: Shell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The guard can observe the suspended pilot before the heartbeat that reports the new mode."""
-
-    def send_signal() -> None:
-        pilot, advance = agent_of(shell, "fly"), autopilot.vehicle.advance
-
-        def suspend_and_take_over(now_ns: int) -> None:
-            monkeypatch.undo()
-            os.kill(pilot, signal.SIGSTOP)
-            autopilot.vehicle.change_mode(Mode.LOITER)
-            advance(now_ns)
-
-        monkeypatch.setattr(autopilot.vehicle, "advance", suspend_and_take_over)
-
-    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
-        with pytest.raises(RobotError, match="ended with exit code 137"):
-            fly(shell, port, "60min", send_signal)
-        wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
-        assert autopilot.vehicle.mode is Mode.LOITER
         assert not autopilot.vehicle.body.on_ground
 
 
