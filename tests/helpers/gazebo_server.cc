@@ -3,7 +3,8 @@
  * It follows the loop of Fortress (ign-gazebo6, SimulationRunner): the control service answers before anything
  * happens, the clock of a step is published before the step is made, poses are limited to a rate in wall time, a request
  * without `pause` lets the world run, and a reset sets the time to 0 without moving the models. DART clears commands
- * to joints after each step.
+ * to joints after each step. Unlike Fortress, a world that has been paused for some time iterates less often until the
+ * next request, so that an idle server uses no processor.
  *
  *     gazebo_server WORLD.sdf [--reset world] [--fault KIND@SECONDS]
  *
@@ -32,6 +33,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <condition_variable>
 #include <csignal>
 #include <cstring>
 #include <filesystem>
@@ -59,6 +61,9 @@ static std::string engine_path()
     }
     return "";
 }
+
+/* Longer than the period of the slowest poses in the tests, 60 Hz. */
+static constexpr auto ACTIVE_PERIOD = std::chrono::milliseconds(40), IDLE_PERIOD = std::chrono::milliseconds(5);
 
 static volatile std::sig_atomic_t is_stopped = 0;
 
@@ -137,6 +142,7 @@ public:
             [this](const msgs::WorldControl &request, msgs::Boolean &answer) {
                 std::lock_guard<std::mutex> guard(mutex_);
                 controls_.push_back(request);
+                requested_.notify_all();
                 answer.set_data(true);
                 return true;
             };
@@ -144,6 +150,7 @@ public:
                                                                                   msgs::Boolean &answer) {
             std::lock_guard<std::mutex> guard(mutex_);
             poses_.push_back(request);
+            requested_.notify_all();
             answer.set_data(true);
             return true;
         };
@@ -162,11 +169,24 @@ public:
         while (!is_stopped) {
             iterate();
             next = std::max(next + std::chrono::nanoseconds(period_ns_), SteadyClock::now());
-            std::this_thread::sleep_until(next);
+            if (!is_idle()) {
+                std::this_thread::sleep_until(next);
+                continue;
+            }
+            std::unique_lock<std::mutex> lock(mutex_);
+            requested_.wait_for(lock, IDLE_PERIOD, [this] { return !controls_.empty() || !poses_.empty(); });
         }
     }
 
 private:
+    /* Return true if poses and clock have been published often enough since the last request. */
+    bool is_idle()
+    {
+        if (!is_paused_ || rewinds_)
+            last_active_ = SteadyClock::now();
+        return SteadyClock::now() - last_active_ > ACTIVE_PERIOD;
+    }
+
     static std::string value(sdf::ElementPtr element, const char *key)
     {
         return element->HasElement(key) ? element->GetElement(key)->Get<std::string>() : "";
@@ -284,6 +304,8 @@ private:
             is_paused_ = true;
         cause_fault();
         std::lock_guard<std::mutex> guard(mutex_);
+        if (!controls_.empty())
+            last_active_ = SteadyClock::now();
         for (const msgs::WorldControl &control : controls_) {
             is_paused_ = control.pause();
             uint32_t steps = control.multi_step() ? control.multi_step() : control.step() ? 1 : 0;
@@ -375,6 +397,8 @@ private:
     physics::World3dPtr<Features> dart_;
     std::vector<std::unique_ptr<Model>> models_;
     std::mutex mutex_; /* for the requests */
+    std::condition_variable requested_;
+    SteadyClock::time_point last_active_ = SteadyClock::now(); /* of the last request or step */
     std::vector<msgs::WorldControl> controls_;
     std::vector<msgs::Pose> poses_;
     transport::Node::Publisher clock_, moving_, passed_;
