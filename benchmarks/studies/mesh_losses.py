@@ -22,7 +22,7 @@ from benchmarks.studies.mesh import BOUND_HELLOS
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
-from fieldkit.lab.protocol import LabRobot
+from fieldkit.lab.robots import LabRobot
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice

@@ -20,7 +20,7 @@ from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotE
 from fieldkit.core.model import FaultKind, Protocol, Role
 from fieldkit.core.threads import run_parallel
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import outage
+from fieldkit.measure.evidence import outage, outage_columns
 from fieldkit.measure.robot_clock import Offset, offset
 from fieldkit.measure.transfers import recoveries
 from fieldkit.measure.transfers.recoveries import FaultTimes
@@ -72,7 +72,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         during: Steps during which the fault occurs.
     """
 
-    columns = outage.COLUMNS
+    columns = outage_columns.COLUMNS
     cross_checks = (
         CrossCheck(
             "outage and recovery",
@@ -254,7 +254,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of this kind of fault, and of the recoveries of the flows inside."""
-        return (*outage.declared(self.kind), *across.declared(self))
+        return (*outage_columns.declared(self.kind), *across.declared(self))
 
     @override
     def measure(self, view: View) -> Measured:
