@@ -3,8 +3,8 @@
 Driving robots, 10 m apart, send packets of 1,000 bytes to the next robot by UDP in 802.11g, under `sliding_window`
 with windows of 10 ms. *Alone* is the same program of ns-3 with the same packets and positions, read from a file and
 simulated in one `Run()`. *Coupled* is the co-simulation: processor time of both processes, without that of physics
-and programs. *Built-in* is the co-simulation with the built-in network. Figures are medians of several rounds, in
-alternation. An error is raised if alone and coupled deliver different numbers of packets.
+and programs. *Built-in* is the co-simulation with the built-in network. Figures are medians of several rounds; in
+each round the variants alternate. An error is raised if alone and coupled deliver different numbers of packets.
 """
 
 import argparse
@@ -39,7 +39,7 @@ Figures = dict[str, float]
 
 
 def scenario_of(count: int, seconds: float, rate_hz: float, folder: Path) -> CosimScenario:
-    """Return the scenario of a number of robots, which ns-3 carries.
+    """Return the scenario of a number of robots whose network is ns-3.
 
     Args:
         count: Number of robots.

@@ -1,9 +1,9 @@
 """Time until a moving robot stops: `python -m benchmarks.stop`, as root; needs Debian's ROS 1.
 
-An emulated robot, which fieldkit treats as a real one, drives at 0.6 m/s. Each round runs in sequence, each in a new
-process: OpenSSH's `ssh ROBOT true` and `fieldkit stop`, both for another robot that no program moves; then `fieldkit
-stop` for the driving robot. Times are from the start of the process. The robot's motion is from the log of its base
-with 50 samples per second, independent of fieldkit's report.
+An emulated robot, which fieldkit treats as a real one, drives at 0.6 m/s. Each round runs three commands in sequence,
+each in a new process: OpenSSH's `ssh ROBOT true` and `fieldkit stop`, both for another robot that no program moves;
+then `fieldkit stop` for the driving robot. Times are from the start of the process. The robot's motion is from the
+log of its base with 50 samples per second, independent of fieldkit's report.
 """
 
 import argparse

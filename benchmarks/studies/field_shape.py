@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.analysis import repeats
+from fieldkit.analysis import table_files
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.repeats import Repeats
@@ -96,7 +96,7 @@ def run(folder: Path) -> None:
 
 def read(folder: Path) -> Repeats:
     """Return all attempts of the campaigns."""
-    return repeats.read(sorted(folder.glob("trials/campaign_*/*/trial.csv")), trial_columns())
+    return table_files.read(sorted(folder.glob("trials/campaign_*/*/trial.csv")), trial_columns())
 
 
 def chart(cells: Sequence[Cell], name: str, panels: Sequence[tuple[str, str, str]]) -> Chart:

@@ -1,9 +1,10 @@
 """Time that a mesh takes to find another path: `python -m benchmarks.studies.mesh_losses [--losses N]`, as root.
 
-Three labs run at the same time: a path of three hops with an alternative of four, without and with fading, and with
-an alternative of three with fading. In each lab the sender's next hop is switched off until the receiver answers a
-ping of the sender again, or for at most `PATIENCE_S`; then it is switched on until packets use it again. Then a table
-of these times is printed. 40 losses take about half an hour.
+In each of three labs, which run at the same time, a path of three hops leads from the sender to the receiver, and a
+second path leads around it: one of four hops without fading, one of four with fading, one of three with fading.
+The first robot on the path in use is switched off until the receiver answers a ping of the sender again, or for at
+most `PATIENCE_S`. Then it is switched on again, and the next loss follows when packets use it again. At the end a
+table of the times without an answer is printed. 40 losses take about half an hour.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from benchmarks.studies.mesh import BOUND_HELLOS
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
-from fieldkit.lab.protocol import LabRobot
+from fieldkit.lab.robots import LabRobot
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from fieldkit.analysis import comparable, statistics
+from fieldkit.analysis import comparable, significance
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
@@ -28,7 +28,7 @@ class Difference:
         a: Estimate of A; None if A did not measure it.
         b: Estimate of B; None if B did not measure it.
         interval: B - A with its 95 % interval; None if one of the estimates has no interval.
-        cliffs_delta: Effect size over repeats, see `statistics.cliffs_delta`; None unless both measured it.
+        cliffs_delta: Effect size over repeats, see `significance.cliffs_delta`; None unless both measured it.
         p_holm: p-value, corrected for the number of all comparisons; None without an interval.
         threshold: Largest acceptable difference; None if none was given.
     """
@@ -196,7 +196,7 @@ def _differences(
             continue
         difference = Difference(quantity, a, b, threshold=thresholds.get(quantity.name))
         if a is not None and b is not None and rows[0] is not None and rows[1] is not None:
-            delta = statistics.cliffs_delta(*(_values(side, quantity) for side in rows if side is not None))
+            delta = significance.cliffs_delta(*(_values(side, quantity) for side in rows if side is not None))
             difference = replace(difference, interval=_interval(a, b), cliffs_delta=delta)
         differences.append(difference)
     return tuple(differences)
@@ -213,7 +213,7 @@ def _values(rows: Repeats, quantity: Quantity) -> Numbers:
 def _interval(a: Estimate, b: Estimate) -> Interval | None:
     if a.low is None or a.high is None or b.low is None or b.high is None:
         return None
-    return statistics.between(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))
+    return significance.between(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))
 
 
 def _with_holm(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
@@ -221,7 +221,7 @@ def _with_holm(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
     intervals = [
         difference.interval for pair in pairs for difference in pair.differences if difference.interval is not None
     ]
-    p_holm = iter(statistics.holm([statistics.p_value(interval) for interval in intervals]))
+    p_holm = iter(significance.holm([significance.p_value(interval) for interval in intervals]))
     return tuple(
         replace(
             pair,

@@ -39,7 +39,7 @@ _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "iperf3 datagrams sent": ("iperf3_loss",),
     }
 )
-"""Label of a count, and the losses whose `trials` give it; the first one that a cell has is used."""
+"""Label of a count of sent items, and names of losses: the count is `trials` of the first loss that a cell has."""
 
 
 @dataclass(frozen=True)

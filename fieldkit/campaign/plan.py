@@ -32,7 +32,7 @@ def _require_distinct(key: Callable[[Item], Hashable]) -> AfterValidator:
     return AfterValidator(check)
 
 
-_ONCE: Final = (Field(min_length=1), _require_distinct(lambda item: item))
+_NONEMPTY_AND_DISTINCT: Final = (Field(min_length=1), _require_distinct(lambda item: item))
 
 
 class Exclusion(Strict):
@@ -79,11 +79,11 @@ class CampaignFile(Strict):
     """
 
     name: Annotated[
-        str, schema.pattern_field(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: letters, digits, - and _, 61 in all")
+        str, schema.pattern_field(r"^[A-Za-z0-9][A-Za-z0-9_-]{0,60}$", "a name: at most 61 letters, digits, - and _")
     ]
-    procedures: Annotated[tuple[str, ...], *_ONCE]
+    procedures: Annotated[tuple[str, ...], *_NONEMPTY_AND_DISTINCT]
     distances: Annotated[tuple[Span, ...], Field(min_length=1), _require_distinct(lambda distance: distance.metres)]
-    topologies: Annotated[tuple[Topology, ...], *_ONCE]
+    topologies: Annotated[tuple[Topology, ...], *_NONEMPTY_AND_DISTINCT]
     protocols: Annotated[tuple[Protocol, ...], _require_distinct(lambda item: item)] = ()
     repeats: Repeats | None = None
     record: Annotated[Duration, Field(gt=0)] | None = None

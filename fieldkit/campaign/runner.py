@@ -23,8 +23,8 @@ from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running.opening import opened
-from fieldkit.trial.running.resumption import require_cast, resumable
-from fieldkit.trial.running.runner import begin, continue_trial, place
+from fieldkit.trial.running.resumption import continue_trial, require_cast, resumable
+from fieldkit.trial.running.runner import begin, place
 from fieldkit.trial.running.stop import Stop
 from fieldkit.trial.size import trial_bytes
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.analysis import result_tables, table_lines, wording
+from fieldkit.analysis import paper_tables, result_tables, table_lines, wording
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.comparable import MIXED_BY, mixtures
 from fieldkit.analysis.expectations import Expectation
@@ -27,7 +27,7 @@ _AdditionalRepeats = Sequence[Mapping[str, int]]
 """For each cell, the number of additional repeats per quantity; empty unless `--width` is given."""
 
 _FOR_PROGRAMS: Final = MappingProxyType({"csv": result_tables.to_csv, "json": result_tables.to_json})
-_FOR_PAPERS: Final = MappingProxyType({"markdown": result_tables.to_markdown, "latex": result_tables.to_latex})
+_FOR_PAPERS: Final = MappingProxyType({"markdown": paper_tables.to_markdown, "latex": paper_tables.to_latex})
 # A table in a paper has space for one delay and one loss. Each protocol has one of these two losses.
 _PAPER_COLUMNS: Final = ("rtt_median_s", "ip_loss", "tcp_byte_loss")
 _VALUE_HEADS: Final = MappingProxyType(

@@ -6,7 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.analysis import comparison_results, result_tables, wording
+from fieldkit.analysis import comparison_results, paper_tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.comparable import VARIED, Concern
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
@@ -159,9 +159,9 @@ def _markdown(comparison: Comparison) -> str:
         *(f"{_concern_text(comparison, concern)}: {concern}" for concern in differing),
     ]
     return (
-        "".join(map(result_tables.markdown_line, rows))
+        "".join(map(paper_tables.markdown_line, rows))
         + "\n"
-        + "".join(f"- {result_tables.markdown_escaped(line)}\n" for line in notes)
+        + "".join(f"- {paper_tables.markdown_escaped(line)}\n" for line in notes)
     )
 
 

@@ -27,7 +27,7 @@ CHECKS: Final = "fieldkit.checks"
 `fieldkit.trial.running.preflight`."""
 POSITIONS: Final = "fieldkit.positions"
 """Entry point group of readers of positions: `SUFFIX = "package.module:function"`, without the dot; see
-`fieldkit.measure.positions.recorded`."""
+`fieldkit.measure.positions.position_files`."""
 POLICIES: Final = "fieldkit.policies"
 """Entry point group of sync policies of the co-simulation: `NAME = "package.module:Class"`, a `SyncPolicy`; see
 `sim_backends.cosim.policies.registry`."""

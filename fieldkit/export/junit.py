@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from fieldkit.analysis import judgements, repeats, wording
+from fieldkit.analysis import judgements, table_files, wording
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import quantities
@@ -93,7 +93,7 @@ def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
     if not plan.procedure.expect:
         return ()
     table = folder / store.TRIAL_CSV
-    rows = repeats.read([table], plan.table) if table.exists() else None
+    rows = table_files.read([table], plan.table) if table.exists() else None
     cells = () if rows is None else aggregate(rows, quantities=quantities(plan.table))
     return judgements.judge(plan.procedure.expectations, cells)
 

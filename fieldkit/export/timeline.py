@@ -19,9 +19,9 @@ from fieldkit.export.mcap import Channel, Json, Message
 from fieldkit.export.schemas import Level
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
-from fieldkit.measure.positions import position_columns, position_sources
+from fieldkit.measure.positions import position_sources, recorded_positions
 from fieldkit.measure.positions.samples import WGS84, Samples
-from fieldkit.trial import journal, rebuild, store
+from fieldkit.trial import journal, rows, store
 from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
 
@@ -116,9 +116,9 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 
 
 def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, int]]) -> Iterator[Message]:
-    """Yield the positions of robots by attempt, each from the best source according to `position_columns`."""
+    """Yield the positions of robots by attempt, each from the best source according to `recorded_positions`."""
     for attempt, ended_ns in attempts:
-        samples_by_role = position_columns.readable_samples(evidence(attempt))
+        samples_by_role = recorded_positions.readable_samples(evidence(attempt))
         # A position from before the start of the attempt is reported at the start.
         messages_of_attempt = [
             _place(plan, point.role, max(point.utc_ns, attempt.started_utc_ns), point.position_m)
@@ -150,7 +150,7 @@ def _place(plan: Plan, role: Role, t_ns: int, place: Vector, frame: str = "field
 def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int) -> Message:
     meaning = "The measurements of each attempt, at its end."
     channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(plan.table), _LAPTOP, meaning)
-    row = rebuild.row(plan, attempt, evidence)
+    row = rows.measured(plan, attempt, evidence)
     return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row, plan.table))
 
 

@@ -15,7 +15,8 @@ from fieldkit.config.schema import Codec
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError
 from fieldkit.core.model import Vector
 from fieldkit.lab.folder import LabFolder
-from fieldkit.lab.protocol import Destination, Overview
+from fieldkit.lab.protocol import Overview
+from fieldkit.lab.robots import Destination
 
 _ERROR_CLASSES: Final = {error_class.__name__: error_class for error_class in (ConfigurationError, LinkError)}
 

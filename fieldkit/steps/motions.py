@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Final, Protocol
 
 STOPPED: Final = "stopped by the operator"
-"""Reason of a void repeat, and of the block of motions, after the order to stop."""
+"""Reason for which, after the order to stop, the repeat is void and no robot may move until a person permits it."""
 
 _SIGNAL_S: Final = 0.5
 

@@ -7,7 +7,7 @@ from typing import Final
 from fieldkit.core import columns
 from fieldkit.core.columns import Column, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.measure.evidence import link, oracle_delays, outage
+from fieldkit.measure.evidence import link, oracle_delays, outage_columns
 from fieldkit.steps.base import Step, step_types
 
 IDENTITY: Final = columns.columns(
@@ -47,7 +47,7 @@ ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS)
 """Columns that are measured with any steps."""
 
 _KINDS_WITH_COLUMNS: Final = ("capture", "transfer", "ping")
-"""Kinds of step whose columns are in every trial, in addition to `outage.COLUMNS` of faults.
+"""Kinds of step whose columns are in every trial, in addition to `outage_columns.COLUMNS` of faults.
 
 Columns of all other kinds are only in trials with such steps, so that a trial imports no kind that it does not use.
 """
@@ -60,7 +60,7 @@ Row = Mapping[str, Value]
 def measures() -> tuple[Column, ...]:
     """Return every column that evidence fills in every trial: those of the testbed and of fieldkit's step kinds."""
     of_kinds = (column for kind in _KINDS_WITH_COLUMNS for column in step_types()[kind].columns)
-    filled = dict.fromkeys((*ALWAYS, *of_kinds, *outage.COLUMNS))
+    filled = dict.fromkeys((*ALWAYS, *of_kinds, *outage_columns.COLUMNS))
     return tuple(sorted(filled, key=lambda column: column.rank))
 
 

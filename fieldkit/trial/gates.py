@@ -10,8 +10,10 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
+from fieldkit.measure.positions import position_columns
+from fieldkit.steps.scene import Scene
 from fieldkit.steps.view import View
-from fieldkit.trial import hosts, placements
+from fieldkit.trial import hosts
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
 from fieldkit.trial.step_errors import StepErrors
@@ -58,7 +60,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     )
     for role in link.ROLES:
         measured |= link.measure(role, evidence.links(role))
-    placement_problem = placements.contradiction(scene, evidence)
+    placement_problem = _placement_problem(scene, evidence)
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
         columns: tuple[Column, ...] = ()
@@ -72,7 +74,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
                 problems += impossible.values()
             result = result.without(impossible)
             if placement_problem:
-                dependent = {name: placement_problem for name in result.values if placements.is_dependent(name)}
+                dependent = {name: placement_problem for name in result.values if position_columns.is_dependent(name)}
                 result = result.without(dependent)
         except MemoryError:
             raise
@@ -83,6 +85,15 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks))
+
+
+def _placement_problem(scene: Scene, evidence: AttemptEvidence) -> str | None:
+    """Return the reason why recorded positions contradict the planned placement, or None."""
+    if not position_columns.are_recorded(evidence):
+        return None
+    from fieldkit.trial import placements  # noqa: PLC0415 (few attempts have recorded positions)
+
+    return placements.contradiction(scene, evidence)
 
 
 def _step_problem(placed: PlacedStep, reason: str) -> str:

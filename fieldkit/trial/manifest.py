@@ -13,7 +13,6 @@ from typing import Final
 from fieldkit.core import files, laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.text import sanitized
-from fieldkit.measure.positions import position_sources
 from fieldkit.trial import store
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE
@@ -174,7 +173,7 @@ def _top_level_differences(folder: Path, sums: Sums) -> dict[str, str]:
 
 def is_positions(name: str) -> bool:
     """Return True if a top-level file of a trial contains positions of robots."""
-    return name == position_sources.FILE or name.startswith(store.POSITIONS)
+    return name == laptop_files.POSITIONS or name.startswith(store.POSITIONS)
 
 
 def _unchanged_lines(path: Path, digest: str) -> int | None:

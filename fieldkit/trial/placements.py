@@ -1,7 +1,6 @@
 """Compare the recorded positions of robots with the planned placement."""
 
 from collections.abc import Iterator
-from fnmatch import fnmatch
 from itertools import combinations
 from typing import Final
 
@@ -12,19 +11,10 @@ from fieldkit.core.model import Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.arrays import Ints
 from fieldkit.measure.evidence import host
-from fieldkit.measure.positions import position_columns
+from fieldkit.measure.positions import recorded_positions
 from fieldkit.measure.positions.samples import WGS84
 from fieldkit.measure.positions.trajectories import Trajectory
 from fieldkit.steps.scene import Scene
-
-DEPENDENT: Final = (
-    "*distance_start_m",
-    "*distance_m??_m",
-    "*distance_mean_m",
-    "*relative_speed_m_s",
-    "*sender_speed_m_s",
-)
-"""Columns that depend on positions; they are withheld if the recorded positions contradict the plan."""
 
 SATELLITE_M: Final = 15.0
 """Tolerance for satellite positions: twice 7.5 m. A receiver under open sky is within 5 m in 95 % of cases
@@ -48,13 +38,13 @@ def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
 def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
     places_m = scene.places_m
     try:
-        sources_by_role = position_columns.read_position_sources(evidence).robots
+        sources_by_role = recorded_positions.read_position_sources(evidence).robots
     except EvidenceError:
         return
     for ends in combinations([role for role in sort_roles(sources_by_role) if role in places_m], 2):
         try:
-            source, destination = position_columns.trajectories_of_pair(evidence, (ends[0], ends[1]))
-            satellites = position_columns.samples_of(evidence, ends[0]).frame == WGS84
+            source, destination = recorded_positions.trajectories_of_pair(evidence, (ends[0], ends[1]))
+            satellites = recorded_positions.samples_of(evidence, ends[0]).frame == WGS84
         except EvidenceError:
             continue  # there are no distances then
         times_ns = _times_ns(evidence, ends[0], source, destination)
@@ -74,12 +64,7 @@ def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) 
     clocks = [state.clock for state in states if state is not None and state.clock is not None]
     if len(clocks) < len(states):
         return times_ns
-    offset_ns = position_columns.clock_offset_ns(evidence, role)
+    offset_ns = recorded_positions.clock_offset_ns(evidence, role)
     first, last = clocks[0].first_ns - offset_ns, clocks[1].last_ns - offset_ns
     inside = times_ns[(times_ns > first) & (times_ns < last)]
     return np.concatenate(((first,), inside, (last,)))
-
-
-def is_dependent(column: str) -> bool:
-    """Return True if a column depends on positions."""
-    return any(fnmatch(column, pattern) for pattern in DEPENDENT)

@@ -13,7 +13,7 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean
 from fieldkit.core.model import Role, Status
 from fieldkit.core.units import format_bytes, parse_offset_m
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.positions import position_columns, position_files, position_sources
+from fieldkit.measure.positions import position_files, position_sources, recorded_positions
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.trial import gates, journal, manifest, store
@@ -175,7 +175,7 @@ def attempt_positions(folder: Path) -> Iterator[AttemptPositions]:
             measured = gates.judge(plan, attempt.repeat, evidence).measured
             yield AttemptPositions(
                 attempt.folder,
-                position_columns.sources_text(evidence),
+                recorded_positions.sources_text(evidence),
                 dict(_distances_m(measured)),
                 _missing(measured),
             )

@@ -7,9 +7,9 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError, shell_command
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import gates, journal, manifest, rows, store
+from fieldkit.trial import journal, manifest, rows, store
 from fieldkit.trial.columns import Row
-from fieldkit.trial.journal import Attempt, JournalEntry
+from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 
 
@@ -72,12 +72,10 @@ def measured(folder: Path, plan: Plan) -> list[Row]:
 
 def _rows(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row]:
     attempts = journal.ended(entries)
-    return [row(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder))) for attempt in attempts]
-
-
-def row(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
-    """Return the row of an attempt; values that its evidence does not contain are missing."""
-    return rows.build(plan, attempt, gates.judge(plan, attempt.repeat, evidence).measured)
+    return [
+        rows.measured(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder)))
+        for attempt in attempts
+    ]
 
 
 def _content(path: Path) -> bytes | None:

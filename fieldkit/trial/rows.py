@@ -13,10 +13,11 @@ from fieldkit.core.columns import Column, Measured, Value, step_prefixed
 from fieldkit.core.events import NOTHING_ARRIVED
 from fieldkit.core.model import FIXED_ROLES, Role, sort_roles
 from fieldkit.core.text import encodable
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.steps.base import Step
 from fieldkit.steps.capabilities import Summarizes
 from fieldkit.steps.nest import Nest
-from fieldkit.trial import store
+from fieldkit.trial import gates, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
@@ -64,6 +65,11 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
         "code_sha256": plan.code_sha256,
     }
     return {name: value for name, value in identity.items() if value is not None} | dict(measured.values)
+
+
+def measured(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
+    """Return the row of an attempt, measured from its evidence; values that the evidence lacks are missing."""
+    return build(plan, attempt, gates.judge(plan, attempt.repeat, evidence).measured)
 
 
 def describe(plan: Plan, row: Row) -> str:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
-from fieldkit.analysis import expectations, repeats
+from fieldkit.analysis import expectations, table_files
 from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities, word_columns
@@ -116,7 +116,7 @@ class Sources:
     def read(
         self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False
     ) -> Repeats:
-        """Return the attempts in the tables without duplicates, as `repeats.read`.
+        """Return the attempts in the tables without duplicates, as `table_files.read`.
 
         Args:
             columns: Columns that are needed; None for all that are declared.
@@ -128,13 +128,13 @@ class Sources:
                 evidence to rebuild from.
             EvidenceError: A line or a journal is damaged, or no repeat has ended.
         """
-        others = [column.name for column in self.columns if repeats.is_undeclared(column)]
+        others = [column.name for column in self.columns if table_files.is_undeclared(column)]
         if others and undeclared:
             self.note(f"kept as text, because no installed kind of step declares it: {', '.join(others)}")
         if columns is None:
             columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
         content = partial(_remeasured_table, note=self.note) if self.rebuild else Path.read_bytes
-        attempts, notes = deduplicated(repeats.read(self.tables, self.columns, columns, content))
+        attempts, notes = deduplicated(table_files.read(self.tables, self.columns, columns, content))
         for note in notes:
             self.note(note)
         if not len(attempts):

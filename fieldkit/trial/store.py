@@ -11,7 +11,6 @@ from fieldkit.config import schema
 from fieldkit.core import files, laptop_files
 from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
 from fieldkit.core.model import RepeatId
-from fieldkit.measure.positions import position_sources
 from fieldkit.trial import step_packages
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
@@ -37,7 +36,7 @@ _TRIAL_FILES: Final = frozenset(
         SUMMARY_CSV,
         MANIFEST_FILE,
         REPEATS,
-        position_sources.FILE,
+        laptop_files.POSITIONS,
     }
 )
 """Files that fieldkit reads and writes in a trial's folder; other files in it are ignored."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fieldkit.analysis import repeats
+from fieldkit.analysis import table_files
 from fieldkit.analysis.repeats import SOURCE
 from fieldkit.core import files
 from fieldkit.core.columns import Column, plain_name, with_step_name
@@ -18,7 +18,8 @@ def declared_in(tables: Sequence[Path]) -> tuple[Column, ...]:
     """Return every column of the tables: those of every trial first, then others in the order of the tables.
 
     A column that is not in every trial is declared by the `trial.yaml` next to the table; otherwise by an installed
-    kind of step, by its name with or without the name of the step; otherwise it is text (`repeats.is_undeclared`).
+    kind of step, by its name with or without the name of the step; otherwise it is text
+    (`table_files.is_undeclared`).
 
     Args:
         tables: CSV files with the columns of trial.csv.
@@ -72,7 +73,7 @@ def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str
 
 
 def _other_column_names(table: Path, everywhere: Iterable[str]) -> list[str]:
-    return [name for name in repeats.names(table) if name not in everywhere]
+    return [name for name in table_files.names(table) if name not in everywhere]
 
 
 def _frozen_columns(table: Path) -> tuple[Column, ...]:
@@ -87,7 +88,7 @@ def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
     column = installed_columns.get(name) or (
         installed_columns.get(plain_name(name)) and with_step_name(step, installed_columns[plain])
     )
-    return column if column and not column.declaration_error() else repeats.undeclared(name)
+    return column if column and not column.declaration_error() else table_files.undeclared(name)
 
 
 def _type_of(column: Column) -> tuple[object, ...]:

@@ -38,7 +38,8 @@ class Errors:
         delivery_error_s: Absolute difference of delivery times, over packets that arrived in both runs.
         position_error_m: Largest error, at the time when a packet was sent, of the relative position that the network
             assumed for two of the agents that transmit, forward or interfere in this run. The true positions are
-            those of the continuous trajectories: states that are held for a step h have an error of v h / 2.
+            those of the continuous trajectories. The mean error of a state that is held for a step of length h, at
+            speed v, is therefore v h / 2.
         path_error_m: Distance of agents from their positions in the reference, over time; above 0 only if programs
             steer by received data.
         fate_disagreement: Share of packets that arrived in one run only.

@@ -99,10 +99,10 @@ class EmulatedOptions(Strict):
     """Options of the emulated backend.
 
     Attributes:
-        ros: `debian`: ROS's own master and rosbag from Debian. `builtin`: fieldkit's own
-            ([cheaper](add-a-robot.md#built-in-or-debians-ros)). `auto`: Debian's where installed. Robots with ROS 2
-            always use fieldkit's own, and [communicate over the
-            radio](add-a-robot.md#ros-2-over-the-radio) unless this is `builtin`.
+        ros: `debian`: ROS's master and rosbag from Debian. `builtin`: fieldkit's, which [need less processor
+            time](add-a-robot.md#built-in-or-debians-ros). `auto`: Debian's if they are installed. Robots with ROS 2
+            always use fieldkit's, and [communicate over the radio](add-a-robot.md#ros-2-over-the-radio) unless this
+            is `builtin`.
         ros2: Discovery between robots with ROS 2.
         robots: Variants of tools, by robot; the default is the tools of this machine. See [add a
             robot](add-a-robot.md#variants-of-tools).

@@ -14,7 +14,8 @@ from fieldkit.backends.registry import profiles_of
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site
 from fieldkit.core.model import Vector
-from fieldkit.lab.protocol import Destination, LabLink, LabRobot, Login, Outline, Overview
+from fieldkit.lab.protocol import LabLink, Login, Outline, Overview
+from fieldkit.lab.robots import Destination, LabRobot
 from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered

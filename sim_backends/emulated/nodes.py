@@ -13,7 +13,7 @@ from typing_extensions import override
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import LinkError, RobotError, TestbedLostError
-from fieldkit.lab.protocol import LabRobot
+from fieldkit.lab.robots import LabRobot
 from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.medium.framing import ETHERNET, IP

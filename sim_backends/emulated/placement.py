@@ -8,7 +8,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Move, Placement, Role, Topology, Vector
-from fieldkit.lab.protocol import Destination
+from fieldkit.lab.robots import Destination
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.world.motion import Motion, OnGround, State, WayPoints

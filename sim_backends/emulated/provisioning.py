@@ -29,7 +29,7 @@ from sim_backends.world.shapes import Cylinder, Shape
 from sim_backends.world.world import World
 
 if TYPE_CHECKING:
-    from fieldkit.lab.protocol import LabRobot
+    from fieldkit.lab.robots import LabRobot
 
 NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]

@@ -16,12 +16,14 @@ from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits, VelocityC
 TICK_NS: Final = 10_000_000
 """Period of the controllers: PX4's velocity controller runs at 100 Hz."""
 _UPRIGHT: Final = 0.1
-"""Below this cosine of its tilt, a quadrotor's thrust cannot hold its height, and is the minimum."""
+"""If the cosine of a quadrotor's tilt is below this value, no thrust holds its height, and the minimum is used."""
 
 
 @dataclass(frozen=True)
 class Registers:
-    """Arrays of the simulation that controllers read and write, flat; memory views are faster than NumPy for items.
+    """Arrays of the simulation that controllers read and write, flat.
+
+    Memory views access single items faster than NumPy.
 
     Attributes:
         ctrl: Set-points of the motors.
@@ -124,6 +126,7 @@ class FlightController:
     def tick(self, registers: Registers, elapsed_s: float) -> bool:  # noqa: ARG002 (see Controller)
         """Implement `Controller.tick`."""
         limits, (body, mocap, dof, motor) = self._limits, self._indices
+        # Axes x and z of the body, in components east, north, up; then velocity and wanted thrust in the same order.
         x_e, _, z_e, x_n, _, z_n, _, _, z_u = registers.xmat[9 * body : 9 * body + 9]
         v_e, v_n, v_u = registers.qvel[dof : dof + 3]
         f_e, f_n, f_u = self._law.thrust_m_s2((v_e, v_n, v_u), self._target)

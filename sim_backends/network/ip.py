@@ -49,7 +49,7 @@ class Fragment:
 
     @property
     def identity(self) -> PacketIdentity:
-        """The key of its random draws; the first fragment has that of an unfragmented packet."""
+        """Identity from which its random numbers are derived; the first fragment has that of the whole packet."""
         flow, number = self.packet.identity
         return (f"{flow} fragment {self.index}", number) if self.index else (flow, number)
 

@@ -36,7 +36,7 @@ class Packet:
         source: Name of the sender.
         destination: Name of the receiver.
         size_bytes: Its size.
-        identity: Flow and number, which key random draws.
+        identity: Flow and number, from which random numbers are derived.
         sent_ns: Time at which its program sent it.
         enters_ns: Time at which the network receives it; later than `sent_ns` if a policy delays it.
         protocol: Name of the transport that carries it.

@@ -114,10 +114,10 @@ class Frame(Generic[Payload]):
         source: Name of the original sender.
         receiver: Index of the station at the end of this hop; None for a broadcast.
         onward: Indices of the stations to which the relay forwards it; None for a broadcast.
-        keep: True if the receiver of this hop keeps the packet.
-        packet: Identity that keys its random draws.
+        keep: True if the packet is delivered to the receiver of this hop.
+        packet: Identity of the packet, from which its random numbers are derived.
         queued_ns: Time at which it entered the transmitter's queue.
-        before: Delay of the packet before this hop, 0 for none.
+        before: Sum of the delays before this hop, in the packed form of `links.Delay`; 0 for none.
         first_attempt_ns: Start of its first attempt.
         attempts: Number of attempts so far.
     """

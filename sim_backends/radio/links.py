@@ -73,6 +73,7 @@ RADIO_OFF: Final = "radio off"
 
 
 Delay = int
+"""Sums of the parts of delays, and the number of packets, packed into one integer with 64 bits for each field."""
 
 Payload = TypeVar("Payload")
 """The content of a packet, which radio models do not inspect."""
@@ -83,7 +84,7 @@ Delivery = tuple[int, str, Payload, str, Delay]
 A plain tuple, because one is created per packet.
 """
 
-# The unit of each field; multiply it by the number of nanoseconds, or of packets.
+# The lowest bit of each field of a `Delay`; multiply it by the number of nanoseconds, or of packets.
 PROCESSING_NS: Final = 1
 TRANSMISSION_NS: Final = 1 << 64
 PROPAGATION_NS: Final = 1 << 128

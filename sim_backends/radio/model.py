@@ -57,7 +57,8 @@ class RadioModel(Protocol[Payload]):
             payload: Content of the packet.
             size_bytes: Its size, without MAC header.
             destination: Name of the receiver; None for a broadcast.
-            packet: Identity that keys its random draws; None to number the packets of the source in order.
+            packet: Identity from which its random numbers are derived; None to number the packets of the source in
+                order.
             before: Delay of the packet until now.
 
         Raises:

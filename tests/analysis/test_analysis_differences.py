@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from fieldkit.analysis.statistics import between, cliffs_delta, holm, p_value
+from fieldkit.analysis.significance import between, cliffs_delta, holm, p_value
 from fieldkit.core.model import Interval
 from tests.helpers.single import wilson
 

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.analysis import repeats as repeats_module
+from fieldkit.analysis import table_files
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.duplicates import deduplicated
-from fieldkit.analysis.repeats import Repeats, parse, read
+from fieldkit.analysis.repeats import Repeats, parse
+from fieldkit.analysis.table_files import read
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.columns import trial_columns
@@ -204,7 +205,7 @@ def test_a_large_table_is_read_block_by_block_to_the_same_rows(
 ) -> None:
     table = write(tmp_path, [replace(ROW, repeat=1 + n, sender=f"robot {n}") for n in range(50)])
     whole = read([table], trial_columns())
-    monkeypatch.setattr(repeats_module, "_BATCH_BYTES", 1000)
+    monkeypatch.setattr(table_files, "_BATCH_BYTES", 1000)
     blocks = read([table], trial_columns())
     assert same(blocks, whole)
     assert (blocks.texts["source"] == whole.texts["source"]).all()
@@ -217,7 +218,7 @@ def test_a_damaged_line_of_a_large_table_has_its_number_in_the_whole_file(
     lines = table.read_text(encoding="utf-8").splitlines()
     lines[40] = lines[40].replace(",valid,", ",vali,")
     table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    monkeypatch.setattr(repeats_module, "_BATCH_BYTES", 1000)
+    monkeypatch.setattr(table_files, "_BATCH_BYTES", 1000)
     with pytest.raises(EvidenceError, match=r"trial\.csv:41"):
         read([table], trial_columns())
 

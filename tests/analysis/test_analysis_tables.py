@@ -2,7 +2,7 @@
 
 import pytest
 
-from fieldkit.analysis.result_tables import markdown_escaped, markdown_line
+from fieldkit.analysis.paper_tables import markdown_escaped, markdown_line
 
 
 @pytest.mark.parametrize(

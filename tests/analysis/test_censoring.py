@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.analysis import expectations, judgements, result_tables, wording
+from fieldkit.analysis import expectations, judgements, paper_tables, result_tables, wording
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.judgements import Judgement, Ruling
 from fieldkit.analysis.quantities import Quantity, quantities
@@ -107,9 +107,9 @@ def test_missing_repeats_are_counted_in_all_outputs() -> None:
     assert (result.ruling, result.why) == (Ruling.OPEN, "2 of 10 repeats have no value")
     assert wording.judgement_texts(result)[2] == "200 ms (8 of 10)"
     shown = [Quantity.of(column) for column in GAP]
-    markdown = result_tables.to_markdown(BY, [cell], [quantity for quantity in shown if quantity])
+    markdown = paper_tables.to_markdown(BY, [cell], [quantity for quantity in shown if quantity])
     assert "(8 of 10)" in markdown
-    assert "(8 of 10)" in result_tables.to_latex(BY, [cell], [quantity for quantity in shown if quantity])
+    assert "(8 of 10)" in paper_tables.to_latex(BY, [cell], [quantity for quantity in shown if quantity])
     (written,) = json.loads(result_tables.to_json(BY, [cell]))["cells"]
     assert (written["n_valid"], written["estimates"]["rtt_gap_s"]["n"]) == (10, 8)
 
@@ -120,8 +120,8 @@ def test_open_gaps_are_in_every_table_format() -> None:
     estimate = written["estimates"]["rtt_gap_s"]
     assert (estimate["n_censored"], estimate["is_lower_bound"], estimate["high"]) == (5, True, None)
     shown = [quantity for column in GAP if (quantity := Quantity.of(column))]
-    assert "| >= 1500 [200, ...) (5 of 7 not ended) |" in result_tables.to_markdown(BY, [cell], shown)
-    assert r"$\geq$ 1500 [200, ...) (5 of 7 not ended)" in result_tables.to_latex(BY, [cell], shown)
+    assert "| >= 1500 [200, ...) (5 of 7 not ended) |" in paper_tables.to_markdown(BY, [cell], shown)
+    assert r"$\geq$ 1500 [200, ...) (5 of 7 not ended)" in paper_tables.to_latex(BY, [cell], shown)
     head, row, *_ = result_tables.to_csv(BY, [cell]).splitlines()
     by_name = dict(zip(head.split(","), row.split(","), strict=True))
     assert (by_name["high"], by_name["n_censored"], by_name["is_lower_bound"]) == ("", "5", "true")

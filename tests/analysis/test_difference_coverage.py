@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fieldkit.analysis.statistics import Intervals, between, holm, medians, p_value, shares
+from fieldkit.analysis.significance import between, holm, p_value
+from fieldkit.analysis.statistics import Intervals, medians, shares
 from fieldkit.core.model import Interval
 
 Floats = NDArray[np.float64]

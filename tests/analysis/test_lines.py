@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.analysis import repeats, result_tables, table_lines
+from fieldkit.analysis import paper_tables, repeats, table_lines
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.quantities import DEFAULT_BY, quantities
 from fieldkit.cli import main
@@ -52,7 +52,7 @@ def test_the_label_has_the_range_of_payload_sizes() -> None:
 
 @pytest.mark.parametrize("form", ["markdown", "latex"])
 def test_tables_for_papers_have_payload_size_and_number_of_repeats(form: str) -> None:
-    made = {"markdown": result_tables.to_markdown, "latex": result_tables.to_latex}[form]
+    made = {"markdown": paper_tables.to_markdown, "latex": paper_tables.to_latex}[form]
     table = [
         PINGED,
         *(replace(PINGED, repeat=2 + n, rtt_loss=1.0, rtt_received=0, rtt_median_s=None) for n in (0, 1)),

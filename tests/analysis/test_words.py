@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.analysis import comparison_results, repeats, result_tables, wording
+from fieldkit.analysis import comparison_results, paper_tables, repeats, result_tables, wording
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.compare import compare
 from fieldkit.analysis.repeats import Repeats
@@ -76,8 +76,8 @@ def test_a_table_has_a_row_per_word_without_an_interval() -> None:
     ]
     assert [float(entry["value"]) for entry in rows] == pytest.approx([2 / 3, 1 / 3])
     assert {entry["low"] + entry["high"] + entry["wilson_low"] for entry in rows} == {""}
-    assert "| the grass |\n" in result_tables.to_markdown(("protocol",), [result], ())
-    assert "| wet 2, dry 1, 1 without |\n" in result_tables.to_markdown(("protocol",), [result], ())
+    assert "| the grass |\n" in paper_tables.to_markdown(("protocol",), [result], ())
+    assert "| wet 2, dry 1, 1 without |\n" in paper_tables.to_markdown(("protocol",), [result], ())
 
 
 @pytest.mark.parametrize(

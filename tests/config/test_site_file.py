@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from fieldkit.config import profiles
 from fieldkit.config.documents import with_value
-from fieldkit.config.site import create_site_file, load_site, pin_host_key
+from fieldkit.config.site import load_site
+from fieldkit.config.site_edits import create_site_file, pin_host_key
 from fieldkit.core.errors import ConfigurationError
 
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"

@@ -21,7 +21,7 @@ from fieldkit.config.site import load_site
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Placement, Role, Scenario, Topology, TrackPoint, Vector
 from fieldkit.core.units import parse_distance
-from fieldkit.lab.protocol import Destination
+from fieldkit.lab.robots import Destination
 from fieldkit.remote import jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.ssh import SshShell

@@ -19,7 +19,7 @@ from fieldkit.core.model import Role
 from fieldkit.core.prompts import Question
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
-from fieldkit.measure.positions import position_columns, position_files, position_sources
+from fieldkit.measure.positions import position_columns, position_files, position_sources, recorded_positions
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
 from fieldkit.measure.robot_clock import Offset
@@ -176,12 +176,12 @@ def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
     found = position_columns.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
     assert all(math.isfinite(float(value)) for value in found.values.values())  # gates reject excessive distances
     position_columns.distances_m(evidence, _ENDS)
-    position_columns.readable_samples(evidence)
+    recorded_positions.readable_samples(evidence)
     output_text = position_sources.read(folder / position_sources.FILE)
     (place / "again.json").write_text(position_sources.text(output_text), encoding="utf-8")
     assert position_sources.read(place / "again.json") == output_text
-    position_columns.sources_text(evidence)
-    assert math.isfinite(position_columns.clock_error_s(evidence) or 0.0)
+    recorded_positions.sources_text(evidence)
+    assert math.isfinite(recorded_positions.clock_error_s(evidence) or 0.0)
 
 
 def _position_sources() -> tuple[bytes, ...]:

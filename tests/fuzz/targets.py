@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.agent import records
-from fieldkit.analysis import duplicates, repeats
+from fieldkit.analysis import duplicates, table_files
 from fieldkit.campaign.plan import load_campaign
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
@@ -259,7 +259,7 @@ def _rebuild_trial(name: str, data: bytes, place: Path) -> None:
 
 def _read_csv(data: bytes, place: Path) -> None:
     (place / "trial.csv").write_bytes(data)
-    duplicates.deduplicated(repeats.read([place / "trial.csv"], columns.trial_columns()))
+    duplicates.deduplicated(table_files.read([place / "trial.csv"], columns.trial_columns()))
 
 
 def _verify_manifest(path: Path) -> None:

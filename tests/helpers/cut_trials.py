@@ -18,8 +18,9 @@ from typing import Final
 import pytest
 
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.running.resumption import resume_trial
 from fieldkit.trial.running.robots import Robots
-from fieldkit.trial.running.runner import resume_trial, run_trial
+from fieldkit.trial.running.runner import run_trial
 from tests.helpers.disks import Disk, FileSystem
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.power import Cut, Witness, assert_resumable

@@ -11,7 +11,7 @@ from fieldkit.core.events import Event, Note, RepeatEnded, TrialEnded
 from fieldkit.core.model import Status
 from fieldkit.trial import journal
 from fieldkit.trial.journal import JOURNAL_FILE
-from fieldkit.trial.running.runner import resume_trial
+from fieldkit.trial.running.resumption import resume_trial
 from tests.helpers.disks import Disk
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.trial.test_trial_crash import VOID_FIRST, demand_whole, trial_of

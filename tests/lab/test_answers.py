@@ -6,8 +6,9 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
 from fieldkit.lab import requests
-from fieldkit.lab.protocol import Destination, LabLink, Outline, Overview
+from fieldkit.lab.protocol import LabLink, Outline, Overview
 from fieldkit.lab.requests import LabState, RobotState
+from fieldkit.lab.robots import Destination
 
 STATE = LabState(
     pid=4711,

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.repeats import Repeats, read
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.table_files import read
 from fieldkit.core.columns import fault_column_name
 from fieldkit.core.model import FaultKind
-from fieldkit.measure.evidence import outage, ping
+from fieldkit.measure.evidence import outage_columns, ping
 from fieldkit.report import distance, distribution, dots, figures
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.contents import build_contents
@@ -164,7 +165,7 @@ def test_axis_of_a_distribution_is_logarithmic_for_a_wide_range(longest_s: float
 
 
 def test_flag_is_drawn_as_a_share_of_repeats(tmp_path: Path) -> None:
-    columns = trial_columns(outage.declared(FaultKind.REBOOT))
+    columns = trial_columns(outage_columns.declared(FaultKind.REBOOT))
     name = fault_column_name(FaultKind.REBOOT, "recovered")
     rows = [{**row, name: n > 1} for metres in (10, 20) for n, row in enumerate(at(metres, 4))]
     path = tmp_path / "trial.csv"

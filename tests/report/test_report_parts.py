@@ -12,7 +12,8 @@ from scapy.utils import rdpcap, wrpcap
 from scipy import stats
 
 from fieldkit.analysis.cells import aggregate
-from fieldkit.analysis.repeats import Repeats, read
+from fieldkit.analysis.repeats import Repeats
+from fieldkit.analysis.table_files import read
 from fieldkit.core.columns import with_step_name
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence

@@ -37,7 +37,7 @@ from fieldkit.trial import gates, journal, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
-from fieldkit.trial.running import locks, preflight, runner
+from fieldkit.trial.running import locks, preflight, resumption, runner
 from fieldkit.trial.running.locks import Holder
 from fieldkit.trial.running.stop import Stop
 from sim_backends.emulated.backend import EmulatedBackend
@@ -187,7 +187,7 @@ class Bench:
         with locks.held(
             self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=lambda event: None
         ):
-            runner.continue_trial(self.out / plan.trial, self.testbed, lambda event: None, Stop())
+            resumption.continue_trial(self.out / plan.trial, self.testbed, lambda event: None, Stop())
         return self.ended(plan)
 
     def ended(self, plan: Plan) -> tuple[str, str, Path]:

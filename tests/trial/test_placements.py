@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.positions import position_sources
+from fieldkit.measure.positions import position_columns, position_sources
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.steps.kinds import follow
@@ -101,10 +101,10 @@ def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
     ],
 )
 def test_columns_that_depend_on_positions(column: str, dependent: bool) -> None:
-    assert placements.is_dependent(column) is dependent
+    assert position_columns.is_dependent(column) is dependent
 
 
 def test_every_column_of_positions_depends_on_them() -> None:
     from fieldkit.measure.evidence.track import Separation  # noqa: PLC0415
 
-    assert all(placements.is_dependent(f"rtt_{name}") for name in Separation.__dataclass_fields__)
+    assert all(position_columns.is_dependent(f"rtt_{name}") for name in Separation.__dataclass_fields__)

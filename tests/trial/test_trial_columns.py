@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit.analysis import repeats
+from fieldkit.analysis import repeats, table_files
 from fieldkit.config import schema
 from fieldkit.core import plugins
 from fieldkit.core.columns import Column, Figure, Kind, Value, with_step_name
@@ -228,7 +228,7 @@ def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Pat
 
 def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
     paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", vendor_trials.NAMED_STEP_COLUMNS)]
-    read = repeats.read(paths, tables.declared_in(paths))
+    read = table_files.read(paths, tables.declared_in(paths))
     assert [value is None for value in read.column("probe.level")] == [False] * 4 + [True] * 4
     assert [value is None for value in read.column("up.transfer_s")] == [True] * 4 + [False] * 4
 
@@ -241,7 +241,7 @@ def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path:
     for column in vendor_trials.NAMED_STEP_COLUMNS:
         assert found[column.name] == column
     for column in vendor_trials.VENDOR_COLUMNS:
-        assert found[column.name] == repeats.undeclared(column.name)
+        assert found[column.name] == table_files.undeclared(column.name)
 
 
 def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:
     path.write_text(spoiled, encoding="utf-8")
     found = [column for column in tables.declared_in([table]) if column.name in {"status", "probe.level"}]
     assert found[0] in IDENTITY
-    assert found[1] == repeats.undeclared("probe.level")
+    assert found[1] == table_files.undeclared("probe.level")
 
 
 def test_a_plan_that_is_a_link_is_not_read(tmp_path: Path) -> None:
@@ -323,4 +323,4 @@ def test_a_plan_that_is_a_link_is_not_read(tmp_path: Path) -> None:
     plan = table.with_name("trial.yaml")
     plan.rename(tmp_path / "elsewhere.yaml")
     plan.symlink_to(tmp_path / "elsewhere.yaml")
-    assert tables.declared_in([table])[-1] == repeats.undeclared("probe.level")
+    assert tables.declared_in([table])[-1] == table_files.undeclared("probe.level")

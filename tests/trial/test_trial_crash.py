@@ -26,8 +26,9 @@ from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running import preflight
+from fieldkit.trial.running.resumption import resume_trial
 from fieldkit.trial.running.robots import Robots
-from fieldkit.trial.running.runner import resume_trial, run_trial
+from fieldkit.trial.running.runner import run_trial
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.nightly import mark_nightly

@@ -35,7 +35,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Pin the key, unless it is pinned already."""
-    from fieldkit.config.site import pin_host_key
+    from fieldkit.config.site_edits import pin_host_key
     from fieldkit.remote.link import over_tcp
     from fieldkit.remote.login import offered_key
     from fieldkit.remote.ssh import CONNECT_S

@@ -20,7 +20,8 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the file and print the next commands."""
-    from fieldkit.config.site import create_site_file, load_site
+    from fieldkit.config.site import load_site
+    from fieldkit.config.site_edits import create_site_file
 
     path: Path = arguments.out
     create_site_file(path)

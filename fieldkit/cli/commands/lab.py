@@ -168,7 +168,7 @@ def list_robots(arguments: argparse.Namespace) -> int:
 def move(arguments: argparse.Namespace) -> int:
     """Move the robot and print its position."""
     from fieldkit.lab import requests
-    from fieldkit.lab.protocol import Destination
+    from fieldkit.lab.robots import Destination
 
     relative = arguments.to is None
     option, words = ("--by", arguments.by) if relative else ("--to", arguments.to)

@@ -12,8 +12,8 @@ def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit resume`."""
     parser.description = (
         "Continue a trial that stopped: by Ctrl-C, a kill, a lost robot or testbed, a full disk. Finished repeats "
-        "are not repeated. Files that differ from their checksums are reported; if trial.csv would have to be made "
-        "again from them, the trial does not continue (exit code 4). Backend and cast must be those with which "
+        "are not repeated. Files that differ from their checksums are reported; if rows of trial.csv must be rebuilt "
+        "from them, the trial does not continue (exit code 4). Backend and cast must be those with which "
         "the trial started."
     )
     shared.add_trial(parser, "folder of the trial")
@@ -31,14 +31,13 @@ def add(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining repeats of the trial and print its table."""
     from fieldkit.cli import cli_options, results
-    from fieldkit.trial.running import opening
-    from fieldkit.trial.running.resumption import resumable
+    from fieldkit.trial.running import resumption
 
-    resumable(arguments.trial)  # raise errors of the trial before those of site files and backends
+    resumption.resumable(arguments.trial)  # raise errors of the trial before those of site files and backends
     with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         with cli_options.operator(arguments, sink) as operator:
-            outcome = opening.resume(
+            outcome = resumption.resume(
                 arguments.trial,
                 name,
                 backend,

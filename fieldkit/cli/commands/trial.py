@@ -46,7 +46,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the trial at each distance and print the table of each."""
-    from fieldkit.cli import cli_options, dry_run
+    from fieldkit.cli import cli_options
     from fieldkit.trial.request import make_plan
 
     requests = [
@@ -71,11 +71,13 @@ def run(arguments: argparse.Namespace) -> int:
         ]
         for line in (*requests[0].procedure.adjustments(cast), *plans[0].shortfalls()):
             sink(Note(line))
-        if arguments.dry_run and arguments.json:
-            dry_run.report_commands(plans[0], sink)
-        elif arguments.dry_run:
-            dry_run.print_commands(plans[0])
         if arguments.dry_run:
+            from fieldkit.cli import dry_run
+
+            if arguments.json:
+                dry_run.report_commands(plans[0], sink)
+            else:
+                dry_run.print_commands(plans[0])
             return 0
         # These modules import pyarrow, which a dry run does not need.
         from fieldkit.cli import results

@@ -69,10 +69,12 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
 
 
 def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
-    """Return a description of packets of an earlier transfer, or None; in one transfer each netcat has one port.
+    """Return a description of packets of an earlier transfer, or None if there are none.
 
-    Such packets arrive with payload from a port that sent nothing; or they were delayed in the sender, and
-    are sent from another port than that of the last start. A retransmission of an aborted connection is not a start.
+    A sending netcat uses one source port per transfer. Packets of an earlier transfer are detected in two ways: they
+    arrive with payload from a port from which the sender's capture has no packet; or they left the sender late, from
+    another port than the transfer that started last. Over TCP a SYN marks a start, because retransmissions of an
+    aborted connection have none.
     """
     sent, received = (
         packets.where(packets.dport == transfer.port) for packets in map(transfer.forward, (sender, receiver))

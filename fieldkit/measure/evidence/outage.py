@@ -11,12 +11,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import Column, Figure, Kind, Measured, columns, fault_column_name, step_prefixed
+from fieldkit.core.columns import Measured, fault_column_name, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
-
-_KINDS_IN_ORDER: Final = (FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE, FaultKind.REBOOT, FaultKind.KILL)
+from fieldkit.measure.evidence.outage_columns import declared
 
 SILENT_S: Final = 1.0
 """A robot has not recovered if its last answer is older than this at the end of the observation."""
@@ -27,32 +26,6 @@ _MAX_NORMAL_GAP_INTERVALS: Final = 3
 _NUMBER: Final = r"[0-9]{1,9}(?:\.[0-9]{1,9})?"
 _NOTE: Final = re.compile(rf"lasted_s (?P<lasted>{_NUMBER}|unknown)\ninterval_s (?P<interval>{_NUMBER})\n")
 _WATCH_LINE: Final = re.compile(rf"(?P<at>{_NUMBER})(?: up(?P<pids>(?: [0-9]{{1,9}})+))?\Z")
-
-
-def _observer(kind: FaultKind) -> str:
-    """Return the observer of the outage, which is not the traffic of other steps."""
-    return "process" if kind is FaultKind.KILL else "ping"
-
-
-def declared(kind: FaultKind) -> tuple[Column, ...]:
-    """Return the columns of a kind of fault."""
-    outage_meaning = f"Longest time without a reply around the fault {kind}; empty if the robot did not recover."
-    recovery_meaning = f"Part of this outage after the end of the cause of {kind}; empty if that end is unknown."
-    recovered_meaning = f"True if the robot recovered from the fault {kind} within the time limit."
-    bound_meaning = f"Lower bound of the recovery time if the robot did not recover from {kind}; otherwise empty."
-    index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")
-    recovered = Figure(f"{_observer(kind)} back after {kind}", Kind.FLAG, rank=70 + index)
-    recovery = Figure(f"{_observer(kind)} recovery after {kind}", Kind.MEDIAN, rank=80 + index, at_least=bound)
-    times = columns(
-        90,
-        (fault_column_name(kind, "outage_s"), "s", outage_meaning),
-        (fault_column_name(kind, "recovery_s"), "s", recovery_meaning, recovery),
-        (fault_column_name(kind, "recovered"), "bool", recovered_meaning, recovered),
-    )
-    return (*times, *columns(110, (bound, "s", bound_meaning)))
-
-
-COLUMNS: Final = tuple(column for kind in _KINDS_IN_ORDER for column in declared(kind))
 
 
 def note_file(kind: FaultKind) -> str:

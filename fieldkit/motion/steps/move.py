@@ -13,7 +13,7 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.positions import position_columns
+from fieldkit.measure.positions import recorded_positions
 from fieldkit.motion.logs import drive_checks, drive_log, motion_sources
 from fieldkit.motion.profile_sections import drive_of, drives
 from fieldkit.motion.steps import driving
@@ -255,7 +255,7 @@ class MoveStep(
             return measured
         during_ns = (log[0].utc_ns, log[-1].utc_ns) if log[0].utc_ns else None
         away_m = max(moment.off_m for moment in log)
-        why = position_columns.distance_contradiction(
+        why = recorded_positions.distance_contradiction(
             view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns
         )
         return measured.without({name: why for name in measured.values if name != "drive_ended"}) if why else measured

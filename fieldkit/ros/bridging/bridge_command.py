@@ -30,9 +30,7 @@ from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 from fieldkit.ros.middlewares.ports import MAX_DOMAIN
 
 MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
-"""The keys of `agent.middleware.ADAPTERS` without `ros2`; a test compares them.
-
-That adapter needs the Python of a robot's ROS 2.
+"""The adapters of `agent.middleware` without `ros2`, which needs the Python of a robot's ROS 2; a test compares them.
 """
 
 

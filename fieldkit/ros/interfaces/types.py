@@ -17,12 +17,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 from rosbags.typesys.store import Typestore
 
 from fieldkit.core.errors import ConfigurationError, did_you_mean
-
-EXTRA_DEFINITIONS: Final[Mapping[str, str]] = MappingProxyType(
-    {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
-)
-"""Definitions of standard types that rosbags lacks."""
-
+from fieldkit.ros.interfaces.definitions import EXTRA_DEFINITIONS
 
 _HEADER: Final = "std_msgs/msg/Header"
 

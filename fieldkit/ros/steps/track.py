@@ -94,8 +94,9 @@ class TrackedRobot(Strict):
     Attributes:
         topic: `nav_msgs/Odometry`, `sensor_msgs/NavSatFix`, or of a tracker `geometry_msgs/PoseStamped`,
             `PoseWithCovarianceStamped`, `TransformStamped` or `tf2_msgs/TFMessage`. Either this or `at`.
-        facing: Direction of the robot when the step begins: `away`, `towards`, `left` or `right`, seen by an observer
-            who looks away from the other end of its link; required for odometry.
+        facing: Direction in which the robot faces when the step begins; required for odometry. `away`: away from the
+            robot at the other end of its link; `towards`: towards that robot; `left` and `right`: to the left and to
+            the right of the direction `away`.
         child: Frame of the robot in a tree of transforms, whose parent is the tracker's frame.
         times: Time of a message: `header`, its stamp, or `received`, when the recorder received it, for stamps of
             another clock.

@@ -33,7 +33,7 @@ LONGEST_S: Final = 3600.0
 
 
 def _is_profile(name: str) -> str:
-    # This module and the message types take 50 ms to import, so only procedures with topics import them.
+    # `qos` and the message types take 50 ms to import, so only procedures with topics import them.
     from fieldkit.ros.interfaces.qos import PROFILES  # noqa: PLC0415
 
     if name not in PROFILES:

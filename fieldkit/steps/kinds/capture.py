@@ -34,7 +34,8 @@ from fieldkit.steps.scene import BY_FIELDKIT, Announce, CommandResult, Flow, Nee
 from fieldkit.steps.variants import Tool
 from fieldkit.steps.view import View
 
-# Immediate mode with the default snap length dropped 177 of 215 packets of a burst; with these values none.
+# In immediate mode the kernel dropped 177 of 215 packets of a burst with the default snap length and buffer, and none
+# with these values.
 SNAP_BYTES: Final = 128
 BUFFER_KIB: Final = 4096
 
@@ -43,7 +44,8 @@ LIMIT_S: Final = 900.0
 # Size of the header of each captured frame in the file.
 _RECORD_BYTES: Final = 16
 
-# Without immediate mode the kernel delivers packets within a second: of 215, none after 0.5 s, all after 1.0 s.
+# Without immediate mode the kernel passes packets to tcpdump within a second: of 215 packets, tcpdump had none after
+# 0.5 s and all after 1.0 s.
 RING_S: Final = 2
 
 # Text of tcpdump's last line; after it the kernel needs 15 to 31 ms to close the socket.

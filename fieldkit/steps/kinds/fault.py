@@ -20,7 +20,7 @@ from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotE
 from fieldkit.core.model import FaultKind, Protocol, Role
 from fieldkit.core.threads import run_parallel
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import outage
+from fieldkit.measure.evidence import outage, outage_columns
 from fieldkit.measure.robot_clock import Offset, offset
 from fieldkit.measure.transfers import recoveries
 from fieldkit.measure.transfers.recoveries import FaultTimes
@@ -28,7 +28,7 @@ from fieldkit.remote import jobs
 from fieldkit.steps import across, clocks
 from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import AsksOperator, DescribesActions, Restarts, Summarizes
-from fieldkit.steps.kinds.observer import HEALED_S, Observer, observed_from
+from fieldkit.steps.kinds.observer import RECOVERED_S, Observer, observed_from
 from fieldkit.steps.nest import Nest, end_inside
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
@@ -57,9 +57,9 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     - `kill`: every process named `process` ends at the same moment.
 
     An observer records when the robot answers, from before the fault until it has answered for a second again: a ping
-    every 100 ms from the other end of the pair (200 ms where old iputils allows no less), or for `kill` a poll of the
+    every 100 ms from the other end of the pair (200 ms if an old iputils requires it), or for `kill` a poll of the
     robot's processes. Leaves `fault-KIND-ping.txt` or `fault-kill-watch.txt`, `fault-KIND.txt` (duration of the cause
-    and its interval) and `fault-KIND-times.txt` (when, see [recovery](method-delay.md#recovery)).
+    and its interval) and `fault-KIND-times.txt` (its start and end, see [recovery](method-delay.md#recovery)).
 
     Attributes:
         robot: Role of the robot with the fault.
@@ -72,7 +72,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         during: Steps during which the fault occurs.
     """
 
-    columns = outage.COLUMNS
+    columns = outage_columns.COLUMNS
     cross_checks = (
         CrossCheck(
             "outage and recovery",
@@ -117,7 +117,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield self._watch(scene)
         yield from self.inside(scene)
-        yield self._observer(scene).heals("SECONDS", self.limit)
+        yield self._observer(scene).await_recovery("SECONDS", self.limit)
 
     @override
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
@@ -140,7 +140,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         shell = testbed.shells[observer.role]
         announce(f"watch {scene.robot(self.robot).name}", None)
         jobs.start(shell, watch.job)
-        ahead = {} if scene.laptop_folder is None else self._clocks(testbed)
+        clock_offsets = {} if scene.laptop_folder is None else self._clocks(testbed)
         inner = replace(scene, halt=scene.halt.child())
         pool = ThreadPoolExecutor(max_workers=1)
         steps = pool.submit(self._run_inside, inner, testbed, announce)
@@ -149,10 +149,10 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             announce(f"{self.kind} of {scene.robot(self.robot).name}", self.lasts)
             asked_ns = time.time_ns()
             lasted_s = testbed.inject(self.cause)
-            self._note_times(scene, asked_ns, lasted_s, ahead)
+            self._note_times(scene, asked_ns, lasted_s, clock_offsets)
             announce("recovery", None)
-            heals = observer.heals("unknown" if lasted_s is None else f"{lasted_s:.3f}", self.limit)
-            jobs.run(shell, heals.job)  # `measure` evaluates whether the robot recovered
+            recovery = observer.await_recovery("unknown" if lasted_s is None else f"{lasted_s:.3f}", self.limit)
+            jobs.run(shell, recovery.job)  # `measure` evaluates whether the robot recovered
             jobs.stop(shell, watch.job)
             self._wait_for_steps(steps, scene, testbed)
         except Exception:
@@ -179,17 +179,21 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
         roles = list(testbed.shells)
         return {
-            role: ahead for role, ahead in zip(roles, run_parallel(query, roles), strict=True) if ahead is not None
+            role: clock_offset
+            for role, clock_offset in zip(roles, run_parallel(query, roles), strict=True)
+            if clock_offset is not None
         }
 
-    def _note_times(self, scene: Scene, asked_ns: int, lasted_s: float | None, ahead: Mapping[Role, Offset]) -> None:
+    def _note_times(
+        self, scene: Scene, asked_ns: int, lasted_s: float | None, clock_offsets: Mapping[Role, Offset]
+    ) -> None:
         """Record the times of the fault by the laptop's clock, when its cause is over."""
         if scene.laptop_folder is None:
             return
         now_ns = time.time_ns()
         # A lasting fault started `lasted_s` ago; a reboot or a kill lasts from the request until now.
         began_ns = now_ns - round(1e9 * lasted_s) if lasted_s else asked_ns
-        times = FaultTimes(began_ns, None if lasted_s is None else now_ns, ahead)
+        times = FaultTimes(began_ns, None if lasted_s is None else now_ns, clock_offsets)
         path = scene.laptop_folder / self.prefixed_name(recoveries.fault_times_file(self.kind))
         path.write_text(recoveries.fault_times_text(times), encoding="ascii")
 
@@ -254,7 +258,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of this kind of fault, and of the recoveries of the flows inside."""
-        return (*outage.declared(self.kind), *across.declared(self))
+        return (*outage_columns.declared(self.kind), *across.declared(self))
 
     @override
     def measure(self, view: View) -> Measured:
@@ -270,4 +274,4 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return max(self.after + (self.lasts or 0.0) + HEALED_S, self.inside_s(protocol)) + 0.3
+        return max(self.after + (self.lasts or 0.0) + RECOVERED_S, self.inside_s(protocol)) + 0.3

@@ -11,7 +11,7 @@ from fieldkit.core.columns import Measured, columns
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Role
 from fieldkit.core.threads import run_parallel
-from fieldkit.measure.positions import position_columns, position_sources
+from fieldkit.measure.positions import position_sources, recorded_positions
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import PLACED
 from fieldkit.measure.robot_clock import Exchange, Offset, offset
@@ -125,9 +125,9 @@ def placement_error(what: str, within: Sequence[Nest]) -> str | None:
 def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
     """Yield the reasons why the recorded positions of robots cannot be used."""
     try:
-        sources = position_columns.read_position_sources(view.evidence)
+        sources = recorded_positions.read_position_sources(view.evidence)
         for role in roles:
-            position_columns.samples_of(view.evidence, role)
+            recorded_positions.samples_of(view.evidence, role)
     except EvidenceError as error:
         yield error.what
         return
@@ -156,7 +156,7 @@ def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
 def measure(view: View) -> Measured:
     """Return the values of `COLUMNS`: source of the positions, and error of the clocks."""
     values = {
-        "positions_from": position_columns.sources_text(view.evidence),
-        "positions_clock_error_s": position_columns.clock_error_s(view.evidence),
+        "positions_from": recorded_positions.sources_text(view.evidence),
+        "positions_clock_error_s": recorded_positions.clock_error_s(view.evidence),
     }
     return Measured.from_optional(values, f"{position_sources.FILE} does not contain it")

@@ -11,7 +11,7 @@ from fieldkit.steps.kinds import ping
 from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF_OR_LIMIT, Planned, Scene
 from fieldkit.steps.variants import PingTool, Tool
 
-HEALED_S: Final = 1.0
+RECOVERED_S: Final = 1.0
 """A robot has recovered when it has given as many answers as it normally gives in this time."""
 
 _INTERVAL_S: Final = 0.1
@@ -26,7 +26,7 @@ _WATCH: Final = (
 )
 
 # Prints the duration of the cause ($1) and the interval ($2), then waits for $5 more lines with text $4 in file $3.
-_HEALS: Final = (
+_WAIT_FOR_RECOVERY: Final = (
     'echo "lasted_s $1"; echo "interval_s $2"; enough=$(($(grep -c "$4" "$3") + $5)); '
     'until [ "$(grep -c "$4" "$3")" -ge "$enough" ]; do sleep 0.1; done'
 )
@@ -80,7 +80,7 @@ class Observer:
         program = self.scene.robot(self.role).profile.tools.ping
         return Planned(self.role, job, program=program, tool=Tool.PING, permitted_causes=BY_FIELDKIT)
 
-    def heals(self, lasted_s: str, limit_s: float) -> Planned:
+    def await_recovery(self, lasted_s: str, limit_s: float) -> Planned:
         """Return the job that records the duration of the cause and ends when the robot has recovered.
 
         Args:
@@ -88,11 +88,17 @@ class Observer:
             limit_s: Timeout.
         """
         answer = " up " if self._is_kill else "bytes from"
-        arguments = (lasted_s, f"{self._interval_s:g}", self._file, answer, str(round(HEALED_S / self._interval_s)))
+        arguments = (
+            lasted_s,
+            f"{self._interval_s:g}",
+            self._file,
+            answer,
+            str(round(RECOVERED_S / self._interval_s)),
+        )
         job = Job(
             folder=self.scene.folder,
             name=step_prefixed(self.name, f"fault-{self.fault.kind}-heals"),
-            argv=("sh", "-c", _HEALS, "sh", *arguments),
+            argv=("sh", "-c", _WAIT_FOR_RECOVERY, "sh", *arguments),
             limit_s=limit_s,
             log=step_prefixed(self.name, outage.log_file(self.fault.kind)),
             stdout=step_prefixed(self.name, outage.note_file(self.fault.kind)),

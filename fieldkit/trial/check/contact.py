@@ -29,7 +29,7 @@ def judge(shell: Shell, report: Report) -> Offset | None:
     log_in(shell)
     exchanges = clocks.exchanges(shell, CONTACT_S)
     fastest_s = min((exchange.response_ns - exchange.request_ns for exchange in exchanges), default=0) / 1e9
-    report.ok("connection", f"host key and login right, answers in {1e3 * fastest_s:.0f} ms")
+    report.ok("connection", f"host key and login are correct, answers in {1e3 * fastest_s:.0f} ms")
     return offset(exchanges) if exchanges else None
 
 

@@ -14,7 +14,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Status
 from fieldkit.core.text import encodable
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import journal, manifest, rebuild, rows, store
+from fieldkit.trial import journal, manifest, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.manifest import Manifest
@@ -72,7 +72,7 @@ class Ledger:
         for number, attempt in enumerate(ended):
             evidence = store.attempt_folder(folder, attempt.folder)
             is_known = number < len(unchanged) and not attempt.reopened  # a reopened attempt changes its row
-            row = {} if is_known else rebuild.row(plan, attempt, AttemptEvidence(evidence))
+            row = {} if is_known else rows.measured(plan, attempt, AttemptEvidence(evidence))
             self._add_line(attempt, unchanged[number] if is_known else rows.line(row, self._plan.table))
             if attempt.folder not in self._manifest:
                 self._manifest.add(evidence)

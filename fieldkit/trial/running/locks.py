@@ -20,7 +20,7 @@ from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
 """Lifetime of a lock that is not renewed; `evidence.begin` renews it after half of this time.
-It is longer than any attempt or walk."""
+It is longer than any attempt, and than robots are carried to another place."""
 
 _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
 

@@ -11,11 +11,10 @@ from fieldkit.backends.protocols import Backend, Cast, Testbed, Transient
 from fieldkit.core import runtime
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
-from fieldkit.trial import session_jobs, step_packages, store
+from fieldkit.trial import session_jobs, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import locks, motion_control, preflight, runner
 from fieldkit.trial.running.locks import Holder
-from fieldkit.trial.running.resumption import require_backend, require_cast, resumable
 from fieldkit.trial.running.runner import Outcome
 from fieldkit.trial.running.stop import Stop
 
@@ -89,35 +88,3 @@ def run(
                 sink(Note(f"not started: {', '.join(str(plan.distance) for plan in later)}"))
             raise
     return ended
-
-
-def resume(
-    folder: Path, name: str, backend: Backend, *, failed: bool, sink: Sink, operator: Operator, stop: Stop
-) -> Outcome | None:
-    """Resume an interrupted trial.
-
-    Args:
-        folder: The trial's folder.
-        name: Name of the backend.
-        backend: The backend.
-        failed: Whether failed repeats are repeated too.
-        sink: Receives events.
-        operator: The person who does what the backend cannot do.
-        stop: Request to stop the trial.
-
-    Returns:
-        The outcome; None if the operator skipped the trial.
-
-    Raises:
-        FieldkitError: The trial is not of this fieldkit, of this backend or of these robots; or as for `opened` and
-            `runner.resume_trial`.
-    """
-    plan = resumable(folder)
-    for change in step_packages.changes(plan.step_packages):
-        sink(Note(change))
-    require_backend(plan, name, folder)
-    require_cast(plan, backend.cast(plan.topology))
-    with opened(
-        backend, plan.cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
-    ) as testbed:
-        return runner.resume_trial(folder, testbed, sink, stop, failed=failed)

@@ -1,13 +1,88 @@
-"""Checks before a trial is resumed: code, backend and robots must be those with which it started."""
+"""Resume a trial: code, backend and robots must be those with which it started."""
 
 from pathlib import Path
 
-from fieldkit.backends.protocols import Cast
+from fieldkit.backends.protocols import Backend, Cast, Testbed
 from fieldkit.core import permissions, plugins
 from fieldkit.core.errors import ConfigurationError, shell_command
-from fieldkit.trial import store
+from fieldkit.core.events import Note, Sink
+from fieldkit.core.prompts import Operator
+from fieldkit.trial import journal, step_packages, store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.running.opening import opened
+from fieldkit.trial.running.runner import Outcome, converting_write_errors, place, run_repeats
+from fieldkit.trial.running.stop import Stop
+
+
+def resume(
+    folder: Path, name: str, backend: Backend, *, failed: bool, sink: Sink, operator: Operator, stop: Stop
+) -> Outcome | None:
+    """Resume an interrupted trial.
+
+    Args:
+        folder: The trial's folder.
+        name: Name of the backend.
+        backend: The backend.
+        failed: Whether failed repeats are repeated too.
+        sink: Receives events.
+        operator: The person who does what the backend cannot do.
+        stop: Request to stop the trial.
+
+    Returns:
+        The outcome; None if the operator skipped the trial.
+
+    Raises:
+        FieldkitError: The trial is not of this fieldkit, of this backend or of these robots; or as for `opened` and
+            `resume_trial`.
+    """
+    plan = resumable(folder)
+    for change in step_packages.changes(plan.step_packages):
+        sink(Note(change))
+    require_backend(plan, name, folder)
+    require_cast(plan, backend.cast(plan.topology))
+    with opened(
+        backend, plan.cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
+    ) as testbed:
+        return resume_trial(folder, testbed, sink, stop, failed=failed)
+
+
+def resume_trial(
+    folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None = None, *, failed: bool = False
+) -> Outcome | None:
+    """Place the robots and resume a trial; None if the operator skipped it. Errors as for `continue_trial`."""
+    placement = place(resumable(folder), testbed, sink)
+    if placement.answer.skip:
+        return None
+    return continue_trial(folder, testbed, sink, stop or Stop(), failed=failed)
+
+
+def continue_trial(
+    folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, report_resume: bool = True, failed: bool = False
+) -> Outcome:
+    """Resume an interrupted trial: finished repeats are kept, each other repeat is attempted again.
+
+    The evidence of an attempt whose steps were done is fetched and judged. An interrupted attempt is stored as void
+    and does not count as one of the allowed attempts.
+
+    Args:
+        folder: The trial's folder.
+        testbed: The robots of its plan, at their places.
+        sink: Receives events.
+        stop: Request to stop the trial.
+        report_resume: As for `begin`.
+        failed: Whether failed repeats are repeated too, each with as many attempts as the procedure allows.
+
+    Raises:
+        ConfigurationError: `folder` is not a trial, other code started it, or another fieldkit runs it now.
+        EvidenceError: Its journal is damaged.
+        FieldkitError: As for `begin`.
+    """
+    plan = resumable(folder)
+    with journal.locked(folder), converting_write_errors(folder):
+        if failed and not journal.reopen_failed(folder, plan) and report_resume:
+            sink(Note("no repeat of this trial failed"))
+        return run_repeats(plan, testbed, folder, sink, stop, report_resume=report_resume)
 
 
 def resumable(folder: Path) -> Plan:

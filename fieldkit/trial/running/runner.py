@@ -1,4 +1,4 @@
-"""Run or resume a planned trial: every repeat is attempted until it is valid or has failed."""
+"""Run a planned trial: every repeat is attempted until it is valid or has failed."""
 
 import errno
 import time
@@ -33,7 +33,6 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import motion_control, preflight
 from fieldkit.trial.running.attempts import Attempts
 from fieldkit.trial.running.ledger import Ledger
-from fieldkit.trial.running.resumption import resumable
 from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.stop import Stop
 
@@ -65,16 +64,6 @@ def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | 
     return begin(plan.with_note(placement.answer.note), testbed, out, sink, stop or Stop())
 
 
-def resume_trial(
-    folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None = None, *, failed: bool = False
-) -> Outcome | None:
-    """Place the robots and resume a trial; None if the operator skipped it. Errors as for `continue_trial`."""
-    placement = place(resumable(folder), testbed, sink)
-    if placement.answer.skip:
-        return None
-    return continue_trial(folder, testbed, sink, stop or Stop(), failed=failed)
-
-
 @dataclass(frozen=True)
 class PlacementResult:
     """Result of placing a trial's robots.
@@ -100,7 +89,8 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
     """Run preflight on robots at their places, and run every repeat.
 
     If the trial ends early, its folder contains the plan, the journal, every attempt that ended, their rows and a
-    manifest, and `continue_trial` resumes it. If fieldkit was killed, the summary is missing; `rebuild` writes it.
+    manifest, and `resumption.continue_trial` resumes it. If fieldkit was killed, the summary is missing; `rebuild`
+    writes it.
 
     Args:
         plan: The trial.
@@ -118,39 +108,13 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
     """
     folder = store.create(out, plan)
     sink(Note(f"trial {folder}"))
-    with journal.locked(folder), _converting_write_errors(folder):
-        return _run(plan, testbed, folder, sink, stop, report_resume=report_resume)
+    with journal.locked(folder), converting_write_errors(folder):
+        return run_repeats(plan, testbed, folder, sink, stop, report_resume=report_resume)
 
 
-def continue_trial(
-    folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, report_resume: bool = True, failed: bool = False
+def run_repeats(
+    plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, report_resume: bool
 ) -> Outcome:
-    """Resume an interrupted trial: finished repeats are kept, each other repeat is attempted again.
-
-    The evidence of an attempt whose steps were done is fetched and judged. An interrupted attempt is stored as void
-    and does not count as one of the allowed attempts.
-
-    Args:
-        folder: The trial's folder.
-        testbed: The robots of its plan, at their places.
-        sink: Receives events.
-        stop: Request to stop the trial.
-        report_resume: As for `begin`.
-        failed: Whether failed repeats are repeated too, each with as many attempts as the procedure allows.
-
-    Raises:
-        ConfigurationError: `folder` is not a trial, other code started it, or another fieldkit runs it now.
-        EvidenceError: Its journal is damaged.
-        FieldkitError: As for `begin`.
-    """
-    plan = resumable(folder)
-    with journal.locked(folder), _converting_write_errors(folder):
-        if failed and not journal.reopen_failed(folder, plan) and report_resume:
-            sink(Note("no repeat of this trial failed"))
-        return _run(plan, testbed, folder, sink, stop, report_resume=report_resume)
-
-
-def _run(plan: Plan, testbed: Testbed, folder: Path, sink: Sink, stop: Stop, *, report_resume: bool) -> Outcome:
     """Run the remaining repeats of a trial whose journal is locked by this process."""
     ledger = Ledger(plan, folder, stop)
     robots = Robots(plan, testbed, sink)
@@ -266,7 +230,7 @@ def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, re
 
 
 @contextmanager
-def _converting_write_errors(folder: Path) -> Iterator[None]:
+def converting_write_errors(folder: Path) -> Iterator[None]:
     """Convert errors from writing to a trial's folder, for example if the disk is full or the folder was moved."""
     try:
         yield

@@ -171,7 +171,7 @@ def generated_bag(
     """Return a bag of messages of one size and rate; each is recorded with a random delay, and the order is kept.
 
     Args:
-        draws: One draw for each message.
+        draws: Random numbers, one for each message.
         length_ns: Length of the recording.
         rate_hz: Messages per second.
         size_bytes: Size of each message.

@@ -39,7 +39,7 @@ class PolicyChoice(Strict):
 
     Attributes:
         name: The default policy of a run.
-        window: Length of a window, or the w of the velocity-aware policies.
+        window: Length of a window, or the parameter w of the velocity-aware policies.
         longest: Longest window of policies with variable windows.
         bound: Largest error of the network's relative position of two agents that transmit, for `error_bounded`.
         bound_db: Instead of `bound`: largest error of the path loss between them in free line of sight, in dB.
@@ -78,7 +78,7 @@ class PhysicsOptions(Strict):
         step: Its time step.
         federate: An [external federate](federates.md) that replaces the built-in physics: the name of an installed
             simulator, a command, or an address of `tcp`, `udp`, `dds` or `ros1` (addresses: `fieldkit docs
-            federates`). A command is run when the scenario is.
+            federates`). A command is started for each run of the scenario.
         options: Options of the federate; its page lists them.
     """
 

@@ -183,8 +183,8 @@ class Formation:
         station_mean_m: Distance from the station above the leaders, mean over time and followers that fly.
         station_max_m: Its maximum.
         amplification: Largest ratio of the L2 norm of the acceleration of a follower that drives to that of its
-            leader: up to 1, the row was string stable for the motion of its first vehicle. Accelerations are 0 before
-            and after a change of speed, so unlike with speeds, the end of the run does not matter.
+            leader. At most 1 if the row was string stable for the motion of its first vehicle. Accelerations are 0
+            before and after a change of speed, so the end time of the run has no effect, as it would on speeds.
     """
 
     spacing_mean_m: float

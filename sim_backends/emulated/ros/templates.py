@@ -87,7 +87,7 @@ def _types(kind: str, definition: str) -> "Typestore":
     """Return ROS 1's types and those of a definition: fields of the type, then `MSG: package/Name` and fields."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (50 ms)
 
-    from fieldkit.ros.interfaces.types import EXTRA_DEFINITIONS  # noqa: PLC0415 (as above)
+    from fieldkit.ros.interfaces.definitions import EXTRA_DEFINITIONS  # noqa: PLC0415 (as above)
 
     store = get_typestore(Stores.ROS1_NOETIC)
     for name, text in EXTRA_DEFINITIONS.items():

@@ -144,8 +144,8 @@ class TcpConnection:
         self._transmit(name.destination, name.source, "syn-ack" if segment.syn else "ack", segment)
 
     def _transmit(self, source: str, destination: str, kind: str, segment: Segment) -> None:
-        # Draws are keyed by the number of earlier transmissions; an ACK is identified by the segment that it
-        # acknowledges.
+        # Random numbers are derived from the number of earlier transmissions, so that each has others. An ACK is
+        # identified by the segment that it acknowledges.
         stream = f"{self._name.flow} {self._name.number} {kind} {segment.earlier_transmissions}"
         identity = stream, segment.number
         body = self._name, segment
@@ -180,7 +180,7 @@ class TcpConnection:
 
 
 class Tcp:
-    """Carries messages in order, once and complete, or gives up; implements the protocol `Transport`.
+    """Delivers each message once, complete and in order, or gives up its connection; a `Transport`.
 
     Args:
         wire: The network below.

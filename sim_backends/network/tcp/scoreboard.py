@@ -22,7 +22,7 @@ class SentSegment:
     Attributes:
         first: Sequence number of its first byte.
         end: Sequence number after its last byte.
-        number: Its number in the stream, for random draws.
+        number: Its number in the stream, from which its random numbers are derived.
         sent_ns: Time of its last transmission.
         transmissions: Number of transmissions.
         copies: Number of transmissions that are assumed to be in flight.

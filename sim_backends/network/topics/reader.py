@@ -17,7 +17,10 @@ from sim_backends.network.wire import Wire, WireTimer
 _LONG_AGO_NS: Final = -(10**18)
 _MAX_BITS: Final = 256
 _INITIAL_BACKOFF: Final = ((10 * SECOND, 1), (60 * SECOND, 2), (120 * SECOND, 5))
-"""Time since the reader was matched, and factor of the repetition interval up to then; 10 beyond."""
+"""Upper limits of the time since the reader was matched, and the factor of the repetition interval until each limit.
+
+After the last limit the factor is 10.
+"""
 
 _Kind = Literal["ack", "nack", "nack_frag", "silent_ack", "silent_nack", "suppressed_nack"]
 

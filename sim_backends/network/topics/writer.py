@@ -16,7 +16,8 @@ from sim_backends.network.wire import Wire, WireTimer
 from sim_backends.radio.random_streams import PacketIdentity
 
 Transmit = Callable[[tuple[Submessage, ...], PacketIdentity], None]
-"""Sends a message to the other end; the key of its random draws begins with the kind of message."""
+"""Sends a message to the other end. Its random numbers are derived from the identity, which begins with the kind of
+message."""
 
 PUSHED_OUT: Final = "pushed out of the writer's history before it was acknowledged"
 OVERTAKEN: Final = "overtaken by a later sample"

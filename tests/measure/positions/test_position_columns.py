@@ -14,7 +14,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FIXED_ROLES, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping, track
-from fieldkit.measure.positions import position_columns, position_sources
+from fieldkit.measure.positions import position_columns, position_sources, recorded_positions
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, PLACED, WGS84
 from fieldkit.measure.robot_clock import Offset
@@ -67,7 +67,7 @@ def test_sources_of_the_trial_precede_those_of_the_attempt_and_of_the_testbed(at
     write_bag(attempt, AWAY)
     write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
     assert mean_m(attempt) == pytest.approx(12)
-    assert position_columns.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
+    assert recorded_positions.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
     trial = attempt.parent.parent
     lines = "".join(f"{BEGAN_NS + n * S},{30 + n},0\n" for n in range(5))
     (trial / "positions-receiver.csv").write_text(f"t_ns,x_m,y_m\n{lines}", encoding="ascii")
@@ -108,7 +108,7 @@ def test_times_of_robots_are_converted_to_one_clock(
     write_sources(attempt, {SENDER: HERE, RECEIVER: start}, clocks)
     begin_s, end_s = (1.0 + wrong_ns / 1e9, 3.0 + wrong_ns / 1e9)
     assert mean_m(attempt, begin_s, end_s) == pytest.approx(metres)
-    assert position_columns.clock_error_s(AttemptEvidence(attempt)) == (
+    assert recorded_positions.clock_error_s(AttemptEvidence(attempt)) == (
         pytest.approx(0.01 * len(clocks)) if clocks else None
     )
 

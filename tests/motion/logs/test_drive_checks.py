@@ -17,7 +17,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Leg, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import reading, track
-from fieldkit.measure.positions import position_columns
+from fieldkit.measure.positions import recorded_positions
 from fieldkit.motion.logs import drive_checks, drive_log
 from fieldkit.motion.logs.drive_checks import DrivePlan
 from tests.motion.logs.test_drive_log import drive
@@ -160,7 +160,7 @@ def oracle(folder: Path, far_m: float) -> AttemptEvidence:
 @pytest.mark.parametrize(("far_m", "agrees"), [(2.0, True), (2.1, True), (8.0, False), (0.0, False)])
 def test_the_farthest_position_agrees_with_the_testbed(far_m: float, agrees: bool, tmp_path: Path) -> None:
     during_ns = (START_NS, START_NS + 9 * 10**9)
-    why = position_columns.distance_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
+    why = recorded_positions.distance_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
     assert (why is None) is agrees
     if why:
         assert why == f"it was 2.0 m from its place by its odometry, and {far_m:.1f} m by track.csv"

@@ -15,7 +15,7 @@ from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence.track import Separation
-from fieldkit.measure.positions import position_columns, position_sources, trajectories
+from fieldkit.measure.positions import position_sources, recorded_positions, trajectories
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import WGS84
 from fieldkit.measure.robot_clock import Offset
@@ -120,7 +120,7 @@ def attempt(
 
 
 def apart(view: View, from_s: float, to_s: float) -> Separation:
-    source, destination = position_columns.trajectories_of_pair(view.evidence, (Role.SENDER, Role.RECEIVER))
+    source, destination = recorded_positions.trajectories_of_pair(view.evidence, (Role.SENDER, Role.RECEIVER))
     began_ns = START_NS + round(1e9 * START_S)
     return trajectories.separation_between(
         source, destination, began_ns + round(from_s * 1e9), began_ns + round(to_s * 1e9)
@@ -145,7 +145,7 @@ def test_local_frame_is_rotated_into_frame_of_placement(tmp_path: Path) -> None:
 def test_times_use_clock_of_the_recorder(tmp_path: Path) -> None:
     step = mavlink(f"at: sender, {LOCAL}")
     view = attempt(tmp_path, step, flight(10, 1.0), Offset(0.5, 0.001))
-    assert position_columns.samples_of(view.evidence, Role.RECEIVER).times_ns[0] == START_NS + 500_000 - 500_000_000
+    assert recorded_positions.samples_of(view.evidence, Role.RECEIVER).times_ns[0] == START_NS + 500_000 - 500_000_000
 
 
 def test_delayed_messages_count_at_time_in_header(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from fieldkit.core.events import Event, Note
 from fieldkit.core.model import BRIDGE_IS_UP, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import UNATTENDED
 from fieldkit.core.units import parse_distance
-from fieldkit.lab.protocol import LabRobot
+from fieldkit.lab.robots import LabRobot
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.ros.bridging import session_bridges

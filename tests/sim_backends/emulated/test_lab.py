@@ -16,7 +16,7 @@ from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Scenario, Vector
 from fieldkit.lab import requests
-from fieldkit.lab.protocol import Destination
+from fieldkit.lab.robots import Destination
 from fieldkit.report import figures
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions

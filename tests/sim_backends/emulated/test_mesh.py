@@ -16,7 +16,7 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.lab.protocol import LabRobot
+from fieldkit.lab.robots import LabRobot
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import requirements
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice

@@ -12,8 +12,9 @@ from fieldkit.core.events import Event, Note
 from fieldkit.core.model import Protocol, RepeatId, Status
 from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
+from fieldkit.trial.running.resumption import resume_trial
 from fieldkit.trial.running.robots import Robots
-from fieldkit.trial.running.runner import Outcome, resume_trial, run_trial
+from fieldkit.trial.running.runner import Outcome, run_trial
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.plans import write_states
 from tests.helpers.runs import rows

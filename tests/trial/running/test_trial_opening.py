@@ -17,7 +17,7 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 from fieldkit.trial import store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import locks, opening, preflight, runner
+from fieldkit.trial.running import locks, opening, preflight, resumption, runner
 from fieldkit.trial.running.locks import Holder
 from fieldkit.trial.running.runner import Outcome
 from fieldkit.trial.running.stop import Stop
@@ -111,7 +111,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
         monkeypatch.setattr(preflight, "connect_all", meet)
         monkeypatch.setattr(locks, "held", held)
         monkeypatch.setattr(runner, "run_trial", run_trial)
-        monkeypatch.setattr(runner, "resume_trial", resume_trial)
+        monkeypatch.setattr(resumption, "resume_trial", resume_trial)
         return made
 
     return make
@@ -183,7 +183,7 @@ def test_nothing_is_opened_for_a_folder_that_cannot_be_written(
 
 
 def resume(made: Recorder, folder: Path, backend: str = "field") -> Outcome | None:
-    return opening.resume(
+    return resumption.resume(
         folder, backend, made, failed=False, sink=made.events.append, operator=Nobody(), stop=Stop()
     )
 

@@ -18,9 +18,9 @@ from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import rebuild
-from fieldkit.trial.running.resumption import resumable
+from fieldkit.trial.running.resumption import resumable, resume_trial
 from fieldkit.trial.running.robots import Robots
-from fieldkit.trial.running.runner import resume_trial, run_trial
+from fieldkit.trial.running.runner import run_trial
 from fieldkit.trial.running.stop import Stop
 from fieldkit.trial.running.unfetched import unfetched_file
 from tests.helpers.idle_testbed import IdleTestbed

@@ -1,0 +1,34 @@
+"""Columns of the outages that faults cause; every table of trials has them."""
+
+from typing import Final
+
+from fieldkit.core.columns import Column, Figure, Kind, columns, fault_column_name
+from fieldkit.core.model import FaultKind
+
+_KINDS_IN_ORDER: Final = (FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE, FaultKind.REBOOT, FaultKind.KILL)
+
+
+def _observer(kind: FaultKind) -> str:
+    """Return the observer of the outage, which is not the traffic of other steps."""
+    return "process" if kind is FaultKind.KILL else "ping"
+
+
+def declared(kind: FaultKind) -> tuple[Column, ...]:
+    """Return the columns of a kind of fault."""
+    outage_meaning = f"Longest time without a reply around the fault {kind}; empty if the robot did not recover."
+    recovery_meaning = f"Part of this outage after the end of the cause of {kind}; empty if that end is unknown."
+    recovered_meaning = f"True if the robot recovered from the fault {kind} within the time limit."
+    bound_meaning = f"Lower bound of the recovery time if the robot did not recover from {kind}; otherwise empty."
+    index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")
+    recovered = Figure(f"{_observer(kind)} back after {kind}", Kind.FLAG, rank=70 + index)
+    recovery = Figure(f"{_observer(kind)} recovery after {kind}", Kind.MEDIAN, rank=80 + index, at_least=bound)
+    times = columns(
+        90,
+        (fault_column_name(kind, "outage_s"), "s", outage_meaning),
+        (fault_column_name(kind, "recovery_s"), "s", recovery_meaning, recovery),
+        (fault_column_name(kind, "recovered"), "bool", recovered_meaning, recovered),
+    )
+    return (*times, *columns(110, (bound, "s", bound_meaning)))
+
+
+COLUMNS: Final = tuple(column for kind in _KINDS_IN_ORDER for column in declared(kind))

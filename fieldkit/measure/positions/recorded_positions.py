@@ -1,0 +1,284 @@
+"""Recorded positions of robots, from the sources that `positions.json` lists, and a check of travelled distances.
+
+Positions of the testbed are used for robots without such a source (`position_columns`).
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.columns import Column, Measured
+from fieldkit.core.errors import EvidenceError
+from fieldkit.core.model import Role, sort_roles
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures.arrays import Floats
+from fieldkit.measure.evidence import track
+from fieldkit.measure.positions import position_files, position_sources, trajectories
+from fieldkit.measure.positions.position_columns import trial_folder
+from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
+from fieldkit.measure.positions.samples import WGS84, Samples, ecef_m
+from fieldkit.measure.positions.trajectories import Trajectory
+
+
+def measure(
+    evidence: AttemptEvidence,
+    declared: Sequence[Column],
+    ends: tuple[Role, Role],
+    times_ns: Collection[int],
+) -> Measured:
+    """Return the columns of `position_columns.measure` for an attempt with recorded positions."""
+    try:
+        sources = read_position_sources(evidence)
+        if not sources.robots.keys() & set(ends):
+            return track.measure(evidence.read_or_none(track.read, track.FILE), declared, ends, times_ns)
+        source, destination = trajectories_of_pair(evidence, ends)
+    except EvidenceError as error:
+        return Measured.all_missing(declared, error.what)
+    if not len(times_ns):
+        return Measured.all_missing(declared, "no packet has a time")
+    offset_ns = _offset_ns(sources, ends[0])
+    start_ns, end_ns = int(min(times_ns)) - offset_ns, int(max(times_ns)) - offset_ns
+    for role, trajectory in zip(ends, (source, destination), strict=True):
+        if problem := trajectory.coverage_problem(start_ns, end_ns):
+            reason = f"the positions of the {role} from {sources.robots[role].description} {problem}"
+            return Measured.all_missing(declared, reason)
+    separation = trajectories.separation_between(source, destination, start_ns, end_ns)
+    return Measured.from_optional(
+        {column.name: getattr(separation, column.name.partition("_")[2]) for column in declared}, ""
+    )
+
+
+def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
+    """Return the distances of `position_columns.distances_m` for an attempt with recorded positions."""
+    try:
+        sources = read_position_sources(evidence)
+        if not sources.robots.keys() & set(ends):
+            return list(track.distances_m(evidence.read_or_none(track.read, track.FILE) or (), *ends))
+        source, destination = trajectories_of_pair(evidence, ends)
+    except EvidenceError:
+        return ()
+    offset_ns, distances = _offset_ns(sources, ends[0]), list[tuple[int, float | None]]()
+    for at_ns, metres in zip(*trajectories.distances_m(source, destination), strict=True):
+        since_ns = distances[-1][0] - offset_ns if distances else int(at_ns)
+        if any(trajectory.coverage_problem(since_ns, int(at_ns)) for trajectory in (source, destination)):
+            distances.append((since_ns + offset_ns + 1, None))
+        distances.append((int(at_ns) + offset_ns, float(metres)))
+    return distances
+
+
+def read_position_sources(evidence: AttemptEvidence) -> PositionSources:
+    """Return the sources of positions besides the testbed; most attempts have none.
+
+    Raises:
+        EvidenceError: A file that lists them is damaged.
+    """
+    return evidence.cached(_read_sources)
+
+
+def _read_sources(evidence: AttemptEvidence) -> PositionSources:
+    of_attempt = (
+        evidence.read(position_sources.read, position_sources.FILE)
+        if evidence.has(position_sources.FILE)
+        else PositionSources()
+    )
+    trial = trial_folder(evidence)
+    of_trial = (
+        position_sources.read(trial / position_sources.FILE)
+        if trial and (trial / position_sources.FILE).is_file()
+        else PositionSources()
+    )
+    return PositionSources(
+        {**of_attempt.robots, **of_trial.robots}, of_attempt.clocks, of_attempt.heights or of_trial.heights
+    )
+
+
+def sources_text(evidence: AttemptEvidence) -> str | None:
+    """Return the sources as text, `sender as placed, receiver /odom`, or None if there are none."""
+    robots = read_position_sources(evidence).robots
+    return ", ".join(f"{role} {robots[role].description}" for role in sort_roles(robots)) or None
+
+
+def trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
+    """Return the trajectories of two robots by the laptop's clock, in one frame.
+
+    Raises:
+        EvidenceError: A robot has no source, a source cannot be read, or the frames differ.
+    """
+    return evidence.cached(_trajectories_of_pair, ends)
+
+
+def _trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
+    sources = read_position_sources(evidence)
+    source, destination = (samples_of(evidence, role) for role in ends)
+    if source.frame != destination.frame:
+        frames = f"the {ends[0]} {source.frame}, the {ends[1]} {destination.frame}"
+        raise EvidenceError(f"the positions of the robots are in different frames: {frames}")
+    if source.frame == WGS84:
+        source_m, destination_m = _ecef_m(source, destination, heights=sources.heights)
+    else:
+        source_m, destination_m = source.values, destination.values
+    return _trajectory(source, source_m, sources.robots[ends[0]]), _trajectory(
+        destination, destination_m, sources.robots[ends[1]]
+    )
+
+
+def _trajectory(samples: Samples, places_m: Floats, position_source: PositionSource) -> Trajectory:
+    if position_source.place is not None:
+        return trajectories.stationary(places_m[0])
+    return Trajectory(samples.times_ns, places_m, round(position_source.gap_s * 1e9))
+
+
+def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
+    """Return the samples of one robot, with times by the laptop's clock.
+
+    Raises:
+        EvidenceError: The robot has no source, or the source cannot be read.
+    """
+    sources = read_position_sources(evidence)
+    if (position_source := sources.robots.get(role)) is None:
+        raise EvidenceError(f"no source has the position of the {role}")
+    if position_source.place is not None:
+        place = np.array([position_source.place], dtype=float)  # NaN for None
+        return Samples(np.zeros(1, dtype=np.int64), place, position_source.frame)
+    if position_source.topic:
+        recorded_samples = evidence.read(position_files.read_topic, position_source.file, position_source)
+        samples = _shifted(
+            recorded_samples, -_offset_ns(sources, Role(position_source.clock) if position_source.clock else role)
+        )
+        return samples if samples.yaws_rad is None else position_files.to_placement_frame(samples, position_source)
+    folder = trial_folder(evidence)
+    assert folder is not None  # only the sources of a trial have neither a place nor a topic
+    return _shifted(_samples_in_trial(folder / position_source.file), round(position_source.offset_s * 1e9))
+
+
+def readable_samples(evidence: AttemptEvidence) -> Mapping[Role, Samples]:
+    """Return the samples of each robot with a readable source besides the testbed."""
+    samples_by_role: dict[Role, Samples] = {}
+    with suppress(EvidenceError):
+        for role in read_position_sources(evidence).robots:
+            with suppress(EvidenceError):
+                samples_by_role[role] = samples_of(evidence, role)
+    return samples_by_role
+
+
+def _shifted(samples: Samples, by_ns: int) -> Samples:
+    return Samples(samples.times_ns + by_ns, samples.values, samples.frame, samples.yaws_rad)
+
+
+def _samples_in_trial(path: Path) -> Samples:
+    """Return the samples in a file of a trial; cached, because all of the trial's attempts use it."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise EvidenceError(f"{path.name} cannot be read: {error.strerror}", where=str(path)) from error
+    return _read_cached(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=4)
+def _read_cached(path: Path, _mtime_ns: int, _size_bytes: int) -> Samples:
+    return position_files.read_file(path)
+
+
+def _offset_ns(sources: PositionSources, role: Role) -> int:
+    """Return the offset of a robot's clock from the laptop's, positive if it was ahead; 0 if it was not measured."""
+    return round(sources.clocks[role].offset_s * 1e9) if role in sources.clocks else 0
+
+
+def clock_offset_ns(evidence: AttemptEvidence, role: Role) -> int:
+    """Return the offset of a robot's clock from the laptop's, or 0; raises as `read_position_sources`."""
+    return _offset_ns(read_position_sources(evidence), role)
+
+
+def clock_error_s(evidence: AttemptEvidence) -> float | None:
+    """Return the maximum error between the times of two robots, or None if no clock offset was measured."""
+    errors = sorted(offset.error_s for offset in read_position_sources(evidence).clocks.values())
+    return sum(errors[-2:]) if errors else None
+
+
+def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Floats, Floats]:
+    """Return positions of two robots in metres. Unless `heights` is set, both are at the median height.
+
+    Raises:
+        EvidenceError: `heights` is set and some are unknown.
+    """
+    heights_m = np.concatenate((source.values[:, 2], destination.values[:, 2]))
+    known_heights_m = heights_m[np.isfinite(heights_m)]
+    if heights and len(known_heights_m) < len(heights_m):
+        raise EvidenceError("heights are required, but some positions have none")
+    median_m = float(np.median(known_heights_m)) if len(known_heights_m) else 0.0
+
+    def place_m(samples: Samples) -> Floats:
+        north, east, up_m = samples.values.T
+        return ecef_m(north, east, up_m if heights else np.full(len(up_m), median_m))
+
+    return place_m(source), place_m(destination)
+
+
+DRIFT: Final = 0.1
+"""Upper limit of odometry drift as a share of the path, for wheels that do not slip."""
+PLACE_M: Final = 0.5
+SATELLITE_M: Final = 10.0
+"""Largest position errors: `PLACE_M` of local positions, `SATELLITE_M` of a satellite receiver (5 m at each end of
+the path)."""
+_AROUND_NS: Final = 1_000_000_000
+
+
+def distance_contradiction(
+    evidence: AttemptEvidence, role: Role, farthest_m: float, speed_m_s: float, during_ns: tuple[int, int] | None
+) -> str | None:
+    """Return the reason why a robot cannot have been that far from its start, or None if it can.
+
+    Args:
+        evidence: The attempt's evidence.
+        role: The robot.
+        farthest_m: Its largest distance by its log.
+        speed_m_s: Its speed.
+        during_ns: First and last time of that log by the robot's clock; None if it has no times.
+    """
+    track_samples = evidence.read_or_none(track.read, track.FILE) if evidence.has(track.FILE) else None
+    if track_samples is not None and during_ns is not None:
+        places_m = [
+            sample.position_m
+            for sample in track_samples
+            if sample.role is role
+            and sample.position_m is not None
+            and during_ns[0] - _AROUND_NS <= sample.utc_ns <= during_ns[1] + _AROUND_NS
+        ]
+        other_m = _from_first_m(np.array(places_m, dtype=float)) if len(places_m) > 1 else None
+        tolerance_m = PLACE_M + DRIFT * farthest_m + speed_m_s
+        if other_m is not None and abs(other_m - farthest_m) > tolerance_m:
+            return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_m:.1f} m by {track.FILE}"
+    return _recorded_contradiction(evidence, role, farthest_m)
+
+
+def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: float) -> str | None:
+    """Return the reason why recorded positions of a robot contradict the distance, or None.
+
+    The recording may cover more of the attempt than the movement does. A larger recorded distance is therefore valid,
+    a smaller one is not.
+    """
+    try:
+        position_source = read_position_sources(evidence).robots.get(role)
+        if position_source is None or position_source.place is not None:
+            return None
+        samples = samples_of(evidence, role)
+    except EvidenceError:
+        return None
+    on_earth = samples.frame == WGS84
+    north, east, up_m = samples.values.T
+    places_m = ecef_m(north, east, np.zeros(len(up_m))) if on_earth else samples.values
+    other_m = _from_first_m(places_m)
+    if farthest_m - other_m > (SATELLITE_M if on_earth else PLACE_M) + DRIFT * farthest_m:
+        other_text = f"{other_m:.1f} m by {position_source.description}"
+        return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_text}"
+    return None
+
+
+def _from_first_m(places_m: Floats | Sequence[Sequence[float]]) -> float:
+    """Return the largest distance from the first place. Shape (n, 3)."""
+    ground_m = np.asarray(places_m)
+    return float(np.linalg.norm(ground_m - ground_m[0], axis=1).max())

@@ -1,0 +1,10 @@
+"""Definitions of standard ROS message types that rosbags lacks."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+EXTRA_DEFINITIONS: Final[Mapping[str, str]] = MappingProxyType(
+    {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
+)
+"""Definition of each type by its name."""
