@@ -10,6 +10,7 @@ from docs.generator.commands import commands
 from docs.generator.federate_frames import DESCRIPTION, WITHOUT_VECTOR, example_frames
 from docs.generator.markdown import page, relative, table
 from docs.generator.models import HEAD, describe, keys_table, kinds, rows
+from docs.generator.simulators import simulator_options
 from fieldkit import cli
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.campaign.plan import CampaignFile
@@ -45,6 +46,7 @@ def pages() -> dict[str, str]:
         "step-capabilities.md": step_capabilities,
         "campaign-file.md": lambda: page("Campaign file", describe(CampaignFile), _MARKS, keys_table(CampaignFile)),
         "scenario-file.md": scenario_file,
+        "simulator-options.md": simulator_options,
         "columns.md": columns,
         "events.md": json_events,
         "federate-vectors.md": federate_vectors,
@@ -90,6 +92,7 @@ def index() -> str:
         ("[Capabilities of steps](step-capabilities.md)", "for a kind of step of your own"),
         ("[Campaign file](campaign-file.md)", "the file of `fieldkit campaign`"),
         ("[Scenario file](scenario-file.md)", "`scenarios/NAME.yaml` of the co-simulation"),
+        ("[Options of simulators](simulator-options.md)", "`physics.options` and `network.options` of a scenario"),
         ("[World file](../world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
         ("[Values in files](../values.md)", "quantities with units, YAML, expectations"),
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
