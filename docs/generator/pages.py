@@ -8,6 +8,7 @@ from typing import Final
 
 from docs.generator.commands import commands
 from docs.generator.federate_frames import DESCRIPTION, WITHOUT_VECTOR, example_frames
+from docs.generator.federate_protocol import federate_protocol
 from docs.generator.markdown import page, relative, table
 from docs.generator.models import HEAD, describe, keys_table, kinds, rows
 from docs.generator.simulators import simulator_options
@@ -29,6 +30,10 @@ from sim_backends.cosim.scenario.agent_plans import MotionPlan, Traffic
 from sim_backends.cosim.scenario.faults import Fault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.emulated.emulated_options import EmulatedOptions
+from sim_backends.world.materials import MATERIALS
+from sim_backends.world.obstacles import Obstacle
+from sim_backends.world.world import SHIPPED as WORLDS
+from sim_backends.world.world import World
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / "reference"
 _MARKS: Final = "`[]` means each item of a list, `*` each name of a mapping. Values: [quantities](../values.md)."
@@ -49,6 +54,8 @@ def pages() -> dict[str, str]:
         "simulator-options.md": simulator_options,
         "columns.md": columns,
         "events.md": json_events,
+        "world-file.md": world_file,
+        "federate-protocol.md": federate_protocol,
         "federate-vectors.md": federate_vectors,
     }
     return {"index.md": index()} | {name: make() for name, make in makers.items()}
@@ -93,11 +100,12 @@ def index() -> str:
         ("[Campaign file](campaign-file.md)", "the file of `fieldkit campaign`"),
         ("[Scenario file](scenario-file.md)", "`scenarios/NAME.yaml` of the co-simulation"),
         ("[Options of simulators](simulator-options.md)", "`physics.options` and `network.options` of a scenario"),
-        ("[World file](../world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
+        ("[World file](world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
         ("[Values in files](../values.md)", "quantities with units, YAML, expectations"),
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
         ("[JSON events](events.md)", "output of `--json`"),
+        ("[Layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
         ("[Test vectors of federates](federate-vectors.md)", "frames of the protocol of external federates"),
         ("[Errors](../errors.md)", "messages and remedies"),
     )
@@ -197,6 +205,22 @@ def scenario_file() -> str:
         for kind, model in kinds(union).items():
             blocks += [f"## {title}: {kind}", describe(model), keys_table(model)]
     return page("Scenario file", describe(CosimScenario), _MARKS, *blocks)
+
+
+def world_file() -> str:
+    """Return the page of world files, with a shipped one."""
+    blocks = ["## Obstacles", f"`material` is one of {', '.join(f'`{name}`' for name in MATERIALS)}."]
+    for kind, model in kinds(Obstacle).items():
+        blocks += [f"### {kind}", describe(model), keys_table(model)]
+    example = (WORLDS / "lawn.yaml").read_text(encoding="utf-8").strip()
+    return page(
+        "World file",
+        describe(World),
+        f"The shipped world `lawn`:\n\n```yaml\n{example}\n```",
+        _MARKS,
+        keys_table(World),
+        *blocks,
+    )
 
 
 def columns() -> str:
