@@ -22,6 +22,7 @@ from fieldkit.config.site import Site
 from fieldkit.core import errors, events
 from fieldkit.core.columns import Column
 from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
+from fieldkit.pytest import plugin
 from fieldkit.steps.base import Step, step_types
 from fieldkit.steps.capabilities import CAPABILITIES
 from fieldkit.trial.columns import installed
@@ -52,6 +53,7 @@ def pages() -> dict[str, str]:
         "campaign-file.md": lambda: page("Campaign file", describe(CampaignFile), _MARKS, keys_table(CampaignFile)),
         "scenario-file.md": scenario_file,
         "simulator-options.md": simulator_options,
+        "pytest-options.md": pytest_options,
         "columns.md": columns,
         "events.md": json_events,
         "world-file.md": world_file,
@@ -103,6 +105,7 @@ def index() -> str:
         ("[World file](world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
         ("[Values in files](../values.md)", "quantities with units, YAML, expectations"),
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
+        ("[Options of pytest](pytest-options.md)", "of the pytest plugin"),
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
         ("[JSON events](events.md)", "output of `--json`"),
         ("[Layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
@@ -220,6 +223,25 @@ def world_file() -> str:
         _MARKS,
         keys_table(World),
         *blocks,
+    )
+
+
+def pytest_options() -> str:
+    """Return the page of the options of the pytest plugin."""
+    lines = [
+        (
+            f"`--fieldkit-{name} {metavar}`",
+            f"`fieldkit_{name}`",
+            ", ".join(f"`{word}`" for word in choices or ()) or "any",
+            text,
+        )
+        for name, (metavar, text, choices) in plugin.OPTIONS.items()
+    ]
+    return page(
+        "Options of pytest",
+        "Options and configuration keys that the [pytest plugin](../pytest.md) adds. A path in the configuration is "
+        "relative to pytest's root folder.",
+        table(("option", "key", "values", "meaning"), [*lines, ("`--fieldkit-yes`", "none", "none", plugin.YES)]),
     )
 
 
