@@ -27,6 +27,7 @@ from fieldkit.steps.base import Step, step_types
 from fieldkit.steps.capabilities import CAPABILITIES
 from fieldkit.trial.columns import installed
 from fieldkit.trial.procedure import Procedure
+from sim_backends.cosim.recording.packet_tables import SCHEMAS
 from sim_backends.cosim.scenario.agent_plans import MotionPlan, Traffic
 from sim_backends.cosim.scenario.faults import Fault
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -53,6 +54,7 @@ def pages() -> dict[str, str]:
         "campaign-file.md": lambda: page("Campaign file", describe(CampaignFile), _MARKS, keys_table(CampaignFile)),
         "scenario-file.md": scenario_file,
         "simulator-options.md": simulator_options,
+        "recording-tables.md": recording_tables,
         "pytest-options.md": pytest_options,
         "columns.md": columns,
         "events.md": json_events,
@@ -107,6 +109,7 @@ def index() -> str:
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
         ("[Options of pytest](pytest-options.md)", "of the pytest plugin"),
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
+        ("[Tables of a recording](recording-tables.md)", "packets, states and windows of a co-simulation"),
         ("[JSON events](events.md)", "output of `--json`"),
         ("[Layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
         ("[Test vectors of federates](federate-vectors.md)", "frames of the protocol of external federates"),
@@ -242,6 +245,22 @@ def pytest_options() -> str:
         "Options and configuration keys that the [pytest plugin](../pytest.md) adds. A path in the configuration is "
         "relative to pytest's root folder.",
         table(("option", "key", "values", "meaning"), [*lines, ("`--fieldkit-yes`", "none", "none", plugin.YES)]),
+    )
+
+
+def recording_tables() -> str:
+    """Return the page of the Parquet tables of a recorded co-simulation."""
+    blocks = []
+    for name, schema in SCHEMAS.items():
+        lines = (
+            (f"`{field.name}`", field.metadata[b"unit"].decode() or "none", field.metadata[b"meaning"].decode())
+            for field in schema
+        )
+        blocks += [f"## {name}", table(("field", "unit", "meaning"), lines)]
+    return page(
+        "Tables of a recording",
+        "Fields of the Parquet tables in a [recording](../cosim-commands.md#recordings) of the co-simulation.",
+        *blocks,
     )
 
 
