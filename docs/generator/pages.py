@@ -8,8 +8,10 @@ from typing import Final
 
 from docs.generator.commands import commands
 from docs.generator.federate_frames import DESCRIPTION, WITHOUT_VECTOR, example_frames
+from docs.generator.federate_protocol import federate_protocol
 from docs.generator.markdown import page, relative, table
 from docs.generator.models import HEAD, describe, keys_table, kinds, rows
+from docs.generator.simulators import simulator_options
 from fieldkit import cli
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.campaign.plan import CampaignFile
@@ -20,14 +22,20 @@ from fieldkit.config.site import Site
 from fieldkit.core import errors, events
 from fieldkit.core.columns import Column
 from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
+from fieldkit.pytest import plugin
 from fieldkit.steps.base import Step, step_types
 from fieldkit.steps.capabilities import CAPABILITIES
 from fieldkit.trial.columns import installed
 from fieldkit.trial.procedure import Procedure
+from sim_backends.cosim.recording.packet_tables import SCHEMAS
 from sim_backends.cosim.scenario.agent_plans import MotionPlan, Traffic
 from sim_backends.cosim.scenario.faults import Fault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.emulated.emulated_options import EmulatedOptions
+from sim_backends.world.materials import MATERIALS
+from sim_backends.world.obstacles import Obstacle
+from sim_backends.world.world import SHIPPED as WORLDS
+from sim_backends.world.world import World
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / "reference"
 _MARKS: Final = "`[]` means each item of a list, `*` each name of a mapping. Values: [quantities](../values.md)."
@@ -45,8 +53,13 @@ def pages() -> dict[str, str]:
         "step-capabilities.md": step_capabilities,
         "campaign-file.md": lambda: page("Campaign file", describe(CampaignFile), _MARKS, keys_table(CampaignFile)),
         "scenario-file.md": scenario_file,
+        "simulator-options.md": simulator_options,
+        "recording-tables.md": recording_tables,
+        "pytest-options.md": pytest_options,
         "columns.md": columns,
         "events.md": json_events,
+        "world-file.md": world_file,
+        "federate-protocol.md": federate_protocol,
         "federate-vectors.md": federate_vectors,
     }
     return {"index.md": index()} | {name: make() for name, make in makers.items()}
@@ -90,11 +103,15 @@ def index() -> str:
         ("[Capabilities of steps](step-capabilities.md)", "for a kind of step of your own"),
         ("[Campaign file](campaign-file.md)", "the file of `fieldkit campaign`"),
         ("[Scenario file](scenario-file.md)", "`scenarios/NAME.yaml` of the co-simulation"),
-        ("[World file](../world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
+        ("[Options of simulators](simulator-options.md)", "`physics.options` and `network.options` of a scenario"),
+        ("[World file](world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
         ("[Values in files](../values.md)", "quantities with units, YAML, expectations"),
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
+        ("[Options of pytest](pytest-options.md)", "of the pytest plugin"),
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
+        ("[Tables of a recording](recording-tables.md)", "packets, states and windows of a co-simulation"),
         ("[JSON events](events.md)", "output of `--json`"),
+        ("[Layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
         ("[Test vectors of federates](federate-vectors.md)", "frames of the protocol of external federates"),
         ("[Errors](../errors.md)", "messages and remedies"),
     )
@@ -194,6 +211,57 @@ def scenario_file() -> str:
         for kind, model in kinds(union).items():
             blocks += [f"## {title}: {kind}", describe(model), keys_table(model)]
     return page("Scenario file", describe(CosimScenario), _MARKS, *blocks)
+
+
+def world_file() -> str:
+    """Return the page of world files, with a shipped one."""
+    blocks = ["## Obstacles", f"`material` is one of {', '.join(f'`{name}`' for name in MATERIALS)}."]
+    for kind, model in kinds(Obstacle).items():
+        blocks += [f"### {kind}", describe(model), keys_table(model)]
+    example = (WORLDS / "lawn.yaml").read_text(encoding="utf-8").strip()
+    return page(
+        "World file",
+        describe(World),
+        f"The shipped world `lawn`:\n\n```yaml\n{example}\n```",
+        _MARKS,
+        keys_table(World),
+        *blocks,
+    )
+
+
+def pytest_options() -> str:
+    """Return the page of the options of the pytest plugin."""
+    lines = [
+        (
+            f"`--fieldkit-{name} {metavar}`",
+            f"`fieldkit_{name}`",
+            ", ".join(f"`{word}`" for word in choices or ()) or "any",
+            text,
+        )
+        for name, (metavar, text, choices) in plugin.OPTIONS.items()
+    ]
+    return page(
+        "Options of pytest",
+        "Options and configuration keys that the [pytest plugin](../pytest.md) adds. A path in the configuration is "
+        "relative to pytest's root folder.",
+        table(("option", "key", "values", "meaning"), [*lines, ("`--fieldkit-yes`", "none", "none", plugin.YES)]),
+    )
+
+
+def recording_tables() -> str:
+    """Return the page of the Parquet tables of a recorded co-simulation."""
+    blocks = []
+    for name, schema in SCHEMAS.items():
+        lines = (
+            (f"`{field.name}`", field.metadata[b"unit"].decode() or "none", field.metadata[b"meaning"].decode())
+            for field in schema
+        )
+        blocks += [f"## {name}", table(("field", "unit", "meaning"), lines)]
+    return page(
+        "Tables of a recording",
+        "Fields of the Parquet tables in a [recording](../cosim-commands.md#recordings) of the co-simulation.",
+        *blocks,
+    )
 
 
 def columns() -> str:

@@ -51,7 +51,8 @@ def cast_of(site: Site, document: Document | None, topology: Topology, addresses
     master = names.get(site.ros_master) if site.ros_master else None
     if master is not None and not _runs_ros1(profiles[master]):
         raise ConfigurationError(
-            f"ros_master: {master} plays {site.ros_master}, but its profile {profiles[master].name} has no ROS 1",
+            f"ros_master: {master} has the role {site.ros_master}, but its profile {profiles[master].name} has no "
+            "ROS 1",
             where=document.where(("ros_master",)) if document else "",
             remedy="name the role of a robot that can run roscore, or remove the line",
         )

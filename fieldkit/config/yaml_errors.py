@@ -40,7 +40,7 @@ def misplaced_hint(key: str, data: Mapping[Any, Any], fields: Fields, outer: Seq
     for index in reversed(range(len(outer))):
         if key in outer[index]:
             return "", index
-    valid = f"valid keys: {', '.join(fields)}"
+    valid = f"valid keys: {', '.join(fields)}" if fields else "no keys are valid here"
     if preceding and _is_opaque_mapping(fields.get(preceding[-1])):
         similar = [
             f"did you mean {name!r}? " for name in difflib.get_close_matches(key, fields, n=1, cutoff=_MIN_SIMILARITY)
@@ -167,9 +167,17 @@ def _message(problem: Mapping[str, Any]) -> str:
         case "too_short":
             least, short = context["min_length"], context["actual_length"]
             message = f"at least {format_count(least, 'item')} are needed here, not {short}"
+        case "literal_error" | "enum" if isinstance(value, str) and "'" in context["expected"]:
+            message = _choice_message(value, re.findall(r"'([^']*)'", context["expected"]))
         case kind:
             message = _type_message(kind, message, value)
     return message
+
+
+def _choice_message(text: str, choices: Sequence[str]) -> str:
+    """Return the message about a text that is not one of the valid ones."""
+    hint = did_you_mean(text, choices, "")
+    return f"{_quoted(text)} is not one of: {', '.join(choices)}{f'; {hint}' if hint else ''}"
 
 
 def _type_message(kind: str, message: str, value: object) -> str:
@@ -194,10 +202,12 @@ def _kinds(names: Sequence[str]) -> str:
 
 def _pattern_message(text: str, pattern: str) -> str:
     """Return the message about a text that does not match a pattern."""
-    quoted = repr(text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}...")
     if words := _WORDS.fullmatch(pattern):
-        choices = words[1].split("|")
-        return f"{quoted} is not one of: {', '.join(choices)}"
+        return _choice_message(text, words[1].split("|"))
     if pattern in SHAPES:
-        return f"{quoted} is not {SHAPES[pattern]}"
-    return f"{quoted} should match pattern {pattern!r}"
+        return f"{_quoted(text)} is not {SHAPES[pattern]}"
+    return f"{_quoted(text)} should match pattern {pattern!r}"
+
+
+def _quoted(text: str) -> str:
+    return repr(text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}...")

@@ -21,29 +21,33 @@ _KEEPER: Final = pytest.StashKey[Any]()  # the `EvidenceKeeper`
 _STAMP: Final = pytest.StashKey[str]()
 _RUN: Final = "fieldkit_run"
 
-_OPTIONS: Final[dict[str, tuple[str, str, tuple[str, ...] | None]]] = {
-    "backend": ("NAME", "backend of the robots, emulated or field; default: that of the site file", None),
+OPTIONS: Final[dict[str, tuple[str, str, tuple[str, ...] | None]]] = {
+    "backend": ("NAME", "backend of the robots: emulated, field or another; default: that of the site file", None),
     "site": ("FILE", "the lab's site file; default: fieldkit.yaml in the current folder, if there is one", None),
-    "topology": ("NAME", "topology of the robots; default: the first of the site file", ("master", "masterless")),
-    "output": ("DIR", "folder for evidence; default: fieldkit-results in pytest's root folder", None),
-    "keep": ("WHICH", "which evidence is kept; default: that of failed tests", ("failed", "all", "none")),
+    "topology": (
+        "NAME",
+        "topology of the robots; default: the first of the site file, for a trial that of its procedure",
+        ("master", "masterless"),
+    ),
+    "output": ("DIR", "folder for the evidence of all runs; default: fieldkit-results in pytest's root folder", None),
+    "keep": ("WHICH", "tests whose evidence is kept; default: failed", ("failed", "all", "none")),
 }
+"""Options by name: placeholder, meaning, and the possible values if they are limited."""
+YES: Final = "show no questions: real robots are already at their places"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options; each is also a key of pytest's configuration: `fieldkit_backend`."""
     group = parser.getgroup("fieldkit", "fieldkit: tests on emulated or real robots")
-    for name, (metavar, text, choices) in _OPTIONS.items():
+    for name, (metavar, text, choices) in OPTIONS.items():
         group.addoption(f"--fieldkit-{name}", metavar=metavar, choices=choices, help=text)
         parser.addini(f"fieldkit_{name}", text)
-    group.addoption(
-        "--fieldkit-yes", action="store_true", help="show no questions: real robots are already at their places"
-    )
+    group.addoption("--fieldkit-yes", action="store_true", help=YES)
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Reject invalid values in the configuration file, as pytest does for the command line."""
-    for name, (_, _, choices) in _OPTIONS.items():
+    for name, (_, _, choices) in OPTIONS.items():
         configured = config.getini(f"fieldkit_{name}")
         if choices and configured and configured not in choices:
             raise pytest.UsageError(f"fieldkit_{name} = {configured}: choose from {', '.join(choices)}")

@@ -1,6 +1,5 @@
 """The physics federate `emane`: agents that have the locations and path losses of EMANE's events, in real time."""
 
-import json
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -51,7 +50,7 @@ class EmaneLocations:
     """
 
     def __init__(self, hello: Hello) -> None:
-        self._options = EmaneOptions.model_validate(json.loads(hello.configuration).get("options", {}))
+        self._options = EmaneOptions.of_run(hello)
         nems = self._options.nems_of(agent.name for agent in hello.agents)
         self._agents = {nem: name for name, nem in nems.items()}
         self._frame = LocalFrame(self._options.reference)
@@ -140,5 +139,7 @@ def _load() -> FederateService:
     )
 
 
-FEDERATE: Final = PythonFederate(PHYSICS, _load, "positions and path losses from the events of EMANE, in real time")
+FEDERATE: Final = PythonFederate(
+    PHYSICS, _load, "positions and path losses from the events of EMANE, in real time", EmaneOptions
+)
 """Target of the entry point `emane`."""

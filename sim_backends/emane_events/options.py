@@ -1,12 +1,15 @@
 """Options of the connection to EMANE's event channel."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from ipaddress import IPv4Address
 from typing import Annotated
 
+from typing_extensions import override
+
 from fieldkit.config import schema
-from fieldkit.config.schema import AfterValidator, Bool, Duration, Field, Int, Strict
+from fieldkit.config.schema import AfterValidator, Bool, Duration, Field, Int, Location
 from sim_backends.emane_events.events import MAX_NEM
+from sim_backends.federates.simulator_options import SimulatorOptions
 from sim_backends.world.obstacles import Real
 
 
@@ -31,7 +34,7 @@ def split_channel(text: str) -> tuple[str, int]:
     return group, int(port)
 
 
-class EmaneOptions(Strict):
+class EmaneOptions(SimulatorOptions):
     """The event channel of the network emulator EMANE, see [its page](emane.md).
 
     Attributes:
@@ -56,6 +59,10 @@ class EmaneOptions(Strict):
     pathloss: Bool = True
     real_time: Bool = True
     wait: Annotated[Duration, Field(gt=0)] = 30.0
+
+    @override
+    def agent_names(self) -> Iterator[tuple[str, Location]]:
+        yield from ((name, ("nems", name)) for name in self.nems)
 
     def nems_of(self, agents: Iterable[str]) -> dict[str, int]:
         """Return the NEM identifier of each agent.

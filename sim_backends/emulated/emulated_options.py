@@ -107,7 +107,7 @@ class EmulatedOptions(Strict):
         robots: Variants of tools, by robot; the default is the tools of this machine. See [add a
             robot](add-a-robot.md#variants-of-tools).
         world: The world around the robots: a file in the folder `worlds/` of the lab, or a shipped one (`lawn`,
-            `baylands`, `open`). See [world file](world-file.md).
+            `baylands`, `open`). See [world file](reference/world-file.md).
         radio: The radio between the robots: Wi-Fi in that world, unless one of `loss`, `delay`, `rate` and `jitter`
             fixes the links.
         late_bound: A repeat is void if a packet was delayed by the emulator itself by more than this in total, before

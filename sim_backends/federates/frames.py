@@ -1,7 +1,8 @@
 """Frames of the wire protocol: header, kinds of message, and a reader that checks every length before it reads.
 
-The protocol is described in docs/federates.md. Both sides are untrusted: no length or count of a frame is used before
-it has been compared with the number of bytes that have arrived.
+The protocol is described in docs/federates.md; `MessageKind` has the layout of each message. Both sides
+are untrusted: no length or count of a frame is used before it has been compared with the number of bytes that have
+arrived.
 """
 
 import struct
@@ -25,7 +26,32 @@ HEADER_BYTES: Final = _HEADER.size
 
 
 class MessageKind(IntEnum):
-    """Kind of a message."""
+    """Kind of a message: its sender, and the layout of its body.
+
+    Attributes:
+        JOIN: federate: only on a connection that the federate opened: `magic` 8 bytes `FIELDKIT`, `version` u16,
+            `token` text
+        HELLO: coordinator: `magic` 8 bytes, `version` u16, `role` u8 (1 physics, 2 network), `reserved` u8,
+            `heartbeat_ms` u32, `seed` u64, `step_ns` i64, `end_ns` i64, `configuration_hash` 32 bytes, `token` text,
+            `name` text, `agents` u32, each an agent, `configuration` u32 bytes of JSON
+        WELCOME: federate: `version` u16, `role` u8, `reserved` u8, `capabilities` u32, `step_ns` i64,
+            `next_event_ns` i64, `configuration_hash` 32 bytes, `name` text, `software` text, `commands` u16, each a
+            u16, `transports` u16, each a text, `transmitters` u32, each a u32 agent, `emitters` u32, each 3 f64
+        ADVANCE_PHYSICS: coordinator: `to_ns` i64, `from_ns` i64, `commands` u32, each a command
+        STATES: federate: `at_ns` i64, `new` u32, each u32 index and text name, `states` u32, each a state
+        ADVANCE_NETWORK: coordinator: `to_ns` i64, `since_ns` i64, `reckoning_ns` i64, `new` u32 as in states,
+            `states` u32, each a state, `packets` u32, each a packet
+        OUTCOMES: federate: `at_ns` i64, `next_event_ns` i64, `arrivals` u32, each an arrival, `drops` u32, each a
+            drop
+        PING: coordinator: `value` i64
+        PONG: federate: `value` i64 of the ping
+        BUSY: federate: `at_ns` i64, the time that it has reached
+        FORK: coordinator: `copy` u32, number of the new copy of the federate in the state of the header's copy
+        DONE: federate: empty; answers fork
+        RELEASE: coordinator: empty; the header's copy is not used again; without an answer
+        ERROR: federate: `text`; answers any request; the session ends
+        BYE: coordinator: empty; the federate ends, without an answer
+    """
 
     JOIN = 1
     HELLO = 2

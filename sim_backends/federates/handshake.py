@@ -40,7 +40,17 @@ _AGENT_BYTES: Final = 4 + _AGENT.size + STATE.size
 
 
 class FederateCapability(IntFlag):
-    """Optional properties of a federate."""
+    """Optional properties of a federate.
+
+    Attributes:
+        DETERMINISTIC: Equal requests give equal answers.
+        FORK: It can be copied in its present state.
+        NEXT_EVENT: Unless a packet enters, nothing arrives or is dropped and no position is used before its
+            `next_event_ns`, which may be too early; -1: never.
+        EXTRAPOLATES: It moves agents by dead reckoning.
+        AGENTS_APPEAR: Agents may appear during a run.
+        AGENTS_DISAPPEAR: Agents may disappear. The coordinator then ends the run.
+    """
 
     DETERMINISTIC = 1
     FORK = 2

@@ -13,6 +13,7 @@ from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.federates.answering import FederateService
 from sim_backends.federates.frames import ROLES
+from sim_backends.federates.simulator_options import SimulatorOptions
 
 _WORD: Final = re.compile(r"[\w.-]+")
 
@@ -26,11 +27,13 @@ class ProgramFederate:
         command: Returns its command line, and builds it before if necessary. It raises `ConfigurationError` if
             something is not installed; the remedy is the command that installs it.
         summary: What it is, in one line.
+        options: Model of its options in a scenario; None if it has any options, which are not validated.
     """
 
     role: int
     command: Callable[[], str]
     summary: str = ""
+    options: type[SimulatorOptions] | None = None
 
 
 @dataclass(frozen=True)
@@ -42,11 +45,13 @@ class PythonFederate:
         load: Imports the simulator, and returns the class with its properties. It raises `ConfigurationError` if
             something is not installed; the remedy is the command that installs it.
         summary: What it is, in one line.
+        options: As for `ProgramFederate`.
     """
 
     role: int
     load: Callable[[], FederateService]
     summary: str = ""
+    options: type[SimulatorOptions] | None = None
 
 
 NamedFederate = ProgramFederate | PythonFederate

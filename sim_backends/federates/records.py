@@ -20,6 +20,22 @@ TWIST, VELOCITY = 1, 2
 COMMAND_TYPES: Final = (TWIST, VELOCITY)
 _MAX_BYTES: Final = 1 << 62
 
+LAYOUTS: Final = {
+    "agent": "`name` text, `profile` text, `flies` u8, `antenna_m` f64 (its height above the body's position), "
+    "`start` state",
+    "state": "`agent` u32, `reserved` u32, `position_m` 3 f64, `velocity_m_s` 3 f64, `heading_rad` f64, `limit_m_s2` "
+    "f64: 72 bytes",
+    "command": "`agent` u32, `type` u16, `size` u16, then `size` bytes",
+    f"command {TWIST}, twist": "`forward_m_s` f64, `turn_rad_s` f64: for robots that drive",
+    f"command {VELOCITY}, velocity": "`velocity_m_s` 3 f64, `yaw_rad` f64, NaN to keep the heading: for robots that "
+    "fly",
+    "packet": "`id` u64, `number` i64, `size_bytes` u64, `sent_ns` i64, `enters_ns` i64, `source` u32, `destination` "
+    "u32, `flow` text, `protocol` text",
+    "arrival": "`id` u64, `at_ns` i64, `agent` u32, `reserved` u32",
+    "drop": "`id` u64, `reason` text",
+}
+"""Layout of each part of a message, for the reference."""
+
 
 def commands_bytes(commands: Mapping[str, Any], agents: AgentTable) -> bytes:
     """Return commands to agents.

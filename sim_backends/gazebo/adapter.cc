@@ -51,11 +51,7 @@ class Federate
         m_heartbeat.SetInterval(hello.heartbeat_ms);
         Json configuration = Json::parse(hello.configuration);
         CheckLifetimes(configuration);
-        Options options(configuration.value("options", Json::object()));
-        if (options.world.empty())
-        {
-            options.world = configuration.at("world").at("name").get<std::string>();
-        }
+        Options options(configuration);
         for (const auto& [name, value] :
              {std::pair<std::string, std::string>{"IP", options.ip}, {"PARTITION", options.partition}})
         {

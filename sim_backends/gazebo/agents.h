@@ -63,11 +63,8 @@ AgentsOf(const protocol::Hello& hello, const Options& options)
         auto origin = options.origins_m.find(agent.name);
         if (origin != options.origins_m.end())
         {
-            if (origin->second.size() != 3)
-            {
-                throw Refusal("physics.options.origins_m of " + agent.name + " needs three numbers");
-            }
-            agent.antenna = agent.antenna + Vector{origin->second[0], origin->second[1], origin->second[2]};
+            const auto& [x, y, z] = origin->second;
+            agent.antenna = agent.antenna + Vector{x, y, z};
         }
         const auto& position_m = announced.start.position_m;
         Vector start{position_m[0], position_m[1], position_m[2]};

@@ -9,6 +9,7 @@ from typing import Final
 from sim_backends.federates.compiling import CompiledProgram
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.named import ProgramFederate
+from sim_backends.gazebo.gazebo_options import GazeboOptions
 
 _SOURCE: Final = Path(__file__).parent / "adapter.cc"
 _LIBRARIES: Final = (
@@ -43,5 +44,5 @@ def _command() -> str:
     return shlex.quote(str(adapter().path()))
 
 
-FEDERATE: Final = ProgramFederate(PHYSICS, _command, "a running Gazebo, in lock-step")
+FEDERATE: Final = ProgramFederate(PHYSICS, _command, "a running Gazebo, in lock-step", GazeboOptions)
 """Target of the entry point `gazebo`."""

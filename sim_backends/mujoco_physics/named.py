@@ -6,6 +6,7 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.answering import FederateService
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.named import PythonFederate
+from sim_backends.federates.simulator_options import SimulatorOptions
 
 
 def load() -> FederateService:
@@ -24,4 +25,8 @@ def load() -> FederateService:
     return SERVICE
 
 
-MUJOCO = PythonFederate(PHYSICS, load, "MuJoCo: robots with wheels and rotors, ground and contacts")
+class MujocoOptions(SimulatorOptions):
+    """The physics [MuJoCo](mujoco.md) has no options."""
+
+
+MUJOCO = PythonFederate(PHYSICS, load, "MuJoCo: robots with wheels and rotors, ground and contacts", MujocoOptions)

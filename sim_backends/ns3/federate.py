@@ -9,6 +9,7 @@ from typing import Final
 from sim_backends.federates.compiling import CompiledProgram
 from sim_backends.federates.frames import NETWORK
 from sim_backends.federates.named import ProgramFederate
+from sim_backends.ns3.ns3_options import Ns3Options
 
 _MODULES: Final = ("core", "network", "internet", "mobility", "propagation", "traffic-control", "wifi")
 _CPP20_SINCE: Final = (3, 43)
@@ -54,4 +55,6 @@ def command() -> str:
     return shlex.join((str(program(installed).path()), installed))
 
 
-NS3: Final = ProgramFederate(NETWORK, command, "ns-3: its Wi-Fi, TCP and UDP, over the path loss of the world")
+NS3: Final = ProgramFederate(
+    NETWORK, command, "ns-3: its Wi-Fi, TCP and UDP, over the path loss of the world", Ns3Options
+)

@@ -216,7 +216,7 @@ class _HigherGround(_Rectangular):
 
 
 class Raised(_HigherGround):
-    """Raised ground with upright sides.
+    """Raised ground with upright sides, on which robots can be.
 
     Attributes:
         kind: `raised`.
@@ -241,6 +241,8 @@ class Raised(_HigherGround):
 
 class Ramp(_HigherGround):
     """Ground that rises evenly along its first edge, from 0 to its height, with upright sides.
+
+    For radio waves and robots that fly it has eight steps.
 
     Attributes:
         kind: `ramp`.

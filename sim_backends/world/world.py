@@ -17,7 +17,8 @@ from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
 from sim_backends.world.obstacles import Obstacle, Part, Place, Raised, Ramp, Real
 from sim_backends.world.shapes import Floats, Solids
 
-_SHIPPED: Final = Path(__file__).parent / "worlds"
+SHIPPED: Final = Path(__file__).parent / "worlds"
+"""Folder of the shipped worlds."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,16 @@ class Line(Strict):
 
 
 class World(Named):
-    """The surroundings of the robots. The ground is flat at height 0, except for raised ground and ramps.
+    """The surroundings of emulated and simulated robots: `worlds/NAME.yaml` of the lab, or a shipped one.
+
+    Coordinates are metres east and north of a corner. The ground is flat at height 0, except for raised ground and
+    ramps. An antenna is 0.2 m above the ground. The robots of a trial are placed along the line of its scenario, in
+    the compass direction `bearing_deg`: the sender at `from_m`, then the relay at the distance and the receiver at
+    twice the distance (`master`), or the receiver at the distance (`masterless`).
 
     Attributes:
+        name: Its name, that of its file without `.yaml`.
+        summary: Description in one line.
         area_m: Extent of the drawn area, metres east and north from the origin.
         obstacles: Its obstacles.
         lines: Lines for the robots of a trial, by scenario.
@@ -137,7 +145,7 @@ def load_world(name: str) -> World:
     Raises:
         ConfigurationError: The world does not exist or is invalid; the error names the location.
     """
-    paths = {path.stem: path for folder in (_SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
+    paths = {path.stem: path for folder in (SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
     if name not in paths:
         raise ConfigurationError(
             f"there is no world {name!r}", remedy=did_you_mean(name, paths, f"worlds: {', '.join(paths)}")

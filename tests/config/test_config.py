@@ -124,7 +124,7 @@ def test_error_has_the_line_of_the_key(tmp_path: Path) -> None:
         ),
         ("into: recv.bag", "file: a/b/c.bag", "is not the name of a recording"),
         ("port: 1234\n", "port: 0\n", "greater than 0"),
-        ("topology: master", "topology: mesh", "'master' or 'masterless'"),
+        ("topology: master", "topology: mesh", "'mesh' is not one of: master, masterless"),
         ("repeats: 20", "repeats: 20.5", "valid integer"),
         ("repeats: 20", "repeats: '20'", "valid integer"),
         (

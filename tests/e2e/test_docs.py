@@ -4,6 +4,7 @@ import ast
 import inspect
 import os
 import re
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typing_extensions import get_protocol_members
 
 from docs.generator import pages as reference
 from docs.generator.commands import GUIDES
 from docs.generator.models import rows
 from fieldkit import cli
+from fieldkit.backends.protocols import Backend, Testbed
 from fieldkit.config import documentation
 from fieldkit.steps.base import Step
 from fieldkit.steps.kinds.run import RunStep
@@ -165,6 +168,12 @@ def test_python_examples_import_and_are_complete(page: Path, monkeypatch: pytest
             value for value in names.values() if inspect.isclass(value) and value.__module__ == "example"
         ]
         assert not [kind for kind in example_classes if issubclass(kind, Step) and inspect.isabstract(kind)]
+
+
+def test_the_example_of_a_backend_has_the_members_of_its_protocols() -> None:
+    module = runpy.run_path(str(ROOT / "docs" / "examples" / "fieldkit-bench" / "bench.py"))
+    for protocol, kind in ((Backend, module["BenchBackend"]), (Testbed, module["BenchTestbed"])):
+        assert not set(get_protocol_members(protocol)) - set(dir(kind))
 
 
 def test_the_reference_is_up_to_date() -> None:

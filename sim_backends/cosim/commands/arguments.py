@@ -233,7 +233,9 @@ def _add_sdf(commands: Commands) -> None:
 
 def _add_list(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
-        "list", help="list scenarios and sync policies", description="List every scenario and sync policy."
+        "list",
+        help="list scenarios, simulators and sync policies",
+        description="List every scenario, simulator and sync policy.",
     )
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.listing:list_all")

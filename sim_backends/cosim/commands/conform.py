@@ -10,6 +10,7 @@ from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.scenario.agent_setup import bodies
 from sim_backends.cosim.scenario.external import make_hello
+from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import CheckResult, run_checks
@@ -29,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     """
     where = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
     deadline_s = settings.deadline_s(arguments.deadline)
-    scenario = settings.scenario(arguments)  # a hello has the options of its role, and not the federate
+    scenario = load_scenario(arguments.scenario, settings.changes(arguments) | _named_federate(where))
     role, name = _role(where, scenario, arguments.role, deadline_s)
     opener = partial(open_session, role, where, deadline_s=deadline_s)
     target = Target(opener, _hello(scenario, role), arguments.windows)
@@ -70,6 +71,11 @@ def _role(where: str, scenario: CosimScenario, requested: str | None, deadline_s
         session.close()
         return role, session.name
     raise FieldkitError(f"{where} has no role")
+
+
+def _named_federate(where: str) -> dict[str, str]:
+    """Return the change of a scenario that uses a federate with a name, whose options are then validated."""
+    return {f"{ROLES[role]}.federate": where for role in (PHYSICS, NETWORK) if _has_role(where, role)}
 
 
 def _has_role(where: str, role: int) -> bool:

@@ -9,8 +9,7 @@ from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
 from sim_backends.cosim.policies.registry import policies
 from sim_backends.cosim.scenario.external import simulators
-from sim_backends.cosim.scenario.loading import load_scenario, scenario_files
-from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.loading import editor_schema, load_scenario, scenario_files
 
 _SCENARIO: Final = (SheetColumn("scenario", "scenario", ""), SheetColumn("summary", "summary", ""))
 _SIMULATOR: Final = (
@@ -47,7 +46,7 @@ def list_all(arguments: argparse.Namespace) -> int:
 
 def print_schema(_: argparse.Namespace) -> int:
     """Print the JSON schema of scenario files."""
-    print_text(json_text(CosimScenario.model_json_schema(by_alias=True), indent=2))
+    print_text(json_text(editor_schema(), indent=2))
     return 0
 
 

@@ -43,7 +43,7 @@ def _end_fields(prefix: str, meaning: str) -> list[pa.Field]:
     ]
 
 
-_SCHEMAS: Final[Mapping[str, pa.Schema]] = {
+SCHEMAS: Final[Mapping[str, pa.Schema]] = {
     "packets": pa.schema(
         [
             _field("packet_id", pa.int64(), "", "number of the packet in the run"),
@@ -111,8 +111,9 @@ _SCHEMAS: Final[Mapping[str, pa.Schema]] = {
         ]
     ),
 }
+"""Fields of each table of a recording."""
 
-TABLES: Final = tuple(_SCHEMAS)
+TABLES: Final = tuple(SCHEMAS)
 """The names of the tables, in the order in which parts are written: if the last part exists, all are complete."""
 
 
@@ -130,7 +131,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
     Raises:
         OSError: It cannot be written; no file is left.
     """
-    schema = _SCHEMAS[table]
+    schema = SCHEMAS[table]
     columns = zip(*rows, strict=True) if rows else [()] * len(schema)
     arrays = [_array(values, field.type) for values, field in zip(columns, schema, strict=True)]
     sink = pa.BufferOutputStream()
@@ -155,12 +156,12 @@ def read_parts(folder: Path, table: str, count: int) -> dict[str, list[Any]]:
     Raises:
         EvidenceError: A part is missing or damaged.
     """
-    columns: dict[str, list[Any]] = {name: [] for name in _SCHEMAS[table].names}
+    columns: dict[str, list[Any]] = {name: [] for name in SCHEMAS[table].names}
     for number in range(count):
         path = folder / part_path(table, number)
         try:
             part = pa.parquet.read_table(path, partitioning=None)
-            if not part.schema.equals(_SCHEMAS[table]):
+            if not part.schema.equals(SCHEMAS[table]):
                 raise EvidenceError(f"its columns are not those of {table}", where=str(path), remedy=RUN_AGAIN)
             for name in columns:
                 columns[name] += _values(part.column(name).combine_chunks())

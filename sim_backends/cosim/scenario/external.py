@@ -13,6 +13,7 @@ from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, Hello
 from sim_backends.federates.named import PythonFederate, federates, named
 from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
+from sim_backends.federates.simulator_options import options_json
 from sim_backends.federates.transports.transport_table import parse_address
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Body
@@ -87,7 +88,7 @@ def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
             }
             for name, plan in scenario.agents.items()
         },
-        "options": (scenario.physics if role == PHYSICS else scenario.network).options or {},
+        "options": options_json((scenario.physics if role == PHYSICS else scenario.network).options),
     }
     return json.dumps(configuration).encode()
 

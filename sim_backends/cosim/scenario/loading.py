@@ -6,16 +6,22 @@ from typing import Any, Final
 
 from fieldkit.config import catalog, schema
 from fieldkit.config.documentation import attribute_meanings, class_description, without_links
-from fieldkit.config.schema import Strict
+from fieldkit.config.schema import Document, Strict
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.cosim.scenario.checks import check
-from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.scenario.schema import BUILT_IN, CosimScenario
+from sim_backends.federates.frames import PHYSICS, ROLES
+from sim_backends.federates.named import federates
+from sim_backends.federates.simulator_options import SimulatorOptions
 from sim_backends.world.world import load_world
 
 
 def editor_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a scenario file, with the meaning of each key."""
     whole = CosimScenario.model_json_schema()
+    for name, federate in federates().items():
+        if federate.options is not None:
+            _add_options(whole["$defs"], name, federate.role, federate.options)
     models = {model.__name__: model for model in _models(Strict)}
     for part in (whole, *whole["$defs"].values()):
         model = models.get(part.get("title", ""))
@@ -23,12 +29,26 @@ def editor_schema() -> dict[str, Any]:
             continue  # an enumeration, or any JSON value
         part["description"] = without_links(class_description(model))
         meanings = attribute_meanings(model)
-        for key, value in part["properties"].items():
+        for key, value in part.get("properties", {}).items():
             value.pop("title", None)
             value["description"] = without_links(meanings[key])
             if not isinstance(value.get("default"), str) and "string" in _types(value):
                 value.pop("default", None)  # it is a number in SI units, but files have texts with units
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole}
+
+
+def _add_options(definitions: dict[str, Any], name: str, role: int, options: type[SimulatorOptions]) -> None:
+    """Add the schema of a simulator's options, which are valid if the scenario uses it."""
+    whole = options.model_json_schema()
+    definitions |= whole.pop("$defs", {})
+    definitions[f"{name}.options"] = whole
+    section = definitions["PhysicsOptions" if role == PHYSICS else "NetworkOptions"]
+    section.setdefault("allOf", []).append(
+        {
+            "if": {"properties": {"federate": {"const": name}}, "required": ["federate"]},
+            "then": {"properties": {"options": {"anyOf": [{"$ref": f"#/$defs/{name}.options"}, {"type": "null"}]}}},
+        }
+    )
 
 
 def _models(base: type[Strict]) -> Iterator[type[Strict]]:
@@ -65,15 +85,16 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     path = _path(str(name_or_path))
     document = schema.read(path)
     try:
+        _drop_options_of_replaced_federates(document.data, changes or {})
         for key, value in (changes or {}).items():
-            _change(document.data, key.split("."), value)
+            _change(document, key.split("."), value)
         scenario = catalog.validate_named(document, CosimScenario, path.stem)
         with document.locating_errors("world"):
             world = load_world(scenario.world)
         check(scenario, world, document.where)
     except ConfigurationError as error:
+        error.where = error.where or str(path)
         if changes:
-            error.where = error.where or str(path)
             error.where += f" with {', '.join(f'{key}={value}' for key, value in changes.items())}"
             error.remedy = error.remedy.replace(
                 "correct this line", "correct the option with this value, or the line"
@@ -82,13 +103,24 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     return scenario
 
 
-def _change(data: Any, keys: list[str], value: Any) -> None:  # noqa: ANN401 (any YAML value)
-    """Set the value of a key; missing parent mappings are created.
+def _drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) -> None:  # noqa: ANN401 (any YAML value)
+    """Remove the options of each federate that a change replaces, because they are only valid for it."""
+    for role in ROLES.values():
+        section = data.get(role) if isinstance(data, dict) else None
+        other = changes.get(f"{role}.federate")
+        if isinstance(section, dict) and other and section.get("federate") not in {None, BUILT_IN, other}:
+            section.pop("options", None)
+
+
+def _change(document: Document, keys: list[str], value: Any) -> None:  # noqa: ANN401 (any YAML value)
+    """Set the value of a key; missing parent mappings are created, with the line of their parent.
 
     Raises:
         ConfigurationError: A parent key has a value without keys, or an index is beyond the end of a list.
     """
-    *parents, last = (int(key) if key.isdecimal() else key for key in keys)
+    location = tuple(int(key) if key.isdecimal() else key for key in keys)
+    *parents, last = location
+    data = document.data
     try:
         for key in parents:
             data = data.setdefault(key, {}) if isinstance(data, dict) else data[key]
@@ -98,6 +130,8 @@ def _change(data: Any, keys: list[str], value: Any) -> None:  # noqa: ANN401 (an
             f"the key {'.'.join(keys)} cannot be changed, because it does not exist",
             remedy="use the keys of the scenario's file, and numbers from 0 for the items of a list",
         ) from None
+    for depth in range(1, len(location) + 1):
+        document.lines.setdefault(location[:depth], document.lines.get(location[: depth - 1], 1))
 
 
 def _path(name_or_path: str) -> Path:

@@ -1,8 +1,20 @@
-"""Datagrams of the UDP transport (docs/federates.md): their layout, and a channel that resends lost ones.
+"""Datagrams of the UDP transport: frames are a byte stream, in numbered datagrams that are acknowledged and resent.
 
-A frame is sent in one or several datagrams, which are numbered. The receiver acknowledges by the number that it
-expects next: in its next datagram, or in one without data when it waits for more. The sender resends what is
-unacknowledged when its timer fires (RFC 6298). There is no thread: each side handles its timer whenever it waits.
+A datagram has at most 1,200 bytes: a header of 40 bytes, `FKUD`, `version` u8 (1), `kind` u8, `reserved` u16,
+`connection` u64, `cookie` u64, `number` u64, `expected` u64, then, in data (kind 3), a part of the stream.
+
+- The side that connects draws `connection`, and sends open (1) with `cookie` 0, again after 50 ms and then after
+  twice the time, up to 1 s, until it receives cookie (2), which has the other side's `cookie` for this number and
+  address.
+  All later datagrams have both numbers; others are ignored, also those from other addresses. The side that connects
+  sends the first data.
+- Data are numbered from 0 in each direction, `number` of other kinds is that of the next data. `expected`
+  acknowledges all data before this number. At most 64 are unacknowledged.
+- A side that waits after it has received data sends an acknowledgement (4), and one every 2 s. Unacknowledged data
+  are sent again after the time-out of RFC 6298, between 20 ms and 2 s.
+- A side that ends sends close (5) once, when all its data are acknowledged or after 0.5 s. It ends the connection, if
+  `number` is the expected one. It may be lost: an ICMP message that the port is unreachable, or 3,600 s of silence,
+  end it too.
 """
 
 import select
@@ -108,6 +120,7 @@ class RetransmissionTimer:
         self.interval_s = min(2 * self.interval_s, self._MAX_S)
 
 
+# There is no thread: each side handles its timer whenever it waits.
 class DatagramChannel:
     """A channel over a UDP socket that is connected to the other side, so that the kernel checks its address.
 

@@ -1,7 +1,10 @@
-"""Channels over a bus of samples, such as a pair of topics: each sample has a run's number and one frame.
+"""Channels over a bus of samples, a pair of topics of DDS or ROS 1.
 
-The federate reads one topic and writes the other, the coordinator the reverse. The coordinator draws the number of
-the run, and begins with `hello`. A sample without a frame ends the run.
+The coordinator writes `requests` and reads `answers`, the federate the reverse. A sample is the `run`, a u64 that the
+coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run. DDS: topics
+`fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type `fieldkit::Frame { sequence<octet> data; }` in plain
+CDR, reliable, keep all, volatile. ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type
+`std_msgs/UInt8MultiArray` without dimensions.
 """
 
 import secrets

@@ -86,7 +86,7 @@ def test_master_on_robot_without_ros_1_is_refused(tmp_path: Path, monkeypatch: p
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(
-        ConfigurationError, match="duckiedrone-1 plays relay, but its profile box has no ROS 1"
+        ConfigurationError, match="duckiedrone-1 has the role relay, but its profile box has no ROS 1"
     ) as caught:
         registry.cast_of(*site(SITE.replace("profile: duckiedrone}", "profile: box}")), Topology.MASTER, ADDRESSES)
     assert caught.value.where == "fieldkit.yaml:9"

@@ -42,7 +42,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GazeboServer]:
 
 
 def hello(running: GazeboServer, options: Mapping[str, object], changes: Mapping[str, object]) -> Hello:
-    scenario = load_scenario("convoy", {"physics.options": {**running.options, **options}, **changes})
+    federate = {"physics.federate": "gazebo", "physics.options": {**running.options, **options}}
+    scenario = load_scenario("convoy", {**federate, **changes})
     world = load_world(scenario.world)
     return make_hello(scenario, world, bodies(scenario, world), 1, PHYSICS)
 
@@ -177,8 +178,6 @@ def test_parallel_runs_use_it_one_after_the_other_by_its_name(
             "no service|/world/moon/control has not been found \\(visible worlds: baylands\\) within 4 s",
         ),
         ({"models": {"drone": "kite"}}, "it has no moving model kite \\(models and links: leader, follower, drone"),
-        ({"speed": 1}, "physics.options has no key 'speed'; keys: acknowledge, "),
-        ({"acknowledge": "no"}, "is 'no', not auto, required or off"),
         ({"command_topics": {"drone": "/nowhere"}}, "nothing subscribes to the commands of drone on /nowhere"),
         (
             {"origins_m": {"leader": [0, 0, 9]}, "place": False},

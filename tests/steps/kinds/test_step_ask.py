@@ -75,7 +75,7 @@ def run_and_view(step: AskStep, here: Path, operator: ScriptedOperator | None = 
         ("column: a, question: b, choices: [a, ' b']", "cannot be a choice"),
         ("column: a, question: b, choices: [a, '-']", "cannot be a choice"),
         ("column: a, question: b, choices: [a, nan]", "cannot be a choice"),
-        (f"{WIND}, each: day", "'repeat' or 'trial'"),
+        (f"{WIND}, each: day", "'day' is not one of: repeat, trial"),
     ],
 )
 def test_invalid_question_is_refused(text: str, complaint: str) -> None:

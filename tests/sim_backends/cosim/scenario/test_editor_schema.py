@@ -37,6 +37,8 @@ def test_every_shipped_scenario_is_valid(name: str) -> None:
         (("traffic", 0, "protocol"), "dds"),
         (("traffic", 0, "to"), []),
         (("faults",), [{"kind": "jammer"}]),
+        (("physics",), {"federate": "gazebo", "options": {"speed": 1}}),
+        (("network",), {"federate": "ns3", "options": {"standard": "802.11ax"}}),
     ],
     ids=str,
 )
@@ -47,6 +49,13 @@ def test_wrong_scenarios_are_invalid(keys: tuple[str | int, ...], value: object)
         inner = inner[key]
     inner[keys[-1]] = value
     with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data, SCHEMA)
+
+
+def test_options_of_a_simulator_are_valid_where_it_is_used() -> None:
+    data = data_of("baylands")
+    for federate, options in (("gazebo", {"settle_s": 1}), ("mujoco", None), ("./carts", {"speed": 1})):
+        data["physics"] = {"federate": federate, "options": options}
         jsonschema.validate(data, SCHEMA)
 
 

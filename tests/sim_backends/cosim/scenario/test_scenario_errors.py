@@ -86,7 +86,7 @@ WRONG = [
     ("from: one, to: two", "from: one, to: []", 18, "at least 1 item"),
     ("from: one, to: two", "from: one, to: [two, two]", 18, "listed twice"),
     ("to: [one]", "to: [three]", 16, "three sends, receives or relays and has no radio"),
-    ("to: two, rate", "to: two, protocol: dds, rate", 18, "'udp', 'tcp', 'topic', 'ros1' or 'ros1-udp'"),
+    ("to: two, rate", "to: two, protocol: dds, rate", 18, "'dds' is not one of: udp, tcp, topic, ros1, ros1-udp"),
     ("to: two, rate", "to: two, protocol: ros1, rate", 18, "ros1 needs a master: name its host by relay: AGENT"),
     ("to: two, rate", "to: two, qos: {depth: 3}, rate", 18, "only a topic has a qos, and the protocol is udp"),
     ("rate: 10Hz", "rate: 10", 18, "'10' has no unit; write for example 10Hz"),

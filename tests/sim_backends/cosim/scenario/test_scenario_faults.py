@@ -209,7 +209,7 @@ def test_a_run_has_a_row_per_packet(run_of: RunOf) -> None:
         "flow number source destination protocol size_bytes sent_ns enters_ns arrived_ns counted_ns late_ns reason"
     )
     assert set(table) == set(names.split())
-    assert set(table) <= set(packet_tables._SCHEMAS["packets"].names), "the columns of the recorded file"
+    assert set(table) <= set(packet_tables.SCHEMAS["packets"].names), "the columns of the recorded file"
     assert {len(column) for column in table.values()} == {len(run.fates)}
     for row, ((flow, number), fate) in enumerate(run.fates.items()):
         assert (table["flow"][row], table["number"][row]) == (flow, number)

@@ -1,0 +1,42 @@
+"""Options of simulators: `physics.options` and `network.options` of a scenario."""
+
+import json
+from collections.abc import Iterator
+from typing import Any, Self
+
+from fieldkit.config.schema import JsonValue, Location, Strict
+from sim_backends.federates.handshake import Hello
+
+
+class SimulatorOptions(Strict):
+    """Base of the options of a simulator, and the options of a simulator that has none.
+
+    Validation, defaults and documentation come from the model: the docstring has the description of the simulator's
+    options, and under `Attributes:` the meaning of each key.
+    """
+
+    @classmethod
+    def of_run(cls, hello: Hello) -> Self:
+        """Return the options of a run.
+
+        Raises:
+            ValueError: An option is invalid, which is only possible if the coordinator has not validated it.
+        """
+        return cls.model_validate(json.loads(hello.configuration).get("options", {}))
+
+    def agent_names(self) -> Iterator[tuple[str, Location]]:
+        """Yield every reference to an agent of the scenario, with its keys."""
+        yield from ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all options as JSON values, defaults included, without those that are None."""
+        return self.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+Options = SimulatorOptions | dict[str, JsonValue] | None
+"""Options of a federate: a model, or any mapping if the federate declares no options."""
+
+
+def options_json(options: Options) -> dict[str, Any]:
+    """Return options as JSON values."""
+    return options.to_json() if isinstance(options, SimulatorOptions) else options or {}

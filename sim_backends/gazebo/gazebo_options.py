@@ -1,0 +1,83 @@
+"""Options of Gazebo: `physics.options` of a scenario. The adapter reads them in `options.h`."""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from typing_extensions import override
+
+from fieldkit.config.schema import Bool, Field, Location
+from sim_backends.federates.simulator_options import SimulatorOptions
+from sim_backends.world.obstacles import Coordinate, Real
+
+Positive = Annotated[Real, Field(gt=0, le=1e6)]
+NotNegative = Annotated[Real, Field(ge=0, le=1e6)]
+Position = tuple[Coordinate, Coordinate, Coordinate]
+
+
+class GazeboOptions(SimulatorOptions):
+    """Options of the physics [Gazebo](gazebo.md).
+
+    In names of services and topics, `{world}` and `{model}` are replaced by the names of the world and of the agent's
+    model.
+
+    Attributes:
+        world: Name of Gazebo's world; if omitted, that of the scenario's world.
+        models: Name of the model of each agent whose model does not have the agent's name.
+        origins_m: For each agent, the body's lowest point in the frame of its model; if omitted, `[0, 0, 0]`.
+        partition: Value of `IGN_PARTITION` and `GZ_PARTITION`; if omitted, that of the environment.
+        ip: Value of `IGN_IP` and `GZ_IP`; if omitted, that of the environment.
+        control_service: Service that advances, pauses and resets the world.
+        pose_service: Service that places robots.
+        pose_topic: Topic of the poses of the models.
+        clock_topic: Topic of the simulated time.
+        command_topic: Topic of the commands to an agent.
+        command_topics: Topic of the commands to each agent that has another one.
+        acknowledge: Acknowledgement of the commands before each window: `auto` if the world has a plugin for it,
+            `required`, or `off`; see [lock-step](gazebo.md#lock-step).
+        fence_topic: Topic of requests for the acknowledgement.
+        fence_answer: Topic of the acknowledgement.
+        reset: Reset the world before a run.
+        place: Set the poses of the robots before a run.
+        settle_s: Simulated time in which robots come to rest, before the reset and before time 0.
+        start_error_m: Largest distance of a robot from its start.
+        velocity: Velocities are the difference of positions over the last `step`, or over the `window` at half the
+            cost.
+        gravity_m_s2: Gravity that is compensated for robots that fly; 0 if their links have no gravity.
+        yaw_gain_per_s: Turning rate of robots that fly per difference of their direction.
+        control_period_s: Interval between commands to robots that fly, in simulated time.
+        limit_m_s2: Largest acceleration, for `error_bounded`; if omitted, that policy exchanges every step while an
+            agent sends.
+        deterministic: Declare that equal requests give equal answers.
+        timeout_s: Longest wait without progress, in wall time.
+    """
+
+    world: str | None = None
+    models: dict[str, str] = Field(default_factory=dict)
+    origins_m: dict[str, Position] = Field(default_factory=dict)
+    partition: str | None = None
+    ip: str | None = None
+    control_service: str = "/world/{world}/control"
+    pose_service: str = "/world/{world}/set_pose"
+    pose_topic: str = "/world/{world}/dynamic_pose/info"
+    clock_topic: str = "/world/{world}/clock"
+    command_topic: str = "/model/{model}/cmd_vel"
+    command_topics: dict[str, str] = Field(default_factory=dict)
+    acknowledge: Literal["auto", "required", "off"] = "auto"
+    fence_topic: str = "/world/{world}/fieldkit/fence"
+    fence_answer: str = "/world/{world}/fieldkit/passed"
+    reset: Bool = True
+    place: Bool = True
+    settle_s: NotNegative = 0.5
+    start_error_m: Positive = 0.3
+    velocity: Literal["step", "window"] = "step"
+    gravity_m_s2: NotNegative = 9.80665
+    yaw_gain_per_s: NotNegative = 4
+    control_period_s: Positive = 0.02
+    limit_m_s2: Positive | None = None
+    deterministic: Bool = False
+    timeout_s: Positive = 10
+
+    @override
+    def agent_names(self) -> Iterator[tuple[str, Location]]:
+        for key in ("models", "origins_m", "command_topics"):
+            yield from ((name, (key, name)) for name in getattr(self, key))

@@ -1,0 +1,27 @@
+"""Options of ns-3: `network.options` of a scenario. `network.cc` reads them."""
+
+from typing import Annotated, Literal
+
+from fieldkit.config.schema import Field, Int
+from sim_backends.federates.simulator_options import SimulatorOptions
+
+
+class Ns3Options(SimulatorOptions):
+    """Options of the network [ns-3](ns3.md).
+
+    Attributes:
+        standard: Standard of all radios; if omitted, 802.11n if all radios have it, otherwise 802.11g.
+        ampdu_bytes: Largest aggregate of frames in 802.11n; 0 sends frames singly, as the built-in network does.
+        topics: With `udp`, topics with `reliability: best_effort` are sent as UDP datagrams with the headers of RTPS,
+            without discovery; if omitted, a scenario with topics is refused.
+        delay_parts: File for the [parts of each delay](ns3.md#parts-of-the-delay); `{seed}` is replaced by the seed
+            of the run.
+        pcap: Beginning of the names of [captures of frames](ns3.md), one per robot, in the format of radiotap;
+            `{seed}` as above.
+    """
+
+    standard: Literal["802.11a", "802.11g", "802.11n"] | None = None
+    ampdu_bytes: Annotated[Int, Field(ge=0, le=65535)] = 0
+    topics: Literal["udp"] | None = None
+    delay_parts: Annotated[str, Field(min_length=1)] | None = None
+    pcap: Annotated[str, Field(min_length=1)] | None = None

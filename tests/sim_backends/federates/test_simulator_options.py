@@ -1,0 +1,101 @@
+"""Options of simulators in a scenario: validated with file and line before anything starts, complete on the wire."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.cosim import load_scenario
+from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.external import make_hello
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.emane_events.options import EmaneOptions
+from sim_backends.federates.frames import NETWORK, PHYSICS
+from sim_backends.federates.simulator_options import SimulatorOptions
+from sim_backends.world.world import load_world
+
+SCENARIO = """\
+name: pair
+summary: two robots
+world: open
+duration: 1s
+physics:
+  federate: PHYSICS
+  options:
+    VALUE
+network: {federate: NETWORK, options: {ampdu_bytes: 100}}
+agents:
+  ann: {robot: husky, at_m: [0, 0]}
+  bob: {robot: husky, at_m: [10, 0]}
+"""
+
+
+def loaded(
+    folder: Path, value: str = "reset: false", physics: str = "gazebo", network: str = "ns3", **changes: object
+) -> CosimScenario:
+    path = folder / "pair.yaml"
+    text = SCENARIO.replace("PHYSICS", physics).replace("NETWORK", network).replace("VALUE", value)
+    path.write_text(text, encoding="utf-8")
+    return load_scenario(path, {key.replace("__", "."): value for key, value in changes.items()})
+
+
+def options_sent(scenario: CosimScenario, role: int) -> dict[str, object]:
+    world = load_world(scenario.world)
+    hello = make_hello(scenario, world, bodies(scenario, world), 1, role)
+    options: dict[str, object] = json.loads(hello.configuration)["options"]
+    return options
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("reste: true", "in physics.options: unknown key reste; did you mean 'reset'?"),
+        ("speed: 1", "unknown key speed; valid keys: world, models, origins_m"),
+        ("acknowledge: of", "'of' is not one of: auto, required, off; did you mean 'off'?"),
+        ("timeout_s: 0", "in physics.options.timeout_s: Input should be greater than 0"),
+        ("settle_s: 1s", "'1s' is not a number; write it without a unit"),
+        ("models: {anne: husky}", "there is no agent 'anne'; did you mean 'ann'?"),
+        ("origins_m: {ann: [0, 0]}", "in physics.options.origins_m.ann: this list needs more values"),
+    ],
+)
+def test_a_wrong_option_has_its_line_and_a_remedy(value: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        loaded(tmp_path, value)
+    assert message in caught.value.what
+    assert caught.value.where == f"{tmp_path / 'pair.yaml'}:8"
+
+
+def test_an_option_of_the_command_line_is_validated_too(tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigurationError, match=r"in network.options.standard: '802.11ax' is not one of: 802.11a"
+    ) as caught:
+        loaded(tmp_path, network__options__standard="802.11ax")
+    assert "correct the option with this value" in caught.value.remedy
+    with pytest.raises(ConfigurationError, match="gazebo is a physics, not a network"):
+        loaded(tmp_path, network__federate="gazebo")
+    with pytest.raises(ConfigurationError, match="unknown key gravity; no keys are valid here"):
+        loaded(tmp_path, physics__federate="mujoco", physics__options={"gravity": 1})
+
+
+def test_a_simulator_receives_all_options(tmp_path: Path) -> None:
+    scenario = loaded(tmp_path, "limit_m_s2: 3")
+    sent = options_sent(scenario, PHYSICS)
+    assert (sent["limit_m_s2"], sent["settle_s"], sent["acknowledge"]) == (3, 0.5, "auto")
+    assert "world" not in sent
+    assert options_sent(scenario, NETWORK) == {"ampdu_bytes": 100}
+    assert options_sent(load_scenario("convoy", {"network.federate": "ns3"}), NETWORK) == {"ampdu_bytes": 0}
+    emane = load_scenario("convoy", {"physics.federate": "emane", "physics.options": {"nems": {"leader": 7}}})
+    assert EmaneOptions.model_validate(options_sent(emane, PHYSICS)) == emane.physics.options
+
+
+def test_a_command_and_an_address_have_any_options(tmp_path: Path) -> None:
+    scenario = loaded(tmp_path, "speed: [1, {x: y}]", "./carts", "tcp:127.0.0.1:7000")
+    assert options_sent(scenario, PHYSICS) == {"speed": [1, {"x": "y"}]}
+    assert not isinstance(scenario.network.options, SimulatorOptions)
+
+
+def test_another_simulator_does_not_get_the_options_of_the_one_that_it_replaces(tmp_path: Path) -> None:
+    scenario = loaded(tmp_path, physics__federate="mujoco", network__federate="builtin")
+    assert options_sent(scenario, PHYSICS) == {}
+    assert scenario.network.options is None
