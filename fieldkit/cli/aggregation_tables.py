@@ -18,6 +18,7 @@ from fieldkit.cli import results
 from fieldkit.cli.display import print_folded, show_note, table
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.executors import Workers
 from fieldkit.core.text import print_text
 from fieldkit.core.units import parse_quantity
 from fieldkit.trial import sources
@@ -43,7 +44,9 @@ _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a
 def show(arguments: argparse.Namespace) -> int:
     """Print the cells."""
     output_format = arguments.format
-    data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
+    data = sources.find(
+        arguments.paths, show_note, rebuild=arguments.rebuild, workers=Workers(arguments.jobs, arguments.cluster)
+    )
     by = data.condition(arguments.by)
     selected, words = data.chosen(arguments.quantity)
     if words and output_format == "latex":

@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Final
 
 from fieldkit.analysis import expectations, repeats
 from fieldkit.analysis.duplicates import deduplicated
@@ -14,8 +15,14 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.core import files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
+from fieldkit.core.executors import Workers
 from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
+
+ALL_PROCESSORS: Final = Workers()
+
+_IN_PARALLEL: Final = 8
+"""Number of trials from which they are measured in parallel by default; processes take a second to start."""
 
 Note = Callable[[str], None]
 """Shows a sentence about data that is left out or treated in an unexpected way."""
@@ -31,6 +38,7 @@ class Sources:
         columns: The columns of all tables.
         rebuild: Whether raw evidence is measured again instead; nothing is written.
         note: Receives notes.
+        workers: Where raw evidence is measured again.
     """
 
     where: str
@@ -38,6 +46,7 @@ class Sources:
     columns: Sequence[Column]
     rebuild: bool
     note: Note
+    workers: Workers = ALL_PROCESSORS
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
@@ -133,7 +142,7 @@ class Sources:
             self.note(f"kept as text, because no installed kind of step declares it: {', '.join(others)}")
         if columns is None:
             columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
-        content = partial(_remeasured_table, note=self.note) if self.rebuild else Path.read_bytes
+        content = _remeasured_tables(self.tables, self.workers, self.note) if self.rebuild else Path.read_bytes
         attempts, notes = deduplicated(repeats.read(self.tables, self.columns, columns, content))
         for note in notes:
             self.note(note)
@@ -147,28 +156,31 @@ class Sources:
         return attempts
 
 
-def find(paths: Sequence[Path], note: Note, *, rebuild: bool = False) -> Sources:
+def find(paths: Sequence[Path], note: Note, *, rebuild: bool = False, workers: Workers = ALL_PROCESSORS) -> Sources:
     """Return the tables of the trials and CSV files at or below `paths`, with their columns.
 
     Args:
         paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
         note: Receives notes.
         rebuild: Whether to measure raw evidence again.
+        workers: Where it is measured.
 
     Raises:
         ConfigurationError: A path does not exist or has no trial below, or as for `tables.declared_in`.
         EvidenceError: No trial has its table.
     """
-    return find_each([paths], note, rebuild=rebuild)[0]
+    return find_each([paths], note, rebuild=rebuild, workers=workers)[0]
 
 
-def find_each(runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = False) -> list[Sources]:
+def find_each(
+    runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = False, workers: Workers = ALL_PROCESSORS
+) -> list[Sources]:
     """Return the sources at the paths of each run, as `find`; all have the columns of all runs."""
     tables_by_run = [_find_tables(paths, note, rebuild=rebuild) for paths in runs]
     all_tables = [table for run_tables in tables_by_run for table in run_tables]
     columns = tables.planned(all_tables) if rebuild else tables.declared_in(all_tables)
     return [
-        Sources(_paths_text(paths), run_tables, columns, rebuild, note)
+        Sources(_paths_text(paths), run_tables, columns, rebuild, note, workers)
         for paths, run_tables in zip(runs, tables_by_run, strict=True)
     ]
 
@@ -194,7 +206,7 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
         raise ConfigurationError(
             "there is no such file or folder", where=str(path), remedy=shell_command("ls", path.parent)
         )
-    folders = list(_trials(path, set()))
+    folders = trial_folders(path)
     if not folders:
         raise ConfigurationError(
             "no trial is there or below",
@@ -209,6 +221,11 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
         else:
             command = shell_command("fieldkit", "rebuild", folder)
             note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {command}")
+
+
+def trial_folders(path: Path) -> list[Path]:
+    """Return the folders of trials at or below a path; empty if there are none, or if it is not a folder."""
+    return list(_trials(path, set())) if path.is_dir() else []
 
 
 def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
@@ -231,6 +248,29 @@ def _identity(table: Path) -> object:
     """Return the identity of a table, which is the same for two paths to it."""
     status = table.parent.stat() if table.name == store.TRIAL_CSV else table.stat()
     return status.st_dev, status.st_ino
+
+
+def _remeasured_tables(tables: Sequence[Path], workers: Workers, note: Note) -> Callable[[Path], bytes]:
+    """Return a function that returns the table of a trial, measured again from its raw evidence."""
+    if workers.is_default and len(tables) < _IN_PARALLEL:
+        return partial(_remeasured_table, note=note)
+    from fieldkit.core.tasks import completed  # noqa: PLC0415 (as for rebuild below)
+
+    contents: dict[Path, bytes] = {}
+    absolute = [table.absolute() for table in tables]  # workers of a cluster have another working directory
+    for end in completed(_remeasure, absolute, workers, note):
+        if end.result is None:
+            raise end.error or EvidenceError("no table was measured", where=str(tables[end.number]))
+        contents[tables[end.number]], notes = end.result
+        for text in notes:
+            note(text)
+    return contents.__getitem__
+
+
+def _remeasure(table: Path) -> tuple[bytes, list[str]]:
+    """Return a trial's table, measured again, and the notes on it."""
+    notes: list[str] = []
+    return _remeasured_table(table, notes.append), notes
 
 
 def _remeasured_table(table: Path, note: Note) -> bytes:

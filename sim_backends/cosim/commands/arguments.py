@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.cli.parser import Commands, Parser
-from fieldkit.cli.shared_arguments import natural, repeats
+from fieldkit.cli.shared_arguments import add_workers, natural, repeats
 
 _PACKAGE: Final = "sim_backends.cosim.commands"
 _FORMATS: Final = ("table", "csv", "json", "markdown")
@@ -93,6 +93,7 @@ def _add_shootout(commands: Commands) -> None:
     parser.add_argument(
         "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
     )
+    add_workers(parser)
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.shootout:run")
 
@@ -117,6 +118,7 @@ def _add_table(commands: Commands) -> None:
         "--seeds", type=repeats, default=20, metavar="N", help="run each row N times, with seeds 1 to N (default 20)"
     )
     _add_changes(parser)
+    add_workers(parser)
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.table:run")
 

@@ -1,19 +1,17 @@
-"""Many runs in parallel processes; results do not depend on the number of processes."""
+"""Many runs in parallel; results do not depend on the number of workers."""
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from typing import TypeVar
+from functools import partial
+from typing import Final, TypeVar
 
 from fieldkit.core.errors import FieldkitError
+from fieldkit.core.executors import Workers
+from fieldkit.core.tasks import WorkerDiedError, completed
 
 Result = TypeVar("Result")
+
+ALL_PROCESSORS: Final = Workers()
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,7 @@ def run_many(
     work: Callable[[Task], Result],
     tasks: Sequence[Task],
     *,
-    workers: int | None = None,
+    workers: Workers = ALL_PROCESSORS,
     progress: Callable[[int], None] | None = None,
 ) -> list[Result]:
     """Return the result of `work` for each task, in the order of the tasks.
@@ -46,14 +44,14 @@ def run_many(
     After the first error, and after Ctrl-C, all tasks are stopped.
 
     Args:
-        work: Called in another process, unless there is only one worker; it and its results must be picklable.
+        work: As for `tasks.completed`.
         tasks: The tasks.
-        workers: Number of processes; None for the number of processors that this process may use.
+        workers: Where they run.
         progress: Called with the number of finished tasks.
 
     Raises:
-        FieldkitError: A task failed, or its process died; the error names the task. Errors of fieldkit keep their
-            class.
+        FieldkitError: A task failed, or its worker died repeatedly; the error names the task. Errors of fieldkit keep
+            their class.
     """
     results: dict[int, Result] = {}
     for number, result in as_completed_tasks(work, tasks, workers=workers):
@@ -64,57 +62,15 @@ def run_many(
 
 
 def as_completed_tasks(
-    work: Callable[[Task], Result], tasks: Sequence[Task], *, workers: int | None = None
+    work: Callable[[Task], Result], tasks: Sequence[Task], *, workers: Workers = ALL_PROCESSORS
 ) -> Iterator[tuple[int, Result]]:
     """Yield the number and the result of each task when it has finished; otherwise like `run_many`."""
-    workers = min(workers or len(os.sched_getaffinity(0)), len(tasks))
-    return _in_parallel(work, tasks, workers) if workers > 1 else _in_sequence(work, tasks)
-
-
-def _in_sequence(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[tuple[int, Result]]:
-    for number, task in enumerate(tasks):
-        yield number, _run_task(work, task)
-
-
-def _in_parallel(work: Callable[[Task], Result], tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Result]]:
-    """Yield results when they are available; if the generator is closed early, the processes exit immediately."""
-    stop_reader, stop_writer = multiprocessing.Pipe(duplex=False)
-    executor = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), initializer=_exit_with_parent, initargs=(stop_reader,)
-    )
-    futures: list[Future[Result]] = []
-    with stop_reader:
-        try:
-            futures.extend(executor.submit(_run_task, work, task) for task in tasks)
-            numbers = {future: number for number, future in enumerate(futures)}
-            for future in as_completed(futures):
-                yield numbers[future], future.result()
-            executor.shutdown()
-        except BrokenProcessPool:
-            broken_tasks = [str(task) for task, future in zip(tasks, futures, strict=False) if _is_broken(future)]
-            raise FieldkitError(
-                "a process was killed",
-                where=" or ".join(broken_tasks[:workers]),
-                remedy="if memory ran out, use fewer workers",
-            ) from None
-        finally:
-            stop_writer.close()
-            executor.shutdown(cancel_futures=True)
-
-
-def _is_broken(future: Future[Result]) -> bool:
-    return future.done() and isinstance(future.exception(), BrokenProcessPool)
-
-
-def _exit_with_parent(stop_reader: Connection) -> None:
-    """Ignore Ctrl-C, and exit when the other end of the pipe is closed, for example because the parent has exited."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def wait() -> None:
-        stop_reader.poll(None)
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
+    for end in completed(partial(_run_task, work), tasks, workers):
+        if isinstance(end.error, WorkerDiedError):
+            end.error.where = str(tasks[end.number])
+        if end.error is not None:
+            raise end.error
+        yield end.number, end.result  # type: ignore[misc] (a task without an error has a result)
 
 
 def _run_task(work: Callable[[Task], Result], task: Task) -> Result:
