@@ -16,6 +16,7 @@ from fieldkit.analysis.sample_size import additional_repeats_by_cell
 from fieldkit.analysis.table_lines import TableLine
 from fieldkit.cli import results
 from fieldkit.cli.display import print_folded, show_note, table
+from fieldkit.cli.shared_arguments import CONDITION
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.executors import Workers
@@ -47,7 +48,7 @@ def show(arguments: argparse.Namespace) -> int:
     data = sources.find(
         arguments.paths, show_note, rebuild=arguments.rebuild, workers=Workers(arguments.jobs, arguments.cluster)
     )
-    by = data.condition(arguments.by)
+    by = (arguments.by == CONDITION and data.sweep_condition) or data.condition(arguments.by)
     selected, words = data.chosen(arguments.quantity)
     if words and output_format == "latex":
         raise ConfigurationError(

@@ -43,7 +43,8 @@ class ClusterExecutor(WorkerExecutor):
             )
         where = {"scheduler_file": address} if address.endswith(".json") else {"address": address}
         try:
-            self._client: Any = Client(**where, timeout=_CONNECT_S, set_as_default=False)
+            client: Any = Client  # it has no annotations
+            self._client = client(**where, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise LinkError(
                 f"no Dask scheduler answers at {address}",

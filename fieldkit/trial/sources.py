@@ -7,12 +7,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Final
 
-from fieldkit.analysis import expectations, repeats
+from fieldkit.analysis import datasets, expectations, repeats
 from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities, word_columns
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.core import files
+from fieldkit.core import files, laptop_files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
 from fieldkit.core.executors import Workers
@@ -77,6 +77,13 @@ class Sources:
                     remedy=did_you_mean(name, names_allowed, "fieldkit columns lists them"),
                 )
         return tuple(dict.fromkeys(names))
+
+    @cached_property
+    def sweep_condition(self) -> tuple[str, ...]:
+        """The columns that define a condition: the flow and the factors of sweeps; empty if not all are sweeps."""
+        if not all(table.is_dir() for table in self.tables):
+            return ()
+        return tuple(dict.fromkeys(name for table in self.tables for name in datasets.condition(table)))
 
     def chosen(
         self, names: Collection[str], *, option: str = "--quantity"
@@ -214,6 +221,12 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
             remedy=f"name the folder that trials are in, or CSV files: {shell_command(path)}/*.csv",
         )
     for folder in folders:
+        if (folder / laptop_files.SWEEP).is_file():
+            if (folder / laptop_files.SWEEP_RESULTS).is_dir():
+                yield folder / laptop_files.SWEEP_RESULTS
+            else:
+                note(f"{folder}: has no results yet; run its command again")
+            continue
         if not rebuild and (reason := files.unexpected_type(folder / store.TRIAL_CSV)):
             note(f"{folder / store.TRIAL_CSV}: {reason}; it is left out")
         elif rebuild or (folder / store.TRIAL_CSV).is_file():
@@ -229,14 +242,17 @@ def trial_folders(path: Path) -> list[Path]:
 
 
 def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
-    """Yield the folders of trials at or below a folder, sorted; links are followed, each folder is visited once."""
+    """Yield the folders of trials and sweeps at or below a folder, sorted.
+
+    Links are followed, each folder is visited once.
+    """
     status = folder.stat()
     if (status.st_dev, status.st_ino) in seen:
         return
     seen.add((status.st_dev, status.st_ino))
     with os.scandir(folder) as scan:
         entries = sorted(scan, key=lambda entry: entry.name)
-    if any(entry.name in {PLAN_FILE, store.TRIAL_CSV} for entry in entries):
+    if any(entry.name in {PLAN_FILE, store.TRIAL_CSV, laptop_files.SWEEP} for entry in entries):
         yield folder
         return
     for entry in entries:
@@ -246,7 +262,7 @@ def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
 
 def _identity(table: Path) -> object:
     """Return the identity of a table, which is the same for two paths to it."""
-    status = table.parent.stat() if table.name == store.TRIAL_CSV else table.stat()
+    status = table.parent.stat() if table.name == store.TRIAL_CSV or table.is_dir() else table.stat()
     return status.st_dev, status.st_ino
 
 

@@ -22,7 +22,16 @@ _NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "durati
 
 
 def table(trial: str, scenario: CosimScenario, policy: str, number: int, result: SeedResult) -> str:
-    """Return a trial.csv with a row for each flow of a run.
+    """Return a trial.csv with a row for each flow of a run; the arguments are those of `flow_rows`."""
+    rows = flow_rows(trial, scenario, policy, number, result)
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    return csv_text(names, ([row.get(name) for name in names] for row in rows))
+
+
+def flow_rows(
+    trial: str, scenario: CosimScenario, policy: str, number: int, result: SeedResult
+) -> list[dict[str, Value]]:
+    """Return the columns of trial.csv for each flow of a run; missing values are left out.
 
     Args:
         trial: Name of the folder of all runs.
@@ -31,23 +40,19 @@ def table(trial: str, scenario: CosimScenario, policy: str, number: int, result:
         number: Number of the run, from 1.
         result: The result of the run.
     """
-    rows = [
+    return [
         _identity(trial, scenario, policy, result, flow)
         | {"repeat": number}
         | {name: value for name, value in _measured(flow).items() if not _is_missing(value)}
         for flow in result.flows
     ]
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    return csv_text(names, ([row.get(name) for name in names] for row in rows))
 
 
 def _identity(
     trial: str, scenario: CosimScenario, policy: str, result: SeedResult, flow: FlowResult
 ) -> dict[str, Value]:
     distance_m = _distance_m(flow, scenario, result.starts_m)
-    dumped = scenario.model_dump(mode="json", by_alias=True)
-    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
-    return {
+    identity: dict[str, Value] = {
         "schema_version": SCHEMA_VERSION,
         "trial": f"{trial}/{flow.name}",
         "procedure": f"{scenario.name} {flow.name} ({policy})",
@@ -64,9 +69,15 @@ def _identity(
         "sender": flow.source,
         "receiver": flow.destination,
         "relay": scenario.relay or "",
-        "profiles_sha256": _digest(dumped["agents"]),
-        "procedure_sha256": _digest(procedure),
     }
+    return identity | scenario_hashes(scenario)
+
+
+def scenario_hashes(scenario: CosimScenario) -> dict[str, Value]:
+    """Return the columns with the hashes of the agents and of the procedure of a scenario."""
+    dumped = scenario.model_dump(mode="json", by_alias=True)
+    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
+    return {"profiles_sha256": _digest(dumped["agents"]), "procedure_sha256": _digest(procedure)}
 
 
 def _measured(flow: FlowResult) -> dict[str, Value]:

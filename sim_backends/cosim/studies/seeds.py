@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, TypeVar
+from typing import Final, TypeVar, cast
 
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.executors import Workers
@@ -70,7 +70,7 @@ def as_completed_tasks(
             end.error.where = str(tasks[end.number])
         if end.error is not None:
             raise end.error
-        yield end.number, end.result  # type: ignore[misc] (a task without an error has a result)
+        yield end.number, cast("Result", end.result)
 
 
 def _run_task(work: Callable[[Task], Result], task: Task) -> Result:
