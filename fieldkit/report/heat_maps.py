@@ -52,7 +52,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], axes: tuple[str, str], oth
     values = [cell.estimates[quantity.name].value for cell in cells]
     scale = scale_of(quantity, values)
     panels = [
-        _panel(title, quantity, group, axes, scale, (min(values), max(values)))
+        _panel(title, quantity, group, axes=axes, scale=scale, limits=(min(values), max(values)))
         for title, group in list(groups.items())[:_MAX_PANELS]
     ]
     omitted = len(groups) - len(panels)
@@ -67,6 +67,7 @@ def _panel(
     title: str,
     quantity: Quantity,
     cells: Sequence[Cell],
+    *,
     axes: tuple[str, str],
     scale: Scale,
     limits: tuple[float, float],
