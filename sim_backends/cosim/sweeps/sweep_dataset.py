@@ -6,13 +6,13 @@ Equal results give equal bytes: rows are in the order of the plan, whatever the 
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
 from typing import Final
 from urllib.parse import quote
 
 import pyarrow as pa
 import pyarrow.parquet
 
-from fieldkit import __version__
 from fieldkit.core import files
 from fieldkit.core.columns import SCHEMA_VERSION, Kind, Value
 from sim_backends.cosim.commands.run_folder import scenario_hashes
@@ -109,7 +109,7 @@ def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> p
         if name not in partitions
     ]
     metadata = {
-        "fieldkit_version": __version__,
+        "fieldkit_version": version("fieldkit"),
         "schema_version": str(SCHEMA_VERSION),
         "partitions": json.dumps(partitions),
         "by": json.dumps(["flow", *by]),

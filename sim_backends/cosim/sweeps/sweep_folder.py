@@ -9,10 +9,10 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit import __version__
 from fieldkit.core import files
 from fieldkit.core.columns import Value
 from fieldkit.core.errors import ConfigurationError, EvidenceError
@@ -173,12 +173,12 @@ class SweepFolder:
 
 
 def _identity(run: SweepRun) -> dict[str, Any]:
-    return {"fieldkit": __version__, "settings": dict(run.setting.values), "seed": run.seed}
+    return {"fieldkit": version("fieldkit"), "settings": dict(run.setting.values), "seed": run.seed}
 
 
 def _description(plan: SweepPlan) -> dict[str, Any]:
     return {
-        "fieldkit": __version__,
+        "fieldkit": version("fieldkit"),
         "scenario": plan.scenario.name,
         "factors": {factor.name: list(factor.values) for factor in plan.factors},
         "seeds": list(plan.seeds),

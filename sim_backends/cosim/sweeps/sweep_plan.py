@@ -5,10 +5,10 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit import __version__
 from fieldkit.config import schema
 from fieldkit.config.locations import names
 from fieldkit.core.errors import ConfigurationError
@@ -123,5 +123,5 @@ def digest(scenario: CosimScenario) -> str:
     robots = {plan.robot for plan in scenario.agents.values()} - BODIES.keys()
     paths: list[Path] = [world_files()[scenario.world], *(profiles[robot] for robot in sorted(robots))]
     files = [hashlib.sha256(path.read_bytes()).hexdigest() for path in paths]
-    content = {"fieldkit": __version__, "scenario": settings, "files": files}
+    content = {"fieldkit": version("fieldkit"), "scenario": settings, "files": files}
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:24]
