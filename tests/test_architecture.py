@@ -110,7 +110,9 @@ ONE_IMPORTER = {
     "pydantic_core": "fieldkit/config/schema.py",
     # One module per format: CSV is read into columns, columns are written as Parquet. Simulators, which may import
     # neither, write their own tables.
-    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/export/table.py sim_backends/cosim/recording/packet_tables.py",
+    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/analysis/datasets.py fieldkit/export/table.py "
+    "sim_backends/cosim/recording/packet_tables.py sim_backends/cosim/sweeps/sweep_dataset.py",
+    "distributed": "fieldkit/core/cluster.py",
     # Messages of trials, messages of co-simulation recordings, and recovery of truncated bags.
     "mcap": "fieldkit/ros/bags/salvage.py fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
     # Trials and simulations draw different figures; `report.theme` defines their style.
@@ -261,7 +263,13 @@ def test_required_and_imported_packages_are_the_same() -> None:
     extras = project["optional-dependencies"]
     required = {
         re.split(r"[<>=]", line)[0]
-        for line in (*project["dependencies"], *extras["mujoco"], *extras["pandas"], *extras["ros2"])
+        for line in (
+            *project["dependencies"],
+            *extras["cluster"],
+            *extras["mujoco"],
+            *extras["pandas"],
+            *extras["ros2"],
+        )
     }
     paths = modules("fieldkit") + modules("sim_backends")
     tops = {name.split(".")[0] for path in paths for name in imported_names(path)}

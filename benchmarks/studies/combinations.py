@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from fieldkit.core.executors import Workers
 from fieldkit.core.text import print_text
 from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.comparison import errors, lost_share
@@ -144,7 +145,10 @@ def run(arguments: argparse.Namespace) -> None:
             "network.options": NETWORK_OPTIONS.get(network),
         }
         results = outcomes(
-            partial(make, arguments.scenario, changes), arguments.policy, range(1, arguments.seeds + 1), workers=1
+            partial(make, arguments.scenario, changes),
+            arguments.policy,
+            range(1, arguments.seeds + 1),
+            workers=Workers(1),
         )
         append_rows(arguments.file, [*study_rows(physics, network, results)])
         print_text(f"{physics} and {network}: {time.monotonic() - began_s:.0f} s", flush=True)

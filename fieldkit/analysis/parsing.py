@@ -50,13 +50,26 @@ def columns(
             pa.BufferReader(body),
             read_options=pa.csv.ReadOptions(column_names=names, block_size=max(len(body) // 8, 1 << 20)),
             convert_options=pa.csv.ConvertOptions(
-                column_types={name: _arrow_type(declared[name]) for name in present},
+                column_types={name: arrow_type(declared[name]) for name in present},
                 include_columns=present,
                 null_values=MISSING,
                 strings_can_be_null=False,
             ),
         )
         by_name, rows = dict(zip(present, table.columns, strict=True)), len(table)
+    return *arrow_columns(by_name, declared, rows), rows
+
+
+def arrow_columns(
+    by_name: Mapping[str, pa.ChunkedArray], declared: Mapping[str, Column], rows: int
+) -> tuple[dict[str, Numbers], dict[str, Texts]]:
+    """Return columns of numbers and of texts, as in `repeats.Repeats`; missing columns are missing in all rows.
+
+    Args:
+        by_name: Columns of Arrow, of the types of `arrow_type`.
+        declared: The requested columns.
+        rows: Number of rows.
+    """
     numbers: dict[str, Numbers] = {}
     texts: dict[str, Texts] = {}
     for name, declaration in declared.items():
@@ -67,7 +80,7 @@ def columns(
             numbers[name] = (
                 np.asarray(np.full(rows, np.nan, _numpy_type(declaration))) if column is None else _numbers(column)
             )
-    return numbers, texts, rows
+    return numbers, texts
 
 
 def codes(column: Texts) -> NDArray[np.int64]:
@@ -126,7 +139,8 @@ def first_problem(where: str, content: bytes, declared: Mapping[str, Column]) ->
     return None
 
 
-def _arrow_type(column: Column) -> pa.DataType:
+def arrow_type(column: Column) -> pa.DataType:
+    """Return the type as which Arrow reads a column."""
     if column.type is str:
         return pa.dictionary(pa.int32(), pa.string())
     return {"bool": pa.bool_(), "ns": pa.int64()}.get(column.unit, pa.float64())

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis import parsing
+from fieldkit.analysis import datasets, parsing
 from fieldkit.analysis.repeats import SOURCE, Repeats, by_name, header_names, parse_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
@@ -61,6 +61,11 @@ def read(
         order.append(np.repeat(batch.numbers, counts))
 
     for number, path in enumerate(paths):
+        if path.is_dir():
+            dataset = _read_dataset(path, named)
+            parts.append(dataset)
+            order.append(np.full(len(dataset), number))
+            continue
         if content == Path.read_bytes and (large := _read_large(path, named)) is not None:
             parts.append(large)
             order.append(np.full(len(large), number))
@@ -97,7 +102,10 @@ def names(path: Path) -> tuple[str, ...]:
 
     Raises:
         ConfigurationError: The file cannot be read.
+        EvidenceError: As for `datasets.names`.
     """
+    if path.is_dir():
+        return datasets.names(path)
     with _readable(path), path.open("rb") as file:
         return header_names(file.readline(_MAX_HEADER_BYTES))
 
@@ -143,6 +151,15 @@ class _Batch:
             raise EvidenceError(str(error), where=str(path), remedy="correct the file") from error
 
 
+def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
+    """Return the rows of a dataset of Parquet files; errors as `datasets.read`, or if a value is not possible."""
+    numbers, texts, rows = datasets.read(path, declared)
+    table = Repeats(numbers, texts, tuple(declared.values()))
+    if not _is_valid(table, declared):
+        raise EvidenceError("it has impossible values", where=str(path), remedy="run the command of the sweep again")
+    return replace(table, texts={**texts, SOURCE: np.full(rows, _source(path), np.object_)})
+
+
 def _read_large(path: Path, declared: Mapping[str, Column]) -> Repeats | None:
     """Return the rows of a large table, read in blocks; None for a small or an invalid table.
 
@@ -177,7 +194,7 @@ def _is_valid(rows: Repeats, declared: Mapping[str, Column]) -> bool:
 
 
 def _source(path: Path) -> str:
-    return str(path.parent if path.name == "trial.csv" else path)
+    return str(path.parent if path.name == "trial.csv" or path.is_dir() else path)
 
 
 @contextmanager

@@ -16,8 +16,10 @@ from fieldkit.analysis.sample_size import additional_repeats_by_cell
 from fieldkit.analysis.table_lines import TableLine
 from fieldkit.cli import results
 from fieldkit.cli.display import print_folded, show_note, table
+from fieldkit.cli.shared_arguments import CONDITION
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.executors import Workers
 from fieldkit.core.text import print_text
 from fieldkit.core.units import parse_quantity
 from fieldkit.trial import sources
@@ -43,8 +45,10 @@ _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a
 def show(arguments: argparse.Namespace) -> int:
     """Print the cells."""
     output_format = arguments.format
-    data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
-    by = data.condition(arguments.by)
+    data = sources.find(
+        arguments.paths, show_note, rebuild=arguments.rebuild, workers=Workers(arguments.jobs, arguments.cluster)
+    )
+    by = (arguments.by == CONDITION and data.sweep_condition) or data.condition(arguments.by)
     selected, words = data.chosen(arguments.quantity)
     if words and output_format == "latex":
         raise ConfigurationError(

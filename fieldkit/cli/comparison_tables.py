@@ -9,7 +9,7 @@ from typing import Final
 from fieldkit.analysis import comparison_results, paper_tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.comparable import VARIED, Concern
-from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
+from fieldkit.analysis.compare import PAIRED_BY, Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import ConfigurationError, did_you_mean, shell_command
@@ -33,6 +33,8 @@ def show(arguments: argparse.Namespace) -> int:
     _require_two([arguments.a, arguments.b, *arguments.more])
     a, b = sources.find_each([[arguments.a], [arguments.b]], show_note, rebuild=arguments.rebuild)
     by = a.condition(arguments.by)
+    if arguments.by == ",".join(PAIRED_BY) and a.sweep_condition:  # only sweeps have common factors
+        by = tuple(name for name in a.sweep_condition if name in b.sweep_condition) or by
     thresholds = dict(_threshold(text, a.quantities) for text in arguments.threshold)
     comparison = compare(a.read(also=by), b.read(also=by), by, thresholds=thresholds)
     _require_common_condition(comparison, arguments)

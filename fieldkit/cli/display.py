@@ -39,12 +39,15 @@ from fieldkit.core.events import (
     RepeatEnded,
     Request,
     Sink,
+    SweepEnded,
+    SweepPlanned,
+    SweepRunEnded,
     TrialEnded,
     TrialStopped,
 )
 from fieldkit.core.model import Status, Verdict
 from fieldkit.core.text import json_text, sanitized
-from fieldkit.core.units import TimeEstimate, format_bytes
+from fieldkit.core.units import TimeEstimate, format_bytes, format_count
 
 _PLAIN_WIDTH: Final = 160
 _INDENT: Final = 8
@@ -309,6 +312,8 @@ def event_words(event: Event, width: int | None = None) -> Words:
             words = ((f"stopped, {done} of {total} repeats are done; {command}", "bold"),)
         case CampaignPlanned() | CampaignTrial() | CampaignWent() | CampaignEnded():
             words = _campaign_words(event)
+        case _:
+            words = _sweep_words(event)
     return words
 
 
@@ -333,6 +338,23 @@ def _campaign_words(event: CampaignPlanned | CampaignTrial | CampaignWent | Camp
         case CampaignEnded():
             hint = "" if event.done == event.total else "; to continue, run the same command again"
             return ((f"{done}{hint}: {event.folder}", "bold"),)
+
+
+def _sweep_words(event: Event) -> Words:
+    """Return the texts of an event of a sweep; empty for others, and for finished runs, as there may be thousands."""
+    match event:
+        case SweepPlanned():
+            done = f"; {event.done:,} are done" if event.done else ""
+            factors = f"{format_count(event.settings, 'setting')} with {format_count(event.seeds, 'seed')}"
+            return ((f"{event.total:,} runs: {factors}{done}", ""),)
+        case SweepRunEnded() if event.reason:
+            remedy = f"\n{' ' * _INDENT}remedy: {event.remedy}" if event.remedy else ""
+            head = f"{event.settings}, seed {event.seed}: " if event.settings else f"seed {event.seed}: "
+            return ((head, ""), (f"failed (attempt {event.attempt}): ", "red"), (event.reason, ""), (remedy, ""))
+        case SweepEnded():
+            failed = f", {event.failed:,} failed" if event.failed else ""
+            return ((f"{event.done:,} of {event.total:,} runs are done{failed}: {event.folder}", "bold"),)
+    return ()
 
 
 def _repeat_words(event: RepeatEnded, width: int | None) -> Words:

@@ -14,6 +14,7 @@ from fieldkit.core.events import (
     Progress,
     RepeatEnded,
     Request,
+    SweepEnded,
     TrialEnded,
     TrialStarted,
     TrialStopped,
@@ -72,7 +73,7 @@ class ProgressBar:
             case RepeatEnded():
                 self._done, self._total = event.done, event.total
                 self._end_s = time.monotonic() + event.left_s
-            case TrialEnded() | TrialStopped() | CampaignEnded():
+            case TrialEnded() | TrialStopped() | CampaignEnded() | SweepEnded():
                 self._phase, self._done, self._total, self._end_s = PhaseStarted(""), 0, 0, None
 
     def words(self, width: int) -> Words:

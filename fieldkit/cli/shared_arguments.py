@@ -127,6 +127,23 @@ def add_cells(parser: Parser, default: str = CONDITION) -> None:
     )
 
 
+def add_workers(parser: Parser) -> None:
+    """Add the options that choose where tasks run; `executors.Workers` has both."""
+    workers = parser.add_mutually_exclusive_group()
+    workers.add_argument(
+        "--jobs",
+        type=positive,
+        metavar="N",
+        help="number of parallel processes (default: the number of processors)",
+    )
+    workers.add_argument(
+        "--cluster",
+        default="",
+        metavar="ADDRESS",
+        help="use the workers of a Dask scheduler: tcp://HOST:PORT, or its scheduler file (see fieldkit docs sweep)",
+    )
+
+
 def add_show(parser: Parser, dest: str, what: str) -> None:
     """Add `show NAME` to a listing command. `dest` is None if all are listed."""
     parser.usage = "%(prog)s [-h] [show NAME]"
@@ -148,6 +165,13 @@ def natural(text: str, least: int = 0) -> int:
         raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number from {least}")
     if len(text) > _MAX_DIGITS:
         raise argparse.ArgumentTypeError(f"a number of {len(text)} digits is too large")
+    return int(text)
+
+
+def positive(text: str) -> int:
+    """Return a whole number from 1; argparse reports other texts."""
+    if natural(text, least=1) < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
     return int(text)
 
 

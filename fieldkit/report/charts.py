@@ -81,6 +81,25 @@ class Span:
 
 
 @dataclass(frozen=True)
+class HeatMap:
+    """A map of values over two factors.
+
+    Attributes:
+        columns: Labels of the columns, from the left.
+        rows: Labels of the rows, from below.
+        values: Values by row and column; nan if missing.
+        texts: Texts of the values.
+        limits: Values at the ends of the colour scale.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[str]
+    values: Sequence[Sequence[float]]
+    texts: Sequence[Sequence[str]]
+    limits: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Panel:
     """One set of axes.
 
@@ -102,6 +121,7 @@ class Panel:
         spans: Bars in lanes.
         lanes: Names of the lanes, the lowest first; empty if y is a number. With lanes, values of series and their
             intervals are along x.
+        heat: A heat map instead of series; None for other panels.
     """
 
     title: str
@@ -120,6 +140,7 @@ class Panel:
     is_strip: bool = False
     spans: Sequence[Span] = ()
     lanes: Sequence[str] = ()
+    heat: HeatMap | None = None
 
 
 @dataclass(frozen=True)

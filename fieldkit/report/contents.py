@@ -16,7 +16,18 @@ from fieldkit.analysis.wording import word_labels
 from fieldkit.core.columns import fault_column_name, plain_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FaultKind
-from fieldkit.report import distance, distribution, dots, expected, packet_rasters, strips, summary, timeline, wording
+from fieldkit.report import (
+    distance,
+    distribution,
+    dots,
+    expected,
+    heat_maps,
+    packet_rasters,
+    strips,
+    summary,
+    timeline,
+    wording,
+)
 from fieldkit.report.charts import Chart
 from fieldkit.report.coverage import absences
 from fieldkit.report.headlines import Headline, Ranking, headlines
@@ -137,6 +148,7 @@ def build_contents(
     command: Sequence[str],
     quantities: Sequence[str] = (),
     unmeasured: Sequence[str] = (),
+    sweep_condition: Sequence[str] = (),
 ) -> Contents:
     """Return the contents of a report on `repeats`.
 
@@ -147,6 +159,7 @@ def build_contents(
         command: The words of the operator's command, without `--rebuild`.
         quantities: Names of quantities to draw in addition to the default ones.
         unmeasured: Planned conditions without any attempt, in words.
+        sweep_condition: Columns of the flow and the factors, if the repeats are the runs of sweeps.
     """
     evidence = load_evidence(repeats)
     is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
@@ -166,6 +179,9 @@ def build_contents(
             *((kind, [name for name in names if name not in first]) for kind, names in _SECTIONS),
         )
     ]
+    if sweep_condition:
+        maps = list(heat_maps.charts(repeats, sweep_condition, quantities))
+        against_distance.insert(0, ChartSection("factors", "Figures over two factors", maps))
     against_distance.append(_further_charts(cells, identities, evidence, quantities, first))
     sections = (
         ChartSection("quantities", "Quantities at one distance", list(dots.charts(cells, identities, evidence))),

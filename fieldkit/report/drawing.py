@@ -12,7 +12,7 @@ from matplotlib.markers import CARETRIGHT, CARETUP
 from matplotlib.ticker import FormatStrFormatter, MaxNLocator, NullFormatter
 
 from fieldkit.core.text import sanitized
-from fieldkit.report.charts import EdgeMark, Panel, Series
+from fieldkit.report.charts import EdgeMark, HeatMap, Panel, Series
 from fieldkit.report.theme import LIGHT, Style
 
 _MARKER: Final = 5.0
@@ -33,6 +33,11 @@ _ARROW: Final = 14.0
 """Length of the arrow of a lower bound, in points."""
 _STRIP_LANE: Final = 7.5
 """Font size of lane names in panels of a fixed height."""
+_DARK: Final = 0.6
+"""Share of the colour scale of a heat map from which texts are light."""
+_ON_LIGHT: Final = "#111111"
+_ON_DARK: Final = "#fefefe"
+"""They are not colours of the theme, because the colours of a heat map are the same in the dark theme."""
 _EDGE_TEXT: Final = 34
 """Maximum number of characters of a text at the edge."""
 
@@ -42,6 +47,9 @@ def draw(axes: Axes, panel: Panel) -> None:
     axes.set_title(_shorten(panel.title, _TITLE))
     axes.set_xlabel(_shorten(panel.x_label, _TITLE))
     axes.set_ylabel(_shorten(panel.y_label, _TITLE))
+    if panel.heat is not None:
+        _draw_heat(axes, panel.heat)
+        return
     for series in panel.series:
         if len(series.x):  # matplotlib reserves space for an empty series
             _draw_series(axes, series, panel)
@@ -50,6 +58,20 @@ def draw(axes: Axes, panel: Panel) -> None:
     _set_axes(axes, panel)
     for edge in panel.edges:
         _draw_edge(axes, edge, sideways=bool(panel.lanes))
+
+
+def _draw_heat(axes: Axes, heat: HeatMap) -> None:
+    """Draw a heat map with the text of each value, dark on light colours."""
+    low, high = heat.limits
+    axes.pcolormesh(heat.values, cmap="Blues", vmin=low, vmax=high, edgecolors=LIGHT["paper"], linewidth=1.0)
+    for row, texts in enumerate(heat.texts):
+        for column, text in enumerate(texts):
+            is_dark = heat.values[row][column] > low + _DARK * (high - low)
+            colour = _ON_DARK if is_dark else _ON_LIGHT
+            axes.text(column + 0.5, row + 0.5, text, color=colour, ha="center", va="center", fontsize=_NOTE)
+    axes.set_xticks([index + 0.5 for index in range(len(heat.columns))], [_shorten(x, _TICK) for x in heat.columns])
+    axes.set_yticks([index + 0.5 for index in range(len(heat.rows))], [_shorten(y, _LANE) for y in heat.rows])
+    axes.grid(visible=False)
 
 
 def _set_axes(axes: Axes, panel: Panel) -> None:

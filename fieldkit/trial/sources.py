@@ -5,17 +5,24 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Final
 
-from fieldkit.analysis import expectations, table_files
+from fieldkit.analysis import datasets, expectations, table_files
 from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities, word_columns
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.core import files
+from fieldkit.core import files, laptop_files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
+from fieldkit.core.executors import Workers
 from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
+
+ALL_PROCESSORS: Final = Workers()
+
+_IN_PARALLEL: Final = 8
+"""Number of trials from which they are measured in parallel by default; processes take a second to start."""
 
 Note = Callable[[str], None]
 """Shows a sentence about data that is left out or treated in an unexpected way."""
@@ -31,6 +38,7 @@ class Sources:
         columns: The columns of all tables.
         rebuild: Whether raw evidence is measured again instead; nothing is written.
         note: Receives notes.
+        workers: Where raw evidence is measured again.
     """
 
     where: str
@@ -38,6 +46,7 @@ class Sources:
     columns: Sequence[Column]
     rebuild: bool
     note: Note
+    workers: Workers = ALL_PROCESSORS
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
@@ -68,6 +77,13 @@ class Sources:
                     remedy=did_you_mean(name, names_allowed, "fieldkit columns lists them"),
                 )
         return tuple(dict.fromkeys(names))
+
+    @cached_property
+    def sweep_condition(self) -> tuple[str, ...]:
+        """The columns that define a condition: the flow and the factors of sweeps; empty if not all are sweeps."""
+        if not all(table.is_dir() for table in self.tables):
+            return ()
+        return tuple(dict.fromkeys(name for table in self.tables for name in datasets.condition(table)))
 
     def chosen(
         self, names: Collection[str], *, option: str = "--quantity"
@@ -133,7 +149,7 @@ class Sources:
             self.note(f"kept as text, because no installed kind of step declares it: {', '.join(others)}")
         if columns is None:
             columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
-        content = partial(_remeasured_table, note=self.note) if self.rebuild else Path.read_bytes
+        content = _remeasured_tables(self.tables, self.workers, self.note) if self.rebuild else Path.read_bytes
         attempts, notes = deduplicated(table_files.read(self.tables, self.columns, columns, content))
         for note in notes:
             self.note(note)
@@ -147,28 +163,31 @@ class Sources:
         return attempts
 
 
-def find(paths: Sequence[Path], note: Note, *, rebuild: bool = False) -> Sources:
+def find(paths: Sequence[Path], note: Note, *, rebuild: bool = False, workers: Workers = ALL_PROCESSORS) -> Sources:
     """Return the tables of the trials and CSV files at or below `paths`, with their columns.
 
     Args:
         paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
         note: Receives notes.
         rebuild: Whether to measure raw evidence again.
+        workers: Where it is measured.
 
     Raises:
         ConfigurationError: A path does not exist or has no trial below, or as for `tables.declared_in`.
         EvidenceError: No trial has its table.
     """
-    return find_each([paths], note, rebuild=rebuild)[0]
+    return find_each([paths], note, rebuild=rebuild, workers=workers)[0]
 
 
-def find_each(runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = False) -> list[Sources]:
+def find_each(
+    runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = False, workers: Workers = ALL_PROCESSORS
+) -> list[Sources]:
     """Return the sources at the paths of each run, as `find`; all have the columns of all runs."""
     tables_by_run = [_find_tables(paths, note, rebuild=rebuild) for paths in runs]
     all_tables = [table for run_tables in tables_by_run for table in run_tables]
     columns = tables.planned(all_tables) if rebuild else tables.declared_in(all_tables)
     return [
-        Sources(_paths_text(paths), run_tables, columns, rebuild, note)
+        Sources(_paths_text(paths), run_tables, columns, rebuild, note, workers)
         for paths, run_tables in zip(runs, tables_by_run, strict=True)
     ]
 
@@ -194,7 +213,7 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
         raise ConfigurationError(
             "there is no such file or folder", where=str(path), remedy=shell_command("ls", path.parent)
         )
-    folders = list(_trials(path, set()))
+    folders = trial_folders(path)
     if not folders:
         raise ConfigurationError(
             "no trial is there or below",
@@ -202,6 +221,12 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
             remedy=f"name the folder that trials are in, or CSV files: {shell_command(path)}/*.csv",
         )
     for folder in folders:
+        if (folder / laptop_files.SWEEP).is_file():
+            if (folder / laptop_files.SWEEP_RESULTS).is_dir():
+                yield folder / laptop_files.SWEEP_RESULTS
+            else:
+                note(f"{folder}: has no results yet; run its command again")
+            continue
         if not rebuild and (reason := files.unexpected_type(folder / store.TRIAL_CSV)):
             note(f"{folder / store.TRIAL_CSV}: {reason}; it is left out")
         elif rebuild or (folder / store.TRIAL_CSV).is_file():
@@ -211,15 +236,23 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
             note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {command}")
 
 
+def trial_folders(path: Path) -> list[Path]:
+    """Return the folders of trials at or below a path; empty if there are none, or if it is not a folder."""
+    return list(_trials(path, set())) if path.is_dir() else []
+
+
 def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
-    """Yield the folders of trials at or below a folder, sorted; links are followed, each folder is visited once."""
+    """Yield the folders of trials and sweeps at or below a folder, sorted.
+
+    Links are followed, each folder is visited once.
+    """
     status = folder.stat()
     if (status.st_dev, status.st_ino) in seen:
         return
     seen.add((status.st_dev, status.st_ino))
     with os.scandir(folder) as scan:
         entries = sorted(scan, key=lambda entry: entry.name)
-    if any(entry.name in {PLAN_FILE, store.TRIAL_CSV} for entry in entries):
+    if any(entry.name in {PLAN_FILE, store.TRIAL_CSV, laptop_files.SWEEP} for entry in entries):
         yield folder
         return
     for entry in entries:
@@ -229,8 +262,31 @@ def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
 
 def _identity(table: Path) -> object:
     """Return the identity of a table, which is the same for two paths to it."""
-    status = table.parent.stat() if table.name == store.TRIAL_CSV else table.stat()
+    status = table.parent.stat() if table.name == store.TRIAL_CSV or table.is_dir() else table.stat()
     return status.st_dev, status.st_ino
+
+
+def _remeasured_tables(tables: Sequence[Path], workers: Workers, note: Note) -> Callable[[Path], bytes]:
+    """Return a function that returns the table of a trial, measured again from its raw evidence."""
+    if workers.is_default and len(tables) < _IN_PARALLEL:
+        return partial(_remeasured_table, note=note)
+    from fieldkit.core.tasks import completed  # noqa: PLC0415 (as for rebuild below)
+
+    contents: dict[Path, bytes] = {}
+    absolute = [table.absolute() for table in tables]  # workers of a cluster have another working directory
+    for end in completed(_remeasure, absolute, workers, note):
+        if end.result is None:
+            raise end.error or EvidenceError("no table was measured", where=str(tables[end.number]))
+        contents[tables[end.number]], notes = end.result
+        for text in notes:
+            note(text)
+    return contents.__getitem__
+
+
+def _remeasure(table: Path) -> tuple[bytes, list[str]]:
+    """Return a trial's table, measured again, and the notes on it."""
+    notes: list[str] = []
+    return _remeasured_table(table, notes.append), notes
 
 
 def _remeasured_table(table: Path, note: Note) -> bytes:

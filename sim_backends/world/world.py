@@ -139,13 +139,18 @@ def _material_losses(names: tuple[str, ...], frequency_hz: float) -> tuple[Float
     )
 
 
+def world_files() -> dict[str, Path]:
+    """Return the files of all worlds by name: those of the lab's folder `worlds/`, and shipped ones."""
+    return {path.stem: path for folder in (SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
+
+
 def load_world(name: str) -> World:
     """Return a world by name: from the lab's folder `worlds/`, or one that ships with fieldkit.
 
     Raises:
         ConfigurationError: The world does not exist or is invalid; the error names the location.
     """
-    paths = {path.stem: path for folder in (SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
+    paths = world_files()
     if name not in paths:
         raise ConfigurationError(
             f"there is no world {name!r}", remedy=did_you_mean(name, paths, f"worlds: {', '.join(paths)}")

@@ -11,6 +11,7 @@ def add(parser: Parser) -> None:
     parser.description = "Aggregate the repeats of any number of trials, condition by condition, with 95 % intervals."
     parser.epilog = "example: fieldkit aggregate trials --by distance,protocol --quantity ip_loss"
     shared.add_paths(parser)
+    shared.add_workers(parser)
     shared.add_cells(parser)
     parser.add_argument(
         "--quantity",

@@ -1,11 +1,18 @@
-"""`fieldkit rebuild TRIAL`: regenerate the tables from raw evidence."""
+"""`fieldkit rebuild TRIAL...`: regenerate the tables from raw evidence."""
 
 import argparse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import print_folded, show_note
+from fieldkit.cli.display import print_folded, show_error, show_note, showing_progress
 from fieldkit.cli.parser import Parser
 from fieldkit.core.text import print_text
+
+if TYPE_CHECKING:
+    from fieldkit.trial.rebuild import Rebuilt
 
 
 def add(parser: Parser) -> None:
@@ -13,20 +20,71 @@ def add(parser: Parser) -> None:
     parser.description = (
         "Regenerate trial.csv and summary.csv from plan, journal and raw evidence. The result is byte-identical."
     )
-    shared.add_trial(parser)
+    parser.add_argument(
+        "trial",
+        type=Path,
+        nargs="+",
+        metavar="TRIAL",
+        help="folder of a trial, or folder with trials somewhere below",
+    )
     shared.add_all(parser)
+    shared.add_workers(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Rebuild the tables; print the summary and the names of the changed files."""
-    from fieldkit.cli import results
-    from fieldkit.trial.rebuild import rebuild
+    """Rebuild the tables; print the names of the changed files, and the summary if there is only one trial."""
+    from fieldkit.trial import rebuild, sources
 
-    rebuilt = rebuild(arguments.trial)
-    if not rebuilt.has_manifest:
-        show_note(f"{arguments.trial}: there is no manifest to verify its evidence with")
-    if left_out := results.show_summary(rebuilt.cells, show_all=arguments.all, expected=rebuilt.expected):
-        print_folded(f"{results.more_rows_note(left_out)}: add --all")
-    print_text(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
+    paths: list[Path] = arguments.trial
+    folders = [folder for path in paths for folder in sources.trial_folders(path) or [path]]
+    if len(folders) > 1:
+        return _rebuild_many(folders, arguments)
+    rebuilt = rebuild.rebuild(folders[0])
+    _note_missing_manifest(folders[0], rebuilt)
+    _show_summary(rebuilt, show_all=arguments.all)
+    print_text(_changes(rebuilt))
     return 0
+
+
+def _show_summary(rebuilt: "Rebuilt", *, show_all: bool) -> None:
+    from fieldkit.cli import results
+
+    if left_out := results.show_summary(rebuilt.cells, show_all=show_all, expected=rebuilt.expected):
+        print_folded(f"{results.more_rows_note(left_out)}: add --all")
+
+
+def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int:
+    """Rebuild many trials in parallel, and print a line for each; an error does not stop the others."""
+    from fieldkit.core.errors import FieldkitError
+    from fieldkit.core.events import Progress
+    from fieldkit.core.executors import Workers
+    from fieldkit.core.tasks import completed
+    from fieldkit.trial import rebuild
+
+    absolute = [folder.absolute() for folder in folders]  # workers of a cluster have another working directory
+    exit_code = 0
+    with showing_progress() as sink:
+        report = partial(Progress, "rebuild", total=len(folders), unit="trials")
+        workers = Workers(arguments.jobs, arguments.cluster)
+        for done, end in enumerate(completed(rebuild.rebuild, absolute, workers, show_note), start=1):
+            sink(report(done=done))
+            folder = folders[end.number]
+            if end.result is not None:
+                _note_missing_manifest(folder, end.result)
+                print_text(f"{folder}: {_changes(end.result)}")
+            elif isinstance(end.error, FieldkitError):
+                show_error(str(end.error) if end.error.where else f"{folder}: {end.error}")
+                exit_code = exit_code or end.error.exit_code
+            elif end.error is not None:
+                raise end.error
+    return exit_code
+
+
+def _note_missing_manifest(folder: Path, rebuilt: "Rebuilt") -> None:
+    if not rebuilt.has_manifest:
+        show_note(f"{folder}: there is no manifest to verify its evidence with")
+
+
+def _changes(rebuilt: "Rebuilt") -> str:
+    return f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before"

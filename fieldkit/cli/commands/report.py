@@ -76,6 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         command=_command(arguments),
         quantities=selected_names,
         unmeasured=list(unmeasured(arguments.paths, set(repeats.texts["source"].tolist()), show_note)),
+        sweep_condition=data.sweep_condition,
     )
     with _explain_os_errors(out, "-o"):
         files.write(out, page.render(report_contents, out).encode())

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.cli.parser import Commands, Parser
-from fieldkit.cli.shared_arguments import natural, repeats
+from fieldkit.cli.shared_arguments import add_json, add_workers, natural, repeats
 
 _PACKAGE: Final = "sim_backends.cosim.commands"
 _FORMATS: Final = ("table", "csv", "json", "markdown")
@@ -21,6 +21,7 @@ def add(parser: Parser) -> None:
     parser.epilog = "example: fieldkit cosim run baylands --policy sliding_window"
     commands = parser.add_commands(title="commands", metavar="COMMAND")
     _add_run(commands)
+    _add_sweep(commands)
     _add_shootout(commands)
     _add_table(commands)
     _add_satisfy(commands)
@@ -76,6 +77,40 @@ def _add_run(commands: Commands) -> None:
     parser.set_defaults(run=f"{_PACKAGE}.run:run")
 
 
+def _add_sweep(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "sweep",
+        help="run a scenario with all combinations of settings",
+        description="Run a scenario with all combinations of settings and seeds, in parallel. Each result is a file "
+        "in FOLDER; a sweep that was stopped continues with the same command.",
+        epilog="example: fieldkit cosim sweep baylands --over policy=sliding_window,scheduled window=1ms,10ms "
+        "distance=20m,40m --seeds 20 -o sweep",
+    )
+    _add_scenario(parser)
+    parser.add_argument(
+        "--over",
+        nargs="+",
+        default=[],
+        metavar="NAME=VALUE,...",
+        help="settings with their values: policy, window, distance (of the ends of the first flow), physics, "
+        "network, or a key of the scenario's file, for example radio.exponent=2,3",
+    )
+    _add_seeds(parser)
+    _add_federates(parser)
+    parser.add_argument(
+        "-o",
+        "--out",
+        required=True,
+        type=Path,
+        metavar="FOLDER",
+        help="folder of the sweep: a new one, or to continue",
+    )
+    parser.add_argument("--again", action="store_true", help="also try runs again that failed three times")
+    add_workers(parser)
+    add_json(parser)
+    parser.set_defaults(run=f"{_PACKAGE}.sweep:run")
+
+
 def _add_shootout(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "shootout",
@@ -104,6 +139,7 @@ def _add_shootout(commands: Commands) -> None:
     parser.add_argument(
         "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
     )
+    add_workers(parser)
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.shootout:run")
 
@@ -128,6 +164,7 @@ def _add_table(commands: Commands) -> None:
         "--seeds", type=repeats, default=20, metavar="N", help="run each row N times, with seeds 1 to N (default 20)"
     )
     _add_changes(parser)
+    add_workers(parser)
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.table:run")
 

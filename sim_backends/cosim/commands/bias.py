@@ -42,7 +42,11 @@ def run(arguments: argparse.Namespace) -> int:
     with showing_progress() as sink:
         runs = len({*policies, EventDriven.name}) * len(seeds)
         all_outcomes = outcomes(
-            partial(_build, scenario), policies, seeds, progress=partial(progress_reporter(sink), "bias", runs)
+            partial(_build, scenario),
+            policies,
+            seeds,
+            workers=settings.workers(arguments),
+            progress=partial(progress_reporter(sink), "bias", runs),
         )
     by_policy = {name: measures for name, measures in biases(all_outcomes).items() if name in policies}
     title = f"{scenario.name}, {scenario.topology}, {len(seeds)} seeds"

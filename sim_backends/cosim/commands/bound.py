@@ -56,13 +56,14 @@ def run(arguments: argparse.Namespace) -> int:
     seeds = settings.seeds(arguments, scenario)
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     tasks = [Task(ErrorBounded.name, seed) for seed in seeds]
+    workers = settings.workers(arguments)
     with showing_progress() as sink:
         report = partial(progress_reporter(sink, "seeds"), "bound", len(seeds))
         report(0)
-        costs = run_many(partial(_bound_cost, scenario), tasks, progress=report)
+        costs = run_many(partial(_bound_cost, scenario), tasks, workers=workers, progress=report)
         window_s, fixed_costs = longest_for_all(
             [cost.window_s for cost in costs],
-            lambda fixed_s: run_many(partial(_fixed_cost, scenario, fixed_s), tasks),
+            lambda fixed_s: run_many(partial(_fixed_cost, scenario, fixed_s), tasks, workers=workers),
             scenario.policy.bound,
         )
     _sheet(scenario, seeds, costs, window_s, fixed_costs).show(arguments.format)

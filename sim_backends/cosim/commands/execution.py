@@ -10,6 +10,7 @@ from types import FrameType
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.events import Sink
+from fieldkit.core.executors import Workers
 from sim_backends.cosim.commands.results import SeedResult, seed_result
 from sim_backends.cosim.commands.run_folder import RunFolder
 from sim_backends.cosim.commands.settings import progress_reporter
@@ -23,7 +24,7 @@ from sim_backends.cosim.scenario.emane import EmaneObserver, emane_observer
 from sim_backends.cosim.scenario.external import has_addresses
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
-from sim_backends.cosim.studies.seeds import Task, as_completed_tasks
+from sim_backends.cosim.studies.seeds import ALL_PROCESSORS, Task, as_completed_tasks
 from sim_backends.cosim.wall_time import DEADLINE_S
 
 
@@ -163,7 +164,7 @@ def simulate_all(
     interrupted = False
     try:
         # A federate with an address serves one run at a time, and parallel runs would delay each other.
-        workers = 1 if has_addresses(scenario) or pace is not None else None
+        workers = Workers(1) if has_addresses(scenario) or pace is not None else ALL_PROCESSORS
         work = partial(_simulate, scenario, folder, deadline_s, pace)
         for number, result in as_completed_tasks(work, tasks, workers=workers):
             results[number] = result

@@ -47,9 +47,7 @@ def _identity(
     trial: str, scenario: CosimScenario, policy: str, result: SeedResult, flow: FlowResult
 ) -> dict[str, Value]:
     distance_m = _distance_m(flow, scenario, result.starts_m)
-    dumped = scenario.model_dump(mode="json", by_alias=True)
-    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
-    return {
+    identity: dict[str, Value] = {
         "schema_version": SCHEMA_VERSION,
         "trial": f"{trial}/{flow.name}",
         "procedure": f"{scenario.name} {flow.name} ({policy})",
@@ -66,9 +64,15 @@ def _identity(
         "sender": flow.source,
         "receiver": flow.destination,
         "relay": scenario.relay or "",
-        "profiles_sha256": _digest(dumped["agents"]),
-        "procedure_sha256": _digest(procedure),
     }
+    return identity | scenario_hashes(scenario)
+
+
+def scenario_hashes(scenario: CosimScenario) -> dict[str, Value]:
+    """Return the columns with the hashes of the agents and of the procedure of a scenario."""
+    dumped = scenario.model_dump(mode="json", by_alias=True)
+    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
+    return {"profiles_sha256": _digest(dumped["agents"]), "procedure_sha256": _digest(procedure)}
 
 
 def _measured(flow: FlowResult) -> dict[str, Value]:

@@ -9,6 +9,7 @@ from typing import Final
 
 from fieldkit.cli.display import show_note, showing_progress
 from fieldkit.core.events import Sink
+from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
@@ -66,7 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     with showing_progress() as sink:
-        by_policy, failures = _measure(scenario, policies, seeds, windows_s, sink)
+        workers = settings.workers(arguments)
+        by_policy, failures = _measure(scenario, policies, seeds, windows_s, workers=workers, sink=sink)
     title = f"{scenario.name}, {scenario.topology}, {format_count(len(seeds), 'seed')}"
     _error_sheet(title, by_policy).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
@@ -81,13 +83,19 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _measure(
-    scenario: CosimScenario, policies: Sequence[str], seeds: Sequence[int], windows_s: Sequence[float], sink: Sink
+    scenario: CosimScenario,
+    policies: Sequence[str],
+    seeds: Sequence[int],
+    windows_s: Sequence[float],
+    *,
+    workers: Workers,
+    sink: Sink,
 ) -> tuple[dict[str, LocalErrors], dict[str, PolicyError]]:
     """Return the local errors of each policy over all seeds, and the errors of policies that could not be run."""
     tasks = [Task(name, seed) for name in policies for seed in seeds]
     report = partial(progress_reporter(sink), "local errors", len(tasks))
     report(0)
-    results = run_many(partial(_local_errors, scenario, windows_s), tasks, progress=report)
+    results = run_many(partial(_local_errors, scenario, windows_s), tasks, workers=workers, progress=report)
     errors_by_policy: dict[str, list[LocalErrors]] = {}
     failures: dict[str, PolicyError] = {}
     for task, result in zip(tasks, results, strict=True):

@@ -13,6 +13,7 @@ from fieldkit.config import schema
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import Progress, Sink
+from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count, parse_duration_s
 from fieldkit.report.theme import Format, format_of
 from sim_backends.cosim.policies import registry
@@ -82,6 +83,11 @@ def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ..
     if arguments.seeds is not None:
         return tuple(range(1, arguments.seeds + 1))
     return chosen.seeds if arguments.seed is None else (arguments.seed,)
+
+
+def workers(arguments: argparse.Namespace) -> Workers:
+    """Return the workers that the options choose."""
+    return Workers(arguments.jobs, arguments.cluster)
 
 
 def policies(arguments: argparse.Namespace) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Final
 
 from fieldkit.cli.display import show_note, showing_progress
 from fieldkit.core.events import Sink
+from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import bias, bound, orders, settings
 from sim_backends.cosim.commands.results import FORMATION, formation_values
@@ -73,7 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, windows_s, len(seeds))
     with showing_progress() as sink:
-        all_rows = _all_rows(scenario, policies, seeds, windows_s, sink)
+        workers = settings.workers(arguments)
+        all_rows = _all_rows(scenario, policies, seeds, windows_s, workers=workers, sink=sink)
     _sheet(scenario, all_rows, seeds).show(arguments.format)
     for window_s, row in all_rows:
         if row.failure:
@@ -93,7 +95,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _all_rows(
-    scenario: CosimScenario, policies: Sequence[str], seeds: Sequence[int], windows_s: Sequence[float], sink: Sink
+    scenario: CosimScenario,
+    policies: Sequence[str],
+    seeds: Sequence[int],
+    windows_s: Sequence[float],
+    *,
+    workers: Workers,
+    sink: Sink,
 ) -> list[tuple[float, Row]]:
     """Return a row for each policy; policies with a window have a row for each window."""
     all_rows: list[tuple[float, Row]] = []
@@ -104,7 +112,8 @@ def _all_rows(
         runs = len({*chosen, EventDriven.name}) * len(seeds)
         progress = partial(report, f"window {window_s * 1e3:g} ms", runs)
         progress(0)
-        window_rows = rows(outcomes(make, chosen, seeds, progress=progress), partial(formation, scenario))
+        window_outcomes = outcomes(make, chosen, seeds, workers=workers, progress=progress)
+        window_rows = rows(window_outcomes, partial(formation, scenario))
         all_rows += [(window_s, row) for row in window_rows if row.policy in chosen]
     return sorted(all_rows, key=lambda window_and_row: policies.index(window_and_row[1].policy))
 

@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     with showing_progress() as sink:
         progress = partial(progress_reporter(sink), f"table {which}", len(setups) * len(seeds))
         progress(0)
-        samples = flow_samples(setups, seeds, progress=progress)
+        samples = flow_samples(setups, seeds, workers=settings.workers(arguments), progress=progress)
     title = f"{_TITLES[which]}, {format_count(len(seeds), 'seed')}"
     if table is None:
         claim_sheet(title, claims(setups, samples)).show(arguments.format)

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from fieldkit.core.executors import Workers
 from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.packet_columns import round_trips_s
 from sim_backends.cosim.policies.window_policies import EventDriven, SlidingWindow, VelocityAware
@@ -17,7 +18,7 @@ from sim_backends.cosim.scenario.agent_plans import PingTraffic
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.seeds import Task, run_many
+from sim_backends.cosim.studies.seeds import ALL_PROCESSORS, Task, run_many
 
 UNDER_WAY = "under way when the run ended"
 
@@ -67,7 +68,7 @@ def flow_samples(
     setups: Mapping[str, Setup],
     seeds: Sequence[int],
     *,
-    workers: int | None = None,
+    workers: Workers = ALL_PROCESSORS,
     progress: Callable[[int], None] | None = None,
 ) -> dict[str, list[dict[str, FlowSample]]]:
     """Return, for each setup and each seed in order, a sample of each flow.

@@ -9,6 +9,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from fieldkit.core.executors import Workers
 from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.comparison import Errors, errors, lost_share, mean_errors
 from sim_backends.cosim.policies.sync_policy import PolicyError
@@ -16,7 +17,7 @@ from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.studies.formation import NO_FORMATION, Formation, SampledPhysics, Tracks, mean_formation
 from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, mean, repeats_needed
-from sim_backends.cosim.studies.seeds import Task, run_many
+from sim_backends.cosim.studies.seeds import ALL_PROCESSORS, Task, run_many
 
 SAMPLING_NS = 100_000_000
 """Interval at which the positions of agents are sampled."""
@@ -80,7 +81,7 @@ def outcomes(
     policies: Sequence[str],
     seeds: Sequence[int],
     *,
-    workers: int | None = None,
+    workers: Workers = ALL_PROCESSORS,
     progress: Callable[[int], None] | None = None,
 ) -> Outcomes:
     """Run a scenario with each policy and each seed, including the exact reference.

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldkit.core.executors import Workers
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
 from sim_backends.cosim.scenario.build import build
@@ -114,7 +115,7 @@ def test_samples_count_the_packets_of_a_run() -> None:
     run = build(setup.scenario, policy=setup.policy, seed=2).run()
     fates = [fate for (name, _), fate in run.fates.items() if name == flow]
     delays_s = [(fate.counted_ns - fate.packet.sent_ns) / 1e9 for fate in fates if fate.counted_ns is not None]
-    samples = flow_samples({"here": setup}, [7, 2], workers=1)
+    samples = flow_samples({"here": setup}, [7, 2], workers=Workers(1))
     sample = samples["here"][1][flow]
     assert (sample.sent, sample.arrived) == (len(fates), len(delays_s))
     assert sample.sent > 30
@@ -125,7 +126,7 @@ def test_samples_count_the_packets_of_a_run() -> None:
 
 def test_out_of_range_no_packet_arrives_and_there_is_no_delay() -> None:
     setups = {"far": master_based(Sight.NLOS, 100, "ros1", SHORT)}
-    (by_flow,) = flow_samples(setups, [1], workers=1)["far"]
+    (by_flow,) = flow_samples(setups, [1], workers=Workers(1))["far"]
     (sample,) = by_flow.values()
     assert sample.arrived == 0
     assert sample.loss == 1
@@ -136,7 +137,7 @@ def test_out_of_range_no_packet_arrives_and_there_is_no_delay() -> None:
 
 def test_the_delays_of_pings_are_round_trips() -> None:
     setups = {"mesh": mesh({"radio": {"rate": "1Mbit/s"}}, {"duration": "2s"})}
-    (by_flow,) = flow_samples(setups, [1], workers=1)["mesh"]
+    (by_flow,) = flow_samples(setups, [1], workers=Workers(1))["mesh"]
     sample = by_flow["before/node-10"]
     assert sample.arrived == sample.sent == 15, "ten per second from 0.5 s on"
     # Payload, headers of UDP and IP at 1 Mbit/s, and 0.2 ms in addition, in both directions.

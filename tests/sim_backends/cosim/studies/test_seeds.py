@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.executors import Workers
 from sim_backends.cosim.studies.seeds import Task, run_many
 from sim_backends.radio.random_streams import RandomStream
 from tests.helpers.host import alive
@@ -48,33 +49,34 @@ def killed(task: Task) -> int:
 def test_results_are_in_the_order_of_the_tasks() -> None:
     expected = [drawn(task) for task in TASKS]
     counted: list[int] = []
-    assert run_many(drawn, TASKS, workers=2, progress=counted.append) == expected
+    assert run_many(drawn, TASKS, workers=Workers(2), progress=counted.append) == expected
     assert counted == [1, 2, 3, 4, 5, 6]
 
 
 @given(st.permutations(TASKS))
 def test_one_worker_and_any_order_give_the_same(tasks: list[Task]) -> None:
-    results = dict(zip(tasks, run_many(drawn, tasks, workers=1), strict=True))
+    results = dict(zip(tasks, run_many(drawn, tasks, workers=Workers(1)), strict=True))
     assert [results[task] for task in TASKS] == [drawn(task) for task in TASKS]
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_names_its_policy_and_seed_and_keeps_its_class(workers: int) -> None:
     with pytest.raises(ConfigurationError, match=r"policy one, seed 2: at 3 s: no window\n  remedy: another"):
-        run_many(failing, [Task("one", 1), Task("one", 2)], workers=workers)
+        run_many(failing, [Task("one", 1), Task("one", 2)], workers=Workers(workers))
     with pytest.raises(FieldkitError, match="policy one, seed 1: ZeroDivisionError"):
-        run_many(wrong, [Task("one", 2), Task("one", 1)], workers=workers)
+        run_many(wrong, [Task("one", 2), Task("one", 1)], workers=Workers(workers))
 
 
-def test_the_death_of_a_process_is_an_error() -> None:
-    with pytest.raises(FieldkitError, match="was killed") as raised:
-        run_many(killed, TASKS, workers=2)
+def test_the_repeated_death_of_a_process_is_an_error() -> None:
+    with pytest.raises(FieldkitError, match=r"seed 1: its worker died \d times") as raised:
+        run_many(killed, TASKS, workers=Workers(2))
     assert "fewer workers" in raised.value.remedy
 
 
 ENDLESS = """
 import os, sys, time
 from pathlib import Path
+from fieldkit.core.executors import Workers
 from sim_backends.cosim.studies.seeds import Task, run_many
 
 def work(task):
@@ -89,7 +91,9 @@ def test_the_end_of_the_parent_ends_its_workers(how: signal.Signals, tmp_path: P
     (tmp_path / "endless.py").write_text(ENDLESS, encoding="utf-8")
     started = tmp_path / "started"
     started.mkdir()
-    call = "import endless as e; e.run_many(e.work, [e.Task('one', seed) for seed in (1, 2, 3)], workers=2)"
+    call = (
+        "import endless as e; e.run_many(e.work, [e.Task('one', seed) for seed in (1, 2, 3)], workers=e.Workers(2))"
+    )
     with subprocess.Popen(
         [sys.executable, "-c", call],
         env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from fieldkit.core.executors import Workers
 from sim_backends.cosim.comparison import Errors, Spread, errors, mean_errors
 from sim_backends.cosim.policies.window_policies import EventDriven, Scheduled
 from sim_backends.cosim.studies.shootout import Outcomes, biases, outcomes, rows
@@ -16,7 +17,7 @@ SEEDS = [4, 1, 7]
 
 @pytest.fixture(scope="module")
 def all_outcomes() -> Outcomes:
-    return outcomes(MovingPair, POLICIES, SEEDS, workers=2)
+    return outcomes(MovingPair, POLICIES, SEEDS, workers=Workers(2))
 
 
 def reproducible_text(run_errors: Errors) -> str:
@@ -54,7 +55,7 @@ def test_the_reference_is_first_and_a_policy_that_cannot_run_has_a_reason(all_ou
 
 
 def test_one_worker_and_other_orders_give_the_same_table(all_outcomes: Outcomes) -> None:
-    reordered = outcomes(MovingPair, POLICIES[::-1], SEEDS[::-1], workers=1)
+    reordered = outcomes(MovingPair, POLICIES[::-1], SEEDS[::-1], workers=Workers(1))
     for row in rows(all_outcomes):
         for seed, run_errors in zip(SEEDS, row.by_seed, strict=False):
             assert reproducible_text(reordered.errors(row.policy, seed)) == reproducible_text(run_errors)

@@ -1,0 +1,158 @@
+"""Runs of a sweep per second, compared with a bare process pool: `python -m benchmarks.sweep`.
+
+Each round runs the same simulations on 1 and on 2 processes, with `run_sweep` and with a `ProcessPoolExecutor` that
+keeps no results, in random order. Then it measures the cost of an empty task on processes and on a Dask cluster of
+two workers, and the cost of state on disk with many finished runs.
+"""
+
+import argparse
+import json
+import random
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import chdir
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Final
+
+from distributed import LocalCluster
+
+from fieldkit.core.executors import Workers
+from fieldkit.core.tasks import completed
+from sim_backends.cosim.sweeps.factors import parse_factors
+from sim_backends.cosim.sweeps.sweep_dataset import write_dataset
+from sim_backends.cosim.sweeps.sweep_folder import SweepFolder
+from sim_backends.cosim.sweeps.sweep_plan import SweepPlan, plan_sweep
+from sim_backends.cosim.sweeps.sweep_runner import execute, run_sweep
+
+SCENARIO: Final = """\
+name: pair
+summary: two robots and a stream over Wi-Fi
+world: lawn
+duration: {duration}
+policy: {{name: sliding_window, window: 10ms}}
+agents:
+  a: {{robot: husky, along: 0m, radio: {{}}}}
+  b: {{robot: husky, along: 10m, radio: {{}}}}
+traffic:
+  - {{kind: stream, name: pose, from: a, to: b, rate: 97Hz, size_bytes: 100}}
+"""
+WINDOWS: Final = "window=7ms,13ms,17ms,19ms"
+
+
+def nothing(number: int) -> int:
+    """Return the argument: an empty task."""
+    return number
+
+
+def run_bare(plan: SweepPlan, processes: int) -> None:
+    """Run a plan in a bare process pool."""
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        for future in [pool.submit(execute, run) for run in plan.runs]:
+            future.result()
+
+
+def run_sweep_in(plan: SweepPlan, workers: Workers, folder: Path) -> None:
+    """Run a plan as `fieldkit cosim sweep` does, with its dataset."""
+    state = SweepFolder(folder, "")
+    with state.opened(plan):
+        run_sweep(plan, state, workers, sink=lambda _: None)
+        write_dataset(plan, state)
+
+
+def timed(action: Callable[[], object]) -> float:
+    """Return the wall time of an action in seconds."""
+    start_s = time.monotonic()
+    action()
+    return time.monotonic() - start_s
+
+
+def runs_per_s(plan: SweepPlan, folder: Path, rounds: int) -> dict[str, list[float]]:
+    """Return runs per second by method and number of processes, a value per round."""
+    rates: dict[str, list[float]] = {}
+    generator = random.Random(1)
+    for number in range(rounds):
+        for count in (1, 2):
+            out = folder / f"{number}-{count}"
+            # One worker of a sweep is this process, so the peer with one process has its start in addition.
+            methods: list[tuple[str, Callable[[], object]]] = [
+                ("bare", lambda count=count: run_bare(plan, count)),  # type: ignore[misc]
+                ("sweep", lambda count=count, out=out: run_sweep_in(plan, Workers(count), out)),  # type: ignore[misc]
+            ]
+            generator.shuffle(methods)
+            for name, action in methods:
+                rates.setdefault(f"{name} {count}", []).append(len(plan.runs) / timed(action))
+    return rates
+
+
+def empty_task_s(workers: Workers, tasks: int) -> float:
+    """Return the wall time per empty task, without the start of the workers."""
+    ends = completed(nothing, range(tasks), workers)
+    next(ends)
+    return timed(lambda: sum(1 for _ in ends)) / (tasks - 1)
+
+
+def bare_empty_task_s(tasks: int) -> float:
+    """Return the wall time per empty task of a bare pool of two processes, without their start."""
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        pool.submit(nothing, 0).result()
+        return timed(lambda: [future.result() for future in [pool.submit(nothing, n) for n in range(tasks)]]) / tasks
+
+
+def state_costs(plan: SweepPlan, folder: Path) -> dict[str, float]:
+    """Return the costs of the state on disk: of a written result, of continuing without work, and of the dataset."""
+    state = SweepFolder(folder, "")
+    content = execute(plan.runs[0]).content
+    with state.opened(plan):
+        write_s = timed(lambda: [state.write_result(run, content) for run in plan.runs]) / len(plan.runs)
+        continue_s = timed(lambda: run_sweep(plan, state, Workers(2), sink=lambda _: None))
+        return {"write_s": write_s, "continue_s": continue_s, "dataset_s": timed(lambda: write_dataset(plan, state))}
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=50, help="seeds of each of 4 windows")
+    parser.add_argument("--tasks", type=int, default=10_000)
+    parser.add_argument("--duration", default="2s", help="duration of a run")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    factors = parse_factors([WINDOWS])
+    with tempfile.TemporaryDirectory() as name, chdir(name):
+        Path("pair.yaml").write_text(SCENARIO.format(duration=arguments.duration), encoding="utf-8")
+        plan = plan_sweep("pair.yaml", factors, range(1, arguments.seeds + 1), {})
+        rates = runs_per_s(plan, Path("sweeps"), arguments.rounds)
+        costs = {
+            "bare pool": bare_empty_task_s(arguments.tasks),
+            "processes": empty_task_s(Workers(2), arguments.tasks),
+        }
+        memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:  # type: ignore[no-untyped-call]
+            costs["dask"] = empty_task_s(Workers(cluster=cluster.scheduler_address), arguments.tasks)
+        many = plan_sweep("pair.yaml", factors, range(1, max(arguments.tasks // 4, 1) + 1), {})
+        state = state_costs(many, Path("many"))
+    if arguments.json:
+        print(json.dumps({"rates": rates, "empty_s": costs, "state": state, "memory_mb": memory_mb}))
+        return
+    for key, values in rates.items():
+        print(f"{key}: {statistics.median(values):.1f} runs/s ({min(values):.1f} to {max(values):.1f})")
+    for count in (1, 2):
+        ratios = [ours / bare for ours, bare in zip(rates[f"sweep {count}"], rates[f"bare {count}"], strict=True)]
+        print(f"sweep / bare, {count}: {statistics.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})")
+    for key, cost_s in costs.items():
+        print(f"an empty task of {arguments.tasks}, {key}: {cost_s * 1e6:.0f} us")
+    print(f"a result written: {state['write_s'] * 1e6:.0f} us")
+    print(
+        f"{len(many.runs)} finished runs: continued in {state['continue_s']:.2f} s, "
+        f"dataset in {state['dataset_s']:.2f} s"
+    )
+    print(f"largest memory of the submitting process: {memory_mb:.0f} MB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""The workers of a Dask cluster as an executor. Only this module imports `distributed`."""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, Final, ParamSpec, TypeVar
+
+from typing_extensions import override
+
+from fieldkit import __version__
+from fieldkit.core.errors import ConfigurationError, LinkError
+from fieldkit.core.processes import WorkerExecutor
+
+try:
+    from distributed import Client, KilledWorker
+except ImportError as error:
+    raise ConfigurationError(
+        f"a Dask cluster needs the package distributed: {error}", remedy='pip install "fieldkit[cluster]"'
+    ) from error
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+_CONNECT_S: Final = 15.0
+_REFRESH_S: Final = 1.0
+
+
+class ClusterExecutor(WorkerExecutor):
+    """Workers of a Dask scheduler, which need the same version of fieldkit.
+
+    Args:
+        address: Address of the scheduler, `tcp://HOST:PORT`, or its scheduler file, which ends in `.json`.
+
+    Raises:
+        LinkError: The scheduler does not answer.
+    """
+
+    def __init__(self, address: str) -> None:
+        if address.endswith(".json") and not Path(address).is_file():
+            raise ConfigurationError(
+                "there is no scheduler file", where=address, remedy=f"dask scheduler --scheduler-file {address}"
+            )
+        where = {"scheduler_file": address} if address.endswith(".json") else {"address": address}
+        try:
+            client: Any = Client  # it has no annotations
+            self._client = client(**where, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise LinkError(
+                f"no Dask scheduler answers at {address}",
+                remedy="start one with `dask scheduler`, and give the address that it prints",
+            ) from error
+        self._executor = self._client.get_executor(pure=False)
+        self._capacity, self._read_s = 0, -_REFRESH_S
+
+    @override
+    def submit(
+        self, fn: Callable[Parameters, Result], /, *args: Parameters.args, **kwargs: Parameters.kwargs
+    ) -> Future[Result]:
+        future: Future[Result] = self._executor.submit(_run_same_version, __version__, fn, *args, **kwargs)
+        return future
+
+    @override
+    def capacity(self) -> int:
+        if time.monotonic() - self._read_s >= _REFRESH_S:
+            try:
+                self._capacity = sum(self._client.nthreads().values())
+            except (OSError, TimeoutError):  # futures report a lost connection
+                self._capacity = 0
+            self._read_s = time.monotonic()
+        return self._capacity
+
+    @override
+    def is_worker_death(self, error: BaseException) -> bool:
+        return isinstance(error, KilledWorker)
+
+    @override
+    def is_broken(self) -> bool:
+        return False  # the scheduler moves the tasks of a worker that died to another one
+
+    @override
+    def stop(self) -> None:
+        self._executor.shutdown(wait=False)
+        self._client.close(timeout=_CONNECT_S)
+
+
+def _run_same_version(
+    version: str, work: Callable[Parameters, Result], /, *args: Parameters.args, **kwargs: Parameters.kwargs
+) -> Result:
+    """Return the result of a task on a worker.
+
+    Raises:
+        ConfigurationError: The worker has another version of fieldkit.
+    """
+    if version != __version__:
+        raise ConfigurationError(
+            f"a worker has fieldkit {__version__}, and this machine has {version}",
+            remedy=f'install the same version on the workers: pip install "fieldkit[cluster]=={version}"',
+        )
+    return work(*args, **kwargs)

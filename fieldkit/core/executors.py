@@ -1,0 +1,48 @@
+"""Where many tasks run: processes of this machine, or the workers of a Dask cluster.
+
+Both are a `concurrent.futures.Executor`. `tasks` submits to it.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fieldkit.core.processes import WorkerExecutor
+
+
+@dataclass(frozen=True)
+class Workers:
+    """The choice of workers, as the options `--jobs` and `--cluster` give it.
+
+    Attributes:
+        jobs: Number of processes on this machine; None for the number of processors that this process may use.
+        cluster: Address of a Dask scheduler, or its scheduler file; empty for processes on this machine.
+    """
+
+    jobs: int | None = None
+    cluster: str = ""
+
+    @property
+    def is_default(self) -> bool:
+        """True if neither a number of processes nor a cluster was chosen."""
+        return self.jobs is None and not self.cluster
+
+    def processes(self, tasks: int) -> int:
+        """Return the number of processes on this machine for a number of tasks; 0 if a cluster runs them."""
+        return 0 if self.cluster else min(self.jobs or len(os.sched_getaffinity(0)), tasks)
+
+    def open(self, tasks: int) -> "WorkerExecutor":
+        """Return an executor for a number of tasks.
+
+        Raises:
+            ConfigurationError: The package for clusters is not installed.
+            LinkError: The scheduler of the cluster does not answer.
+        """
+        if self.cluster:
+            from fieldkit.core.cluster import ClusterExecutor  # noqa: PLC0415 (a second, and an optional package)
+
+            return ClusterExecutor(self.cluster)
+        from fieldkit.core.processes import LocalProcesses  # noqa: PLC0415 (with multiprocessing, 20 ms)
+
+        return LocalProcesses(self.processes(tasks))

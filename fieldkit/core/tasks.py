@@ -1,0 +1,162 @@
+"""Many tasks on an executor: a bounded number is submitted, results are returned as they complete.
+
+A task whose worker died is run again. If a process of this machine dies, all submitted tasks are lost, and it is
+unknown which of them is the cause; a task that was lost repeatedly is therefore run alone.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from dataclasses import dataclass
+from typing import Final, Generic, TypeVar
+
+from fieldkit.core.errors import FieldkitError, LinkError
+from fieldkit.core.executors import Workers
+from fieldkit.core.units import format_count
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+MAX_DEATHS: Final = 5
+"""Number of deaths of a worker after which a task has failed."""
+ALONE_AFTER: Final = 2
+"""Number of deaths after which a task is run alone."""
+
+_PER_WORKER: Final = 2
+"""Submitted tasks per worker: one that runs and one that waits, so that no worker is idle."""
+_MIN_SUBMITTED: Final = 4
+_POLL_S: Final = 1.0
+"""Interval in which the number of workers of a cluster is read."""
+
+
+class WorkerDiedError(FieldkitError):
+    """The worker of a task died each time."""
+
+
+@dataclass(frozen=True)
+class TaskEnd(Generic[Result]):
+    """The end of a task.
+
+    Attributes:
+        number: Index of the task.
+        result: Its result; None if it failed.
+        error: The exception that it raised, or a `WorkerDiedError`; None if it has a result.
+    """
+
+    number: int
+    result: Result | None = None
+    error: Exception | None = None
+
+
+def ignore(_: str) -> None:
+    """Show no notes."""
+
+
+def completed(
+    work: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    workers: Workers,
+    note: Callable[[str], None] = ignore,
+) -> Iterator[TaskEnd[Result]]:
+    """Yield the end of each task, in the order of completion. Closing the generator early stops all tasks.
+
+    Args:
+        work: Called in another process, unless there is only one process on this machine; it, the tasks and the
+            results must be picklable.
+        tasks: The tasks.
+        workers: Where they run.
+        note: Receives a sentence when a worker died or when no worker is connected.
+
+    Raises:
+        ConfigurationError: As for `Workers.open`.
+        LinkError: The scheduler of the cluster does not answer, or the connection was lost.
+    """
+    if tasks and workers.processes(len(tasks)) != 1:
+        yield from _Submission(work, tasks, workers, note).ends()
+        return
+    for number, task in enumerate(tasks):
+        try:
+            result = work(task)
+        except Exception as error:  # noqa: BLE001 (returned to the caller)
+            yield TaskEnd(number, error=error)
+        else:
+            yield TaskEnd(number, result)
+
+
+class _Submission(Generic[Task, Result]):
+    def __init__(
+        self, work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers, note: Callable[[str], None]
+    ) -> None:
+        self._work, self._tasks, self._workers, self._note = work, tasks, workers, note
+        self._waiting = deque(range(len(tasks)))
+        self._alone: deque[int] = deque()
+        self._deaths: Counter[int] = Counter()
+        self._submitted: dict[Future[Result], int] = {}
+        self._executor = workers.open(len(tasks))
+        self._is_without_worker = False
+        self._lost = 0
+
+    def ends(self) -> Iterator[TaskEnd[Result]]:
+        try:
+            while self._waiting or self._alone or self._submitted:
+                self._submit()
+                done, _ = wait(self._submitted, _POLL_S, FIRST_COMPLETED)
+                for future in done:
+                    if (end := self._end(future)) is not None:
+                        yield end
+                if self._executor.is_broken():
+                    if self._submitted:
+                        continue  # all futures of a broken executor end soon
+                    self._executor.stop()
+                    self._executor = self._workers.open(len(self._tasks))
+                if self._lost:
+                    self._note(f"a worker died; {format_count(self._lost, 'task')} will be run again")
+                    self._lost = 0
+        finally:
+            self._executor.stop()
+
+    def _submit(self) -> None:
+        """Submit tasks up to the limit; a task that is run alone waits for all others."""
+        capacity = self._executor.capacity()
+        if not capacity and not self._is_without_worker:
+            self._note(f"no worker is connected to {self._workers.cluster} yet; waiting for one")
+        self._is_without_worker = not capacity
+        limit = max(_PER_WORKER * capacity, _MIN_SUBMITTED)
+        while not self._executor.is_broken():
+            if self._alone:
+                if self._submitted:
+                    return
+                tasks = self._alone
+            else:
+                tasks = self._waiting
+            if not tasks or len(self._submitted) >= limit:
+                return
+            try:
+                future = self._executor.submit(self._work, self._tasks[tasks[0]])
+            except BrokenExecutor:
+                return
+            self._submitted[future] = tasks.popleft()
+            if tasks is self._alone:
+                return
+
+    def _end(self, future: Future[Result]) -> TaskEnd[Result] | None:
+        """Return the end of a task, or None if it is run again."""
+        number = self._submitted.pop(future)
+        try:
+            return TaskEnd(number, future.result())
+        except CancelledError:
+            raise LinkError(
+                f"the connection to the scheduler {self._workers.cluster} was lost",
+                remedy="start the scheduler and its workers, then run the same command again",
+            ) from None
+        except Exception as error:  # noqa: BLE001 (returned to the caller)
+            if not self._executor.is_worker_death(error):
+                return TaskEnd(number, error=error)
+        self._deaths[number] += 1
+        if self._deaths[number] >= MAX_DEATHS:
+            remedy = "if memory ran out, use fewer workers: --jobs 1"
+            what = f"its worker died {format_count(MAX_DEATHS, 'time')}"
+            return TaskEnd(number, error=WorkerDiedError(what, remedy=remedy))
+        (self._alone if self._deaths[number] >= ALONE_AFTER else self._waiting).appendleft(number)
+        self._lost += 1
+        return None

@@ -1,0 +1,1 @@
+"""Sweeps: a scenario with all combinations of settings and seeds."""

@@ -1,0 +1,195 @@
+"""Factors of a sweep: settings of a scenario, each with several values, and the scenarios of their combinations."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Final
+
+from fieldkit.config import schema
+from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.model import Topology
+from fieldkit.core.units import parse_distance, parse_duration_s
+from sim_backends.cosim.scenario.loading import load_scenario
+from sim_backends.cosim.scenario.schema import CosimScenario
+
+DISTANCE: Final = "distance"
+"""The factor that moves agents along the world's line."""
+
+_SHORT_NAMES: Final = {
+    "policy": "policy.name",
+    "window": "policy.window",
+    "physics": "physics.federate",
+    "network": "network.federate",
+}
+_NOT_SETTINGS: Final = frozenset({"name", "summary", "seeds"})
+_BETWEEN_VALUES: Final = re.compile(r",(?![^\[{]*[\]}])")
+"""A comma outside brackets."""
+_PLAIN_NUMBER: Final = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?")
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A setting with its values.
+
+    Attributes:
+        name: Its name in the command.
+        values: Its values as in the command, at least one.
+    """
+
+    name: str
+    values: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """The key in the scenario's file; that of `distance` depends on the scenario."""
+        return _SHORT_NAMES.get(self.name, self.name)
+
+    @property
+    def column(self) -> str:
+        """Name of the column with the values as in the command."""
+        return re.sub(r"[^a-z0-9_]", "_", self.name.lower())
+
+    @property
+    def numbers(self) -> tuple[str, str, tuple[float, ...]] | None:
+        """Name, unit and values of a column of numbers in SI units; None if a value is not a number.
+
+        The distance has none, because a table has the distance of each flow.
+        """
+        if self.name == DISTANCE:
+            return None
+        if all(_PLAIN_NUMBER.fullmatch(value) for value in self.values):
+            return f"{self.column}_value", "1", tuple(map(float, self.values))
+        for suffix, unit, parse in (
+            ("_s", "s", parse_duration_s),
+            ("_m", "m", lambda text: float(parse_distance(text).metres)),
+        ):
+            try:
+                return self.column + suffix, unit, tuple(map(parse, self.values))
+            except ConfigurationError:
+                continue
+        return None
+
+
+def parse_factors(words: Sequence[str]) -> tuple[Factor, ...]:
+    """Return the factors of `--over NAME=VALUE,...`.
+
+    Raises:
+        ConfigurationError: A word has another form, or a factor or a value is given twice.
+    """
+    factors: dict[str, Factor] = {}
+    for word in words:
+        name, separator, text = word.partition("=")
+        values = tuple(value.strip() for value in _BETWEEN_VALUES.split(text))
+        if not separator or not name or not all(values):
+            raise ConfigurationError(
+                f"--over: {word!r} is not NAME=VALUE,VALUE", remedy="write for example --over window=1ms,10ms"
+            )
+        factor = Factor(name, values)
+        if factor.column in factors:
+            raise ConfigurationError(f"--over: {name} is given twice", remedy="list all its values after one NAME=")
+        if len(set(values)) < len(values):
+            raise ConfigurationError(f"--over: {name} has a value twice", remedy="remove one of them")
+        factors[factor.column] = factor
+    return tuple(factors.values())
+
+
+def settings_of(
+    name_or_path: str, factors: Sequence[Factor], changes: Mapping[str, Any]
+) -> Iterator[tuple[tuple[str, ...], CosimScenario]]:
+    """Yield the values of each combination, in the order of the command, and its scenario.
+
+    Args:
+        name_or_path: As for `load_scenario`.
+        factors: The factors.
+        changes: Changes of all scenarios, as for `load_scenario`.
+
+    Raises:
+        ConfigurationError: There is no such factor, or a combination is invalid.
+    """
+    scenario = load_scenario(name_or_path, changes)
+    for factor in factors:
+        _require_setting(factor, scenario)
+    for values in product(*(factor.values for factor in factors)):
+        named = dict(zip((factor.name for factor in factors), values, strict=True))
+        changed = dict(changes) | {
+            _SHORT_NAMES.get(name, name): _parsed(name, value) for name, value in named.items() if name != DISTANCE
+        }
+        if DISTANCE in named:
+            placed = load_scenario(name_or_path, changed)
+            changed |= _placements(placed, parse_distance(named[DISTANCE]).metres)
+        yield values, load_scenario(name_or_path, changed)
+
+
+def _parsed(name: str, text: str) -> Any:  # noqa: ANN401 (any YAML value)
+    """Return a value as in the scenario's file."""
+    return schema.parse(f"value: {text}", source=f"--over {name}").data["value"]
+
+
+def _require_setting(factor: Factor, scenario: CosimScenario) -> None:
+    """Check that the keys above a setting exist; the schema checks the last one.
+
+    Raises:
+        ConfigurationError: They do not, and a mapping would be added to the scenario.
+    """
+    document = schema.parse(schema.dump(scenario), source="").data
+    names = [*_SHORT_NAMES, DISTANCE, *(key for key, _ in _leaves(document) if key not in _NOT_SETTINGS)]
+    *parents, last = factor.key.split(".")
+    parent: Any = document
+    try:
+        for key in parents:
+            parent = parent[int(key) if isinstance(parent, list) else key]
+    except (KeyError, IndexError, ValueError, TypeError):
+        parent = None
+    known = type(scenario).model_fields if not parents else parent
+    if (
+        factor.name in names
+        or (isinstance(parent, dict) and parents)
+        or (isinstance(known, list) and last.isdecimal())
+    ):
+        return
+    raise ConfigurationError(
+        f"--over: {scenario.name} has no setting {factor.name!r}",
+        remedy=did_you_mean(
+            factor.name,
+            names,
+            f"settings: {', '.join(name for name in names if '.' not in name)}; or a key of its file",
+        ),
+    )
+
+
+def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:  # noqa: ANN401 (any YAML value)
+    """Yield the keys of all values that are not mappings, and lists of mappings, with their values."""
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, item in items:
+        name = f"{prefix}{key}"
+        if isinstance(item, dict) or (isinstance(item, list) and item and isinstance(item[0], dict)):
+            yield from _leaves(item, f"{name}.")
+        else:
+            yield name, item
+
+
+def _placements(scenario: CosimScenario, distance_m: float) -> dict[str, str]:
+    """Return the changes that place the ends of the first flow at a distance; with a relay, its sender and the relay.
+
+    All agents on the world's line keep their relative positions, measured from the sender.
+
+    Raises:
+        ConfigurationError: The scenario does not place these agents on the world's line.
+    """
+    along_m = {name: plan.along for name, plan in scenario.agents.items() if plan.along is not None}
+    if scenario.traffic:
+        _, source, destination = next(iter(scenario.traffic[0].flow_ends))
+        is_relayed = scenario.topology is Topology.MASTER and scenario.relay not in {None, source, destination}
+        peer = scenario.relay if is_relayed and scenario.relay else destination
+        if source in along_m and peer in along_m and along_m[source] != along_m[peer]:
+            origin_m = along_m[source]
+            scale = distance_m / abs(along_m[peer] - origin_m)
+            return {
+                f"agents.{name}.along": f"{origin_m + (at_m - origin_m) * scale:.9f}m"
+                for name, at_m in along_m.items()
+            }
+    raise ConfigurationError(
+        f"--over: distance needs a first flow in {scenario.name} whose ends start at different `along` positions",
+        remedy="sweep positions instead: --over 'agents.NAME.at_m=[10,0],[20,0]'",
+    )

@@ -1,0 +1,125 @@
+"""The results of a sweep as a dataset of Parquet files, partitioned by its factors (Hive style).
+
+Equal results give equal bytes: rows are in the order of the plan, whatever the order in which the runs ended.
+"""
+
+import json
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
+from typing import Final
+from urllib.parse import quote
+
+import pyarrow as pa
+import pyarrow.parquet
+
+from fieldkit.core import files
+from fieldkit.core.columns import SCHEMA_VERSION, Kind, Value
+from sim_backends.cosim.commands.flow_rows import scenario_hashes
+from sim_backends.cosim.sweeps.factors import Factor
+from sim_backends.cosim.sweeps.sweep_folder import SweepFolder
+from sim_backends.cosim.sweeps.sweep_plan import SweepPlan, SweepSetting
+
+_ADDED: Final[Mapping[str, Mapping[str, str]]] = {
+    "flow": {"unit": "text", "meaning": "Stream of packets and its receiver."},
+    "added_delay_mean_s": {
+        "unit": "s",
+        "meaning": "Mean delay that the sync policy added to packets that arrived.",
+        "label": "added delay, mean",
+        "kind": Kind.MEAN,
+    },
+    "exchanges_per_s": {
+        "unit": "1/s",
+        "meaning": "Exchanges of physics and network per simulated second.",
+        "label": "exchanges per second",
+        "kind": Kind.MEAN,
+    },
+}
+"""Declarations of the columns that trials do not have."""
+
+
+def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
+    """Replace the dataset of a sweep by one with the results so far, and return the number of its rows.
+
+    Raises:
+        ConfigurationError: It cannot be written; an existing dataset is unchanged.
+        EvidenceError: The file of a run is damaged.
+    """
+    rows = {setting.digest: _rows_of(setting, plan, folder) for setting in plan.settings}
+    partitions = [factor.column for factor in plan.factors]
+    schema = _schema((row for setting_rows in rows.values() for row in setting_rows), plan.factors)
+    new, old = (folder.path / f".{folder.results.name}.{suffix}" for suffix in ("new", "old"))
+    with folder.explained():
+        for leftover in (new, old):
+            shutil.rmtree(leftover, ignore_errors=True)
+        for setting in plan.settings:
+            if rows[setting.digest]:
+                parts = [
+                    f"{column}={quote(value, safe='')}"
+                    for column, value in zip(partitions, setting.values.values(), strict=True)
+                ]
+                path = new.joinpath(*parts, "part-0.parquet")
+                path.parent.mkdir(parents=True)
+                table = pa.Table.from_pylist(rows[setting.digest], schema=schema)
+                pa.parquet.write_table(table, path, compression="zstd")
+        new.mkdir(exist_ok=True)
+        paths = sorted(new.rglob("*"))
+        files.sync([path for path in paths if path.is_file()])
+        for path in (new, *(path for path in paths if path.is_dir())):
+            files.sync_folder(path)
+        if folder.results.exists():
+            folder.results.rename(old)
+        new.rename(folder.results)
+        files.sync_folder(folder.path)
+        shutil.rmtree(old, ignore_errors=True)
+    return sum(map(len, rows.values()))
+
+
+def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> list[dict[str, Value]]:
+    numbers: dict[str, Value] = {}
+    for factor in plan.factors:
+        if (declared := factor.numbers) is not None:
+            name, _, values = declared
+            numbers[name] = values[factor.values.index(setting.values[factor.name])]
+    runs = (run for run in plan.runs if run.setting is setting)
+    hashes = scenario_hashes(plan.scenario)  # what a factor changes is not another procedure
+    return [numbers | dict(row) | hashes for run in runs for row in folder.rows(run)]
+
+
+def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> pa.Schema:
+    """Return the schema of all files; columns that are folders are not in it."""
+    types: dict[str, set[type]] = {}
+    for row in rows:
+        for name, value in row.items():
+            types.setdefault(name, set()).add(type(value))
+    declarations = dict(_ADDED)
+    by, partitions = [], {}
+    for factor in factors:
+        meaning = f"Value of the setting {factor.name}, as in the command."
+        partitions[factor.column] = meaning
+        if (declared := factor.numbers) is None:
+            by.append(factor.column)
+        else:
+            name, unit, _ = declared
+            declarations[name] = {"unit": unit, "meaning": meaning.replace("as in the command", "as a number")}
+            by.append(name)
+    fields = [
+        pa.field(name, _arrow_type(found), metadata=declarations.get(name))
+        for name, found in types.items()
+        if name not in partitions
+    ]
+    metadata = {
+        "fieldkit_version": version("fieldkit"),
+        "schema_version": str(SCHEMA_VERSION),
+        "partitions": json.dumps(partitions),
+        "by": json.dumps(["flow", *by]),
+    }
+    return pa.schema(fields, metadata=metadata)
+
+
+def _arrow_type(types: set[type]) -> pa.DataType:
+    if types == {bool}:
+        return pa.bool_()
+    if types == {int}:
+        return pa.int64()
+    return pa.float64() if types <= {int, float} else pa.string()

@@ -1,0 +1,185 @@
+"""The state of a sweep on disk: a file per finished run, a file per failed run, and what was planned.
+
+A file is written under a temporary name, synced and renamed, so that it is complete or does not exist.
+"""
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from fieldkit.core import files
+from fieldkit.core.columns import Value
+from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.laptop_files import SWEEP, SWEEP_RESULTS
+from sim_backends.cosim.sweeps.sweep_plan import SweepPlan, SweepRun
+
+Rows = Sequence[Mapping[str, Value]]
+
+_RUNS: Final = "runs"
+_FAILED: Final = "failed"
+_LOCK: Final = ".lock"
+
+
+@dataclass(frozen=True)
+class RunFailure:
+    """The last failure of a run.
+
+    Attributes:
+        attempts: Number of attempts so far.
+        reason: Why the last one failed.
+        remedy: What to do; may be empty.
+        exit_code: Exit code of the error.
+        rows: Columns of its flows until then.
+    """
+
+    attempts: int
+    reason: str
+    remedy: str
+    exit_code: int
+    rows: Rows = field(default_factory=tuple)
+
+
+class SweepFolder:
+    """The folder of a sweep.
+
+    Args:
+        path: The folder.
+        continue_command: The command that continues the sweep, for messages.
+
+    Attributes:
+        path: The folder.
+    """
+
+    def __init__(self, path: Path, continue_command: str) -> None:
+        self.path = path
+        self._continue_command = continue_command
+
+    @property
+    def results(self) -> Path:
+        """The folder of the dataset."""
+        return self.path / SWEEP_RESULTS
+
+    @contextmanager
+    def opened(self, plan: SweepPlan) -> Iterator[None]:
+        """Create the folder or open it again, and lock it during the body.
+
+        Raises:
+            ConfigurationError: It contains something else, another process runs the sweep, or it cannot be written.
+        """
+        with self._explained():
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._require_same(plan)
+            for folder in (_RUNS, _FAILED):
+                (self.path / folder).mkdir(exist_ok=True)
+            descriptor = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise ConfigurationError(
+                    "another process runs this sweep", where=str(self.path), remedy="wait for it, or stop it first"
+                ) from None
+            self._write(self.path / SWEEP, _description(plan))
+            yield
+        finally:
+            os.close(descriptor)
+
+    def _require_same(self, plan: SweepPlan) -> None:
+        path = self.path / SWEEP
+        if not path.exists():
+            if next(self.path.iterdir(), None) is not None:
+                raise ConfigurationError("this folder is not empty", where=str(self.path), remedy="choose another -o")
+            return
+        before, now = self._read(path), _description(plan)
+        for what in ("scenario", "factors"):
+            old, new = ([*item] if isinstance(item, dict) else item for item in (before.get(what), now[what]))
+            if old != new:
+                raise ConfigurationError(
+                    f"this is a sweep with other {what}: {old}", where=str(self.path), remedy="choose another -o"
+                )
+
+    def finished(self) -> set[str]:
+        """Return the names of the finished runs."""
+        return {path.stem for path in (self.path / _RUNS).glob("*.json")}
+
+    def rows(self, run: SweepRun) -> Rows:
+        """Return the columns of the flows of a run; empty if it is neither finished nor failed.
+
+        Raises:
+            EvidenceError: Its file is damaged.
+        """
+        path = self.path / _RUNS / f"{run.name}.json"
+        if path.exists():
+            rows: Rows = self._read(path)["rows"]
+            return rows
+        failure = self.failure(run)
+        return () if failure is None else failure.rows
+
+    def write_result(self, run: SweepRun, result: Mapping[str, Any]) -> None:
+        """Write the result of a run.
+
+        Raises:
+            ConfigurationError: It cannot be written.
+        """
+        self._write(self.path / _RUNS / f"{run.name}.json", _identity(run) | dict(result))
+        (self.path / _FAILED / f"{run.name}.json").unlink(missing_ok=True)
+
+    def failure(self, run: SweepRun) -> RunFailure | None:
+        """Return the last failure of a run; None if it did not fail."""
+        path = self.path / _FAILED / f"{run.name}.json"
+        if not path.exists():
+            return None
+        content = self._read(path)
+        return RunFailure(**{name: content[name] for name in RunFailure.__dataclass_fields__})
+
+    def write_failure(self, run: SweepRun, failure: RunFailure) -> None:
+        """Write the failure of a run; errors as for `write_result`."""
+        self._write(self.path / _FAILED / f"{run.name}.json", _identity(run) | vars(failure))
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Convert an `OSError` of the body to a `ConfigurationError`."""
+        try:
+            yield
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot be written: {error.strerror}",
+                where=str(error.filename or self.path),
+                remedy=f"all finished runs are saved; free some space, then continue: {self._continue_command}",
+            ) from error
+
+    def explained(self) -> Any:  # noqa: ANN401 (a context manager)
+        """Return a context manager that converts an `OSError` to a `ConfigurationError` with the way to continue."""
+        return self._explained()
+
+    def _write(self, path: Path, content: Mapping[str, Any]) -> None:
+        with self._explained():
+            files.write(path, json.dumps(content, indent=1).encode() + b"\n")
+
+    def _read(self, path: Path) -> dict[str, Any]:
+        try:
+            content = json.loads(path.read_bytes())
+        except (OSError, ValueError) as error:
+            raise EvidenceError(
+                f"cannot be read: {error}", where=str(path), remedy="delete it, and run again"
+            ) from error
+        return dict(content)
+
+
+def _identity(run: SweepRun) -> dict[str, Any]:
+    return {"fieldkit": version("fieldkit"), "settings": dict(run.setting.values), "seed": run.seed}
+
+
+def _description(plan: SweepPlan) -> dict[str, Any]:
+    return {
+        "fieldkit": version("fieldkit"),
+        "scenario": plan.scenario.name,
+        "factors": {factor.name: list(factor.values) for factor in plan.factors},
+        "seeds": list(plan.seeds),
+    }

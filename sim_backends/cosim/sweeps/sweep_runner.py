@@ -1,0 +1,187 @@
+"""Runs a sweep: submits the missing runs, writes each result when it arrives, tries failed runs again."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+from fieldkit.core.columns import Value
+from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
+from fieldkit.core.events import Note, Progress, Sink, SweepEnded, SweepPlanned, SweepRunEnded
+from fieldkit.core.executors import Workers
+from fieldkit.core.tasks import TaskEnd, completed
+from sim_backends.cosim.commands import settings
+from sim_backends.cosim.commands.execution import simulate
+from sim_backends.cosim.commands.flow_rows import flow_rows
+from sim_backends.cosim.commands.results import FlowResult, SeedResult
+from sim_backends.cosim.sweeps.factors import DISTANCE
+from sim_backends.cosim.sweeps.sweep_folder import RunFailure, SweepFolder
+from sim_backends.cosim.sweeps.sweep_plan import SweepPlan, SweepRun, digest
+
+ATTEMPTS: Final = 3
+"""Largest number of attempts at a run."""
+
+_IN_OTHER_COLUMNS: Final = frozenset({"policy", DISTANCE, "line", "topology"})
+"""Factors that the name of the procedure need not contain."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """The result of a run, as a worker returns it.
+
+    Attributes:
+        content: The content of its file.
+        error: The error that ended it early; None if it is complete.
+    """
+
+    content: Mapping[str, Any]
+    error: FieldkitError | None
+
+
+@dataclass(frozen=True)
+class SweepOutcome:
+    """The state of a sweep after it was run.
+
+    Attributes:
+        total: Number of runs.
+        finished: Number of finished runs.
+        failures: Runs without a result that have no attempt left, with their last failure, in the order of the plan.
+    """
+
+    total: int
+    finished: int
+    failures: Sequence[tuple[SweepRun, RunFailure]]
+
+
+def execute(run: SweepRun, *, verify: bool = False) -> RunResult:
+    """Return the result of a run.
+
+    Args:
+        run: The run.
+        verify: Whether to check that world and robot profiles are those of the process that planned the run.
+
+    Raises:
+        ConfigurationError: They are not.
+        FieldkitError: The run could not start.
+    """
+    scenario = run.setting.scenario
+    if verify and digest(scenario) != run.setting.digest:
+        raise ConfigurationError(
+            "the world or a robot profile of the scenario differs on a worker",
+            remedy="start the workers in a copy of this folder, with the same worlds/ and robots/",
+        )
+    result = simulate(scenario, scenario.policy.name, run.seed, None)
+    if result.is_interrupted:
+        raise KeyboardInterrupt
+    rows = flow_rows(f"{scenario.name}-{run.setting.digest[:8]}", scenario, _text(run), run.seed, result)
+    content = {
+        "simulated_s": result.simulated_s,
+        "event_hash": result.digest,
+        "wall_s": dict(result.wall_s),
+        "rows": [row | _more_columns(run, flow, result) for row, flow in zip(rows, result.flows, strict=True)],
+    }
+    return RunResult(content, result.error)
+
+
+def _text(run: SweepRun) -> str:
+    """Return the settings that the name of the procedure contains, so that conditions have different names."""
+    scenario = run.setting.scenario
+    text = settings.policy_text(scenario.policy.name, scenario)
+    omitted = _IN_OTHER_COLUMNS | ({"window"} if settings.has_window(scenario.policy.name) else set())
+    return ", ".join(
+        [text, *(f"{name} {value}" for name, value in run.setting.values.items() if name not in omitted)]
+    )
+
+
+def _more_columns(run: SweepRun, flow: FlowResult, result: SeedResult) -> dict[str, Value]:
+    """Return the columns that only sweeps have; a distance is written as in the command."""
+    columns: dict[str, Value] = {"flow": flow.name}
+    if DISTANCE in run.setting.values:
+        columns["distance"] = run.setting.values[DISTANCE]
+    if flow.arrived:
+        columns["added_delay_mean_s"] = flow.added_s
+    if result.simulated_s:
+        columns["exchanges_per_s"] = result.windows / result.simulated_s
+    return columns
+
+
+def run_sweep(
+    plan: SweepPlan, folder: SweepFolder, workers: Workers, *, sink: Sink, again: bool = False
+) -> SweepOutcome:
+    """Run all runs without a result, and return the state afterwards.
+
+    Args:
+        plan: The plan.
+        folder: Its opened folder.
+        workers: Where the runs are executed.
+        sink: Receives events.
+        again: Whether failed runs without an attempt left are tried again.
+
+    Raises:
+        ConfigurationError: A result cannot be written; the message has the command that continues.
+        LinkError: The scheduler of the cluster does not answer.
+    """
+    finished = folder.finished()
+    missing = [run for run in plan.runs if run.name not in finished]
+    attempts = {
+        run.name: 0 if again or (failure := folder.failure(run)) is None else failure.attempts for run in missing
+    }
+    done = len(plan.runs) - len(missing)
+    sink(SweepPlanned(str(folder.path), done, len(plan.runs), len(plan.settings), len(plan.seeds)))
+    report = _Reporter(sink, done, len(plan.runs))
+    work = partial(execute, verify=bool(workers.cluster))
+    while tasks := [run for run in missing if attempts[run.name] < ATTEMPTS and run.name not in finished]:
+        for end in completed(work, tasks, workers, lambda text: sink(Note(text))):
+            run = tasks[end.number]
+            attempts[run.name] += 1
+            failure = _failure(end, attempts[run.name])
+            if failure is None and end.result is not None:
+                folder.write_result(run, end.result.content)
+                finished.add(run.name)
+            elif failure is not None:
+                folder.write_failure(run, failure)
+            report.ended(run, failure)
+    failures = [(run, failure) for run in missing if run.name not in finished and (failure := folder.failure(run))]
+    sink(SweepEnded(str(folder.path), len(finished & attempts.keys()) + done, len(failures), len(plan.runs)))
+    return SweepOutcome(len(plan.runs), len(plan.runs) - len(failures), failures)
+
+
+def _failure(end: TaskEnd[RunResult], attempts: int) -> RunFailure | None:
+    """Return the failure of a run; None if it is complete."""
+    error: Exception | None = end.error if end.result is None else end.result.error
+    if error is None:
+        return None
+    rows = () if end.result is None else end.result.content["rows"]
+    if isinstance(error, FieldkitError):
+        return RunFailure(attempts, error.located, error.remedy, error.exit_code, rows)
+    return RunFailure(attempts, describe_exception(error), "", FieldkitError.exit_code, rows)
+
+
+class _Reporter:
+    """Reports the end of each run and the remaining time."""
+
+    def __init__(self, sink: Sink, done: int, total: int) -> None:
+        self._sink, self._done, self._total, self._done_before = sink, done, total, done
+        self._started_s = time.monotonic()
+        sink(Progress("sweep", done, total, "runs"))
+
+    def ended(self, run: SweepRun, failure: RunFailure | None) -> None:
+        self._done += failure is None
+        spent_s, new = time.monotonic() - self._started_s, self._done - self._done_before
+        left_s = spent_s / new * (self._total - self._done) if new else None
+        if failure is None:
+            self._sink(SweepRunEnded(str(run.setting), run.seed, run.name, "", "", 1, self._done, self._total))
+        else:
+            event = SweepRunEnded(
+                str(run.setting),
+                run.seed,
+                run.name,
+                failure.reason,
+                failure.remedy,
+                failure.attempts,
+                self._done,
+                self._total,
+            )
+            self._sink(event)
+        self._sink(Progress("sweep", self._done, self._total, "runs", left_s))
