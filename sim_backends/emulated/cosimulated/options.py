@@ -17,10 +17,15 @@ from sim_backends.federates.named import PythonFederate, command_line, named
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
 from sim_backends.physics.robot_limits import BODIES
 
+_EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "window": "2ms"})
+"""Default for a network in another process: an exchange at each of its events would take too long for real time.
+ns-3 has about 14 events per packet, and an exchange takes 0.2 ms."""
+
 
 def sync_of(options: EmulatedOptions) -> SyncOptions:
     """Return the sync policy of a lab."""
-    return options.sync or SyncOptions.defaults()
+    default = SyncOptions.defaults() if options.network in {None, BUILTIN} else _EXTERNAL_NETWORK
+    return options.sync or default
 
 
 def resolve(options: EmulatedOptions) -> Simulators:

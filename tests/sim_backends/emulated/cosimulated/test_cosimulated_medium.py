@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.errors import RobotError
+from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.spec import ANTENNA_M
+from sim_backends.federates.frames import NETWORK
+from sim_backends.federates.named import command_line
 from sim_backends.world.world import load_world
 from tests.helpers.cosim_benches import BODY, PLACES, cosim_bench, distance_m
 
@@ -29,6 +31,19 @@ def test_pings_cross_the_network_with_every_policy(policy: str, tmp_path: Path) 
         assert stats.links["a", "b"].delivered == 20
         assert sum(stats.late.values()) == 40
         assert sum(stats.late_windows.values()) > 2
+
+
+def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
+    try:
+        network = command_line("ns3", NETWORK)
+    except ConfigurationError as error:
+        pytest.skip(error.what)
+    with cosim_bench(tmp_path, network=network) as bench:
+        assert len(bench.ping()) == 20
+        bench.ping("-b", count=3, address="10.9.0.255")
+        stats = bench.medium.stats()
+        assert stats.ports["b"].written == 23
+        assert stats.ports["a"].written == 20
 
 
 def test_the_delay_of_the_network_and_of_the_policy_are_separate(tmp_path: Path) -> None:
