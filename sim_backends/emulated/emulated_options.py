@@ -154,9 +154,9 @@ class EmulatedOptions(Strict):
             `gazebo`. If only `network` is given, `kinematic`. Drones fly in `kinematic` only; elsewhere they have no
             autopilot.
         network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
-        sync: The sync policy between both: its name, or name and parameters. The default is `event_driven`, which adds
-            no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an exchange at every event of
-            ns-3 takes too long for real time.
+        sync: The sync policy between both: its name, or name and parameters. The default is `event_driven`, which
+            adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an exchange at every event
+            of ns-3 takes too long for real time.
     """
 
     ros: RosChoice = RosChoice.AUTO
