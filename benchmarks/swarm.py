@@ -116,7 +116,9 @@ def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
     """Return the lateness of the medium's packets since the counts `before`."""
     late = Lateness(bound_ns=1, packets=Counter(medium.stats().late) - before)
     shares = {"median": 0.5, "p99": 0.99, "max": 1.0}
-    return {f"late_{word}_ms": (lateness_quantile_ns(late, share) or 0) / 1e6 for word, share in shares.items()}
+    return {
+        f"late_{word}_ms": (lateness_quantile_ns(late.packets, share) or 0) / 1e6 for word, share in shares.items()
+    }
 
 
 def throughput(near: Namespace, far: Namespace, seconds: float) -> Figures:

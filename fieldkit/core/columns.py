@@ -17,7 +17,7 @@ from typing import Final, Self
 from fieldkit.core.model import FaultKind
 from fieldkit.core.text import escape_formula, one_line
 
-SCHEMA_VERSION: Final = 6
+SCHEMA_VERSION: Final = 7
 """Version of the columns of trial.csv that fieldkit itself declares."""
 
 Value = int | float | bool | str

@@ -316,6 +316,8 @@ class DelayParts:
         transmission_ns: Transmission time of the bits at the rate of the link.
         propagation_ns: Propagation time on the medium.
         queuing_ns: Time for which they waited for earlier packets.
+        undivided_ns: Delay of which the network does not report the components.
+        policy_ns: Time added by the sync policy of a co-simulation, not part of the delay; None without one.
     """
 
     packets: int
@@ -323,6 +325,8 @@ class DelayParts:
     transmission_ns: int
     propagation_ns: int
     queuing_ns: int
+    undivided_ns: int = 0
+    policy_ns: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,10 +336,13 @@ class Lateness:
     Attributes:
         bound_ns: Maximum lateness. If any packet is later, the emulation did not follow the model.
         packets: Number of packets by lateness in ns (a histogram); a lateness is rounded up by at most an eighth.
+        windows: Number of windows of a co-simulation by lateness in ns, the time by which their results were later
+            than their end in real time; None without a co-simulation.
     """
 
     bound_ns: int
     packets: Mapping[int, int]
+    windows: Mapping[int, int] | None = None
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ IDENTITY: Final = columns.columns(
 OTHERS: Final = Column("others", "text", "Robots in further roles of the procedure: ROLE=ROBOT, separated by spaces.")
 """The column is present only if a procedure has such roles."""
 
-ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS)
+ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS, *oracle_delays.WINDOW_COLUMNS)
 """Columns that are measured with any steps."""
 
 _KINDS_WITH_COLUMNS: Final = ("capture", "transfer", "ping")

@@ -55,9 +55,8 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     step_errors = StepErrors()
     # The robots' states are judged first, because their problems cause many of the others.
     problems = list(hosts.problems(plan.procedure, scene, evidence, step_errors))
-    measured = oracle_delays.measure_lateness(
-        evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
-    )
+    lateness = evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
+    measured = oracle_delays.measure_lateness(lateness) | oracle_delays.measure_window_lateness(lateness)
     for role in link.ROLES:
         measured |= link.measure(role, evidence.links(role))
     placement_problem = _placement_problem(scene, evidence)

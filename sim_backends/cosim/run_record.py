@@ -114,9 +114,12 @@ class EventDigest:
             else:
                 events += _EVENT.pack(b"a", fate.packet.packet_id, fate.arrived_ns)
         self.quiet_ends_ns.append(end_ns)
-        if len(events) > _HASHED_BYTES:
-            self._hash.update(events)
-            events.clear()
+        self._hash_full_block()
+
+    def _hash_full_block(self) -> None:
+        if len(self._events) > _HASHED_BYTES:
+            self._hash.update(self._events)
+            self._events.clear()
 
     def _add_quiet_windows(self) -> None:
         """Append the ends of the windows without packets to the events."""
@@ -135,6 +138,7 @@ class EventDigest:
     def hexdigest(self) -> str:
         """Return the hash over all windows so far, in hexadecimal."""
         self._add_quiet_windows()
+        self._hash_full_block()
         complete = self._hash.copy()
         complete.update(self._events)
         return complete.hexdigest()

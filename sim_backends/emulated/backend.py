@@ -120,7 +120,7 @@ class EmulatedBackend:
             and drives_by_topic(robot.profile, self._options)
             and drive.topic_conflict(robot, cast.values()) is None
         )
-        is_flown = mavlink_of(robot.profile) is not None
+        is_flown = mavlink_of(robot.profile) is not None and self._options.has_autopilots
         return frozenset({DRIVE} if is_driven else ()) | frozenset({MAVLINK} if is_flown else ())
 
     @contextmanager

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
-from fieldkit.config.schema import Bool, Document, Duration, Field, Strict
+from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Strict
 from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
 from sim_backends.radio.radio_options import RadioOptions
 
@@ -95,6 +95,40 @@ class Ros2Options(Strict):
         return self
 
 
+class SyncOptions(Strict):
+    """The [sync policy](method-cosim.md#synchronization-methods) of a lab on the co-simulation.
+
+    Attributes:
+        name: Its name. `event_driven` adds no delay to a packet.
+        window: Length of a window, or the w of the velocity-aware policies.
+        longest: Longest window of policies with variable windows.
+        bound: Largest error of the network's relative position of two robots, for `error_bounded`.
+        step: Time step of the physics.
+    """
+
+    name: str = "event_driven"
+    window: Annotated[Duration, Field(gt=0)] = 0.001
+    longest: Annotated[Duration, Field(gt=0)] = 0.1
+    bound: Annotated[Length, Field(gt=0)] = 0.01
+    step: Annotated[Duration, Field(ge=1e-6, le=0.1)] = 0.001
+
+    @schema.model_validator(mode="before")
+    @classmethod
+    def _named(cls, value: object) -> object:
+        """Accept the name alone."""
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def policy(self) -> dict[str, str | float]:
+        """Name and parameters of the policy, as `make_policy` accepts them."""
+        return {"name": self.name, "window_s": self.window, "longest_s": self.longest, "bound_m": self.bound}
+
+    @property
+    def step_ns(self) -> int:
+        """Time step of the physics in nanoseconds."""
+        return round(self.step * 1e9)
+
+
 class EmulatedOptions(Strict):
     """Options of the emulated backend.
 
@@ -116,6 +150,13 @@ class EmulatedOptions(Strict):
             fixed links have none.
         boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
+        physics: The robots move [on the co-simulation](lab-cosim.md), by this physics: `kinematic`, `mujoco` or
+            `gazebo`. If only `network` is given, `kinematic`. Drones fly in `kinematic` only; elsewhere they have no
+            autopilot.
+        network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
+        sync: The sync policy between both: its name, or name and parameters. The default is `event_driven`, which
+            adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an exchange at every event
+            of ns-3 takes too long for real time.
     """
 
     ros: RosChoice = RosChoice.AUTO
@@ -127,6 +168,27 @@ class EmulatedOptions(Strict):
     record_air: Bool = False
     boot: Annotated[Duration, Field(ge=0)] = BOOT_S
     mesh: MeshOptions | None = None
+    physics: Literal["kinematic", "mujoco", "gazebo"] | None = None
+    network: Literal["builtin", "ns3"] | None = None
+    sync: SyncOptions | None = None
+
+    @property
+    def is_cosimulated(self) -> bool:
+        """True if the robots run on the co-simulation."""
+        return self.physics is not None or self.network is not None
+
+    @property
+    def has_autopilots(self) -> bool:
+        """True if drones have an autopilot: it flies the quadrotor of the kinematic physics, and of no other."""
+        return self.physics in {None, "kinematic"}
+
+    @schema.model_validator(mode="after")
+    def _check_sync(self) -> "EmulatedOptions":
+        if self.sync is not None and not self.is_cosimulated:
+            raise schema.validation_error(
+                "`sync` needs a co-simulation; write for example `physics: kinematic`", "sync"
+            )
+        return self
 
 
 def load_options(document: Document | None) -> EmulatedOptions:

@@ -13,6 +13,7 @@ import numpy as np
 from fieldkit.backends.registry import profiles_of
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site
+from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import LabLink, Login, Outline, Overview
 from fieldkit.lab.robots import Destination, LabRobot
@@ -52,10 +53,10 @@ class EmulatedLab:
         self._states: dict[str, State] = {}
         # A separate thread follows robots that steer themselves.
         self._lock = threading.RLock()
+        for name in members:
+            self._assign_place(name, self._places_m[name])
         up.medium.place(self._places_m)
         up.places.write(self._places_m)
-        for name in members:
-            self._assign_place(name)
         self.members = members
         self.login = Login(USER, up.private_key, up.host_keys)
 
@@ -77,16 +78,21 @@ class EmulatedLab:
         with self._lock:
             place_m = placement.moved_m(self._places_m[name], to, self._world)
             places_m = self._places_m | {name: place_m}
-            self._running.medium.place(places_m)
+            # As in a trial, the robot is updated before the medium, whose physics refuses a place in an obstacle.
+            self._assign_place(name, place_m)
+            try:
+                self._running.medium.place(places_m)
+            except RobotError:
+                self._assign_place(name, self._places_m[name])
+                raise
             self._running.places.write(places_m)
             self._places_m = places_m
-            self._assign_place(name)
             return place_m
 
-    def _assign_place(self, name: str) -> None:
+    def _assign_place(self, name: str, place_m: Vector) -> None:
         """Send a robot its new place; it faces east there."""
         self._path_starts_ns[name] = start_ns = time.monotonic_ns()
-        self._running.robots[name].move(AssignedPath(start_ns, [self._places_m[name]], speed_m_s=1.0, facing_rad=0.0))
+        self._running.robots[name].move(AssignedPath(start_ns, [place_m], speed_m_s=1.0, facing_rad=0.0))
 
     def watching(self) -> AbstractContextManager[object]:
         """Return a context that keeps the medium up to date with robots that steer themselves."""

@@ -2,7 +2,7 @@
 
 import os
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, field
@@ -16,7 +16,7 @@ from fieldkit.core.errors import LinkError, RobotError, TestbedLostError
 from fieldkit.lab.robots import LabRobot
 from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
-from sim_backends.emulated.medium.framing import ETHERNET, IP
+from sim_backends.emulated.medium.framing import ETHERNET, IP, Framing
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
@@ -142,6 +142,11 @@ class EmulatedRobot(Node):
         places_fd: Descriptor of the memory with the places of all robots (`laser.PlacesWriter`), which must stay
             open until `build` has returned; None for a robot without neighbours.
 
+    Attributes:
+        spec: Specification of the robot.
+        physics_fds: Descriptors for a physics that moves it, after `build`: the record of its motion, the file of its
+            assigned paths, and the record of its commanded velocity; empty if no such physics moves it.
+
     Raises:
         ConfigurationError: As `Node`.
     """
@@ -151,12 +156,14 @@ class EmulatedRobot(Node):
         self.spec = spec
         self._places_fd = places_fd
         self._record: SteeredRecord | None = None
+        self.physics_fds: Sequence[int] = ()
 
     def build(self) -> None:
         """Give the robot its host name and its file system. Errors as `open_radio`."""
         shared = () if self._places_fd is None else (self._places_fd,)
-        _, (fd,) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
+        _, (fd, *others) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
         self._record = SteeredRecord(fd)
+        self.physics_fds = (fd, *others) if others else ()
 
     def steered(self) -> Steered | None:
         """Return the motion that the robot recorded last, or None if it never steered itself. Sends no request."""
@@ -196,6 +203,9 @@ class EmulatedRobot(Node):
         if self._record is not None:
             self._record.close()
             self._record = None
+        for fd in self.physics_fds[1:]:  # the first is that of the record
+            os.close(fd)
+        self.physics_fds = ()
 
     def connect(self, timeout_s: float) -> socket.socket:
         """Return a TCP connection to the robot's SSH server over its loopback, which bypasses the radio.
@@ -268,7 +278,10 @@ def running_robots(
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
     with ExitStack() as stack:
         framing = IP if options.mesh is None else ETHERNET
-        medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
+        if options.is_cosimulated:
+            medium: MediumClient = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
+        else:
+            medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
         places = stack.enter_context(closing(PlacesWriter([robot.name for robot in robots.values()])))
         # The pool is left after the robots: a request that waits for a robot fails only when the robot exits.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _MAX_PARALLEL_STARTS)))
@@ -284,7 +297,8 @@ def running_robots(
             EmulatedRobot.start, sorted(running.values(), key=lambda robot: not robot.spec.runs_master)
         )
         for key, robot in running.items():
-            medium.attach(robot.name, robot.address, robots[key].profile.radio, robot.radio_fd)
+            radio = robots[key].profile.radio
+            medium.attach(robot.name, robot.address, radio, robot.radio_fd, physics_fds=robot.physics_fds)
         if any(robot.spec.waits_for_another for robot in running.values()):
             medium.place(placement.side_by_side_m(robot.name for robot in running.values()))
         list(started)
@@ -293,6 +307,20 @@ def running_robots(
         )
         for robot in running.values():
             robot.request_exit()
+
+
+def _cosimulated(
+    options: EmulatedOptions, world: World, robots: Mapping[RobotKey, Robot | LabRobot], seed: int, framing: Framing
+) -> MediumClient:
+    from sim_backends.emulated.cosimulated import options as cosimulation  # noqa: PLC0415 (other labs import no simulator)
+    from sim_backends.emulated.cosimulated.client import CosimulatedClient  # noqa: PLC0415 (as above)
+
+    simulators = cosimulation.resolve(options)
+    policy = cosimulation.sync_of(options).policy
+    bodies = cosimulation.bodies_of(robots.values())
+    return CosimulatedClient(
+        options.radio, world, seed=seed, framing=framing, bodies=bodies, simulators=simulators, policy=policy
+    )
 
 
 def _build(robot: EmulatedRobot) -> None:

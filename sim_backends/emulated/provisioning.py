@@ -187,11 +187,12 @@ def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
     return ros.middleware if find_spec(package) else ""
 
 
-def _base(profile: RobotProfile) -> Base | None:
+def _base(profile: RobotProfile, *, simulated: bool) -> Base | None:
     drive = drive_of(profile)
     if drive is None:
         return None
-    return Base(drive.topic, profile.limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s)
+    limits = profile.limits
+    return Base(drive.topic, limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s, simulated)
 
 
 def _ros2_spec(
@@ -249,7 +250,7 @@ def robot_spec(
     is_ros2 = profile_ros is not None and profile_ros.variant == "ros2"
     ros2_over_radio = _ros2_spec(robots, robot, options)
     has_debian_ros1 = ros is RosChoice.DEBIAN and profile_ros is not None and not is_ros2
-    mavlink, limits = mavlink_of(robot.profile), robot.profile.limits
+    mavlink, limits = mavlink_of(robot.profile) if options.has_autopilots else None, robot.profile.limits
     has_laser = any(topic.type == LASER_SCAN for topic in _topics(robot))
     return RobotSpec(
         name=robot.name,
@@ -278,7 +279,9 @@ def robot_spec(
         autopilot=mavlink.autopilot if mavlink else "px4",
         system=mavlink.system if mavlink else 1,
         boot_s=float(mavlink.boot_s) if mavlink else 0.0,
-        base=_base(robot.profile) if has_debian_ros1 or ros2_over_radio is not None else None,
+        base=_base(robot.profile, simulated=options.is_cosimulated)
+        if has_debian_ros1 or ros2_over_radio is not None
+        else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=ros2_over_radio,
         bridge=_bridge(robot),

@@ -55,6 +55,7 @@ class EmulatedOracle:
         self._mobility = mobility
         self._late_bound_s = options.late_bound
         self._records_air = options.record_air
+        self._has_windows = options.is_cosimulated
 
     def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
         """Implement `Oracle.track` from the places that the medium received."""
@@ -66,7 +67,9 @@ class EmulatedOracle:
 
     def lateness(self) -> Lateness:
         """Implement `Oracle.lateness`."""
-        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self._medium.stats().late)
+        stats = self._medium.stats()
+        windows = stats.late_windows if self._has_windows else None
+        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=stats.late, windows=windows)
 
     def links(self, *, continue_sampling: bool) -> dict[Role, list[LinkSample]]:
         """Implement `Oracle.links`."""

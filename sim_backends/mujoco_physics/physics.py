@@ -5,12 +5,14 @@ import json
 import math
 import re
 from collections.abc import Iterator, KeysView, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import mujoco
 from typing_extensions import override
 
 from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.model import Vector
 from sim_backends.federates.answering import FederateService
 from sim_backends.federates.handshake import AgentStart, Hello
 from sim_backends.federates.protocols import FederateError, seconds_text
@@ -109,6 +111,7 @@ class MujocoPhysics:
         world = World.model_validate(configuration["world"]) if "world" in configuration else None
         bodies = configuration.get("robots", {})
         limits = [_limits(agent, bodies.get(agent.name, {}).get("body")) for agent in hello.agents]
+        self._agents, self._limits, self._world = hello.agents, limits, world
         robots = [_model(agent, limit, world) for agent, limit in zip(hello.agents, limits, strict=True)]
         text = model_xml(robots, world, hello.step_ns / self._substeps / 1e9)
         self.model = mujoco.MjModel.from_xml_string(text)
@@ -158,14 +161,19 @@ class MujocoPhysics:
 
     def _place(self, row: int, *, parked: bool) -> None:
         """Place an agent at its start, or far away on flat ground, at rest."""
+        first = int(self.model.jnt_qposadr[self.model.body(f"a{row}").jntadr[0]])
+        pose = self.model.qpos0[first : first + 7].copy()
+        if parked:
+            pose[:3] = (_PARKED_M + _PARKED_APART_M * row, _PARKED_M, _PARKED_UP_M)
+        self._set_pose(row, pose)
+
+    def _set_pose(self, row: int, pose: Sequence[float]) -> None:
+        """Set position and quaternion of an agent, which is at rest then."""
         model, data = self.model, self.data
         body = model.body(f"a{row}")
         first = int(model.jnt_qposadr[body.jntadr[0]])
-        pose = model.qpos0[first : first + 7].copy()
-        if parked:
-            pose[:3] = (_PARKED_M + _PARKED_APART_M * row, _PARKED_M, _PARKED_UP_M)
         data.qpos[first : first + 7] = pose
-        data.qvel[model.body_rootid[model.dof_bodyid] == body.id] = 0
+        data.qvel[model.body_rootid[model.dof_bodyid] == body.id] = 0.0
 
     def _change_presence(self) -> None:
         """Place the agents that appear at the present step, and park those that disappear."""
@@ -180,6 +188,30 @@ class MujocoPhysics:
             self._active.add(row)
             self._due.add(row)
         mujoco.mj_step1(self.model, self.data)
+
+    def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
+        """Put an agent at a place, at rest and without a command; it may overlap something.
+
+        Args:
+            name: The agent.
+            place_m: Position of its lowest point, metres east, north, up.
+            heading_rad: Its heading, from east towards north.
+        """
+        row, model, data = self._rows[name], self.model, self.data
+        agent = self._agents[row]
+        e, n, u = place_m
+        start = State((e, n, u + agent.antenna_m), heading_rad=heading_rad)
+        robot = _model(replace(agent, start=start), self._limits[row], self._world)
+        self._set_pose(row, (*robot.place_m, *robot.quaternion))
+        self._pending.pop(name, None)
+        self._controllers[row] = self._controller(row, robot, self._limits[row])
+        if isinstance(robot.body, Chassis):
+            motor = model.actuator(f"a{row}l0").id
+            data.ctrl[motor : motor + 2 * len(robot.body.wheels.axles_m)] = 0.0
+        self._active.add(row)
+        self._due.add(row)
+        mujoco.mj_step1(model, data)
+        self._states = SensedStates(self._rows, self._sensors.tolist())
 
     def run_controllers(self) -> None:
         """Let the controllers that are due at the present step set their motors."""

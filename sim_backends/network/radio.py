@@ -13,9 +13,9 @@ from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, Node
 from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.network.udp import Udp
-from sim_backends.network.wire import IpPacket, Transport, Wire
+from sim_backends.network.wire import CountsMisses, IpPacket, Transport, Wire
 from sim_backends.radio.channel import Emitter
-from sim_backends.radio.links import RADIO_OFF
+from sim_backends.radio.links import RADIO_OFF, Delay
 from sim_backends.radio.model import RadioModel
 from sim_backends.world.motion import STILL, DeadReckoned, State
 
@@ -23,6 +23,9 @@ TransportFactory = Callable[[Wire], Transport]
 
 IpLog = Callable[[int, str, Fragment], None]
 """Called with the time, the host, and the packet or fragment that the host sent or received."""
+
+DelayLog = Callable[[str, Fragment, Delay], None]
+"""Called with the receiver, the packet or fragment, and its delay."""
 
 UDP_ONLY: Final[Mapping[str, TransportFactory]] = MappingProxyType({"udp": Udp})
 
@@ -39,7 +42,8 @@ class RadioNetwork:
     positions, or move in steps if the coordinator passes dead-reckoned states. The position error is therefore
     decided by the policy alone. A station without a state is absent: its radio is off.
 
-    `Transport.lost` is called for packets with a single destination only, because each host may miss a broadcast.
+    `Transport.lost` is called for packets with a single destination only, because each host may miss a broadcast
+    (`CountsMisses`).
 
     Args:
         radio: The radio model.
@@ -90,20 +94,28 @@ class RadioNetwork:
         self._timers_set = 0
         self._ip_ids = dict.fromkeys(names, 0)
         self._log_ip: IpLog | None = None
+        self._log_delay: DelayLog | None = None
         self._reassembly = ip.Reassembly(self._on_packet_lost)
         self._pending: dict[int, Packet] = {}
         self._arrivals: list[Arrival] = []
         self._drops: list[Drop] = []
         self._transports = {name: make(self) for name, make in transports.items()}
+        self._counting_misses = {
+            name: transport for name, transport in self._transports.items() if isinstance(transport, CountsMisses)
+        }
         radio.log_losses(self._lose)
 
     def log_ip(self, log: IpLog | None) -> None:
         """Pass every IP packet that a host sends or receives from now on to `log`; None stops logging."""
         self._log_ip = log
 
+    def log_delays(self, log: DelayLog | None) -> None:
+        """Pass the delay of every packet or fragment that arrives from now on to `log`; None stops it."""
+        self._log_delay = log
+
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a copy, without the log: events in a copy are not logged."""
-        return self.__dict__ | {"_log_ip": None}
+        """Return the state for a copy, without the logs: events in a copy are not logged."""
+        return self.__dict__ | {"_log_ip": None, "_log_delay": None}
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
@@ -224,7 +236,9 @@ class RadioNetwork:
     def _collect(self) -> None:
         """Pass the packets that the radio delivers now to their hosts, until no immediate consequence is left."""
         while arrived := self._radio.deliveries(self.now_ns):
-            for _, host, fragment, _, _ in arrived:
+            for _, host, fragment, _, delay in arrived:
+                if self._log_delay is not None:
+                    self._log_delay(host, fragment, delay)
                 self._receive(host, fragment)
 
     def _receive(self, host: str, fragment: Fragment) -> None:
@@ -242,6 +256,8 @@ class RadioNetwork:
     def _on_packet_lost(self, packet: IpPacket, host: str, reason: str) -> None:
         if packet.destination == host:
             self._transports[packet.transport].lost(packet, reason)
+        elif packet.destination is None and packet.transport in self._counting_misses:
+            self._counting_misses[packet.transport].missed(packet, host, reason)
 
     def _off_now(self) -> set[str]:
         """Return the stations whose radios are off now."""

@@ -8,7 +8,7 @@ Calls of a wire cannot be cancelled; `WireTimer` can be rescheduled and stopped.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from sim_backends.network.packets import Packet
 from sim_backends.radio.random_streams import PacketIdentity
@@ -80,6 +80,15 @@ class Transport(Protocol):
 
         The ends of a real connection do not have this information, so it must not change their behaviour.
         """
+        ...
+
+
+@runtime_checkable
+class CountsMisses(Transport, Protocol):
+    """A transport that also records which hosts miss a broadcast."""
+
+    def missed(self, packet: IpPacket, host: str, reason: str) -> None:
+        """Record, as by `lost`, that a packet without a single destination will not arrive at a host."""
         ...
 
 

@@ -62,6 +62,23 @@ class IdTag : public NumberTag
     }
 };
 
+// The number of a broadcast, on the one IP packet that it has.
+class BroadcastTag : public NumberTag
+{
+  public:
+    static TypeId GetTypeId()
+    {
+        static TypeId type =
+            TypeId("fieldkit::BroadcastTag").SetParent<Tag>().AddConstructor<BroadcastTag>();
+        return type;
+    }
+
+    TypeId GetInstanceTypeId() const override
+    {
+        return GetTypeId();
+    }
+};
+
 // The number of a frame on one hop.
 class FrameTag : public NumberTag
 {

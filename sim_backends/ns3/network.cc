@@ -17,7 +17,11 @@ namespace fieldkit
 {
 
 // Headers of RTPS in the datagram of a sample: of the message, its time stamp and its data.
-constexpr uint64_t kRtpsHeaderBytes = 20 + 12 + 24;
+constexpr int64_t kRtpsHeaderBytes = 20 + 12 + 24;
+
+// Transports of bare IP packets, which have their own headers in their size.
+constexpr const char* kIp = "ip";
+constexpr const char* kIpBroadcast = "ip-broadcast";
 
 // Time before 0 in which stations scan, and associate with their access point.
 constexpr int64_t kAssociationNs = 1'000'000'000;
@@ -57,7 +61,7 @@ class Network
         welcome.configuration_hash = hello.configuration_hash;
         welcome.name = "ns-3";
         welcome.software = "ns-3 " + m_version;
-        welcome.transports = {"udp", "tcp"};
+        welcome.transports = {"udp", "tcp", kIp, kIpBroadcast};
         if (m_carriesTopics)
         {
             welcome.transports.push_back("topic");
@@ -386,7 +390,9 @@ class Network
         packet.destination = StationOf(entering.destination);
         packet.flow = entering.flow;
         packet.protocol = entering.protocol;
-        if (packet.protocol != "udp" && packet.protocol != "tcp" && !(m_carriesTopics && packet.protocol == "topic"))
+        bool is_bare = packet.protocol == kIp || packet.protocol == kIpBroadcast;
+        if (packet.protocol != "udp" && packet.protocol != "tcp" && !is_bare &&
+            !(m_carriesTopics && packet.protocol == "topic"))
         {
             throw Refusal("there is no transport " + packet.protocol);
         }
@@ -428,6 +434,14 @@ class Network
         else if (packet.protocol == "tcp")
         {
             m_tcp->Send(packet);
+        }
+        else if (packet.protocol == kIpBroadcast)
+        {
+            m_udp->SendToAll(packet);
+        }
+        else if (packet.protocol == kIp)
+        {
+            m_udp->Send(packet, -kIpAndUdpBytes);
         }
         else
         {

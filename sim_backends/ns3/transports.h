@@ -35,6 +35,12 @@ struct Fates
     std::function<void(uint64_t, const std::string&)> drop;
 };
 
+// Headers that ns-3 adds to a datagram, and that a bare IP packet has already.
+constexpr int64_t kIpAndUdpBytes = 28;
+
+// Time after which no station can receive a broadcast any more: frames wait for at most 0.5 s in a queue of ns-3's MAC.
+constexpr int64_t kBroadcastNs = 1'000'000'000;
+
 constexpr uint16_t kUdpPort = 7411;
 constexpr uint16_t kTcpPort = 7412;
 
@@ -50,14 +56,17 @@ class UdpTransport
         {
             auto socket = Socket::CreateSocket(station.node, UdpSocketFactory::GetTypeId());
             socket->Bind(InetSocketAddress(Ipv4Address::GetAny(), kUdpPort));
+            socket->SetAllowBroadcast(true);
             socket->SetRecvCallback(MakeCallback(&UdpTransport::Receive, this));
             m_sockets.push_back(socket);
+            m_stationOf[station.node->GetId()] = m_sockets.size() - 1;
         }
     }
 
-    void Send(const CoordinatorPacket& packet, uint64_t header_bytes)
+    // Send a packet as a datagram, which has `more_bytes` in addition, or less if they are negative.
+    void Send(const CoordinatorPacket& packet, int64_t more_bytes)
     {
-        auto datagram = Create<Packet>(static_cast<uint32_t>(packet.size_bytes + header_bytes));
+        auto datagram = Datagram(packet, more_bytes);
         IdTag tag;
         tag.number = packet.id;
         datagram->AddPacketTag(tag);
@@ -68,11 +77,63 @@ class UdpTransport
         }
     }
 
+    // Send a broadcast, of which the coordinator has a packet per receiver, all of one source and number. The first one
+    // sends the frame.
+    void SendToAll(const CoordinatorPacket& packet)
+    {
+        auto key = std::make_pair(packet.source, packet.number);
+        bool is_first = m_broadcasts.count(key) == 0;
+        m_broadcasts[key][packet.destination] = packet.id;
+        if (!is_first)
+        {
+            return;
+        }
+        auto datagram = Datagram(packet, -kIpAndUdpBytes);
+        BroadcastTag tag;
+        tag.number = static_cast<uint64_t>(packet.number) * m_sockets.size() + packet.source;
+        datagram->AddPacketTag(tag);
+        m_sockets[packet.source]->SendTo(datagram, 0, InetSocketAddress(Ipv4Address::GetBroadcast(), kUdpPort));
+        Simulator::Schedule(NanoSeconds(kBroadcastNs), [this, key] {
+            for (const auto& [station, id] : m_broadcasts[key])
+            {
+                m_fates.drop(id, "broadcast not decoded");
+            }
+            m_broadcasts.erase(key);
+        });
+    }
+
   private:
+    static Ptr<Packet> Datagram(const CoordinatorPacket& packet, int64_t more_bytes)
+    {
+        int64_t bytes = static_cast<int64_t>(packet.size_bytes) + more_bytes;
+        return Create<Packet>(static_cast<uint32_t>(std::max<int64_t>(bytes, 0)));
+    }
+
+    void ReceiveBroadcast(uint64_t number, size_t station)
+    {
+        auto broadcast =
+            m_broadcasts.find({number % m_sockets.size(), static_cast<int64_t>(number / m_sockets.size())});
+        if (broadcast == m_broadcasts.end())
+        {
+            return;
+        }
+        auto packet = broadcast->second.find(station);
+        if (packet != broadcast->second.end())
+        {
+            m_fates.arrive(packet->second);
+            broadcast->second.erase(packet);
+        }
+    }
+
     void Receive(Ptr<Socket> socket)
     {
         while (auto datagram = socket->Recv())
         {
+            BroadcastTag broadcast;
+            if (datagram->PeekPacketTag(broadcast))
+            {
+                ReceiveBroadcast(broadcast.number, m_stationOf.at(socket->GetNode()->GetId()));
+            }
             IdTag tag;
             if (datagram->PeekPacketTag(tag))
             {
@@ -84,6 +145,8 @@ class UdpTransport
     const std::vector<Station>& m_stations;
     Fates m_fates;
     std::vector<Ptr<Socket>> m_sockets;
+    std::map<uint32_t, size_t> m_stationOf;                                           // by node
+    std::map<std::pair<size_t, int64_t>, std::map<size_t, uint64_t>> m_broadcasts; // receivers and their packets
 };
 
 // Each flow has a connection, which its first message opens. A message arrives when its last byte has been read.

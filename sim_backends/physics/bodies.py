@@ -137,6 +137,39 @@ class Bodies:
             self._advance_steps(step)
         return self._states
 
+    def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
+        """Put a body at a place, at rest and without a command; it may overlap something.
+
+        Args:
+            name: The body.
+            place_m: Position, metres east, north, up; up is used only if it flies.
+            heading_rad: Its heading, from east towards north.
+        """
+        self._commands[name] = None
+        self._pending_commands.pop(name, None)
+        pose = self._on_ground(name, self._bodies[name].pose_at(place_m, heading_rad))
+        self._replace_tracks({name: self._track(name, pose, self._step)})
+        self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
+        self._list_step = self._step
+        self._states = Snapshot(self._tracks, self._step)
+
+    def overlap(self, name: str) -> str:
+        """Return the name of an obstacle or body that a body overlaps now; empty if there is none."""
+        body, place_m = self._bodies[name], self._tracks[name].pose(self._step).place_m
+        others = (
+            cylinder_footprint(other, track.pose(self._step).place_m, self._bodies[other])
+            for other, track in self._tracks.items()
+            if other != name
+        )
+        return next(
+            (
+                footprint.name
+                for footprint in (*self._grounds[name].around, *others)
+                if overlaps(footprint, body, place_m)
+            ),
+            "",
+        )
+
     def _apply_commands(self) -> None:
         commands_by_name, self._pending_commands = self._pending_commands, {}
         tracks = {}

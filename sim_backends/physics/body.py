@@ -109,6 +109,10 @@ class Body(Protocol[PoseT]):
         """Return its pose at time 0."""
         ...
 
+    def pose_at(self, place_m: Vector, heading_rad: float) -> PoseT:
+        """Return its pose at rest at a place; see `place_m`."""
+        ...
+
     def on_surface(self, pose: PoseT, surface: Surface) -> PoseT:
         """Return the pose moved vertically to the ground; the same object if it is on the ground or flies."""
         ...

@@ -195,7 +195,11 @@ class DifferentialDrive:
 
     def initial_pose(self) -> DrivePose:
         """Implement `Body.initial_pose`."""
-        return DrivePose(self.place_m, self._heading_rad)
+        return self.pose_at(self.place_m, self._heading_rad)
+
+    def pose_at(self, place_m: Vector, heading_rad: float) -> DrivePose:
+        """Implement `Body.pose_at`."""
+        return DrivePose((*place_m[:2], 0.0), heading_rad)
 
     def on_surface(self, pose: DrivePose, surface: Surface) -> DrivePose:
         """Implement `Body.on_surface`."""

@@ -308,7 +308,11 @@ class Quadrotor:
 
     def initial_pose(self) -> FlightPose:
         """Implement `Body.initial_pose`."""
-        return FlightPose(self.place_m, heading_rad=self._heading_rad)
+        return self.pose_at(self.place_m, self._heading_rad)
+
+    def pose_at(self, place_m: Vector, heading_rad: float) -> FlightPose:
+        """Implement `Body.pose_at`."""
+        return FlightPose(place_m, heading_rad=heading_rad)
 
     def on_surface(self, pose: FlightPose, surface: Surface) -> FlightPose:  # noqa: ARG002 (see Body)
         """Implement `Body.on_surface`: it flies, so the pose does not change."""

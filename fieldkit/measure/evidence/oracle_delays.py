@@ -1,11 +1,14 @@
 """Delays that a testbed's oracle reports: lateness of deliveries, and air delay of a transfer's packets.
 
+On a co-simulation, windows have a lateness too, and its sync policy adds to the delay of packets.
+
 The lateness is that of deliveries during a repeat, in comparison with the radio model (`Oracle.lateness`). The air
 delay has four components (`Oracle.delays`). Its file has one line per number: `packets 215`, then the components
 summed over all packets, in integer nanoseconds.
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import fields
 from itertools import accumulate
 from pathlib import Path
@@ -37,18 +40,47 @@ LATENESS_COLUMNS: Final = columns(
     ),
 )
 
+WINDOW_COLUMNS: Final = columns(
+    150,
+    (
+        "cosim_late_p99_s",
+        "s",
+        (
+            "99th percentile of the time by which the results of a window of the co-simulation were later than its "
+            "end in real time, over the whole repeat; rounded up by at most an eighth. Empty without a co-simulation."
+        ),
+    ),
+    (
+        "cosim_late_max_s",
+        "s",
+        (
+            "Largest such time; above emulated.late_bound of the site file the repeat is void. Empty without a "
+            "co-simulation."
+        ),
+    ),
+)
+
 # 18 digits of nanoseconds are 31 years.
 _MAX_PACKETS: Final = 10**18
 _LATENESS_TEXT: Final = re.compile(
-    r"bound ([0-9]{1,18})(?: lines ([0-9]{1,9}))?\n((?:late [0-9]{1,18} [0-9]{1,18}\n)*)\Z"
+    r"bound ([0-9]{1,18})(?: lines ([0-9]{1,9}))?\n((?:late [0-9]{1,18} [0-9]{1,18}\n)*)"
+    r"(?:windows ([0-9]{1,9})\n((?:window [0-9]{1,18} [0-9]{1,18}\n)*))?\Z"
 )
 
 
 def lateness_text(before: Lateness, after: Lateness) -> str:
     """Return the file text for the packets that were counted between `before` and `after`."""
-    added = {late_ns: count - before.packets.get(late_ns, 0) for late_ns, count in sorted(after.packets.items())}
-    lines = [f"late {late_ns} {count}\n" for late_ns, count in added.items() if count]
-    return "".join((f"bound {after.bound_ns} lines {len(lines)}\n", *lines))
+    lines = _histogram_lines("late", before.packets, after.packets)
+    text = "".join((f"bound {after.bound_ns} lines {len(lines)}\n", *lines))
+    if after.windows is None:
+        return text
+    windows = _histogram_lines("window", before.windows or {}, after.windows)
+    return text + "".join((f"windows {len(windows)}\n", *windows))
+
+
+def _histogram_lines(word: str, before: Mapping[int, int], after: Mapping[int, int]) -> list[str]:
+    added = {late_ns: count - before.get(late_ns, 0) for late_ns, count in sorted(after.items())}
+    return [f"{word} {late_ns} {count}\n" for late_ns, count in added.items() if count]
 
 
 def read_lateness(path: Path) -> Lateness:
@@ -60,19 +92,24 @@ def read_lateness(path: Path) -> Lateness:
     match = _LATENESS_TEXT.match(reading.text(path))
     if match is None:
         raise EvidenceError("is not a file of packet lateness", where=str(path))
-    bound, line_count, body = match.groups()
+    bound, line_count, body, window_count, window_body = match.groups()
+    packets = _histogram(path, line_count, body)
+    if sum(packets.values()) >= _MAX_PACKETS:
+        raise EvidenceError("contains an impossible number of packets", where=str(path))
+    windows = None if window_count is None else _histogram(path, window_count, window_body)
+    return Lateness(bound_ns=int(bound), packets=packets, windows=windows)
+
+
+def _histogram(path: Path, line_count: str | None, body: str) -> dict[int, int]:
     lines = body.splitlines()
     if line_count is not None and int(line_count) != len(lines):
         raise EvidenceError(f"has {len(lines)} lines of {line_count}: truncated", where=str(path))
-    packets = {int(late_ns): int(count) for _, late_ns, count in map(str.split, lines)}
-    if sum(packets.values()) >= _MAX_PACKETS:
-        raise EvidenceError("contains an impossible number of packets", where=str(path))
-    return Lateness(bound_ns=int(bound), packets=packets)
+    return {int(late_ns): int(count) for _, late_ns, count in map(str.split, lines)}
 
 
-def lateness_quantile_ns(lateness: Lateness, share: float) -> int | None:
-    """Return the quantile of the lateness at `share` (0 to 1) in ns; None if there are no packets."""
-    counts = sorted((late_ns, count) for late_ns, count in lateness.packets.items() if count)
+def lateness_quantile_ns(histogram: Mapping[int, int], share: float) -> int | None:
+    """Return the quantile of a histogram of lateness at `share` (0 to 1) in ns; None if it is empty."""
+    counts = sorted((late_ns, count) for late_ns, count in histogram.items() if count)
     cumulative = accumulate(count for _, count in counts)
     min_total = share * sum(count for _, count in counts)
     return next((late_ns for (late_ns, _), total in zip(counts, cumulative, strict=True) if total >= min_total), None)
@@ -87,7 +124,7 @@ def measure_lateness(lateness: Lateness | None) -> Measured:
     """Return the columns; `lateness` is None for real radios, or if the testbed cannot measure it."""
     if lateness is None:
         return Measured.all_missing(LATENESS_COLUMNS, "the radios are real")
-    late_ns = {share: lateness_quantile_ns(lateness, share) for share in (0.99, 1.0)}
+    late_ns = {share: lateness_quantile_ns(lateness.packets, share) for share in (0.99, 1.0)}
     values = {
         "emulator_late_p99_s": None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
         "emulator_late_max_s": None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
@@ -96,13 +133,29 @@ def measure_lateness(lateness: Lateness | None) -> Measured:
     return Measured.from_optional(values, "no packet was delivered")
 
 
+def measure_window_lateness(lateness: Lateness | None) -> Measured:
+    """Return the columns; without values unless the testbed is a co-simulation."""
+    if lateness is None or lateness.windows is None:
+        return Measured.all_missing(WINDOW_COLUMNS, "the robots do not run on a co-simulation")
+    late_ns = {share: lateness_quantile_ns(lateness.windows, share) for share in (0.99, 1.0)}
+    values = {
+        "cosim_late_p99_s": None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
+        "cosim_late_max_s": None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
+    }
+    return Measured.from_optional(values, "no window ended")
+
+
 def lateness_problem(lateness: Lateness) -> str | None:
     """Return the reason why the emulation did not follow its model, or None if it did."""
-    late_ns = lateness_quantile_ns(lateness, 1.0)
-    if late_ns is None or late_ns <= lateness.bound_ns:
-        return None
-    late = f"{too_late(lateness)} packets were delivered too late, by up to {late_ns / 1e6:.3g} ms"
-    return f"{late}; the bound is {lateness.bound_ns / 1e6:g} ms"
+    bound_ns, late = lateness.bound_ns, ""
+    packet_ns = lateness_quantile_ns(lateness.packets, 1.0)
+    window_ns = lateness_quantile_ns(lateness.windows or {}, 1.0)
+    if packet_ns is not None and packet_ns > bound_ns:
+        late = f"{too_late(lateness)} packets were delivered too late, by up to {packet_ns / 1e6:.3g} ms"
+    elif window_ns is not None and window_ns > bound_ns:
+        windows = sum(count for late_ns, count in (lateness.windows or {}).items() if late_ns > bound_ns)
+        late = f"{windows} windows of the co-simulation ended too late, by up to {window_ns / 1e6:.3g} ms"
+    return f"{late}; the bound is {bound_ns / 1e6:g} ms" if late else None
 
 
 AIR_DELAY_FILE: Final = laptop_files.MEDIUM
@@ -125,9 +178,27 @@ AIR_DELAY_COLUMNS: Final = columns(
     ("delay_packets", "count", "Number of packets of which delay_s is the mean: those that were delivered."),
 )
 
-_NAMES: Final = tuple(item.name for item in fields(DelayParts))
+POLICY_COLUMNS: Final = columns(
+    160,
+    (
+        "delay_policy_s",
+        "s",
+        (
+            "Mean time that the sync policy of a co-simulation added to the way of the transfer's packets, which is "
+            "not in delay_s. Empty without a co-simulation."
+        ),
+        Figure("policy delay", Kind.MEDIAN, rank=34),
+    ),
+)
+
+_COSIM_NAMES: Final = ("undivided_ns", "policy_ns")
+_NAMES: Final = tuple(item.name for item in fields(DelayParts) if item.name not in _COSIM_NAMES)
 # 18 digits of nanoseconds are 31 years.
-_AIR_DELAY_TEXT: Final = re.compile("".join(rf"{name} ([0-9]{{1,18}})\n" for name in _NAMES) + r"\Z")
+_NUMBER: Final = "([0-9]{1,18})"
+_AIR_DELAY_TEXT: Final = re.compile(
+    "".join(rf"{name} {_NUMBER}\n" for name in _NAMES)
+    + rf"(?:{_COSIM_NAMES[0]} {_NUMBER}\n{_COSIM_NAMES[1]} {_NUMBER}\n)?\Z"
+)
 
 
 def read_air_delay(path: Path) -> DelayParts:
@@ -139,7 +210,12 @@ def read_air_delay(path: Path) -> DelayParts:
     match = _AIR_DELAY_TEXT.match(reading.text(path))
     if match is None:
         raise EvidenceError("is not a file of packet delays", where=str(path))
-    parts = DelayParts(**dict(zip(_NAMES, map(int, match.groups()), strict=True)))
+    numbers = {
+        name: int(text)
+        for name, text in zip((*_NAMES, *_COSIM_NAMES), match.groups(), strict=True)
+        if text is not None
+    }
+    parts = DelayParts(**numbers)
     if not parts.packets and air_delay_ns(parts):
         raise EvidenceError("contains delays, but of 0 packets", where=str(path))
     return parts
@@ -147,12 +223,14 @@ def read_air_delay(path: Path) -> DelayParts:
 
 def air_delay_ns(parts: DelayParts) -> int:
     """Return the sum of the four components in ns: the paper's eq. 2, summed over all packets."""
-    return parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
+    components_ns = parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
+    return components_ns + parts.undivided_ns
 
 
 def air_delay_text(before: DelayParts, after: DelayParts) -> str:
     """Return the file text for the packets that were delivered between `before` and `after`."""
-    return "".join(f"{name} {getattr(after, name) - getattr(before, name)}\n" for name in _NAMES)
+    names = _NAMES if after.policy_ns is None else (*_NAMES, *_COSIM_NAMES)
+    return "".join(f"{name} {getattr(after, name) - (getattr(before, name) or 0)}\n" for name in names)
 
 
 def measure_air_delay(parts: DelayParts | None) -> Measured:
@@ -160,12 +238,22 @@ def measure_air_delay(parts: DelayParts | None) -> Measured:
     if parts is None:
         return Measured.all_missing(AIR_DELAY_COLUMNS, "the testbed cannot measure the delay on the air")
     scale = 1e9 * parts.packets
+    is_divided = scale and not parts.undivided_ns
     values = {
         "delay_s": air_delay_ns(parts) / scale if scale else None,
-        "delay_processing_s": parts.processing_ns / scale if scale else None,
-        "delay_transmission_s": parts.transmission_ns / scale if scale else None,
-        "delay_propagation_s": parts.propagation_ns / scale if scale else None,
-        "delay_queuing_s": parts.queuing_ns / scale if scale else None,
+        "delay_processing_s": parts.processing_ns / scale if is_divided else None,
+        "delay_transmission_s": parts.transmission_ns / scale if is_divided else None,
+        "delay_propagation_s": parts.propagation_ns / scale if is_divided else None,
+        "delay_queuing_s": parts.queuing_ns / scale if is_divided else None,
         "delay_packets": parts.packets,
     }
-    return Measured.from_optional(values, "no packet was delivered")
+    missing = "the network does not report the components" if scale else "no packet was delivered"
+    return Measured.from_optional(values, missing)
+
+
+def measure_policy_delay(parts: DelayParts | None) -> Measured:
+    """Return the column, a mean over the packets; without a value unless the testbed is a co-simulation."""
+    if parts is None or parts.policy_ns is None:
+        return Measured.all_missing(POLICY_COLUMNS, "the robots do not run on a co-simulation")
+    value = parts.policy_ns / 1e9 / parts.packets if parts.packets else None
+    return Measured.from_optional({"delay_policy_s": value}, "no packet was delivered")

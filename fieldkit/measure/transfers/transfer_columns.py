@@ -214,6 +214,7 @@ COLUMNS: Final[tuple[Column, ...]] = (
     *rates.COLUMNS,
     *STALLS,
     *delay.SENT_COLUMNS,
+    *oracle_delays.POLICY_COLUMNS,
 )
 
 TIMES: Final = [column for column in LAYERS if column.name in {"transfer_s", "transfer_from"}]

@@ -69,6 +69,9 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
     pings = evidence.read_or_none(ping.read, step_prefixed(transfer.name, ping.FILE))
     states = (host.before_file(transfer.destination), host.after_file(transfer.destination))
     files = _files(evidence, transfer)
+    air_delay = evidence.read_or_none(
+        oracle_delays.read_air_delay, step_prefixed(transfer.name, oracle_delays.AIR_DELAY_FILE)
+    )
     return (
         files
         | _layers(
@@ -78,11 +81,8 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
             contradiction,
             stalls.flow_schedule(evidence, transfer, listener),
         )
-        | oracle_delays.measure_air_delay(
-            evidence.read_or_none(
-                oracle_delays.read_air_delay, step_prefixed(transfer.name, oracle_delays.AIR_DELAY_FILE)
-            )
-        )
+        | oracle_delays.measure_air_delay(air_delay)
+        | oracle_delays.measure_policy_delay(air_delay)
         | position_columns.measure(
             evidence, DISTANCE, (transfer.source, transfer.destination), _sent_ns(sender, transfer)
         )

@@ -1,6 +1,6 @@
 """The lab's client of the medium process."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -36,13 +36,16 @@ class MediumClient:
         ConfigurationError: A program of util-linux is missing.
     """
 
+    module = "sim_backends.emulated.medium.process"
+    """Module of the process."""
+
     def __init__(
         self, options: RadioOptions, world: World | None = None, *, seed: int, framing: Framing = IP
     ) -> None:
         self._options = options
         self._world = world
         self._configured = False
-        self._worker = Worker("medium", "sim_backends.emulated.medium.process", words=(str(seed), framing.name))
+        self._worker = Worker("medium", self.module, words=(str(seed), framing.name))
         self._robots: set[str] = set()
 
     def __enter__(self) -> Self:
@@ -56,7 +59,15 @@ class MediumClient:
         """Process id of the medium."""
         return self._worker.pid
 
-    def attach(self, name: str, address: str, radio: Radio, fd: int) -> None:
+    def attach(
+        self,
+        name: str,
+        address: str,
+        radio: Radio,
+        fd: int,
+        *,
+        physics_fds: Sequence[int] = (),  # noqa: ARG002 (see below)
+    ) -> None:
         """Attach a robot to the medium.
 
         Args:
@@ -65,6 +76,7 @@ class MediumClient:
             radio: Its radio.
             fd: Descriptor of its device, or of a packet socket: each read returns one framed packet, and each write
                 accepts one. The medium gets a copy; the caller closes this descriptor.
+            physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics; others ignore it.
 
         Raises:
             LinkError: The medium ended or did not answer.
@@ -101,11 +113,14 @@ class MediumClient:
                 remedy="attach every robot, and give the relay a position",
             )
         if not self._configured:
-            world = None if self._world is None else self._world.model_dump(mode="json")
-            self._worker.request({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
+            self._configure()
             self._configured = True
         velocities = dict(velocities_m_s)
         self._worker.request({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
+
+    def _configure(self) -> None:
+        world = None if self._world is None else self._world.model_dump(mode="json")
+        self._worker.request({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
 
     def record(self, folder: Path | None) -> None:
         """Record transmissions to files in `folder` from now on (see `air_log`), or stop recording with None.

@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 from ipaddress import IPv4Address, IPv4Interface
 from typing import Final
 
@@ -112,6 +112,8 @@ class MediumStats:
         ports: Counters per robot.
         delays: Delays of the packets written to a robot, per pair of sender and receiver; lateness is counted as
             processing delay.
+        late_windows: Number of windows of a co-simulation per lateness in ns, rounded by `rounded_up`: the time from
+            the end of the window until its packets were written. Empty for a medium without windows.
     """
 
     scheduling: str
@@ -119,6 +121,7 @@ class MediumStats:
     links: dict[Pair, LinkCounters]
     ports: dict[str, PortCounters]
     delays: dict[Pair, DelayParts]
+    late_windows: Mapping[int, int] = field(default_factory=dict)
 
 
 def pack_stats(stats: MediumStats) -> Message:
@@ -126,6 +129,7 @@ def pack_stats(stats: MediumStats) -> Message:
     return {
         "scheduling": stats.scheduling,
         "late": [*stats.late.items()],
+        "late_windows": [*stats.late_windows.items()],
         "links": [[*pair, vars(counters)] for pair, counters in stats.links.items()],
         "ports": {name: vars(counters) for name, counters in stats.ports.items()},
         "delays": [[*pair, vars(parts)] for pair, parts in stats.delays.items()],
@@ -137,6 +141,7 @@ def unpack_stats(message: Message) -> MediumStats:
     return MediumStats(
         scheduling=message["scheduling"],
         late=dict(message["late"]),
+        late_windows=dict(message["late_windows"]),
         links={(sender, receiver): LinkCounters(**values) for sender, receiver, values in message["links"]},
         ports={name: PortCounters(**values) for name, values in message["ports"].items()},
         delays={(source, robot): DelayParts(**values) for source, robot, values in message["delays"]},

@@ -30,7 +30,7 @@ def command(module: str) -> list[str]:
 
 
 LINE_LIMIT_BYTES: Final = 8 << 20
-DESCRIPTORS: Final = 2
+DESCRIPTORS: Final = 3
 """Maximum number of file descriptors in one message."""
 
 Message = dict[str, Any]

@@ -7,6 +7,7 @@ for `TIMEOUT_NS`. The robot is a differential drive of the co-simulation's physi
 import math
 from typing import Final
 
+from fieldkit.core.model import Vector
 from sim_backends.emulated.robot.spec import Base
 from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
 from sim_backends.physics.body import Twist
@@ -18,6 +19,21 @@ TIMEOUT_NS: Final = 500_000_000
 STEP_NS: Final = 10_000_000
 _TURN_RISE_S: Final = 0.5
 """Time in which the turn rate rises from 0 to its limit."""
+
+
+def odometry(start: OwnMotion, place_m: Vector, heading_rad: float) -> Vector:
+    """Return the odometry of a robot after a motion; see `Steered.odometry`.
+
+    Args:
+        start: Its state of motion before.
+        place_m: Its position, metres east, north, up.
+        heading_rad: Its heading, continuous over full turns.
+    """
+    x_m, y_m = place_m[0] - start.place_m[0], place_m[1] - start.place_m[1]
+    turned_rad = start.yaw_rad - start.heading_rad
+    cos, sin = math.cos(turned_rad), math.sin(turned_rad)
+    yaw_rad = start.yaw_rad + heading_rad - start.heading_rad
+    return start.x_m + cos * x_m - sin * y_m, start.y_m + sin * x_m + cos * y_m, yaw_rad
 
 
 class BaseController:
@@ -56,12 +72,7 @@ class BaseController:
     @property
     def odometry(self) -> tuple[float, float, float]:
         """Odometry; see `Steered.odometry`."""
-        start, (east_m, north_m, _) = self._start, self._pose.place_m
-        x_m, y_m = east_m - start.place_m[0], north_m - start.place_m[1]
-        turned_rad = start.yaw_rad - start.heading_rad
-        cos, sin = math.cos(turned_rad), math.sin(turned_rad)
-        yaw_rad = start.yaw_rad + self._pose.heading_rad - start.heading_rad
-        return start.x_m + cos * x_m - sin * y_m, start.y_m + sin * x_m + cos * y_m, yaw_rad
+        return odometry(self._start, self._pose.place_m, self._pose.heading_rad)
 
     def reset(self, motion: OwnMotion) -> None:
         """Start again at the place where the lab put the robot; it is at rest, and earlier velocities are dropped."""

@@ -5,13 +5,15 @@ module, so it imports only the standard library and modules that do the same.
 """
 
 import contextlib
+import math
 import select
 import socket
 import struct
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NoReturn
 
+from sim_backends.emulated.robot.commanded import COMMANDED, Commanded, CommandedRecord
 from sim_backends.emulated.robot.spec import STATE, Base
 from sim_backends.emulated.ros.own_motion import MotionReporter
 
@@ -36,6 +38,9 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
     CHANNEL.unlink(missing_ok=True)  # left by a process that was killed
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
         channel.bind(str(CHANNEL))
+        if base.simulated:
+            ready.touch()
+            _record_velocities(channel)
         channel.setblocking(False)
         reporter = MotionReporter(motion, steered, time.monotonic_ns())
         ready.touch()
@@ -52,6 +57,15 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
             _receive_velocities(channel, controller, now_ns)
             controller.advance(now_ns)
             _write_motion(reporter, controller, now_ns)
+
+
+def _record_velocities(channel: socket.socket) -> NoReturn:
+    """Record each velocity for the physics, which limits it and stops the robot if none arrives any more."""
+    record = CommandedRecord.open(COMMANDED)
+    while True:
+        velocity = unpack(channel.recv(BYTES + 1))
+        if velocity is not None and all(map(math.isfinite, velocity)):
+            record.write(Commanded(time.monotonic_ns(), *velocity))
 
 
 def _receive_velocities(channel: socket.socket, controller: "BaseController", now_ns: int) -> None:

@@ -22,6 +22,7 @@ from fieldkit.core.errors import FieldkitError, RobotError
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
 from sim_backends.emulated.robot import mounts, network, rootfs, services
+from sim_backends.emulated.robot.commanded import COMMANDED
 from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
 from sim_backends.emulated.ros import own_motion
@@ -188,7 +189,7 @@ class Init:
                 _build(spec)
                 # The sensors process is forked from this one: it inherits the mapping, but no descriptor.
                 self._neighbourhood = Neighbourhood(received_fds[0], len(spec.hosts)) if received_fds else None
-                return [os.open(services.STEERED, os.O_RDONLY | os.O_CREAT, 0o600)]
+                return _motion_files(spec)
             case "open radio":
                 return [_open_radio(request)]
             case "start":
@@ -245,6 +246,17 @@ def _build(spec: RobotSpec) -> None:
     mounts.isolate(replaced=spec.setup)
     rootfs.write_files(spec)
     os.chdir(HOME)
+
+
+def _motion_files(spec: RobotSpec) -> list[int]:
+    """Return descriptors of the record of the robot's motion, and of the inputs of a simulated physics, if any."""
+    if spec.base is None or not spec.base.simulated:
+        return [os.open(services.STEERED, os.O_RDONLY | os.O_CREAT, 0o600)]
+    return [
+        os.open(services.STEERED, os.O_RDWR | os.O_CREAT, 0o600),
+        os.open(services.MOTION, os.O_RDONLY | os.O_CREAT, 0o600),
+        os.open(COMMANDED, os.O_RDONLY | os.O_CREAT, 0o600),
+    ]
 
 
 def _reset_signals() -> None:

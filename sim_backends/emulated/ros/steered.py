@@ -1,27 +1,22 @@
 """Record of the motion of a robot that steers itself, read by its sensors and by the lab.
 
 One process of a robot writes it: its base controller, or its autopilot. Each record has the position and velocity and
-a time of the monotonic clock, which all processes of a machine share; readers extrapolate from there. Two slots are
-written alternately, each with a CRC, so that a reader finds a complete record while one is being written, and after
-the writer was killed.
+a time of the monotonic clock, which all processes of a machine share; readers extrapolate from there.
 """
 
 import math
 import os
-import struct
-import zlib
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 from fieldkit.core.model import Vector
+from sim_backends.emulated.ros.slots import Slots
 from sim_backends.world.motion import STILL, State
 
 SILENT_NS: Final = 500_000_000
 """Timeout: a robot that moves writes much more often than this, and one that has not written for this long stops."""
 
-_SLOT: Final = struct.Struct("<Q2q11d")
-_CRC: Final = struct.Struct("<I")
-_SLOT_BYTES: Final = _SLOT.size + _CRC.size
+_LAYOUT: Final = "2q11d"
 
 
 class Steered(NamedTuple):
@@ -90,10 +85,9 @@ class SteeredRecord:
     """
 
     def __init__(self, fd: int) -> None:
-        self._fd = fd
-        self._number = 0
+        self._slots = Slots(fd, _LAYOUT)
+        self._values: tuple[Any, ...] | None = None
         self._last: Steered | None = None
-        self.read()
 
     @classmethod
     def open(cls, path: Path) -> Self:
@@ -110,9 +104,7 @@ class SteeredRecord:
         Raises:
             OSError: There is no space for it.
         """
-        self._number, self._last = self._number + 1, motion
-        slot = _SLOT.pack(
-            self._number,
+        self._slots.write(
             motion.time_ns,
             motion.path_start_ns,
             *motion.place_m,
@@ -121,7 +113,6 @@ class SteeredRecord:
             motion.turn_rad_s,
             *motion.odometry,
         )
-        os.pwrite(self._fd, slot + _CRC.pack(zlib.crc32(slot)), self._number % 2 * _SLOT_BYTES)
 
     def read(self) -> Steered | None:
         """Return the newest motion, or None if the robot never steered itself.
@@ -129,24 +120,20 @@ class SteeredRecord:
         Raises:
             OSError: The file cannot be read.
         """
-        data = os.pread(self._fd, 2 * _SLOT_BYTES, 0)
-        for start in (0, _SLOT_BYTES):
-            slot, crc = data[start : start + _SLOT.size], data[start + _SLOT.size : start + _SLOT_BYTES]
-            if len(crc) == _CRC.size and _CRC.unpack(crc)[0] == zlib.crc32(slot):
-                self._accept(*_SLOT.unpack(slot))
+        values = self._slots.read()
+        if values is not None and values is not self._values:
+            self._values, self._last = values, _steered(*values)
         return self._last
 
     def close(self) -> None:
         """Close the file."""
-        os.close(self._fd)
+        self._slots.close()
 
-    def _accept(self, number: int, time_ns: int, path_start_ns: int, *values: float) -> None:
-        """Store a slot if it is newer than the last one."""
-        if number > self._number:
-            place, velocity, odometry = (_vector(values[index : index + 3]) for index in (0, 3, 8))
-            heading_rad, turn_rad_s = values[6:8]
-            self._number = number
-            self._last = Steered(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, odometry)
+
+def _steered(time_ns: int, path_start_ns: int, *values: float) -> Steered:
+    place, velocity, odometry = (_vector(values[index : index + 3]) for index in (0, 3, 8))
+    heading_rad, turn_rad_s = values[6:8]
+    return Steered(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, odometry)
 
 
 def _moved(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:

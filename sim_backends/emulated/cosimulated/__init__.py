@@ -1,0 +1,17 @@
+"""The medium of a co-simulation: real programs on emulated robots, moved by a physics and heard over a network.
+
+| module | purpose | imports |
+| --- | --- | --- |
+| `options` | a lab's choice of simulators and policy, and its check before a run | named federates |
+| `client` | the lab's client: starts the process, and passes it bodies, devices and places | medium client |
+| `cosim_process` | the process: requests of the lab, reading and delivery of packets | medium server, all below |
+| `session` | one run of the coordinator, with its physics and network | cosim, all below |
+| `clock` | simulated time as real time | nothing |
+| `real_agents` | the agents of the coordinator: packets read from devices, in windows that end in real time | cosim |
+| `lab_physics` | the physics, with robots that the lab has put at a place | steering, federates |
+| `steering` | commanded velocities of one robot, and the record of its motion | records in the robot |
+| `simulators` | builds the physics and the network | cosim, network, radio, physics |
+
+The coordinator is that of simulated co-simulations: windows, policies, ledger and their meaning are the same. Only
+its agents differ: the end of a window is a deadline of the monotonic clock.
+"""

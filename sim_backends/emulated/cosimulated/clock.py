@@ -1,0 +1,30 @@
+"""Simulated time as real time."""
+
+import time
+
+
+class RealTime:
+    """Maps simulated time to the monotonic clock.
+
+    Attributes:
+        epoch_ns: Time of the monotonic clock at simulated time 0.
+    """
+
+    def __init__(self) -> None:
+        self.epoch_ns = time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Return the simulated time that it is now."""
+        return time.monotonic_ns() - self.epoch_ns
+
+    def monotonic_ns(self, simulated_ns: int) -> int:
+        """Return the time of the monotonic clock at a simulated time."""
+        return self.epoch_ns + simulated_ns
+
+    def simulated_ns(self, monotonic_ns: int) -> int:
+        """Return the simulated time at a time of the monotonic clock."""
+        return monotonic_ns - self.epoch_ns
+
+    def give_up(self, lag_ns: int) -> None:
+        """Delay all later simulated time: a simulation that lags behind by this does not catch up."""
+        self.epoch_ns += lag_ns

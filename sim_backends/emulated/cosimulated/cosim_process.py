@@ -1,0 +1,342 @@
+"""The process of a co-simulated medium: packets between devices through a network, robots moved by a physics.
+
+`client` runs it as `python -m sim_backends.emulated.cosimulated.cosim_process FD SEED FRAMING`, as the process of the
+medium of a radio model. It answers the same requests, and in addition `simulate`, with simulators and policy, and
+`body`, with the body of a robot.
+
+A session is one run of the coordinator. Its time begins at 0 when the session starts, and its windows end in real
+time. Another set of stations or another relay needs a new session; packets on the air of the old one are lost.
+"""
+
+import gc
+import os
+import socket
+import sys
+import time
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from typing_extensions import override
+
+from fieldkit.core.errors import FieldkitError
+from fieldkit.core.model import LinkSample, Vector
+from sim_backends.cosim.run_record import Fate, Window
+from sim_backends.emulated.cosimulated.clock import RealTime
+from sim_backends.emulated.cosimulated.real_agents import RealPacket
+from sim_backends.emulated.cosimulated.session import CosimSession
+from sim_backends.emulated.cosimulated.simulators import LabSettings, RobotBody, Simulators
+from sim_backends.emulated.cosimulated.steering import Steering
+from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing
+from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, rounded_up
+from sim_backends.emulated.medium.server import (
+    BURST,
+    DEVICE_PACKETS,
+    INTERFACE_POLL_NS,
+    READ_BYTES,
+    AttemptLog,
+    MediumServer,
+)
+from sim_backends.emulated.process.worker import Message
+from sim_backends.physics.differential_drive import DriveLimits
+from sim_backends.radio.links import PACKET, PROCESSING_NS, TRANSMISSION_NS, LinkCounters, Pair
+from sim_backends.world.motion import STILL, State
+
+_MAX_SLEEP_NS: Final = 10_000_000
+"""Longest sleep. After a longer one, packets may have waited for the excess."""
+_END_NS: Final = 1 << 62
+_WINDOWS: Final = 1000
+"""Number of windows after which the record of the coordinator is cleared."""
+_GIVE_UP_NS: Final = 1_000_000_000
+"""A simulation that lags behind real time by more than this does not catch up, so that its later results are usable.
+Packets in it are delivered late, so their repeat is void."""
+
+_START_NS: Final = 5_000_000
+"""A request to place robots that takes longer has started a simulator."""
+
+
+class _NewSession(BaseException):
+    """Raised through the coordinator of an old session."""
+
+
+class CosimulatedMedium(MediumServer):
+    """Moves packets between ports through the coordinator of a co-simulation.
+
+    It is the coordinator's observer and the devices of its agents. Arguments as `MediumServer`.
+    """
+
+    def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:
+        super().__init__(seed, framing, channel)
+        self._simulators = Simulators("", "")
+        self._policy: dict[str, Any] = {}
+        self._bodies: dict[str, RobotBody] = {}
+        self._steerings: dict[str, Steering] = {}
+        self._session: CosimSession | None = None
+        self._clock = RealTime()
+        self._queue: deque[RealPacket] = deque()
+        self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
+        self._late_windows: Counter[int] = Counter()
+        self._added = FlowDelays()
+
+    def run(self) -> None:
+        """Run one session after another until the owner closes the socket."""
+        while True:
+            session = self._session
+            try:
+                if session is None:
+                    self._poll(None)
+                    self._queue.clear()
+                    continue
+                session.coordinator.advance(_END_NS, max_windows=_WINDOWS)
+                session.coordinator.run.windows_ns.clear()
+            except _NewSession:
+                continue
+            except _Closed:
+                break
+        if self._session is not None:
+            self._session.close()
+
+    # The devices of the agents.
+
+    def wait(self, until_ns: int) -> None:
+        """Implement `Devices.wait`."""
+        session = self._session
+        while True:
+            due_ns = self._clock.monotonic_ns(until_ns)
+            self._poll(due_ns)
+            if time.monotonic_ns() - self._polled_ns > INTERFACE_POLL_NS:
+                self._update_interfaces()
+            if self._session is not session:
+                raise _NewSession
+            if time.monotonic_ns() >= due_ns:
+                break
+        if self._sample_ns is not None and time.monotonic_ns() >= self._sample_ns:
+            self._sample()
+
+    def wait_for_packet(self, until_ns: int) -> None:
+        """Implement `Devices.wait_for_packet`; the next event of the network ends the wait, too."""
+        assert self._session is not None
+        event_ns = self._session.network.next_event_ns()
+        due_ns = self._clock.monotonic_ns(until_ns if event_ns is None else min(until_ns, event_ns))
+        while not self._queue and time.monotonic_ns() < due_ns:
+            self._poll(due_ns, answers=False)
+
+    def first_ns(self) -> int | None:
+        """Implement `Devices.first_ns`."""
+        return self._queue[0].at_ns if self._queue else None
+
+    def take(self, last_ns: int) -> list[RealPacket]:
+        """Implement `Devices.take`."""
+        packets, read = [], self._queue
+        while read and read[0].at_ns <= last_ns:
+            packets.append(read.popleft())
+        return packets
+
+    def receivers(self, source: str) -> Sequence[str]:
+        """Implement `Devices.receivers`."""
+        present, _ = self._routed
+        return sorted(present - {source})
+
+    def _poll(self, due_ns: int | None, *, answers: bool = True) -> None:
+        """Wait until a time of the monotonic clock, a packet or a request; read the packets and answer the request.
+
+        The earliest time at which packets can have arrived is determined as by the medium of a radio model.
+        """
+        polled_ns = time.monotonic_ns()
+        ready = self._epoll.poll(0)
+        if ready:
+            self._arrived_after_ns, self._previous_poll_ns = self._previous_poll_ns, polled_ns
+        elif due_ns is None or polled_ns < due_ns:
+            if due_ns is not None:
+                self._timer.set(due_ns)
+            ready = self._epoll.poll(_MAX_SLEEP_NS / 1e9)
+            self._arrived_after_ns = self._previous_poll_ns = min(time.monotonic_ns(), polled_ns + _MAX_SLEEP_NS)
+        else:
+            self._previous_poll_ns = polled_ns
+        for fd, _ in ready:
+            if fd in self._by_fd:
+                self._read_port(self._by_fd[fd])
+            elif answers and fd == self._channel.fileno() and not self._serve():
+                raise _Closed
+
+    def _read_port(self, port: Port) -> None:
+        """Read the packets that wait at a port."""
+        if port.backlog <= 0:
+            port.backlog, port.backlog_since_ns = DEVICE_PACKETS, self._arrived_after_ns
+        framing, routes = self._framing, port.routes
+        for _ in range(BURST):
+            try:
+                content = os.read(port.fd, READ_BYTES)
+                carried = framing.carries(content)
+            except BlockingIOError:
+                port.backlog = 0
+                return
+            except (OSError, IndexError):
+                # The robot's namespace and its device no longer exist; a socket returns no bytes in this case.
+                self._epoll.unregister(port.fd)
+                return
+            port.read += 1
+            if not carried:
+                port.not_ipv4 += 1
+                continue
+            destination = framing.destination(content, routes)
+            if destination == NO_ROBOT:
+                port.unroutable += 1
+                continue
+            if self._flows.counted and (inner := framing.ipv4(content)) is not None:
+                self._flows.note_first_fragment(inner)
+                self._added.note_first_fragment(inner)
+            now_ns = time.monotonic_ns()
+            size_bytes = len(content) - framing.header_bytes
+            waited_ns = now_ns - port.backlog_since_ns
+            at_ns = self._clock.simulated_ns(now_ns)
+            self._queue.append(RealPacket(at_ns, port.name, destination, content, size_bytes, waited_ns))
+        port.backlog -= BURST
+
+    # The observer of the coordinator.
+
+    def begin(self, states: Mapping[str, State]) -> None:
+        """Implement `WindowObserver.begin`."""
+
+    def window(self, window: Window) -> None:
+        """Implement `WindowObserver.window`: write the packets that arrived, and record the lateness."""
+        session = self._session
+        assert session is not None
+        end_ns = self._clock.monotonic_ns(window.end_ns)
+        if window.ended:
+            delivered = session.agents.delivered
+            arrived = [fate for fate in window.ended if fate.arrived_ns is not None]
+            for fate, packet in zip(arrived, delivered, strict=True):
+                self._write(session, fate, packet, window.end_ns, end_ns)
+            delivered.clear()
+            for fate in window.ended:
+                session.forget(fate.packet)
+        lag_ns = time.monotonic_ns() - end_ns
+        self._late_windows[rounded_up(max(lag_ns, 0))] += 1
+        if lag_ns > _GIVE_UP_NS:
+            self._clock.give_up(lag_ns)
+
+    def _write(
+        self, session: CosimSession, fate: Fate, packet: RealPacket, end_ns: int, end_monotonic_ns: int
+    ) -> None:
+        """Write a packet that arrived to its receiver, and count its delays."""
+        port = self._ports[fate.packet.destination]
+        try:
+            os.write(port.fd, packet.content)
+        except OSError:
+            # The interface is down, or the robot has stopped.
+            port.refused += 1
+            return
+        assert fate.arrived_ns is not None
+        late_ns = packet.waited_ns + time.monotonic_ns() - end_monotonic_ns
+        delay, undivided_ns = session.network_delay(fate)
+        delay += late_ns * PROCESSING_NS
+        port.delays[packet.source] += delay + undivided_ns * PROCESSING_NS
+        if self._flows.counted and (inner := self._framing.ipv4(packet.content)) is not None:
+            added_ns = end_ns - fate.arrived_ns + fate.packet.enters_ns - fate.packet.sent_ns
+            self._flows.count(inner, delay, port.address.packed)
+            extra = PACKET + added_ns * PROCESSING_NS + undivided_ns * TRANSMISSION_NS
+            self._added.count(inner, extra, port.address.packed)
+        self._late[rounded_up(late_ns)] += 1
+
+    # Requests of the lab.
+
+    @override
+    def _answer(self, request: Message, descriptors: list[int]) -> Message:
+        try:
+            match request["do"]:
+                case "simulate":
+                    self._simulators = Simulators(**request["simulators"])
+                    self._policy = request["policy"]
+                    return {}
+                case "body":
+                    self._add_body(request, descriptors)
+                    return {}
+                case _:
+                    return super()._answer(request, descriptors)
+        except FieldkitError as error:
+            return {"error": error.what, "remedy": error.remedy}
+
+    def _add_body(self, request: Message, descriptors: list[int]) -> None:
+        name, limits = request["name"], DriveLimits(**request["limits"])
+        self._bodies[name] = RobotBody(request["profile"], limits)
+        if descriptors:
+            self._steerings[name] = Steering(descriptors, time.monotonic_ns())
+
+    @override
+    def _delays(self, request: Message) -> Message:
+        source, destination = (self._ports[request[key]].address.ip for key in ("source", "destination"))
+        flow = source, destination, request["protocol"], request["port"]
+        added = self._added.delay_parts(*flow)
+        parts = self._flows.delay_parts(*flow)
+        return vars(replace(parts, policy_ns=added.processing_ns, undivided_ns=added.transmission_ns))
+
+    @override
+    def _stats(self) -> MediumStats:
+        return replace(super()._stats(), late_windows=self._late_windows)
+
+    @override
+    def _place_stations(self, positions_m: dict[str, Vector], relay: str | None) -> None:
+        """Place the robots that are on the air; without any, the session continues with all of them out of range."""
+        begin_ns = time.monotonic_ns()
+        session, stations = self._session, tuple(self._ports)
+        if session is None or session.stations != stations or (positions_m and session.settings.relay != relay):
+            if session is not None:
+                self._session = None
+                session.close()
+            self._queue.clear()
+            self._clock = RealTime()
+            settings = LabSettings(
+                self._simulators, self._seed, self._options, self._world, self._antennas, self._bodies, relay
+            )
+            session = CosimSession(self, settings, self._steerings, self._policy, self._clock)
+            self._log_attempts(None if self._air_log is None else self._air_log.write)
+        velocities_m_s = self._layout.velocities_m_s
+        states = {
+            name: State(place_m, velocities_m_s.get(name, STILL))
+            for name, place_m in self._layout.positions_m.items()
+        }
+        session.physics.place(states, frozenset(positions_m))
+        self._session = session
+        if (spent_ns := time.monotonic_ns() - begin_ns) > _START_NS:
+            # A simulator was started. The lab waits for this, so no measurement is in progress.
+            self._clock.give_up(spent_ns)
+
+    @override
+    def _log_attempts(self, log: AttemptLog | None) -> None:
+        if self._session is not None and self._session.builtin is not None:
+            self._session.log_attempts(log)
+
+    @override
+    def _sample_links(self, now_ns: int) -> Mapping[str, LinkSample]:
+        session = self._session
+        if session is None or session.builtin is None:
+            return {}
+        return session.sample_links()
+
+    @override
+    def _link_counters(self) -> dict[Pair, LinkCounters]:
+        session = self._session
+        return {} if session is None or session.builtin is None else session.builtin.radio.counters()
+
+
+class _Closed(BaseException):
+    """Raised when the owner has closed the socket."""
+
+
+def main() -> None:
+    """Run the process; the command line has the descriptor of the socket, the seed and the framing."""
+    channel = socket.socket(fileno=int(sys.argv[1]))
+    medium = CosimulatedMedium(int(sys.argv[2]), FRAMINGS[sys.argv[3]], channel)
+    # A collection of all objects, most of which are modules, would delay packets.
+    gc.freeze()
+    try:
+        medium.run()
+    except FieldkitError as error:
+        # The lab shows the last line.
+        sys.exit(f"{error.what}; {error.remedy}" if error.remedy else error.what)
+
+
+if __name__ == "__main__":
+    main()

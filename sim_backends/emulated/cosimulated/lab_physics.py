@@ -1,0 +1,270 @@
+"""The physics of a lab: it moves robots that their programs drive; others are where the lab has put them."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final, Protocol, runtime_checkable
+
+from typing_extensions import override
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Vector
+from sim_backends.emulated.cosimulated.clock import RealTime
+from sim_backends.emulated.cosimulated.steering import Steering
+from sim_backends.emulated.robot.spec import ANTENNA_M
+from sim_backends.federates.protocols import PhysicsFederate
+from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.body import Twist
+from sim_backends.world.motion import STILL, State
+
+OFF_AIR_M: Final[Vector] = (0.0, 0.0, 1e7)
+"""Position of a station that the lab has put out of range of all others: 10,000 km up."""
+
+_POLL_NS: Final = 10_000_000
+"""Polling interval of the paths that the lab assigns to robots."""
+_MOVED_M: Final = 1e-6
+
+
+@runtime_checkable
+class Placing(PhysicsFederate, Protocol):
+    """A physics that can put a robot at a place during a run. Another one is started again for this."""
+
+    def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
+        """Put a robot at a place, at rest.
+
+        Args:
+            name: The robot.
+            place_m: Position of the ground below it, metres east, north, up.
+            heading_rad: Its heading, from east towards north.
+        """
+        ...
+
+
+StartPhysics = Callable[[Mapping[str, State]], PhysicsFederate]
+"""Starts a physics with the robots at these states, which are those of their antennas; its time begins at 0."""
+
+
+class LabPhysics:
+    """The physics of a session of the co-simulation; implements `PhysicsFederate`.
+
+    It is started when the lab has put all robots that can be driven at a place, and it moves a robot from its first
+    command on. Until then, and after the lab has put it elsewhere, a robot is where the lab says. A station without a
+    body, such as the laptop, always is.
+
+    Args:
+        start: Starts the physics.
+        steerings: Steering of each robot that programs can drive.
+        bodies: Names of the robots, which have a body.
+        stations: Names of all stations.
+        step_ns: Step of the physics.
+        clock: Real time.
+
+    Attributes:
+        step_ns: See `PhysicsFederate`.
+        limits_m_s2: See `PhysicsFederate`.
+    """
+
+    def __init__(
+        self,
+        start: StartPhysics,
+        steerings: Mapping[str, Steering],
+        bodies: tuple[str, ...],
+        stations: tuple[str, ...],
+        *,
+        step_ns: int,
+        clock: RealTime,
+    ) -> None:
+        self.step_ns = step_ns
+        self.limits_m_s2: Mapping[str, float] = _Limits(self, stations)
+        self._start = start
+        self._steerings = steerings
+        self._bodies = bodies
+        self._clock = clock
+        self._physics: PhysicsFederate | None = None
+        self._started_ns = 0
+        self._advanced_ns = 0
+        self._now_ns = 0
+        self._pending: dict[str, Twist] = {}
+        self._assigned = dict.fromkeys(stations, State(OFF_AIR_M))
+        self._hidden: frozenset[str] = frozenset()
+        self._in_physics: dict[str, tuple[Vector, float]] = {}
+        self._physics_states: Mapping[str, State] = {}
+        self._states: Mapping[str, State] = self._assigned
+        self._changed = True
+        self._polled_ns = 0
+
+    def place(self, states: Mapping[str, State], present: frozenset[str]) -> None:
+        """Put stations at places; robots that are driven stay where they are.
+
+        Args:
+            states: State of the antenna of each station that has a place.
+            present: Stations that are on the air; the network assumes that others are out of range.
+
+        Raises:
+            ConfigurationError: A robot would be placed within an obstacle or another robot.
+            FederateError: The physics failed.
+        """
+        self._poll_placements(self._clock.now_ns())
+        self._assigned |= states
+        self._hidden = frozenset(self._assigned) - present
+        self._changed = True
+        if self._steerings and all(steering.is_placed for steering in self._steerings.values()):
+            self._place_bodies()
+
+    @property
+    def states(self) -> Mapping[str, State]:
+        """The present states, also if the lab has changed them since the last call of `advance`."""
+        return self._combined()
+
+    def limit_m_s2(self, name: str) -> float:
+        """Return the limit of a station; 0 if nothing drives it."""
+        steering = self._steerings.get(name)
+        if self._physics is None or steering is None or not steering.is_driven:
+            return 0.0
+        return self._physics.limits_m_s2.get(name, math.inf)
+
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (read here)
+        """Implement `PhysicsFederate.advance`; the commands are those of the robots' programs."""
+        if to_ns - self._polled_ns >= _POLL_NS:
+            self._poll_placements(to_ns)
+        if self._physics is not None:
+            for at_ns, name, twist in sorted(self._commands(to_ns), key=lambda command: command[0]):
+                self._drive(name, max(at_ns, self._now_ns), twist)
+            self._advance(to_ns)
+            self._report(to_ns)
+        self._now_ns = to_ns
+        if self._changed:
+            self._changed = False
+            self._states = self._combined()
+        return self._states
+
+    def close(self) -> None:
+        """End the physics."""
+        if close := getattr(self._physics, "close", None):
+            close()
+
+    def _commands(self, to_ns: int) -> Iterator[tuple[int, str, Twist]]:
+        until_ns = self._clock.monotonic_ns(to_ns)
+        for name, steering in self._steerings.items():
+            for at_ns, twist in steering.commands(until_ns):
+                yield self._clock.simulated_ns(at_ns), name, twist
+
+    def _drive(self, name: str, at_ns: int, twist: Twist) -> None:
+        self._advance(at_ns)
+        self._pending[name] = twist
+
+    def _advance(self, to_ns: int) -> None:
+        """Advance the physics; its time does not advance while nothing moves in it."""
+        physics = self._physics
+        assert physics is not None
+        if not self._pending and all(steering.rests for steering in self._steerings.values()):
+            self._started_ns += (to_ns - self._advanced_ns) // self.step_ns * self.step_ns
+            self._advanced_ns = to_ns
+            return
+        self._advanced_ns = to_ns
+        commands, self._pending = self._pending, {}
+        states = physics.advance(max(to_ns - self._started_ns, 0), commands)
+        if states is not self._physics_states:
+            self._physics_states, self._changed = states, True
+
+    def _report(self, to_ns: int) -> None:
+        at_ns = self._clock.monotonic_ns(to_ns - (to_ns - self._started_ns) % self.step_ns)
+        for name, steering in self._steerings.items():
+            if steering.is_driven:
+                steering.report(at_ns, self._physics_states[name])
+
+    def _combined(self) -> Mapping[str, State]:
+        states = dict(self._assigned)
+        for name, steering in self._steerings.items():
+            if steering.is_driven and self._physics is not None:
+                states[name] = self._physics_states[name]
+        for name in self._hidden:
+            states[name] = State(OFF_AIR_M)
+        return states
+
+    def _poll_placements(self, now_ns: int) -> None:
+        self._polled_ns = now_ns
+        for name, steering in self._steerings.items():
+            state = self._physics_states.get(name)
+            was_driven = steering.is_driven
+            if steering.poll_placement(self._clock.monotonic_ns(now_ns)) is not None:
+                self._changed = True
+                if was_driven and state is not None:
+                    self._assigned[name] = State(state.position_m)  # until the lab's request arrives
+                    self._pending[name] = Twist()
+
+    def _place_bodies(self) -> None:
+        """Put the robots that the lab has moved at their places in the physics."""
+        places = {
+            name: (
+                self._assigned[name].position_m,
+                self._steerings[name].heading_rad if name in self._steerings else 0.0,
+            )
+            for name in self._bodies
+            if name not in self._steerings or not self._steerings[name].is_driven
+        }
+        moved = {name: place for name, place in places.items() if _differs(place, self._in_physics.get(name))}
+        if self._physics is not None and not moved:
+            return
+        self._in_physics |= moved
+        if isinstance(self._physics, Placing):
+            for name, ((east_m, north_m, up_m), heading_rad) in moved.items():
+                self._physics.put(name, (east_m, north_m, up_m - ANTENNA_M), heading_rad)
+            self._check_overlaps(moved)
+            self._physics_states = self._physics.advance(max(self._now_ns - self._started_ns, 0), {})
+        else:
+            self._restart()
+
+    def _check_overlaps(self, moved: Mapping[str, object]) -> None:
+        """Raise ConfigurationError if a robot overlaps something, unless the lab moves it on a path."""
+        if not isinstance(self._physics, Bodies):
+            return
+        for name in moved:
+            if self._assigned[name].velocity_m_s == STILL and (other := self._physics.overlap(name)):
+                raise ConfigurationError(
+                    f"{name} would be within {other}, at {_metres(self._assigned[name].position_m)} m",
+                    remedy="put it at a free place, or choose another world or distance",
+                )
+
+    def _restart(self) -> None:
+        """Start the physics with all robots at their present places; those that move are at rest afterwards."""
+        self.close()
+        self._physics = None
+        states = {name: self._body_state(name) for name in self._bodies}
+        self._in_physics = {name: (state.position_m, state.heading_rad or 0.0) for name, state in states.items()}
+        self._started_ns = self._now_ns - self._now_ns % self.step_ns
+        self._advanced_ns = self._now_ns
+        self._physics = self._start(states)
+        self._physics_states = self._physics.advance(0, {})
+
+    def _body_state(self, name: str) -> State:
+        steering = self._steerings.get(name)
+        if steering is not None and steering.is_driven and name in self._physics_states:
+            state = self._physics_states[name]
+            return State(state.position_m, heading_rad=state.heading_rad)
+        return State(self._assigned[name].position_m, heading_rad=0.0 if steering is None else steering.heading_rad)
+
+
+def _differs(place: tuple[Vector, float], other: tuple[Vector, float] | None) -> bool:
+    return other is None or math.dist(place[0], other[0]) > _MOVED_M or place[1] != other[1]
+
+
+def _metres(place_m: Vector) -> str:
+    return ", ".join(f"{metres:g}" for metres in place_m)
+
+
+class _Limits(Mapping[str, float]):
+    """The limits of all stations, which change with their commands."""
+
+    def __init__(self, physics: LabPhysics, stations: tuple[str, ...]) -> None:
+        self._physics = physics
+        self._stations = stations
+
+    def __getitem__(self, name: str) -> float:
+        return self._physics.limit_m_s2(name)
+
+    @override
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._stations)
+
+    def __len__(self) -> int:
+        return len(self._stations)

@@ -1,0 +1,105 @@
+"""A lab's choice of simulators and sync policy: what it needs, and its check before a run."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+from fieldkit.backends.protocols import Robot
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.lab.protocol import LabRobot
+from sim_backends.cosim.policies.registry import make_policy
+from sim_backends.cosim.policies.window_policies import FixedWindow
+from sim_backends.emulated.cosimulated.simulators import BUILTIN, KINEMATIC, RobotBody, Simulators
+from sim_backends.emulated.emulated_options import EmulatedOptions, SyncOptions
+from sim_backends.emulated.motion_sections import drive_of, mavlink_of
+from sim_backends.federates.frames import NETWORK, PHYSICS
+from sim_backends.federates.named import PythonFederate, command_line, named
+from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
+from sim_backends.physics.robot_limits import BODIES
+
+_EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "window": "2ms"})
+"""Default for a network in another process: an exchange at each of its events would take too long for real time.
+ns-3 has about 14 events per packet, and an exchange takes 0.2 ms."""
+
+
+def sync_of(options: EmulatedOptions) -> SyncOptions:
+    """Return the sync policy of a lab."""
+    default = SyncOptions.defaults() if options.network in {None, BUILTIN} else _EXTERNAL_NETWORK
+    return options.sync or default
+
+
+def resolve(options: EmulatedOptions) -> Simulators:
+    """Return the simulators of a lab; programs are compiled if necessary.
+
+    Raises:
+        ConfigurationError: A simulator is not installed, does not support the lab, or the policy is invalid.
+    """
+    sync = sync_of(options)
+    policy = make_policy(**sync.policy)  # type: ignore[arg-type] # the name is a text, the others are numbers
+    if isinstance(policy, FixedWindow) and sync.window < sync.step:
+        raise ConfigurationError(
+            f"emulated.sync has a window of {sync.window:g} s, which is shorter than the step of the physics, "
+            f"{sync.step:g} s",
+            remedy=f"write window: {sync.step * 1e3:g}ms, or a shorter step",
+        )
+    return Simulators(_physics(options), _network(options), sync.step_ns)
+
+
+def _physics(options: EmulatedOptions) -> str:
+    name = options.physics or KINEMATIC
+    if name == KINEMATIC:
+        return name
+    if name == "gazebo":
+        raise ConfigurationError(
+            "a running Gazebo cannot put robots at the places of a trial",
+            remedy="write physics: kinematic or physics: mujoco under emulated; fieldkit cosim run supports Gazebo",
+        )
+    federate = named(name, PHYSICS)
+    if isinstance(federate, PythonFederate):
+        federate.load()
+    return name
+
+
+def _network(options: EmulatedOptions) -> str:
+    name = options.network or BUILTIN
+    if name == BUILTIN:
+        return name
+    for is_set, key in (
+        (options.radio.fixed, "fixed links under radio"),
+        (options.record_air, "record_air"),
+        (options.mesh is not None, "mesh"),
+    ):
+        if is_set:
+            raise ConfigurationError(
+                f"the network {name} does not support {key} of emulated",
+                remedy=f"remove it, or write network: {BUILTIN}",
+            )
+    return command_line(name, NETWORK)
+
+
+def bodies_of(robots: Iterable[Robot | LabRobot]) -> dict[str, RobotBody]:
+    """Return the bodies of robots on wheels, by name.
+
+    A drone has none: its autopilot flies the quadrotor of the kinematic physics, and the lab follows it.
+    """
+    return {robot.name: _body(robot.profile) for robot in robots if mavlink_of(robot.profile) is None}
+
+
+def _body(profile: RobotProfile) -> RobotBody:
+    """Return the body of a profile, or of a TurtleBot3 if there is none, with the limits of its base."""
+    known = BODIES.get(profile.name)
+    limits = known if isinstance(known, DriveLimits) else TURTLEBOT3_BURGER
+    limits = replace(limits, speed_m_s=float(profile.limits.max_speed_m_s))
+    if (drive := drive_of(profile)) is not None:
+        limits = replace(limits, acceleration_m_s2=drive.acceleration_m_s2, turn_rad_s=drive.turn_rad_s)
+    return RobotBody(profile.name, limits)
+
+
+def summary(options: EmulatedOptions) -> Mapping[str, str]:
+    """Return the simulators and the policy of a lab, by what they are."""
+    sync = sync_of(options)
+    return {
+        "physics": options.physics or KINEMATIC,
+        "network": options.network or BUILTIN,
+        "sync": sync.name,
+    }

@@ -1,0 +1,128 @@
+"""One run of the coordinator in a lab on the co-simulation."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import permutations
+from typing import Any, Protocol
+
+from fieldkit.core.model import LinkSample
+from sim_backends.cosim.coordinator import Coordinator
+from sim_backends.cosim.policies.registry import make_policy
+from sim_backends.cosim.run_record import Fate, WindowObserver
+from sim_backends.emulated.cosimulated.clock import RealTime
+from sim_backends.emulated.cosimulated.lab_physics import LabPhysics
+from sim_backends.emulated.cosimulated.real_agents import Devices, RealAgents
+from sim_backends.emulated.cosimulated.simulators import (
+    BUILTIN,
+    BuiltinNetwork,
+    LabSettings,
+    builtin_network,
+    start_network,
+    start_physics,
+)
+from sim_backends.emulated.cosimulated.steering import Steering
+from sim_backends.emulated.medium.server import AttemptLog
+from sim_backends.federates.protocols import NetworkFederate
+from sim_backends.network.bare_ip import BROADCAST, broadcast_flow
+from sim_backends.network.ip import Fragment
+from sim_backends.network.packets import Packet
+from sim_backends.radio.frames import TransmissionAttempt
+from sim_backends.radio.links import PACKET, Delay
+from sim_backends.radio.random_streams import PacketIdentity
+
+
+class CosimMedium(Devices, WindowObserver, Protocol):
+    """The process, as a session uses it."""
+
+
+class CosimSession:
+    """One run of the coordinator.
+
+    Args:
+        medium: The devices of its agents, and its observer.
+        settings: Simulators and their settings.
+        steerings: Steering of each robot that programs can drive.
+        policy: Name and parameters of the sync policy.
+        clock: Real time.
+
+    Raises:
+        ConfigurationError: A simulator cannot be used with these settings.
+        FederateError: A simulator failed, or has not answered in time.
+    """
+
+    def __init__(
+        self,
+        medium: "CosimMedium",
+        settings: LabSettings,
+        steerings: Mapping[str, Steering],
+        policy: Mapping[str, Any],
+        clock: RealTime,
+    ) -> None:
+        self.settings = settings
+        self._clock = clock
+        self.stations = tuple(settings.antennas)
+        self.physics = LabPhysics(
+            lambda states: start_physics(settings, states),
+            steerings,
+            tuple(settings.bodies),
+            self.stations,
+            step_ns=settings.simulators.step_ns,
+            clock=clock,
+        )
+        self.builtin: BuiltinNetwork | None = None
+        self._delays: dict[tuple[str, PacketIdentity], Delay] = {}
+        if settings.simulators.network == BUILTIN:
+            self.builtin = builtin_network(settings)
+            self.builtin.federate.log_delays(self._log_delay)
+            self.network: NetworkFederate = self.builtin.federate
+        else:
+            self.network = start_network(settings, self.physics.states)
+        self.agents = RealAgents(self.physics, medium)
+        self.coordinator = Coordinator(
+            self.agents, self.network, make_policy(**policy), [*permutations(self.stations, 2)], observer=medium
+        )
+
+    def close(self) -> None:
+        """End the simulators."""
+        self.physics.close()
+        if close := getattr(self.network, "close", None):
+            close()
+
+    def forget(self, packet: Packet) -> None:
+        """Remove a packet whose fate is decided from the record of the coordinator."""
+        del self.coordinator.run.fates[packet.identity]
+
+    def network_delay(self, fate: Fate) -> tuple[Delay, int]:
+        """Return the parts of a packet's delay in the network, and the delay that the network does not divide."""
+        packet = fate.packet
+        identity = packet.identity
+        if packet.protocol == BROADCAST:
+            identity = broadcast_flow(packet.source), identity[1]
+        delay = self._delays.pop((packet.destination, identity), None)
+        if delay is not None:
+            return delay, 0
+        assert fate.arrived_ns is not None
+        return PACKET, fate.arrived_ns - packet.enters_ns
+
+    def log_attempts(self, log: AttemptLog | None) -> None:
+        """Pass every transmission attempt to `log`, in real time, with the content of its packet; None stops it."""
+        assert self.builtin is not None
+        self.builtin.radio.log_attempts(None if log is None else partial(self._log_attempt, log))
+
+    def _log_attempt(self, log: AttemptLog, attempt: TransmissionAttempt) -> None:
+        content = None if attempt.payload is None else self.agents.content(attempt.payload.identity)
+        start_ns, end_ns = self._clock.monotonic_ns(attempt.start_ns), self._clock.monotonic_ns(attempt.end_ns)
+        log(replace(attempt, start_ns=start_ns, end_ns=end_ns, payload=content))
+
+    def sample_links(self) -> Mapping[str, LinkSample]:
+        """Return a sample of the links of all radios at their present positions."""
+        assert self.builtin is not None
+        federate, radio = self.builtin
+        positions_m = {name: state.position_m for name, state in self.physics.states.items()}
+        radio.place(federate.now_ns, positions_m, self.settings.relay)
+        return radio.sample(federate.now_ns, time.time_ns())
+
+    def _log_delay(self, host: str, fragment: Fragment, delay: Delay) -> None:
+        self._delays[host, fragment.identity] = delay

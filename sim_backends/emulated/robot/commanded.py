@@ -1,0 +1,69 @@
+"""Record of the velocity that a robot's base was commanded last, read by the physics that moves the robot.
+
+Only the standard library is imported, because the base process is imported under Debian's Python, too.
+"""
+
+import os
+from pathlib import Path
+from typing import Final, NamedTuple, Self
+
+from sim_backends.emulated.robot.spec import STATE
+from sim_backends.emulated.ros.slots import Slots
+
+COMMANDED: Final = Path(STATE, "commanded")
+"""The file of the record in the robot."""
+
+
+class Commanded(NamedTuple):
+    """A commanded velocity.
+
+    Attributes:
+        time_ns: Time at which the base received it, by the monotonic clock.
+        forward_m_s: Forward speed.
+        turn_rad_s: Turn rate to the left.
+    """
+
+    time_ns: int
+    forward_m_s: float
+    turn_rad_s: float
+
+
+class CommandedRecord:
+    """The record in a file, with one writer and any number of readers.
+
+    Args:
+        fd: Descriptor of the file, which this object closes.
+    """
+
+    def __init__(self, fd: int) -> None:
+        self._slots = Slots(fd, "q2d")
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Return the record in a file, which is created if it is missing.
+
+        Raises:
+            OSError: It cannot be created.
+        """
+        return cls(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+
+    def write(self, commanded: Commanded) -> None:
+        """Write a commanded velocity.
+
+        Raises:
+            OSError: There is no space for it.
+        """
+        self._slots.write(*commanded)
+
+    def read(self) -> Commanded | None:
+        """Return the last commanded velocity, or None if there is none.
+
+        Raises:
+            OSError: The file cannot be read.
+        """
+        values = self._slots.read()
+        return None if values is None else Commanded(*values)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._slots.close()

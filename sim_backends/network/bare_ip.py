@@ -1,0 +1,103 @@
+"""Transports of bare IP packets: each packet of a program is one IP packet, with its own headers in its size.
+
+The programs are real ones, whose kernels have built the packets. A broadcast or multicast enters the network as one
+packet per receiver, all of one source, number and time; on the air they are one frame.
+"""
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from sim_backends.network.packets import Packet
+from sim_backends.network.wire import IpPacket, Wire
+
+UNICAST: Final = "ip"
+"""Name of the transport of packets with one receiver."""
+BROADCAST: Final = "ip-broadcast"
+"""Name of the transport of packets to all stations."""
+
+
+def broadcast_flow(source: str) -> str:
+    """Return the flow that keys the random draws of a source's broadcasts."""
+    return f"{source} > all"
+
+
+class BareIp:
+    """Carries packets with one receiver.
+
+    Args:
+        wire: The network below.
+    """
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+
+    def send(self, packet: Packet) -> None:
+        """Implement `Transport.send`."""
+        self._wire.transmit(
+            IpPacket(packet.source, packet.destination, UNICAST, packet.size_bytes, packet.identity, packet.packet_id)
+        )
+
+    def receive(self, host: str, packet: IpPacket) -> None:  # noqa: ARG002 (see Transport)
+        """Implement `Transport.receive`."""
+        self._wire.deliver(packet.body)
+
+    def lost(self, packet: IpPacket, reason: str) -> None:
+        """Implement `Transport.lost`."""
+        self._wire.drop(packet.body, reason)
+
+
+@dataclass(slots=True)
+class _Group:
+    """The packets of one broadcast.
+
+    Attributes:
+        packet_ids: Number of the packet of each receiver that has not received or missed it.
+        missed: Reason why each receiver missed the frame whose packet has not entered yet.
+    """
+
+    packet_ids: dict[str, int] = field(default_factory=dict)
+    missed: dict[str, str] = field(default_factory=dict)
+
+
+class BareBroadcast:
+    """Carries broadcasts. The first packet of a group sends the frame, the others only wait for it.
+
+    Args:
+        wire: The network below.
+    """
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+        self._last: dict[str, tuple[int, _Group]] = {}
+
+    def send(self, packet: Packet) -> None:
+        """Implement `Transport.send`."""
+        source, number = packet.source, packet.identity[1]
+        last_number, group = self._last.get(source, (None, None))
+        if group is None or last_number != number:
+            group = _Group()
+            self._last[source] = number, group
+            identity = broadcast_flow(source), number
+            self._wire.transmit(IpPacket(source, None, BROADCAST, packet.size_bytes, identity, group))
+        if (reason := group.missed.pop(packet.destination, None)) is not None:
+            self._wire.drop(packet.packet_id, reason)
+        else:
+            group.packet_ids[packet.destination] = packet.packet_id
+
+    def receive(self, host: str, packet: IpPacket) -> None:
+        """Implement `Transport.receive`."""
+        group: _Group = packet.body
+        if (packet_id := group.packet_ids.pop(host, None)) is not None:
+            self._wire.deliver(packet_id)
+
+    def lost(self, packet: IpPacket, reason: str) -> None:
+        """Implement `Transport.lost`; it is called for packets with one receiver only."""
+
+    def missed(self, packet: IpPacket, host: str, reason: str) -> None:
+        """Implement `CountsMisses.missed`."""
+        group: _Group = packet.body
+        packet_id = group.packet_ids.pop(host, None)
+        if packet_id is None:
+            group.missed[host] = reason
+        else:
+            self._wire.drop(packet_id, reason)
