@@ -6,7 +6,7 @@ from dataclasses import replace
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.lab.protocol import LabRobot
+from fieldkit.lab.robots import LabRobot
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.window_policies import FixedWindow
 from sim_backends.emulated.cosimulated.simulators import BUILTIN, KINEMATIC, RobotBody, Simulators
