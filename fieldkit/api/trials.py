@@ -236,7 +236,7 @@ def _note(sentence: str, stacklevel: int = 2) -> None:
     warnings.warn(sentence, stacklevel=stacklevel)
 
 
-def load(*paths: str | PathLike[str], rebuild: bool = False) -> Trials:
+def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "") -> Trials:
     """Return the trials at some paths.
 
     Notes of `fieldkit aggregate`, for example on a trial that is left out, are issued as `UserWarning`.
@@ -244,6 +244,7 @@ def load(*paths: str | PathLike[str], rebuild: bool = False) -> Trials:
     Args:
         paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
         rebuild: Whether to measure the raw evidence again instead of reading trial.csv; nothing is written.
+        where: Condition of the attempts to use, `distance_m < 20 and topology == "master"`; empty for all.
 
     Raises:
         ConfigurationError: A path does not exist or has no trial, or a file is not a table of repeats. It is a
@@ -252,4 +253,4 @@ def load(*paths: str | PathLike[str], rebuild: bool = False) -> Trials:
     """
     if not paths:
         raise ConfigurationError("no path is given", remedy='write for example fieldkit.load("trials")')
-    return Trials(sources.find([Path(path) for path in paths], _note, rebuild=rebuild))
+    return Trials(sources.find([Path(path) for path in paths], _note, rebuild=rebuild).with_filter(where))

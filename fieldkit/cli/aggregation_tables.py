@@ -47,7 +47,7 @@ def show(arguments: argparse.Namespace) -> int:
     output_format = arguments.format
     data = sources.find(
         arguments.paths, show_note, rebuild=arguments.rebuild, workers=Workers(arguments.jobs, arguments.cluster)
-    )
+    ).with_filter(arguments.where)
     by = (arguments.by == CONDITION and data.sweep_condition) or data.condition(arguments.by)
     selected, words = data.chosen(arguments.quantity)
     if words and output_format == "latex":

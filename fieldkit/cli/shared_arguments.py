@@ -109,6 +109,17 @@ def add_paths(parser: Parser) -> None:
     add_rebuild(parser)
 
 
+def add_where(parser: Parser) -> None:
+    """Add `--where`, which `Sources.with_filter` reads."""
+    parser.add_argument(
+        "--where",
+        default="",
+        metavar="EXPRESSION",
+        help="use only the attempts for which it is true: comparisons of columns, with and, or, not, in; for example "
+        "'distance_m < 20 and topology == \"master\"'",
+    )
+
+
 def add_rebuild(parser: Parser) -> None:
     """Add `--rebuild`."""
     parser.add_argument(

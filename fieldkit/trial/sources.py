@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Final
@@ -12,10 +12,12 @@ from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities, word_columns
 from fieldkit.analysis.repeats import SOURCE, Repeats
+from fieldkit.analysis.row_filters import RowFilter, parse_filter
 from fieldkit.core import files, laptop_files
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
 from fieldkit.core.executors import Workers
+from fieldkit.core.units import format_count
 from fieldkit.trial import frozen, rows, store, tables
 from fieldkit.trial.plan import PLAN_FILE
 
@@ -39,6 +41,7 @@ class Sources:
         rebuild: Whether raw evidence is measured again instead; nothing is written.
         note: Receives notes.
         workers: Where raw evidence is measured again.
+        row_filter: Chooses rows; None for all.
     """
 
     where: str
@@ -47,6 +50,7 @@ class Sources:
     rebuild: bool
     note: Note
     workers: Workers = ALL_PROCESSORS
+    row_filter: RowFilter | None = None
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
@@ -149,6 +153,8 @@ class Sources:
             self.note(f"kept as text, because no installed kind of step declares it: {', '.join(others)}")
         if columns is None:
             columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
+        if self.row_filter is not None:
+            columns = {*columns, *self.row_filter.names}
         content = _remeasured_tables(self.tables, self.workers, self.note) if self.rebuild else Path.read_bytes
         attempts, notes = deduplicated(table_files.read(self.tables, self.columns, columns, content))
         for note in notes:
@@ -160,7 +166,26 @@ class Sources:
                 where=self.where,
                 remedy=shell_command("fieldkit", "resume", started) if started else "name a trial that ran",
             )
-        return attempts
+        return attempts if self.row_filter is None else self._chosen_rows(attempts, self.row_filter)
+
+    def _chosen_rows(self, attempts: Repeats, row_filter: RowFilter) -> Repeats:
+        chosen = attempts.where(row_filter.mask(attempts))
+        if not len(chosen):
+            raise EvidenceError(
+                f"none of {format_count(len(attempts), 'attempt')} satisfies --where {row_filter.text}",
+                where=self.where,
+                remedy="a missing value satisfies no comparison; fieldkit columns show NAME explains a column",
+            )
+        return chosen
+
+    def with_filter(self, text: str) -> "Sources":
+        """Return these sources with the rows that satisfy an expression; all rows if it is empty.
+
+        Raises:
+            ConfigurationError: As for `parse_filter`.
+        """
+        columns = {column.name: column for column in self.columns}
+        return replace(self, row_filter=parse_filter(text, columns)) if text else self
 
 
 def find(paths: Sequence[Path], note: Note, *, rebuild: bool = False, workers: Workers = ALL_PROCESSORS) -> Sources:

@@ -12,6 +12,7 @@ def add(parser: Parser) -> None:
     parser.epilog = "example: fieldkit aggregate trials --by distance,protocol --quantity ip_loss"
     shared.add_paths(parser)
     shared.add_workers(parser)
+    shared.add_where(parser)
     shared.add_cells(parser)
     parser.add_argument(
         "--quantity",

@@ -22,6 +22,7 @@ def add(parser: Parser) -> None:
         "above, it lists planned trials without an attempt."
     )
     shared.add_paths(parser)
+    shared.add_where(parser)
     parser.add_argument(
         "-o",
         "--out",
@@ -66,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     out, folder = arguments.out, arguments.figures
     _require_writable(out)
-    data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild)
+    data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild).with_filter(arguments.where)
     selected_names = [data.quantity(name).name for name in arguments.quantity]
     repeats = data.read()
     report_contents = contents.build_contents(
@@ -130,5 +131,6 @@ def _command(arguments: argparse.Namespace) -> list[str]:
     """Return the words of the command that regenerates the page."""
     words = ["fieldkit", "report", *map(str, arguments.paths), "-o", str(arguments.out)]
     words += ["--title", arguments.title] if arguments.title else []
+    words += ["--where", arguments.where] if arguments.where else []
     words += [word for name in arguments.quantity for word in ("--quantity", name)]
     return words + (["--repeat", arguments.repeat] if arguments.repeat else [])
