@@ -281,7 +281,7 @@ def columns() -> str:
     packets = ((f"`{column.name}`", column.unit, column.meaning) for column in PACKET_COLUMNS)
     blocks += [
         "## packets",
-        "Rows of [`trials.packets`](../python-api.md#packets) in Python, with the `step` of the transfer.",
+        "Columns of [`trials.packets`](../python-api.md#packets) in Python, besides `step`.",
         table(("column", "unit", "meaning"), packets),
     ]
     return page("Columns", *blocks)
