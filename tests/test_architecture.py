@@ -379,7 +379,16 @@ def test_the_walk_names_each_method_of_a_step() -> None:
 # External federates are used by these modules of the co-simulation only.
 FEDERATE_SEAMS = {
     "sim_backends/cosim/federates.py": {"protocols"},
-    "sim_backends/cosim/scenario/external.py": {"frames", "handshake", "named", "protocols", "remote", "transports"},
+    "sim_backends/cosim/scenario/external.py": {
+        "frames",
+        "handshake",
+        "named",
+        "protocols",
+        "remote",
+        "simulator_options",
+        "transports",
+    },
+    "sim_backends/cosim/scenario/federate_choice.py": {"frames", "named", "simulator_options"},
     "sim_backends/cosim/scenario/served.py": {"frames", "handshake", "serving"},
     "sim_backends/cosim/commands/conform.py": {"conformance", "frames", "handshake", "named", "protocols", "session"},
 }

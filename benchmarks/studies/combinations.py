@@ -23,7 +23,7 @@ from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.comparison import errors, lost_share
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.scenario.build import Simulation
-from sim_backends.cosim.scenario.schema import BUILT_IN
+from sim_backends.cosim.scenario.federate_choice import BUILT_IN
 from sim_backends.cosim.studies.intervals import mean
 from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, delay_s, mean_separation_m, outcomes
 

@@ -22,6 +22,7 @@ from fieldkit.config.site import Site
 from fieldkit.core import errors, events
 from fieldkit.core.columns import Column
 from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
+from fieldkit.measure.transfers.fates import PACKET_COLUMNS
 from fieldkit.pytest import plugin
 from fieldkit.steps.base import Step, step_types
 from fieldkit.steps.capabilities import CAPABILITIES
@@ -277,6 +278,12 @@ def columns() -> str:
     ]
     for name, file_columns in files.items():
         blocks += [f"## {name}", table(("column", "unit", "repeats give", "meaning"), _column_rows(file_columns))]
+    packets = ((f"`{column.name}`", column.unit, column.meaning) for column in PACKET_COLUMNS)
+    blocks += [
+        "## packets",
+        "Columns of [`trials.packets`](../python-api.md#packets) in Python, besides `step`.",
+        table(("column", "unit", "meaning"), packets),
+    ]
     return page("Columns", *blocks)
 
 

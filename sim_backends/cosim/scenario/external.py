@@ -7,7 +7,8 @@ from typing import Any, Final, NamedTuple
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.scenario.agent_setup import antennas, limits
-from sim_backends.cosim.scenario.schema import BUILT_IN, CosimScenario
+from sim_backends.cosim.scenario.federate_choice import BUILT_IN
+from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, Hello

@@ -9,19 +9,15 @@ from fieldkit.config.documentation import attribute_meanings, class_description,
 from fieldkit.config.schema import Document, Strict
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.cosim.scenario.checks import check
-from sim_backends.cosim.scenario.schema import BUILT_IN, CosimScenario
-from sim_backends.federates.frames import PHYSICS, ROLES
-from sim_backends.federates.named import federates
-from sim_backends.federates.simulator_options import SimulatorOptions
+from sim_backends.cosim.scenario.federate_choice import add_options, drop_options_of_replaced_federates
+from sim_backends.cosim.scenario.schema import CosimScenario, NetworkOptions, PhysicsOptions
 from sim_backends.world.world import load_world
 
 
 def editor_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a scenario file, with the meaning of each key."""
     whole = CosimScenario.model_json_schema()
-    for name, federate in federates().items():
-        if federate.options is not None:
-            _add_options(whole["$defs"], name, federate.role, federate.options)
+    add_options(whole["$defs"], {"physics": PhysicsOptions.__name__, "network": NetworkOptions.__name__})
     models = {model.__name__: model for model in _models(Strict)}
     for part in (whole, *whole["$defs"].values()):
         model = models.get(part.get("title", ""))
@@ -35,20 +31,6 @@ def editor_schema() -> dict[str, Any]:
             if not isinstance(value.get("default"), str) and "string" in _types(value):
                 value.pop("default", None)  # it is a number in SI units, but files have texts with units
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole}
-
-
-def _add_options(definitions: dict[str, Any], name: str, role: int, options: type[SimulatorOptions]) -> None:
-    """Add the schema of a simulator's options, which are valid if the scenario uses it."""
-    whole = options.model_json_schema()
-    definitions |= whole.pop("$defs", {})
-    definitions[f"{name}.options"] = whole
-    section = definitions["PhysicsOptions" if role == PHYSICS else "NetworkOptions"]
-    section.setdefault("allOf", []).append(
-        {
-            "if": {"properties": {"federate": {"const": name}}, "required": ["federate"]},
-            "then": {"properties": {"options": {"anyOf": [{"$ref": f"#/$defs/{name}.options"}, {"type": "null"}]}}},
-        }
-    )
 
 
 def _models(base: type[Strict]) -> Iterator[type[Strict]]:
@@ -85,7 +67,7 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     path = _path(str(name_or_path))
     document = schema.read(path)
     try:
-        _drop_options_of_replaced_federates(document.data, changes or {})
+        drop_options_of_replaced_federates(document.data, changes or {})
         for key, value in (changes or {}).items():
             _change(document, key.split("."), value)
         scenario = catalog.validate_named(document, CosimScenario, path.stem)
@@ -101,15 +83,6 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
             )
         raise
     return scenario
-
-
-def _drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) -> None:  # noqa: ANN401 (any YAML value)
-    """Remove the options of each federate that a change replaces, because they are only valid for it."""
-    for role in ROLES.values():
-        section = data.get(role) if isinstance(data, dict) else None
-        other = changes.get(f"{role}.federate")
-        if isinstance(section, dict) and other and section.get("federate") not in {None, BUILT_IN, other}:
-            section.pop("options", None)
 
 
 def _change(document: Document, keys: list[str], value: Any) -> None:  # noqa: ANN401 (any YAML value)

@@ -1,23 +1,11 @@
 """The schema of a scenario file. Checks that need more than the file are in `checks`."""
 
-from collections.abc import Callable, Iterator
-from typing import Annotated, Any, Final, Literal
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
-from fieldkit.config.schema import (
-    AfterValidator,
-    Duration,
-    Field,
-    Int,
-    Length,
-    Location,
-    PlainSerializer,
-    PlainValidator,
-    Strict,
-    ValidationInfo,
-    WithJsonSchema,
-)
+from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length, Location, Strict
 from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
@@ -25,18 +13,18 @@ from sim_backends.cosim.policies.registry import policies, unknown_policy_remedy
 from sim_backends.cosim.programs.way_points import PERIOD_NS
 from sim_backends.cosim.scenario.agent_plans import FollowPlan, MotionPlan, Name, StandingPlan, StreamTraffic, Traffic
 from sim_backends.cosim.scenario.faults import ClockSkewFault, Fault, JammerFault
+from sim_backends.cosim.scenario.federate_choice import (
+    Federate,
+    NetworkFederateOptions,
+    PhysicsFederateOptions,
+    agent_references,
+)
 from sim_backends.cosim.scenario.reproduced_trial import ReproducedTrial
 from sim_backends.emane_events.options import EmaneOptions
-from sim_backends.federates.frames import NETWORK, PHYSICS
-from sim_backends.federates.named import named
-from sim_backends.federates.simulator_options import Options, SimulatorOptions, options_json
 from sim_backends.network.tcp.tcp_options import Congestion
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import Lifetime
 from sim_backends.world.obstacles import Place, Real
-
-BUILT_IN: Final = "builtin"
-"""Name of the built-in physics and of the built-in network."""
 
 
 def _check_policy_name(name: str) -> str:
@@ -79,34 +67,6 @@ class PolicyChoice(Strict):
         )
 
 
-def _without_built_in(name: str | None) -> str | None:
-    return None if name == BUILT_IN else name
-
-
-Federate = Annotated[str | None, AfterValidator(_without_built_in)]
-
-
-def _options_of(role: int) -> Callable[[Any, ValidationInfo], Options]:
-    """Return the validator of the options of the federate in the same mapping."""
-
-    def validated(value: Any, info: ValidationInfo) -> Options:  # noqa: ANN401 (any YAML value)
-        if not isinstance(value, dict | SimulatorOptions | None):
-            raise schema.validation_error("keys with values are needed here")
-        where = info.data.get("federate")
-        federate = None if where is None else named(where, role)
-        if federate is None or federate.options is None or isinstance(value, SimulatorOptions):
-            return value
-        return federate.options.model_validate(value or {})
-
-    return validated
-
-
-_OPTIONS_JSON: Final = WithJsonSchema({"anyOf": [{"type": "object"}, {"type": "null"}]})
-_OPTIONS_TEXT: Final = PlainSerializer(lambda options: None if options is None else options_json(options))
-# A simulator has the defaults of its options if a scenario has no options.
-_DEFAULT_OPTIONS: Final = Field(validate_default=True)
-
-
 class PhysicsOptions(Strict):
     """The physics of a scenario.
 
@@ -121,9 +81,7 @@ class PhysicsOptions(Strict):
 
     step: Annotated[Duration, Field(ge=1e-6, le=1)] = 0.001
     federate: Federate = None
-    options: Annotated[
-        Options, PlainValidator(_options_of(PHYSICS)), _OPTIONS_TEXT, _OPTIONS_JSON, _DEFAULT_OPTIONS
-    ] = None
+    options: PhysicsFederateOptions = None
 
     @property
     def step_ns(self) -> int:
@@ -141,9 +99,7 @@ class NetworkOptions(Strict):
     """
 
     federate: Federate = None
-    options: Annotated[
-        Options, PlainValidator(_options_of(NETWORK)), _OPTIONS_TEXT, _OPTIONS_JSON, _DEFAULT_OPTIONS
-    ] = None
+    options: NetworkFederateOptions = None
 
 
 class AgentRadio(Strict):
@@ -304,17 +260,12 @@ class CosimScenario(Named):
         for agent, plan in self.agents.items():
             if isinstance(plan.motion, FollowPlan):
                 yield from ((name, ("agents", agent, "motion", "leader")) for name in plan.motion.leader)
-        for place, options in self._options():
-            yield from ((name, (*place, *location)) for name, location in options.agent_names())
-
-    def _options(self) -> Iterator[tuple[Location, SimulatorOptions]]:
-        """Yield all validated options, with their keys."""
-        sections = {
-            ("physics", "options"): self.physics.options,
-            ("network", "options"): self.network.options,
-            ("emane",): self.emane,
-        }
-        yield from ((place, options) for place, options in sections.items() if isinstance(options, SimulatorOptions))
+        for place, options in (
+            (("physics", "options"), self.physics.options),
+            (("network", "options"), self.network.options),
+            (("emane",), self.emane),
+        ):
+            yield from ((name, (*place, *location)) for name, location in agent_references(options))
 
     @schema.model_validator(mode="after")
     def _relay_is_named(self) -> "CosimScenario":

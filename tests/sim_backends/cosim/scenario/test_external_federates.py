@@ -4,7 +4,6 @@ import json
 import os
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -22,6 +21,7 @@ from sim_backends.federates.protocols import FederateError
 from tests.helpers.federate_examples import EXAMPLES
 from tests.helpers.federate_pairs import children, now_s
 from tests.helpers.runs import cosim, finish, start, wait_during
+from tests.helpers.sshd import free_port
 
 SERVED = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served"))
 DURATION = {"duration": "400ms"}
@@ -32,8 +32,7 @@ def served() -> Iterator[dict[str, str]]:
     """The built-in federates as processes that listen, and serve one run after another: addresses by role."""
     processes, addresses = [], {}
     for role in ("physics", "network"):
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            port = server.getsockname()[1]
+        port = free_port()
         command = [*shlex.split(SERVED), role, f"tcp-listen:127.0.0.1:{port}"]
         processes.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
         addresses[role] = f"tcp:127.0.0.1:{port}"

@@ -1,0 +1,102 @@
+"""The federate of a scenario's physics or network, and its options: those of the simulator with its name."""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, Final
+
+from fieldkit.config import schema
+from fieldkit.config.schema import (
+    AfterValidator,
+    Field,
+    Location,
+    PlainSerializer,
+    PlainValidator,
+    ValidationInfo,
+    WithJsonSchema,
+)
+from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
+from sim_backends.federates.named import federates, named
+from sim_backends.federates.simulator_options import Options, SimulatorOptions, options_json
+
+BUILT_IN: Final = "builtin"
+"""Name of the built-in physics and of the built-in network."""
+
+
+def _without_built_in(name: str | None) -> str | None:
+    return None if name == BUILT_IN else name
+
+
+Federate = Annotated[str | None, AfterValidator(_without_built_in)]
+"""Name, command or address of a federate; None for the built-in one."""
+
+
+def _options_of(role: int) -> Callable[[Any, ValidationInfo], Options]:
+    """Return the validator of the options of the federate in the same mapping."""
+
+    def validated(value: Any, info: ValidationInfo) -> Options:  # noqa: ANN401 (any YAML value)
+        if not isinstance(value, dict | SimulatorOptions | None):
+            raise schema.validation_error("keys with values are needed here")
+        where = info.data.get("federate")
+        federate = None if where is None else named(where, role)
+        if federate is None or federate.options is None or isinstance(value, SimulatorOptions):
+            return value
+        return federate.options.model_validate(value or {})
+
+    return validated
+
+
+_JSON_SCHEMA: Final = WithJsonSchema({"anyOf": [{"type": "object"}, {"type": "null"}]})
+_SERIALIZER: Final = PlainSerializer(lambda options: None if options is None else options_json(options))
+# A simulator has the defaults of its options if a scenario has no options.
+_VALIDATED_DEFAULT: Final = Field(validate_default=True)
+
+PhysicsFederateOptions = Annotated[
+    Options, PlainValidator(_options_of(PHYSICS)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
+]
+"""Options of the federate `federate` in the same mapping, a physics."""
+NetworkFederateOptions = Annotated[
+    Options, PlainValidator(_options_of(NETWORK)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
+]
+"""Options of the federate `federate` in the same mapping, a network."""
+
+
+def agent_references(options: Options) -> Iterator[tuple[str, Location]]:
+    """Yield every agent that options name, with its keys."""
+    if isinstance(options, SimulatorOptions):
+        yield from options.agent_names()
+
+
+def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) -> None:  # noqa: ANN401 (any YAML value)
+    """Remove the options of each federate that a change replaces, because they are only valid for it.
+
+    Args:
+        data: A scenario file.
+        changes: Values that replace those of the file, by their keys.
+    """
+    for role in ROLES.values():
+        section = data.get(role) if isinstance(data, dict) else None
+        other = changes.get(f"{role}.federate")
+        if isinstance(section, dict) and other and section.get("federate") not in {None, BUILT_IN, other}:
+            section.pop("options", None)
+
+
+def add_options(definitions: dict[str, Any], sections: Mapping[str, str]) -> None:
+    """Add the JSON schema of the options of each installed simulator, which are valid if the scenario uses it.
+
+    Args:
+        definitions: The definitions of the JSON schema of scenarios.
+        sections: Name of the definition of the physics and of the network, by role.
+    """
+    for name, federate in federates().items():
+        if federate.options is None:
+            continue
+        whole = federate.options.model_json_schema()
+        definitions |= whole.pop("$defs", {})
+        definitions[f"{name}.options"] = whole
+        section = definitions[sections[ROLES[federate.role]]]
+        reference = {"$ref": f"#/$defs/{name}.options"}
+        section.setdefault("allOf", []).append(
+            {
+                "if": {"properties": {"federate": {"const": name}}, "required": ["federate"]},
+                "then": {"properties": {"options": {"anyOf": [reference, {"type": "null"}]}}},
+            }
+        )
