@@ -2,22 +2,29 @@
 
 Driving robots, 10 m apart, send packets of 1,000 bytes to the next robot by UDP in 802.11g, under `sliding_window`
 with windows of 10 ms. *Alone* is the same program of ns-3 with the same packets and positions, read from a file and
-simulated in one `Run()`. *Coupled* is the co-simulation: processor time of both processes, without that of physics
-and programs. *Built-in* is the co-simulation with the built-in network. Figures are medians of several rounds; in
-each round the variants alternate. An error is raised if alone and coupled deliver different numbers of packets.
+simulated in one `Run()`. *Minimal* passes the same requests through a pipe, one per window, and ignores the answers:
+no coordinator can cost less. *Coupled* is the co-simulation: processor time of both processes, without that of
+physics and programs. All three write the parts of every delay to a file. *Built-in* is the co-simulation with the
+built-in network. Figures are medians of several rounds; in each round the variants alternate. An error is raised if
+the delays differ.
+
+On a machine with idle processors, each message resumes a process on a processor whose caches are cold. `taskset -c 0
+python -m benchmarks.cosim_speed_ns3` shows the costs without it.
 """
 
 import argparse
+import hashlib
 import json
 import os
 import resource
+import shlex
 import statistics
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 from unittest.mock import patch
 
 from sim_backends.cosim.scenario.agent_setup import bodies
@@ -25,7 +32,7 @@ from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.federates.frames import NETWORK, MessageKind, ProtocolFrame, encode
+from sim_backends.federates.frames import HEADER_BYTES, NETWORK, MessageKind, ProtocolFrame, encode, read_header
 from sim_backends.federates.remote import RemoteNetwork
 from sim_backends.ns3.federate import command
 from sim_backends.world.world import load_world
@@ -34,8 +41,11 @@ COUNTS: Final = (3, 10, 30)
 SPACING_M: Final = 10.0
 WINDOW: Final = "10ms"
 LONGEST_S: Final = 600.0
+PARTS: Final = "parts.csv"
+"""File with the parts of the delays."""
 
 Figures = dict[str, float]
+Spent = TypeVar("Spent")
 
 
 def scenario_of(count: int, seconds: float, rate_hz: float, folder: Path) -> CosimScenario:
@@ -68,7 +78,7 @@ def scenario_of(count: int, seconds: float, rate_hz: float, folder: Path) -> Cos
         "duration": f"{seconds}s",
         "radio": {"mode": "g24"},
         "policy": {"name": "sliding_window", "window": WINDOW},
-        "network": {"federate": "ns3"},
+        "network": {"federate": "ns3", "options": {"delay_parts": str(folder / PARTS)}},
         "agents": agents,
         "traffic": traffic,
     }
@@ -116,33 +126,68 @@ def _recorder(path: Path) -> Callable[[bytes, ProtocolFrame | None], None]:
     return record
 
 
-def run_alone(requests: Path) -> Figures:
-    """Return the figures of ns-3 without a coordinator."""
+def run_alone(requests: Path) -> float:
+    """Return the processor time of ns-3 without a coordinator, in seconds."""
     words = [*command().split(), "alone", str(requests)]
     before_s = used_s(resource.RUSAGE_CHILDREN)  # after `command`, which starts compiler and pkg-config
-    output = subprocess.run(words, check=True, timeout=LONGEST_S, capture_output=True, text=True).stdout
-    return {"spent_s": used_s(resource.RUSAGE_CHILDREN) - before_s, "arrivals": json.loads(output)["arrivals"]}
+    subprocess.run(words, check=True, timeout=LONGEST_S, capture_output=True)
+    return used_s(resource.RUSAGE_CHILDREN) - before_s
+
+
+def run_minimal(requests: Path) -> float:
+    """Return the processor time of both processes if each request only waits for its answer, in seconds."""
+    frames, data = [], requests.read_bytes()
+    while data:
+        end = HEADER_BYTES + read_header(data).size
+        frames.append(data[:end])
+        data = data[end:]
+    words, before_s = shlex.split(command()), used_s(resource.RUSAGE_CHILDREN)
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        started_s = time.process_time()
+        for frame in frames:
+            process.stdin.write(frame)
+            process.stdin.flush()
+            kind = MessageKind.BUSY
+            while kind is MessageKind.BUSY:
+                size, kind, *_ = read_header(process.stdout.read(HEADER_BYTES))
+                process.stdout.read(size)
+        own_s = time.process_time() - started_s
+    return own_s + used_s(resource.RUSAGE_CHILDREN) - before_s
 
 
 def measure(scenario: CosimScenario, requests: Path) -> Figures:
     """Return the figures of a round.
 
     Raises:
-        RuntimeError: The deliveries differ.
+        RuntimeError: The delays differ.
     """
-    before, coupled, after = run_alone(requests), run_coupled(scenario), run_alone(requests)
-    if not before["arrivals"] == coupled["arrivals"] == after["arrivals"]:
-        raise RuntimeError(f"ns-3 alone delivers {before['arrivals']} packets, and coupled {coupled['arrivals']}")
-    alone_s = (before["spent_s"] + after["spent_s"]) / 2
-    builtin = scenario.model_copy(update={"network": scenario.network.model_copy(update={"federate": None})})
+    parts = requests.with_name(PARTS)
+    hashes = set()
+
+    def checked(spent: Spent) -> Spent:
+        hashes.add(hashlib.sha256(parts.read_bytes()).digest())
+        return spent
+
+    before_s = checked(run_alone(requests))
+    minimal_s, coupled = checked(run_minimal(requests)), checked(run_coupled(scenario))
+    alone_s = (before_s + checked(run_alone(requests))) / 2
+    if len(hashes) > 1:
+        raise RuntimeError("ns-3 alone, with minimal exchanges and coupled, has different delays")
+    packets = coupled["arrivals"]
+    network = scenario.network.model_copy(update={"federate": None, "options": None})
+    builtin = run_coupled(scenario.model_copy(update={"network": network}))
     return {
         "alone_s": alone_s,
+        "minimal_s": minimal_s,
         "coupled_s": coupled["spent_s"],
         "of_it_ns3_s": coupled["child_s"],
+        "minimal_adds_percent": 100 * (minimal_s / alone_s - 1),
         "coupling_adds_percent": 100 * (coupled["spent_s"] / alone_s - 1),
-        "coupling_us_per_window": (coupled["spent_s"] - alone_s) / coupled["windows"] * 1e6,
-        "builtin_s": run_coupled(builtin)["spent_s"],
-        "packets": coupled["arrivals"],
+        "coordinator_us_per_packet": (coupled["spent_s"] - minimal_s) / packets * 1e6,
+        "builtin_s": builtin["spent_s"],
+        "packets": packets,
     }
 
 

@@ -124,8 +124,10 @@ class PacketLedger:
             )
             last = {name: absence.state for name, absence in absent.items()}
             assumed, true = {**true, **last, **assumed}, {**assumed, **last, **true}
-        if destination not in assumed:
-            raise FederateError(f"the program of {source} sent to {destination}, which is not an agent")
+        try:
+            assumed_ends = assumed[source], assumed[destination]
+        except KeyError:
+            raise FederateError(f"the program of {source} sent to {destination}, which is not an agent") from None
         identity = datagram.flow, datagram.number
         if identity in self._fates:
             raise FederateError(
@@ -139,7 +141,7 @@ class PacketLedger:
         ends = true[source], true[destination]
         if since_step_s:
             ends = extrapolate(ends[0], since_step_s), extrapolate(ends[1], since_step_s)
-        fate = Fate(packet, (assumed[source], assumed[destination]), ends)
+        fate = Fate(packet, assumed_ends, ends)
         if self._measured or self._has_fixed_emitters:
             names = self._measured | {source, destination}
             states = [extrapolate(true[name], since_step_s) for name in names]

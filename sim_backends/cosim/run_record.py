@@ -114,12 +114,8 @@ class EventDigest:
             else:
                 events += _EVENT.pack(b"a", fate.packet.packet_id, fate.arrived_ns)
         self.quiet_ends_ns.append(end_ns)
-        self._hash_full_block()
-
-    def _hash_full_block(self) -> None:
-        if len(self._events) > _HASHED_BYTES:
-            self._hash.update(self._events)
-            self._events.clear()
+        if len(events) > _HASHED_BYTES:
+            self._hash_events()
 
     def _add_quiet_windows(self) -> None:
         """Append the ends of the windows without packets to the events."""
@@ -128,6 +124,10 @@ class EventDigest:
         self._events += b"".join(map(_EVENT.pack, repeat(b"w"), numbers, ends_ns))
         self._windows += len(ends_ns)
         ends_ns.clear()
+
+    def _hash_events(self) -> None:
+        self._hash.update(self._events)
+        self._events.clear()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "EventDigest":
         duplicate = EventDigest()
@@ -138,10 +138,8 @@ class EventDigest:
     def hexdigest(self) -> str:
         """Return the hash over all windows so far, in hexadecimal."""
         self._add_quiet_windows()
-        self._hash_full_block()
-        complete = self._hash.copy()
-        complete.update(self._events)
-        return complete.hexdigest()
+        self._hash_events()
+        return self._hash.hexdigest()
 
 
 class Window(NamedTuple):

@@ -2,8 +2,7 @@
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sim_backends.federates.agent_states import (
     STATE,
@@ -98,8 +97,7 @@ def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]
     return at_ns, states
 
 
-@dataclass(frozen=True)
-class AdvanceNetwork:
+class AdvanceNetwork(NamedTuple):
     """A request to a network.
 
     Attributes:
@@ -145,8 +143,7 @@ class AdvanceNetwork:
         return AdvanceNetwork(to_ns, states, packets, since_ns, reckoning_ns)
 
 
-@dataclass(frozen=True)
-class NetworkOutcomes:
+class NetworkOutcomes(NamedTuple):
     """A network's answer.
 
     Attributes:

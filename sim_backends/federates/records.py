@@ -3,6 +3,7 @@
 import math
 import struct
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any, Final
 
 from sim_backends.federates.agent_states import AgentTable
@@ -35,6 +36,9 @@ LAYOUTS: Final = {
     "drop": "`id` u64, `reason` text",
 }
 """Layout of each part of a message, for the reference."""
+
+_text_bytes: Final = lru_cache(maxsize=4096)(text_bytes)
+"""As `text_bytes`; most texts of packets are names of flows and transports, which recur."""
 
 
 def commands_bytes(commands: Mapping[str, Any], agents: AgentTable) -> bytes:
@@ -89,19 +93,12 @@ def read_commands(reader: FrameReader, agents: AgentTable) -> dict[str, Twist | 
 
 def packets_bytes(packets: Iterable[Packet], agents: AgentTable) -> bytes:
     """Return packets."""
+    indices, pack = agents.indices, _PACKET.pack
     parts = [
-        _PACKET.pack(
-            packet.packet_id,
-            packet.identity[1],
-            packet.size_bytes,
-            packet.sent_ns,
-            packet.enters_ns,
-            agents.indices[packet.source],
-            agents.indices[packet.destination],
-        )
-        + text_bytes(packet.identity[0])
-        + text_bytes(packet.protocol)
-        for packet in packets
+        pack(packet_id, number, size_bytes, sent_ns, enters_ns, indices[source], indices[destination])
+        + _text_bytes(flow)
+        + _text_bytes(protocol)
+        for packet_id, source, destination, size_bytes, (flow, number), sent_ns, enters_ns, protocol in packets
     ]
     return count_bytes(len(parts)) + b"".join(parts)
 
@@ -139,13 +136,15 @@ def read_arrivals(reader: FrameReader, agents: AgentTable) -> list[Arrival]:
         MalformedFrameError: An arrival is invalid.
     """
     count = reader.count(_ARRIVAL.size)
-    arrivals = []
-    for _ in range(count):
-        position = reader.position
-        packet_id, at_ns, index, reserved = reader.unpack(_ARRIVAL)
-        if reserved:
-            raise MalformedFrameError(position + 20, f"the reserved field is {reserved}, not 0")
-        arrivals.append(Arrival(packet_id, agents.name(index, position + 16), at_ns))
+    begin, names = reader.position, agents.names
+    arrivals: list[Arrival] = []
+    for packet_id, at_ns, index, reserved in _ARRIVAL.iter_unpack(reader.take(count * _ARRIVAL.size)):
+        if reserved or index >= len(names):
+            position = begin + len(arrivals) * _ARRIVAL.size
+            if reserved:
+                raise MalformedFrameError(position + 20, f"the reserved field is {reserved}, not 0")
+            agents.name(index, position + 16)  # raises
+        arrivals.append(Arrival(packet_id, names[index], at_ns))
     return arrivals
 
 

@@ -157,8 +157,9 @@ class OnGround:
 
 def extrapolate(state: State, seconds: float) -> State:
     """Return the state after this time, at constant velocity."""
-    (e, n, u), (v_e, v_n, v_u) = state.position_m, state.velocity_m_s
-    return state._replace(position_m=(e + seconds * v_e, n + seconds * v_n, u + seconds * v_u))
+    (e, n, u), velocity_m_s, heading_rad = state
+    v_e, v_n, v_u = velocity_m_s
+    return State((e + seconds * v_e, n + seconds * v_n, u + seconds * v_u), velocity_m_s, heading_rad)
 
 
 class _Extrapolated(Mapping[str, State]):

@@ -275,8 +275,8 @@ def test_every_difference_in_a_window_changes_the_digest() -> None:
         "identity": ("a to b", 4),
     }
     fields |= {"sent_ns": 101, "enters_ns": 111, "protocol": "tcp"}
-    others = [replace(ARRIVED, packet=replace(SENT, **{name: value})) for name, value in fields.items()]
-    others.append(replace(ARRIVED, packet=replace(SENT, identity=("a to c", 3))))
+    others = [replace(ARRIVED, packet=SENT._replace(**{name: value})) for name, value in fields.items()]
+    others.append(replace(ARRIVED, packet=SENT._replace(identity=("a to c", 3))))
     fates = [ARRIVED, replace(ARRIVED, arrived_ns=121)]
     fates += [replace(ARRIVED, arrived_ns=None, reason=reason) for reason in ("lost", "late")]
     digests = [digest([fate], [ARRIVED]) for fate in (ARRIVED, *others)]

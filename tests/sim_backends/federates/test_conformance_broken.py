@@ -226,7 +226,7 @@ class Reckons(Net):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
         later = MS if isinstance(states, DeadReckoned) else 0
         return super().advance(
-            to_ns, [replace(packet, enters_ns=packet.enters_ns + later) for packet in packets], states
+            to_ns, [packet._replace(enters_ns=packet.enters_ns + later) for packet in packets], states
         )
 
 
@@ -415,13 +415,13 @@ NETWORK_CASES = [
     ),
     Broken(
         "exactly_once",
-        physics(net(lambda _, arrived, drops, to_ns: ([replace(arrival, receiver="cy") for arrival in arrived], []))),
+        physics(net(lambda _, arrived, drops, to_ns: ([arrival._replace(receiver="cy") for arrival in arrived], []))),
         "for bob arrived at cy",
     ),
     Broken(
         "exactly_once",
         physics(
-            net(lambda _, arrived, drops, to_ns: ([replace(arrival, at_ns=to_ns + 1) for arrival in arrived], []))
+            net(lambda _, arrived, drops, to_ns: ([arrival._replace(at_ns=to_ns + 1) for arrival in arrived], []))
         ),
         "not between",
     ),
@@ -436,7 +436,7 @@ NETWORK_CASES = [
     Broken("window_borders", physics(DropsAtBorders), "at the border of a window neither arrived"),
     Broken(
         "window_length",
-        physics(net(lambda _, arrived, drops, to_ns: ([replace(arrival, at_ns=to_ns) for arrival in arrived], []))),
+        physics(net(lambda _, arrived, drops, to_ns: ([arrival._replace(at_ns=to_ns) for arrival in arrived], []))),
         "windows of another length changed an arrival",
     ),
     Broken("far_away", physics(ForgetsFarAway), "1,000 km away neither arrived nor"),

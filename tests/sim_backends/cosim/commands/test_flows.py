@@ -72,7 +72,7 @@ def test_a_round_trip_is_the_time_in_the_network_and_counts_when_it_is_decided()
     def as_reply(request: Fate) -> Fate:
         packet = request.packet
         identity = ("flow/reply", packet.identity[1])
-        return replace(request, packet=replace(packet, source="b", destination="a", identity=identity))
+        return replace(request, packet=packet._replace(source="b", destination="a", identity=identity))
 
     requests = [fate(0, 1.0), fate(1, 2.0), fate(2, None), fate(3, 1.0), fate(4, 1.0)]
     replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, decided=False)]
