@@ -19,13 +19,13 @@ from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 
 _EXAMPLE: Final = "write for example --where 'distance_m < 20 and topology == \"master\"'"
-_ORDER: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = {
+_ORDER: Final[dict[type[ast.cmpop], Callable[[Any, Any], Any]]] = {
     ast.Lt: operator.lt,
     ast.LtE: operator.le,
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
 }
-_EQUALITY: Final[Mapping[type[ast.cmpop], Callable[[Any, Any], Any]]] = {ast.Eq: operator.eq, ast.NotEq: operator.ne}
+_EQUALITY: Final[dict[type[ast.cmpop], Callable[[Any, Any], Any]]] = {ast.Eq: operator.eq, ast.NotEq: operator.ne}
 _MEMBERSHIP: Final = (ast.In, ast.NotIn)
 
 Mask = NDArray[np.bool_]
@@ -151,9 +151,11 @@ def _truth(node: ast.expr, rows: Repeats) -> Truth:
         case ast.BoolOp(op=connective, values=conditions):
             truths = [_truth(condition, rows) for condition in conditions]
             true, false = (np.array([truth[index] for truth in truths]) for index in (0, 1))
-            if isinstance(connective, ast.And):
-                return Truth(true.all(axis=0), false.any(axis=0))
-            return Truth(true.any(axis=0), false.all(axis=0))
+            all_true, any_true, all_false, any_false = (
+                np.asarray(combined)
+                for combined in (true.all(axis=0), true.any(axis=0), false.all(axis=0), false.any(axis=0))
+            )
+            return Truth(all_true, any_false) if isinstance(connective, ast.And) else Truth(any_true, all_false)
         case ast.UnaryOp(operand=condition):
             truth = _truth(condition, rows)
             return Truth(truth.false, truth.true)

@@ -16,7 +16,7 @@ from tests.helpers.runs import run_here
 from tests.helpers.tables import COMPARABLE, parsed, replace, write
 
 COLUMNS = {column.name: column for column in trial_columns()}
-ROWS = [
+ROWS: list[dict[str, Any]] = [
     {
         "protocol": protocol,
         "distance_m": distance_m,
