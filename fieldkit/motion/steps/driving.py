@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from typing_extensions import override
 
-from fieldkit.agent import drive_plan
-from fieldkit.agent.drive_plan import DriveTask
+from fieldkit.agent.driving import drive_plan
+from fieldkit.agent.driving.drive_plan import DriveTask
 from fieldkit.backends.protocols import Robot, Testbed
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
@@ -156,7 +156,7 @@ def _origin(scene: Scene, move: Move) -> dict[str, Any]:
 
 
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
-    """Return the fields of a `fieldkit.agent.drive_plan.DriveTask`."""
+    """Return the fields of a `fieldkit.agent.driving.drive_plan.DriveTask`."""
     drive = _drive(robot)
     return {
         "legs": [(leg.away_m, leg.left_m) for leg in move.legs],

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 from typing_extensions import override
 
-from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
+from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
@@ -55,7 +55,7 @@ _LIMIT_S: Final = 3600.0
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
-"""Ten lines a second (`agent/flight_log.py`), each of about 200 bytes."""
+"""Ten lines a second (`agent/flying/flight_log.py`), each of about 200 bytes."""
 
 
 class FlyLeg(PathLeg):

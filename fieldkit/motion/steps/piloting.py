@@ -1,7 +1,7 @@
 """Control of drones from the laptop: jobs of the programs on the drone that fly or guard it, and their leases.
 
-The programs are parts of the agent (`fieldkit.agent.flight`, `fieldkit.agent.flying.guard`). If this process is
-killed, or the control link is down for longer than the lease, they end the flight by the action of `on_abort`.
+The programs are parts of the agent (`fieldkit.agent.flying.flight`, `fieldkit.agent.flying.guard`). If this process
+is killed, or the control link is down for longer than the lease, they end the flight by the action of `on_abort`.
 """
 
 import json
@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from typing_extensions import override
 
-from fieldkit.agent.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
+from fieldkit.agent.flying.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError

@@ -1,7 +1,6 @@
 """The sync policies by name, the built-in ones and those of entry points, and their parameters."""
 
 import inspect
-from collections import ChainMap
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint
@@ -25,19 +24,17 @@ from sim_backends.cosim.policies.window_policies import (
 PolicyKind = Callable[..., SyncPolicy]
 """Returns a new policy; its parameters are some of those of `make_policy`."""
 
-BUILTIN: Final[Mapping[str, PolicyKind]] = {
-    kind.name: kind
-    for kind in (
-        EventDriven,
-        VariableStepped,
-        TimeStepped,
-        Scheduled,
-        SlidingWindow,
-        VelocityAwareRaw,
-        VelocityAware,
-        ErrorBounded,
-    )
-}
+_KINDS: Final[tuple[type[SyncPolicy], ...]] = (
+    EventDriven,
+    VariableStepped,
+    TimeStepped,
+    Scheduled,
+    SlidingWindow,
+    VelocityAwareRaw,
+    VelocityAware,
+    ErrorBounded,
+)
+BUILTIN: Final[Mapping[str, PolicyKind]] = {kind.name: kind for kind in _KINDS}
 """Every built-in policy by its name, exact ones first."""
 
 _WINDOW_S: Final = 0.001
@@ -61,7 +58,10 @@ def policies() -> Mapping[str, PolicyKind]:
             where=plugins.location(points[name]),
             remedy="uninstall its package",
         )
-    return ChainMap(LazyMapping(points, _load), BUILTIN)  # type: ignore[arg-type] (it is only read)
+    builtin = {
+        kind.name: EntryPoint(kind.name, f"{kind.__module__}:{kind.__name__}", plugins.POLICIES) for kind in _KINDS
+    }
+    return LazyMapping({**builtin, **points}, _load)
 
 
 def _load(point: EntryPoint) -> PolicyKind:

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import pytest
 
-from fieldkit.agent.drive_plan import DriveTask
+from fieldkit.agent.driving.drive_plan import DriveTask
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
