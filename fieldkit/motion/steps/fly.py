@@ -191,7 +191,14 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:
-        return piloting.guard(scene, self.robot, self.prefixed_name("guard"), lease_s=self._lease_s, has_pilot=True)
+        return piloting.guard(
+            scene,
+            self.robot,
+            self.prefixed_name("guard"),
+            abort=abort_of(scene, self.robot).value,
+            lease_s=self._lease_s,
+            has_pilot=True,
+        )
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
@@ -283,7 +290,8 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
             announce(text, None)
 
         guard_name = self.prefixed_name("guard")
-        job = piloting.rescue(scene, self.robot, self.prefixed_name("rescue"), guard_name)
+        abort = abort_of(scene, self.robot).value
+        job = piloting.rescue(scene, self.robot, self.prefixed_name("rescue"), guard_name, abort=abort)
         may_send = scene.robot(self.robot).control is not Control.RADIO
         return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, may_send=may_send)
 
