@@ -20,7 +20,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.motion.profile_sections import drive_of
 from fieldkit.motion.steps import driving
-from fieldkit.motion.steps.driving import DriveLease
+from fieldkit.motion.steps.drive_lease import DriveLease
 from fieldkit.motion.steps.move import MoveStep
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job
