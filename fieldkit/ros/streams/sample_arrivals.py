@@ -36,7 +36,7 @@ class SampleArrivals:
 
     @classmethod
     def of(cls, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool, reliable: bool) -> "SampleArrivals":
-        """Return the arrivals of samples that occur once; `complete` and `reliable` as in `CapturedTopic`, `TopicPlan`."""
+        """Return the arrivals of samples that occur once; the flags are those of `CapturedTopic` and `TopicPlan`."""
         heads = subscriber.heads.first()
         _, logged, captured = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
         at_ns, head_ns = samples.at_ns[logged], heads.at_ns[captured]
