@@ -27,9 +27,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final
 
-from fieldkit.agent import middleware
-from fieldkit.agent.middleware import Network, Topic
-from fieldkit.agent.stream import HEAD, MAGIC
+from fieldkit.agent.messaging import middleware
+from fieldkit.agent.messaging.middleware import Network, Topic
+from fieldkit.agent.messaging.stream import HEAD, MAGIC
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
 from fieldkit.ros.interfaces.types import shipped
@@ -90,7 +90,7 @@ def dds_plain(name: str, deliver: Deliver | None) -> Write:
     from cyclonedds.topic import Topic as DdsTopic  # noqa: PLC0415
     from cyclonedds.util import duration  # noqa: PLC0415
 
-    from fieldkit.agent import dds  # noqa: PLC0415
+    from fieldkit.agent.messaging import dds  # noqa: PLC0415
 
     kind = make_idl_struct("Plain", "Plain", {"data": types.sequence[types.uint8]})
     domain = Domain(DOMAIN, dds.configuration(Network(HOST, discovery="peers", peers=(HOST,))))
@@ -115,7 +115,7 @@ def zenoh_plain(name: str, deliver: Deliver | None, where: str, *, attached: boo
     """Start an end of a topic with the binding of Zenoh; `attached` adds attachment and time stamp of rmw_zenoh."""
     import zenoh  # noqa: PLC0415
 
-    from fieldkit.agent.zenoh import ATTACHMENT, GID_BYTES  # noqa: PLC0415
+    from fieldkit.agent.messaging.zenoh import ATTACHMENT, GID_BYTES  # noqa: PLC0415
 
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")

@@ -20,7 +20,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit.agent.flight_plan import FlightPlan
+from fieldkit.agent.flying.flight_plan import FlightPlan
 from fieldkit.remote import agent
 
 HEIGHT_M: Final = 3.0

@@ -129,11 +129,11 @@ ONE_IMPORTER = {
     # Messages of the drone, and, in a separate process, reading its log.
     "pymavlink": "fieldkit/motion/logs/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",
     "lz4": "fieldkit/ros/bags/salvage.py",
-    "cyclonedds": "fieldkit/agent/dds.py",
-    "zenoh": "fieldkit/agent/zenoh.py",
+    "cyclonedds": "fieldkit/agent/messaging/dds.py",
+    "zenoh": "fieldkit/agent/messaging/zenoh.py",
     # On a robot, and in the relay of an emulated robot's sensors to its master.
-    "rospy": "fieldkit/agent/ros1.py sim_backends/emulated/robot/ros_relay.py",
-    "rclpy": "fieldkit/agent/ros2.py",
+    "rospy": "fieldkit/agent/messaging/ros1.py sim_backends/emulated/robot/ros_relay.py",
+    "rclpy": "fieldkit/agent/messaging/ros2.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
     "mujoco": "sim_backends/mujoco_physics/physics.py",
 }

@@ -16,10 +16,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Callable, Iterator, Mapping, Sequence
 
-from fieldkit.agent import drive, middleware, records, stream
-from fieldkit.agent.middleware import MiddlewareError, Network, Topic
-from fieldkit.agent.records import Log, LogError
-from fieldkit.agent.stream import Stream
+from fieldkit.agent.driving import drive
+from fieldkit.agent.messaging import middleware, records, stream
+from fieldkit.agent.messaging.middleware import MiddlewareError, Network, Topic
+from fieldkit.agent.messaging.records import Log, LogError
+from fieldkit.agent.messaging.stream import Stream
 
 _USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route|fly|arming|survey|link JSON"
 
@@ -66,7 +67,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _route(arguments: Arguments, stop_event: threading.Event) -> int:
     """Run a Zenoh router until `stop_event` is set."""
-    from fieldkit.agent import zenoh  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.messaging import zenoh  # noqa: PLC0415 (loaded only if needed)
 
     router = zenoh.route(Network(**arguments["network"]))
     _report(f"up, {router.version}")
@@ -78,7 +79,7 @@ def _route(arguments: Arguments, stop_event: threading.Event) -> int:
 
 def _record(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
     """Record MAVLink until `stop_event` is set."""
-    from fieldkit.agent import mavlink  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.autopilots import mavlink  # noqa: PLC0415 (loaded only if needed)
 
     with _naming_connection(arguments["connection"]):
         try:
@@ -105,7 +106,7 @@ def _drive(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
 
 def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
     """Fly a drone, guard it or rescue it, as the plan requires; return the exit code."""
-    from fieldkit.agent import flight, flight_plan  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.flying import flight, flight_plan  # noqa: PLC0415 (loaded only if needed)
 
     with _naming_connection(arguments["connection"]):
         return flight.fly(flight_plan.FlightPlan(**arguments), stop_event)
@@ -113,7 +114,7 @@ def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
 
 def _check_arming(arguments: Arguments, stop_event: threading.Event) -> int:
     """Print the faults that prevent a flight; return the exit code."""
-    from fieldkit.agent import arming, flight_plan  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.flying import arming, flight_plan  # noqa: PLC0415 (loaded only if needed)
 
     with _naming_connection(arguments["connection"]):
         return arming.check_arming(arguments["connection"], flight_plan.FlightNeeds(**arguments["needs"]), stop_event)

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import ClassVar, Final
 
-_PACKAGE: Final = Path(__file__).parents[1]
+_PACKAGES: Final = (Path(__file__).parents[1], Path(__file__).parents[2] / "sim_backends")
 
 
 class FieldkitError(Exception):
@@ -97,15 +97,16 @@ class EvidenceError(FieldkitError):
 def describe_exception(error: BaseException) -> str:
     """Return an exception in one line with the place in the code: `KeyError: 'a' (hops_step.py, line 28)`.
 
-    The place is the last traceback entry in the outermost file that is not part of fieldkit, because a step or policy
-    of another package may call a library that raises the error. Without such a file, it is the last entry.
+    The place is the last traceback entry in the outermost file that is not part of this distribution, because a step
+    or policy of another package may call a library that raises the error. Without such a file, it is the last
+    entry.
     """
     first_line = next(iter(str(error).splitlines()), "")
     text = type(error).__name__ + (f": {first_line}" if first_line else "")
     frames = traceback.extract_tb(error.__traceback__)
     if not frames:
         return text
-    others = [frame for frame in frames if not Path(frame.filename).is_relative_to(_PACKAGE)]
+    others = [frame for frame in frames if not any(map(Path(frame.filename).is_relative_to, _PACKAGES))]
     place = next((frame for frame in reversed(others) if frame.filename == others[0].filename), frames[-1])
     return f"{text} ({Path(place.filename).name}, line {place.lineno})"
 

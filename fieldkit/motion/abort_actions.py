@@ -60,7 +60,8 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
     def around_steps(self, plan: "Plan", scene: Scene, shells: Shells) -> AbstractContextManager[None]:
         from fieldkit.motion.running.guards import guarded  # noqa: PLC0415 (it imports the code that flies drones)
 
-        return guarded(self, plan, scene, shells)
+        actions = {role: self.root[role].value for role in self.guarded_roles(plan)}
+        return guarded(actions, plan, scene, shells)
 
     def guarded_roles(self, plan: "Plan") -> tuple[Role, ...]:
         """Return the roles whose drones no step flies, so that a guard must watch them."""

@@ -10,11 +10,25 @@ from itertools import islice, repeat
 from operator import index
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
 from sim_backends.cosim.agents import Agents, Sent
-from sim_backends.cosim.federates import NetworkFederate, check_physics, check_states, federate_error, seconds_text
+from sim_backends.cosim.federates import (
+    FederateError,
+    NetworkFederate,
+    check_physics,
+    check_states,
+    federate_error,
+    seconds_text,
+)
 from sim_backends.cosim.packet_ledger import ABSENT, PacketLedger, fixed_emitters_m, transmitters
-from sim_backends.cosim.policies.sync_policy import LookingAhead, Pair, PolicyError, Situation, SyncPolicy
+from sim_backends.cosim.policies.sync_policy import (
+    LookingAhead,
+    Pair,
+    PolicyError,
+    Situation,
+    SyncPolicy,
+    missing_members,
+)
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
 from sim_backends.cosim.wall_time import WallTime
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
@@ -68,6 +82,11 @@ class Coordinator:
         measures_all: bool = False,
     ) -> None:
         check_physics(agents.physics)
+        if missing := missing_members(policy):
+            raise ConfigurationError(
+                f"the sync policy {type(policy).__name__} lacks {', '.join(missing)}",
+                remedy="see what a sync policy needs: fieldkit docs cosim-api",
+            )
         self._agents = agents
         self._network = network
         self.policy = policy
@@ -103,10 +122,10 @@ class Coordinator:
             fixed_emitters_m=emitters_m,
         )
         check_states(self.situation.states)
-        missing = self._active - self.situation.states.keys() - agents.absent.keys()
-        if missing:
+        unmoved = self._active - self.situation.states.keys() - agents.absent.keys()
+        if unmoved:
             raise ConfigurationError(
-                f"{', '.join(sorted(missing))} may send, receive or interfere, but the physics does not move it"
+                f"{', '.join(sorted(unmoved))} may send, receive or interfere, but the physics does not move it"
             )
         self._select_present()
         if observer is not None:
@@ -200,16 +219,26 @@ class Coordinator:
                 self._wall_time.start()
 
     def _next_window(self, begin_ns: int, to_ns: int) -> int:
+        window = f"the window that begins at {seconds_text(begin_ns)}"
         try:
             end_ns = self.policy.next_window(self.situation)
-            if end_ns is not None:
-                end_ns = index(end_ns)  # the policy may be of another package; a float is a TypeError
         except PolicyError:
             raise
         except Exception as error:
-            request = f"return the end of the window that begins at {seconds_text(begin_ns)}"
-            raise federate_error(error, f"policy {self.policy.name}", request) from error
-        if end_ns is None or end_ns > to_ns:
+            raise FederateError(
+                f"policy {self.policy.name} failed to return the end of {window}: {describe_exception(error)}",
+                remedy=error.remedy if isinstance(error, FieldkitError) else "",
+            ) from error
+        if end_ns is None:
+            return to_ns
+        try:
+            end_ns = index(end_ns)
+        except TypeError as error:  # the policy may be of another package
+            raise FederateError(
+                f"policy {self.policy.name} returned {end_ns!r} as the end of {window}",
+                remedy="return a whole number of nanoseconds, or None",
+            ) from error
+        if end_ns > to_ns:
             return to_ns
         if end_ns <= begin_ns:
             self._count_empty_window(begin_ns, end_ns)
@@ -282,7 +311,9 @@ class Coordinator:
         self._empty_windows += 1
         if end_ns < begin_ns or self._empty_windows > _MAX_EMPTY_WINDOWS:
             raise PolicyError(
-                f"time does not advance beyond {begin_ns} ns", where=self.policy.name, remedy="use another policy"
+                f"time does not advance beyond {begin_ns} ns",
+                where=self.policy.name,
+                remedy="use another policy, or correct it",
             )
 
     def _enter(

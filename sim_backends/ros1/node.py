@@ -3,7 +3,6 @@
 Sources: wiki.ros.org/ROS/Master_API, wiki.ros.org/ROS/Slave_API, wiki.ros.org/ROS/TCPROS.
 """
 
-import http.client
 import os
 import queue
 import select
@@ -15,20 +14,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final
 from urllib.parse import urlsplit
-from xmlrpc.client import Error as XmlRpcError
-from xmlrpc.client import ServerProxy, Transport
-from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 from sim_backends.ros1.framing import PacketSplitter, pack, pack_header, unpack_header
+from sim_backends.ros1.node_calls import CALL_S, SUCCESS, MasterError, RosNodeRequests, RosNodeServer, call
 
-_SUCCESS: Final = 1
-_CALL_S: Final = 5.0
 _RETRY_S: Final = 0.1
 _CHUNK: Final = 1 << 16
-
-
-class MasterError(ConnectionError):
-    """A master or node refused a call."""
 
 
 @dataclass(frozen=True)
@@ -44,49 +35,6 @@ class RosMessageType:
     name: str
     md5: str
     definition: str
-
-
-class _TimedTransport(Transport):
-    """Calls of XML-RPC with a time limit."""
-
-    def make_connection(self, host: Any) -> http.client.HTTPConnection:  # noqa: ANN401 (of the base class)
-        connection = super().make_connection(host)
-        connection.timeout = _CALL_S
-        return connection
-
-
-class _RosNodeRequests(SimpleXMLRPCRequestHandler):
-    rpc_paths = ("/", "/RPC2")
-    timeout = _CALL_S
-
-
-class _RosNodeServer(SimpleXMLRPCServer):
-    """The XML-RPC server of a node; each call has a thread, so that one that is slow delays no other."""
-
-    def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 (of the base class)
-        threading.Thread(target=self._process, args=(request, client_address), daemon=True).start()
-
-    def _process(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 (of the base class)
-        with suppress(OSError, ValueError):
-            self.finish_request(request, client_address)
-        self.shutdown_request(request)
-
-
-def call(uri: str, method: str, *arguments: object) -> Any:  # noqa: ANN401 (a value of XML-RPC)
-    """Return the value of a call of a master or node.
-
-    Raises:
-        OSError: It cannot be reached.
-        MasterError: It refused the call, or its answer is not one of ROS.
-    """
-    try:
-        answer = getattr(ServerProxy(uri, transport=_TimedTransport()), method)(*arguments)
-        status, message, value = answer
-    except (XmlRpcError, http.client.HTTPException, TypeError, ValueError) as error:
-        raise MasterError(f"{uri} gave no valid answer to {method}: {error}") from error
-    if status != _SUCCESS:
-        raise MasterError(f"{uri} refused {method}: {message}")
-    return value
 
 
 class RosPublisher:
@@ -213,7 +161,7 @@ class RosSubscriber:
         with suppress(OSError, ValueError):
             protocol = call(uri, "requestTopic", self._caller, self._topic, [["TCPROS"]])
             _, host, port = protocol
-            with socket.create_connection((host, port), timeout=_CALL_S) as stream:
+            with socket.create_connection((host, port), timeout=CALL_S) as stream:
                 self._read(stream)
         with self._lock:
             self._publishers.discard(uri)
@@ -289,7 +237,7 @@ class RosNode:
         self._is_closed = False
         self._stream_server = socket.create_server((self._host, 0))
         try:
-            self._server = _RosNodeServer((self._host, 0), _RosNodeRequests, logRequests=False, allow_none=True)
+            self._server = RosNodeServer((self._host, 0), RosNodeRequests, logRequests=False, allow_none=True)
         except OSError:
             self._stream_server.close()
             raise
@@ -351,7 +299,7 @@ class RosNode:
         """Send messages to a subscriber; one that violates TCPROS is disconnected."""
         with stream, suppress(OSError, ValueError):
             stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            stream.settimeout(_CALL_S)
+            stream.settimeout(CALL_S)
             packets = PacketSplitter()
             while data := stream.recv(_CHUNK):
                 packets.feed(data)
@@ -365,15 +313,15 @@ class RosNode:
     def _request_topic(self, _caller: str, topic: str, protocols: Sequence[Any]) -> list[Any]:
         if topic not in self._publishers or not any(protocol[:1] == ["TCPROS"] for protocol in protocols):
             return [0, f"{topic} is not published here by TCPROS", 0]
-        return [_SUCCESS, "", ["TCPROS", self._host, self._stream_server.getsockname()[1]]]
+        return [SUCCESS, "", ["TCPROS", self._host, self._stream_server.getsockname()[1]]]
 
     def _publisher_update(self, _caller: str, topic: str, publishers: Sequence[str]) -> list[Any]:
         if topic in self._subscribers:
             self._subscribers[topic].update(publishers)
-        return [_SUCCESS, "", 0]
+        return [SUCCESS, "", 0]
 
     def _get_pid(self, _caller: str) -> list[Any]:
-        return [_SUCCESS, "", os.getpid()]
+        return [SUCCESS, "", os.getpid()]
 
     def close(self) -> None:
         """Unregister the node and close its connections."""

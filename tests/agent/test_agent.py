@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from fieldkit.agent import records
+from fieldkit.agent.messaging import records
 from fieldkit.core.deadline import Deadline
 from fieldkit.remote import agent
 from fieldkit.ros.interfaces import topics

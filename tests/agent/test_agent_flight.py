@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent import dialect, mavlink_frames
-from fieldkit.agent.arming import ArmingCheck
-from fieldkit.agent.autopilot import AutopilotState, status_text
-from fieldkit.agent.flight_plan import FlightNeeds, FlightPlan, point_on_path
+from fieldkit.agent.autopilots import dialect, mavlink_frames
+from fieldkit.agent.autopilots.autopilot import AutopilotState, status_text
+from fieldkit.agent.flying.arming import ArmingCheck
+from fieldkit.agent.flying.flight_plan import FlightNeeds, FlightPlan, point_on_path
 from fieldkit.agent.flying.origin import FlightOrigin
 from fieldkit.agent.links.client import MessageRate
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as d
 
-from fieldkit.agent import arming
-from fieldkit.agent.arming import ArmingCheck
-from fieldkit.agent.autopilot import AutopilotState
-from fieldkit.agent.flight_plan import FlightNeeds
+from fieldkit.agent.autopilots.autopilot import AutopilotState
+from fieldkit.agent.flying import arming
+from fieldkit.agent.flying.arming import ArmingCheck
+from fieldkit.agent.flying.flight_plan import FlightNeeds
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.px4 import PX4

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.agent import dds
-from fieldkit.agent.middleware import MiddlewareError, Network, Quality, Topic
+from fieldkit.agent.messaging import dds
+from fieldkit.agent.messaging.middleware import MiddlewareError, Network, Quality, Topic
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
 from fieldkit.ros.interfaces.types import MessageTypes, shipped

@@ -12,8 +12,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
 
-from fieldkit.agent import landing
-from fieldkit.agent.flight_plan import CLIMB, FlightPlan
+from fieldkit.agent.flying import landing
+from fieldkit.agent.flying.flight_plan import CLIMB, FlightPlan
 from fieldkit.agent.links import link_files
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
@@ -26,7 +26,7 @@ NO_HEARTBEAT_S: Final = 5.0
 """Replaces `landing.NO_HEARTBEAT_S` by a shorter time, which is longer than the 4 s before an alarm."""
 PROGRAM: Final = f"""\
 import sys
-from fieldkit.agent import landing
+from fieldkit.agent.flying import landing
 landing.NO_HEARTBEAT_S = {NO_HEARTBEAT_S}
 from fieldkit.agent.__main__ import main
 sys.exit(main(sys.argv[1:]))

@@ -4,10 +4,10 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as d
 
-from fieldkit.agent import dialect, mavlink_frames
-from fieldkit.agent.arducopter import ArduCopter
-from fieldkit.agent.dialect import FlightDialect
-from fieldkit.agent.px4 import Px4
+from fieldkit.agent.autopilots import dialect, mavlink_frames
+from fieldkit.agent.autopilots.arducopter import ArduCopter
+from fieldkit.agent.autopilots.dialect import FlightDialect
+from fieldkit.agent.autopilots.px4 import Px4
 
 COPTER, PX4 = ArduCopter(), Px4()
 ACM = {name: number for number, name in mavutil.mode_mapping_acm.items()}

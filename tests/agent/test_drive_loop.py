@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from fieldkit.agent import drive
-from fieldkit.agent.middleware import Deliver, MiddlewareError, Topic
-from fieldkit.agent.steering import DriveVelocity, OdometryPose
+from fieldkit.agent.driving import drive
+from fieldkit.agent.driving.steering import DriveVelocity, OdometryPose
+from fieldkit.agent.messaging.middleware import Deliver, MiddlewareError, Topic
 
 STORES = {False: get_typestore(Stores.ROS1_NOETIC), True: get_typestore(Stores.ROS2_HUMBLE)}
 TASK = {

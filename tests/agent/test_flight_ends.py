@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.agent import flight, landing
-from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
-from fieldkit.agent.flying import liveness, loop
-from fieldkit.agent.mavlink_frames import LOCAL_POSITION_NED, parse_frame
+from fieldkit.agent.autopilots.mavlink_frames import LOCAL_POSITION_NED, parse_frame
+from fieldkit.agent.flying import flight, landing, liveness, loop
+from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, FlightPlan
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.agent import graph
+from fieldkit.agent.messaging import graph
 from fieldkit.ros.interfaces import names
 from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 

@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as d
 
+from fieldkit.agent.autopilots.mavlink_frames import ATTITUDE, LOCAL_POSITION_NED
 from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.links import link_files, survey
 from fieldkit.agent.links.client import SharedLink
-from fieldkit.agent.mavlink_frames import ATTITUDE, LOCAL_POSITION_NED
 from fieldkit.remote import agent
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from tests.helpers import drones

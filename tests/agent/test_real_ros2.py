@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.agent import records
-from fieldkit.agent.stream import HEAD, SampleCodec, Stream
+from fieldkit.agent.messaging import records
+from fieldkit.agent.messaging.stream import HEAD, SampleCodec, Stream
 from fieldkit.remote import agent
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.agent import records
-from fieldkit.agent.records import Log, LogError
+from fieldkit.agent.messaging import records
+from fieldkit.agent.messaging.records import Log, LogError
 from fieldkit.ros.streams import topic_samples
 from tests.helpers.paths import ROOT
 
@@ -18,7 +18,7 @@ SEVERAL_PIECES = 5 * records.PIECE_BYTES // records.RECORD.size
 
 ENDLESS = """
 import itertools, os, sys
-from fieldkit.agent import records
+from fieldkit.agent.messaging import records
 log = records.Log(sys.argv[1])
 for number in itertools.count():
     log.note(records.SAMPLE, number + 2, size=7, sequence=number, sent_ns=number + 1)
@@ -26,7 +26,7 @@ for number in itertools.count():
 """
 UNTIL_FULL = """
 import itertools, sys
-from fieldkit.agent import records
+from fieldkit.agent.messaging import records
 log = records.Log(sys.argv[1])
 try:
     for number in itertools.count():

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.agent import flight, landing
-from fieldkit.agent.flight_plan import FlightPlan
-from fieldkit.agent.flying import liveness, rescue
+from fieldkit.agent.flying import flight, landing, liveness, rescue
+from fieldkit.agent.flying.flight_plan import FlightPlan
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import pytest
 
-from fieldkit.agent import records
+from fieldkit.agent.messaging import records
 from fieldkit.remote import agent
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
@@ -124,8 +124,8 @@ def test_ros_2_node_leaves_no_file_in_the_home_of_its_robot(program: Path, tmp_p
 SHOWN: Final = """
 import json, sys
 sys.path.insert(0, sys.argv[1])
-from fieldkit.agent import ros2
-from fieldkit.agent.middleware import MiddlewareError, Network, Quality
+from fieldkit.agent.messaging import ros2
+from fieldkit.agent.messaging.middleware import MiddlewareError, Network, Quality
 made = ros2.profile(Quality("best_effort", "keep_last", 7, "transient_local", 100_000_000, 2_000_000_000))
 policies = [made.reliability.name, made.history.name, made.depth, made.durability.name]
 errors = []

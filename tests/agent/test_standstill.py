@@ -2,8 +2,8 @@
 
 import pytest
 
-from fieldkit.agent.standstill import WINDOW_S, Standstill
-from fieldkit.agent.steering import OdometryPose
+from fieldkit.agent.driving.standstill import WINDOW_S, Standstill
+from fieldkit.agent.driving.steering import OdometryPose
 
 
 def after(speed_m_s: float, turn_rad_s: float, lasts_s: float, rate_hz: float = 20.0) -> Standstill:

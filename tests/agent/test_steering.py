@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit.agent.drive_plan import BACK, END, OUT, DriveTask, path_duration_s
-from fieldkit.agent.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
+from fieldkit.agent.driving.drive_plan import BACK, END, OUT, DriveTask, path_duration_s
+from fieldkit.agent.driving.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
 
 TICK_S = 0.05
 TASK = DriveTask(

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.agent import records, stream
-from fieldkit.agent.middleware import Deliver, Topic
-from fieldkit.agent.records import Log, LogError
-from fieldkit.agent.stream import SampleCodec, Stream
+from fieldkit.agent.messaging import records, stream
+from fieldkit.agent.messaging.middleware import Deliver, Topic
+from fieldkit.agent.messaging.records import Log, LogError
+from fieldkit.agent.messaging.stream import SampleCodec, Stream
 from fieldkit.ros.interfaces.types import shipped
 from tests.helpers import topic_logs
 

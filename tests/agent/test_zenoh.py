@@ -8,8 +8,8 @@ import zenoh.ext
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.agent import zenoh as adapter
-from fieldkit.agent.middleware import Network
+from fieldkit.agent.messaging import zenoh as adapter
+from fieldkit.agent.messaging.middleware import Network
 from fieldkit.ros.middlewares import tuning
 
 numbers = st.integers(-(2**63), 2**63 - 1)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.agent import records
+from fieldkit.agent.messaging import records
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
 from tests.helpers.runs import only_trial, run_here

@@ -25,7 +25,7 @@ from fieldkit.measure.positions.samples import LOCAL, WGS84, Samples
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.motion.logs import drive_log
 from fieldkit.motion.profile_sections import mavlink_of
-from fieldkit.motion.steps.driving import DriveLease
+from fieldkit.motion.steps.drive_lease import DriveLease
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.ros.bags import recorded_topics

@@ -11,7 +11,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
-from fieldkit.agent import records
+from fieldkit.agent.messaging import records
 from fieldkit.analysis import duplicates, table_files
 from fieldkit.campaign.plan import load_campaign
 from fieldkit.config import schema

@@ -19,7 +19,7 @@ from typing import Any, Final
 from xmlrpc.client import ServerProxy
 from xmlrpc.server import SimpleXMLRPCServer
 
-from fieldkit.agent.stream import MAGIC
+from fieldkit.agent.messaging.stream import MAGIC
 from tests.fuzz.mutate import mutated
 
 TOPIC: Final = "/stream"

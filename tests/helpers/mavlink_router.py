@@ -11,7 +11,7 @@ import time
 from contextlib import suppress
 from typing import Final, Self
 
-from fieldkit.agent.mavlink_frames import COMMAND_ACK, frames, parse_frame
+from fieldkit.agent.autopilots.mavlink_frames import COMMAND_ACK, frames, parse_frame
 
 _POLL_S: Final = 0.05
 _CLOSE_LIMIT_S: Final = 60.0

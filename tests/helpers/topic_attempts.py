@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from fieldkit.agent import records
-from fieldkit.agent.records import Log
+from fieldkit.agent.messaging import records
+from fieldkit.agent.messaging.records import Log
 from fieldkit.core.columns import Measured
 from fieldkit.measure.captures import pcap
 from fieldkit.ros.streams import topic_captures, topic_checks, topic_columns, topic_samples

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from fieldkit.agent import records
+from fieldkit.agent.messaging import records
 
 
 def rows(path: Path) -> list[tuple[int, ...]]:

@@ -22,7 +22,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v10 import common as v1
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent import mavlink, mavlink_frames
+from fieldkit.agent.autopilots import mavlink, mavlink_frames
 from fieldkit.agent.links import devices
 from fieldkit.agent.links.client import MessageRate
 from fieldkit.motion.logs import tlog

@@ -11,13 +11,11 @@ from __future__ import annotations
 import threading
 import time
 
-from fieldkit.agent.autopilot import GUARD
-from fieldkit.agent.flight_plan import LEAVE, STAY, FlightPlan
+from fieldkit.agent.autopilots.autopilot import GUARD
+from fieldkit.agent.autopilots.mavlink_frames import HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.flying import liveness
-from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING, LivenessFile
-from fieldkit.agent.flying.loop import GAP_S, RATE_HZ, wait_for_heartbeat
-from fieldkit.agent.flying.session import AutopilotSession
-from fieldkit.agent.landing import (
+from fieldkit.agent.flying.flight_plan import LEAVE, STAY, FlightPlan
+from fieldkit.agent.flying.landing import (
     CANCELLED,
     LEASE_EXPIRED,
     PEER_STOPPED,
@@ -27,7 +25,9 @@ from fieldkit.agent.landing import (
     landing_marker,
     log_line,
 )
-from fieldkit.agent.mavlink_frames import HEARTBEAT, LOCAL_POSITION_NED
+from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING, LivenessFile
+from fieldkit.agent.flying.loop import GAP_S, RATE_HZ, wait_for_heartbeat
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.orders import Orders
 
 

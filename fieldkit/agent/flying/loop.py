@@ -6,12 +6,10 @@ import threading
 import time
 from typing import Callable, Iterator
 
-from fieldkit.agent.autopilot import AutopilotState, status_text
-from fieldkit.agent.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
-from fieldkit.agent.flying.liveness import FLYING, IDLE, LANDING, PILOT, LivenessFile
-from fieldkit.agent.flying.origin import FlightFence, FlightOrigin, Position
-from fieldkit.agent.flying.session import AutopilotSession
-from fieldkit.agent.landing import (
+from fieldkit.agent.autopilots.autopilot import AutopilotState, status_text
+from fieldkit.agent.autopilots.mavlink_frames import ATTITUDE, GLOBAL_POSITION_INT, HEARTBEAT, LOCAL_POSITION_NED
+from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
+from fieldkit.agent.flying.landing import (
     CANCELLED,
     COMMAND_TIMEOUT_S,
     FENCE_BREACHED,
@@ -23,7 +21,9 @@ from fieldkit.agent.landing import (
     FlightError,
     log_line,
 )
-from fieldkit.agent.mavlink_frames import ATTITUDE, GLOBAL_POSITION_INT, HEARTBEAT, LOCAL_POSITION_NED
+from fieldkit.agent.flying.liveness import FLYING, IDLE, LANDING, PILOT, LivenessFile
+from fieldkit.agent.flying.origin import FlightFence, FlightOrigin, Position
+from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.orders import Orders
 
 RATE_HZ = 10.0

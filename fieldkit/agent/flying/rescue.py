@@ -5,12 +5,10 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 
-from fieldkit.agent.autopilot import GUARD, AutopilotState
-from fieldkit.agent.flight_plan import FlightPlan
+from fieldkit.agent.autopilots.autopilot import GUARD, AutopilotState
 from fieldkit.agent.flying import liveness
-from fieldkit.agent.flying.liveness import LivenessFile
-from fieldkit.agent.flying.session import AutopilotSession
-from fieldkit.agent.landing import (
+from fieldkit.agent.flying.flight_plan import FlightPlan
+from fieldkit.agent.flying.landing import (
     MANUAL_ACTION,
     NO_HEARTBEAT_S,
     REFUSED,
@@ -20,6 +18,8 @@ from fieldkit.agent.landing import (
     landing_marker,
     log_line,
 )
+from fieldkit.agent.flying.liveness import LivenessFile
+from fieldkit.agent.flying.session import AutopilotSession
 
 _POLL_S = 0.1
 _ALARM_DELAY_S = 4.0

@@ -6,8 +6,8 @@ import selectors
 import time
 from typing import Callable
 
-from fieldkit.agent.autopilot import PILOT, AutopilotState
-from fieldkit.agent.mavlink_links import open_link
+from fieldkit.agent.autopilots.autopilot import PILOT, AutopilotState
+from fieldkit.agent.autopilots.mavlink_links import open_link
 
 _HEARTBEAT_INTERVAL_S = 1.0
 

@@ -15,9 +15,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Iterator, Mapping
 
+from fieldkit.agent.autopilots.mavlink_frames import COMMAND_LONG, SET_MESSAGE_INTERVAL, frames, parse_frame
 from fieldkit.agent.links import devices, link_files
 from fieldkit.agent.links.server import ALIVE, FRAMES, STATE
-from fieldkit.agent.mavlink_frames import COMMAND_LONG, SET_MESSAGE_INTERVAL, frames, parse_frame
 
 OPEN_TIMEOUT_S = 3.0
 """Timeout for opening a connection when a client starts; a router restarts in 2 s."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, Callable, Hashable, Mapping, Tuple
 
-from fieldkit.agent.mavlink_frames import ACCEPTED
+from fieldkit.agent.autopilots.mavlink_frames import ACCEPTED
 
 DEFAULT = 0
 """Interval that selects the default rate of the autopilot; it also ends a request."""

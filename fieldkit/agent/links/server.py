@@ -20,10 +20,7 @@ import traceback
 from contextlib import suppress
 from typing import Any, Mapping
 
-from fieldkit.agent.links import devices, link_files
-from fieldkit.agent.links.devices import FlightDevice
-from fieldkit.agent.links.intervals import MessageIntervals, Target
-from fieldkit.agent.mavlink_frames import (
+from fieldkit.agent.autopilots.mavlink_frames import (
     COMMAND_ACK,
     COMMAND_LONG,
     SET_MESSAGE_INTERVAL,
@@ -33,6 +30,9 @@ from fieldkit.agent.mavlink_frames import (
     is_intact,
     parse_frame,
 )
+from fieldkit.agent.links import devices, link_files
+from fieldkit.agent.links.devices import FlightDevice
+from fieldkit.agent.links.intervals import MessageIntervals, Target
 
 FRAMES, ALIVE, STATE = b"F", b"P", b"S"
 

@@ -10,7 +10,7 @@ import time
 from contextlib import closing
 from typing import Iterator
 
-from fieldkit.agent.autopilot import PREFLIGHT
+from fieldkit.agent.autopilots.autopilot import PREFLIGHT
 from fieldkit.agent.flying.session import AutopilotSession
 
 _HEARTBEAT_S = 5.0

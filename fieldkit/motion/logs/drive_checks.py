@@ -15,7 +15,8 @@ MAX_DEVIATION_M: Final = 1.0
 deviation is some centimetres."""
 
 _START_M: Final = 0.3
-"""Largest distance of the start from the origin: `START_M` of `fieldkit.agent.drive_plan`, which a test compares."""
+"""Largest distance of the start from the origin: `START_M` of `fieldkit.agent.driving.drive_plan`, which a test
+compares."""
 _ROUNDING_M: Final = 2e-3
 """Positions are rounded to 0.1 mm, the driven distance to 1 mm."""
 _JITTER_M: Final = 0.05

@@ -1,7 +1,7 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
-The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.drive`): time, pose by its
-odometry in the frame of the start, and driven distance. The last line has the reason for the end. All values are
+The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`): time, pose by
+its odometry in the frame of the start, and driven distance. The last line has the reason for the end. All values are
 measured by the robot itself.
 """
 

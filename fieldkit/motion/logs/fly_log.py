@@ -1,8 +1,8 @@
 """Log of a drone's flight, and its columns.
 
-The agent writes a JSON object per line, ten times a second (`fieldkit.agent.flight_log`): time, phase of the flight,
-and the autopilot's position estimate relative to the origin of the trial's flights, which is the position and heading
-of the first start. All values are measured by the drone itself. The first line has the origin.
+The agent writes a JSON object per line, ten times a second (`fieldkit.agent.flying.flight_log`): time, phase of the
+flight, and the autopilot's position estimate relative to the origin of the trial's flights, which is the position and
+heading of the first start. All values are measured by the drone itself. The first line has the origin.
 """
 
 import math

@@ -7,27 +7,32 @@ from the laptop for `piloting.LEASE_S`; but not while a person or a failsafe con
 A step `fly` has a separate guard.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 
-from fieldkit.core.model import sort_roles
-from fieldkit.motion.abort_actions import AbortActions
+from fieldkit.core.model import Role, sort_roles
 from fieldkit.motion.steps import piloting
 from fieldkit.steps.scene import Scene, Shells
 from fieldkit.trial.plan import Plan
 
 
 @contextmanager
-def guarded(actions: AbortActions, plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
-    """Guard every drone of `on_abort` that no step flies while the body runs.
+def guarded(actions: Mapping[Role, str], plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
+    """Guard drones that no step flies while the body runs.
+
+    Args:
+        actions: Action of each drone if the attempt is aborted, a value of `OnAbort`.
+        plan: The trial.
+        scene: The attempt.
+        shells: Connections to the robots.
 
     Raises:
         LinkError: A robot did not answer.
         RobotError: A guard did not start, for example because the autopilot does not answer.
     """
     with ExitStack() as stack:
-        for role in sort_roles(actions.guarded_roles(plan)):
-            job = piloting.guard(scene, role, f"{role}-guard")
+        for role in sort_roles(actions):
+            job = piloting.guard(scene, role, f"{role}-guard", abort=actions[role])
             body_s = plan.procedure.expected_s(scene.protocol)
             stack.enter_context(piloting.guarding(scene, shells[role], job, body_s=body_s))
         yield

@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict
 
-from fieldkit.agent.flight_plan import FlightPlan
+from fieldkit.agent.flying.flight_plan import FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role, Verdict
 from fieldkit.core.text import JSON_ERRORS, sanitized

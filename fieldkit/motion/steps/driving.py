@@ -1,27 +1,23 @@
 """Drive a robot by its velocity topic while other steps run: its agent steers, this laptop renews the lease."""
 
-import json
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from types import MappingProxyType
 from typing import Any, Final
 
-from typing_extensions import override
-
-from fieldkit.agent import drive_plan
-from fieldkit.agent.drive_plan import DriveTask
+from fieldkit.agent.driving import drive_plan
+from fieldkit.agent.driving.drive_plan import DriveTask
 from fieldkit.backends.protocols import Robot, Testbed
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError
 from fieldkit.core.model import Move
-from fieldkit.core.text import JSON_ERRORS, shorten
 from fieldkit.motion.logs import drive_log
-from fieldkit.motion.origins import MotionOrigin, RobotMotion, origins_of
+from fieldkit.motion.origins import RobotMotion, origins_of
 from fieldkit.motion.profile_sections import Drive, drive_of
 from fieldkit.motion.steps import lease
-from fieldkit.motion.steps.lease import LeaseKeeper, orders_file
+from fieldkit.motion.steps.drive_lease import START_S, STATUS, DriveLease
+from fieldkit.motion.steps.lease import orders_file
 from fieldkit.motion.steps.robot_mover import RobotMover
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
@@ -37,12 +33,7 @@ ODOMETRY_S: Final = 0.5
 _TURN_S: Final = 12.0
 """Maximum duration of a turn at a corner: half a turn at 0.3 rad/s."""
 _SLACK_S: Final = 20.0
-_START_S: Final = 40.0
-"""Time for the start of Python, the middleware and both topics."""
-_RENEWALS: Final = 5
-"""Renewals per lease."""
 _GRACE_S: Final = 3.0
-_SILENT_S: Final = 10.0
 
 _ZENOH_PORT: Final = 7447
 """Default port of Zenoh, on which the router of rmw_zenoh listens."""
@@ -56,7 +47,6 @@ _TOPIC_KEYS: Final = MappingProxyType(
 )
 """Keys of a topic description that each middleware needs; others are omitted to keep command lines readable."""
 
-_STATUS: Final = "drive.status"
 _TEXT: Final = "drive.log"
 
 
@@ -100,7 +90,7 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
         folder=scene.folder,
         name=name.format("drive"),
         argv=with_environment(argv, setup=setup, environment=robot.ros_environment),
-        limit_s=_START_S + 2 * limit_s(move) + inside_s,
+        limit_s=START_S + 2 * limit_s(move) + inside_s,
         log=name.format(_TEXT),
         ready="log:up,",
     )
@@ -127,7 +117,7 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
 
 def files(name: str) -> tuple[str, ...]:
     """Return the files that a drive writes; see `planned` for `name`."""
-    return tuple(name.format(file) for file in (drive_log.FILE, orders_file("drive"), _STATUS, _TEXT))
+    return tuple(name.format(file) for file in (drive_log.FILE, orders_file("drive"), STATUS, _TEXT))
 
 
 def _drive(robot: Robot) -> Drive:
@@ -156,7 +146,7 @@ def _origin(scene: Scene, move: Move) -> dict[str, Any]:
 
 
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
-    """Return the fields of a `fieldkit.agent.drive_plan.DriveTask`."""
+    """Return the fields of a `fieldkit.agent.driving.drive_plan.DriveTask`."""
     drive = _drive(robot)
     return {
         "legs": [(leg.away_m, leg.left_m) for leg in move.legs],
@@ -201,7 +191,7 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
         "task": {**_task(robot, move), **_origin(scene, move)},
         "orders": orders_file(name.format("drive")),
-        "status": name.format(_STATUS),
+        "status": name.format(STATUS),
         "stationary": jobs.stationary_file(name.format("drive")),
     }
     return agent_commands.compact(arguments)
@@ -223,93 +213,6 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
         "listen/endpoints": f'["tcp/{robot.address}:0"]',
     }
     return network | {"settings": settings}
-
-
-class DriveLease(LeaseKeeper):
-    """Keeps the lease of the program that drives a robot. The first order is to wait.
-
-    Args:
-        shell: Connection to the robot.
-        job: The running program.
-        name: See `planned`.
-        lease_s: The robot stops if the lease is not renewed for this time.
-    """
-
-    def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
-        super().__init__(
-            shell, job, output_file=name.format(_STATUS), order=drive_plan.WAIT, lease_s=lease_s, renewals=_RENEWALS
-        )
-
-    def turn_back(self) -> None:
-        """Order the robot back to its place.
-
-        If the order is lost, the next renewal repeats it; without renewals the robot stops.
-        """
-        with suppress(LinkError, RobotError):
-            self.give_order(drive_plan.BACK)
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether the robot is stationary at its start position."""
-        return self.status.get("ready") is True
-
-    @property
-    def is_refused(self) -> bool:
-        """Whether the robot refused to start because it is not at its start position."""
-        return self.status.get("refused") is True
-
-    @property
-    def pose(self) -> MotionOrigin | None:
-        """The last reported pose of the robot in the frame of its odometry; None if there is no valid report."""
-        status = self.status
-        try:
-            x_m, y_m, yaw_rad = map(float, status["pose"])
-            frame_id = status["frame_id"]
-        except (KeyError, TypeError, ValueError):
-            return None
-        if not isinstance(frame_id, str) or not all(map(math.isfinite, (x_m, y_m, yaw_rad))):
-            return None
-        return MotionOrigin("odometry", shorten(frame_id), x_m, y_m, yaw_rad)
-
-    @property
-    def status(self) -> dict[str, Any]:
-        """The last status of the program; empty before the first one."""
-        return _parse_status(self.output)
-
-    @property
-    def end_state(self) -> str:
-        """Why the drive has ended, `home` if the robot is back at its place; empty while it drives.
-
-        The driver writes its status ten times a second. A driver without a new status has exited or is out of reach.
-        """
-        status, silent_s = self.status, self.unchanged_s
-        if isinstance(ended := status.get("ended"), str) and ended:
-            return shorten(ended)
-        if silent_s > (_SILENT_S if status else _START_S):
-            return f"its driver sent no status for {silent_s:.0f} s"
-        return super().end_reason
-
-    @property
-    @override
-    def end_reason(self) -> str:
-        return "" if self.end_state in {"", drive_log.HOME} else f"it stopped on its path: {self.end_state}"
-
-    def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
-        """Wait until a condition holds or the deadline has passed."""
-        while not condition() and not deadline.expired:
-            self.pause()
-            # Without the link the robot stops automatically and its driver reports why; the link may be restored.
-            with suppress(LinkError, RobotError):
-                self.renew()
-
-
-def _parse_status(text: bytes) -> dict[str, Any]:
-    """Return the status that a driver wrote; empty if it is incomplete."""
-    try:
-        status = json.loads(text)
-    except JSON_ERRORS:
-        return {}
-    return status if isinstance(status, dict) else {}
 
 
 @contextmanager
@@ -341,7 +244,7 @@ def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str)
 
 def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
     """Wait until a robot is stationary at its place, and record its origin before its first start there."""
-    drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.end_state, Deadline.after(_START_S))
+    drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.end_state, Deadline.after(START_S))
     if drive_lease.is_refused:
         origins_of(scene).refuse(move.role, drive_lease.end_state)
         raise MotionHeldError(
@@ -351,7 +254,7 @@ def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None
         )
     drive_lease.check_running()
     if not drive_lease.is_ready:
-        raise drive_lease.failure(f"it was not stationary for {_START_S:g} s")
+        raise drive_lease.failure(f"it was not stationary for {START_S:g} s")
     if origins_of(scene).robots_stay and origins_of(scene).get(move.role) is None:
         pose = drive_lease.pose
         if pose is None:
@@ -400,7 +303,7 @@ def _bring_back(
     put it at its place (`fieldkit.motion.running.permission`).
     """
     drive_lease.turn_back()
-    drive_lease.wait(lambda: drive_lease.end_state, Deadline.after(_START_S + limit_s(move)))
+    drive_lease.wait(lambda: drive_lease.end_state, Deadline.after(START_S + limit_s(move)))
     end_state = drive_lease.end_state
     _end(shell, job)
     if by_hand or end_state == drive_log.HOME:

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 from typing_extensions import override
 
-from fieldkit.agent.flight_plan import CLIMB, GO, HOME, FlightPlan
+from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
@@ -55,7 +55,7 @@ _LIMIT_S: Final = 3600.0
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
-"""Ten lines a second (`agent/flight_log.py`), each of about 200 bytes."""
+"""Ten lines a second (`agent/flying/flight_log.py`), each of about 200 bytes."""
 
 
 class FlyLeg(PathLeg):
@@ -191,7 +191,14 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:
-        return piloting.guard(scene, self.robot, self.prefixed_name("guard"), lease_s=self._lease_s, has_pilot=True)
+        return piloting.guard(
+            scene,
+            self.robot,
+            self.prefixed_name("guard"),
+            abort=abort_of(scene, self.robot).value,
+            lease_s=self._lease_s,
+            has_pilot=True,
+        )
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
@@ -283,7 +290,8 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
             announce(text, None)
 
         guard_name = self.prefixed_name("guard")
-        job = piloting.rescue(scene, self.robot, self.prefixed_name("rescue"), guard_name)
+        abort = abort_of(scene, self.robot).value
+        job = piloting.rescue(scene, self.robot, self.prefixed_name("rescue"), guard_name, abort=abort)
         may_send = scene.robot(self.robot).control is not Control.RADIO
         return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, may_send=may_send)
 

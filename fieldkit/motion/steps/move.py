@@ -37,7 +37,7 @@ from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
 from fieldkit.steps.view import View
 
 _LOG_BYTES_PER_S: Final = 2200.0
-"""Ten lines a second (`agent/drive.py`), each of about 220 bytes."""
+"""Ten lines a second (`agent/driving/drive.py`), each of about 220 bytes."""
 _FENCE_MARGIN_M: Final = 0.5
 """Distance between the fence and the end of a shortened path, because the robot may overshoot."""
 

@@ -1,7 +1,7 @@
 """Control of drones from the laptop: jobs of the programs on the drone that fly or guard it, and their leases.
 
-The programs are parts of the agent (`fieldkit.agent.flight`, `fieldkit.agent.flying.guard`). If this process is
-killed, or the control link is down for longer than the lease, they end the flight by the action of `on_abort`.
+The programs are parts of the agent (`fieldkit.agent.flying.flight`, `fieldkit.agent.flying.guard`). If this process
+is killed, or the control link is down for longer than the lease, they end the flight by the action of `on_abort`.
 """
 
 import json
@@ -14,13 +14,12 @@ from typing import Any, Final
 
 from typing_extensions import override
 
-from fieldkit.agent.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
+from fieldkit.agent.flying.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Control, Role
 from fieldkit.core.text import JSON_ERRORS, shorten
-from fieldkit.motion.abort_actions import abort_of
 from fieldkit.motion.origins import MotionOrigin
 from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps import lease
@@ -82,20 +81,23 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
     return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_ITSELF)
 
 
-def guard(scene: Scene, role: Role, name: str, *, lease_s: float = LEASE_S, has_pilot: bool = False) -> Planned:
+def guard(
+    scene: Scene, role: Role, name: str, *, abort: str, lease_s: float = LEASE_S, has_pilot: bool = False
+) -> Planned:
     """Return the job of the program that guards a drone, and ends its flight if the attempt is aborted.
 
     Args:
         scene: The attempt.
         role: Role of the drone.
         name: Name of the job.
+        abort: Action if the attempt is aborted, a value of `OnAbort`.
         lease_s: Time in seconds until an order expires.
         has_pilot: Whether a pilot program flies the drone, with which the guard shares the liveness file.
     """
     plan = FlightPlan(
         connection=connection(scene.robot(role)),
         orders=orders_file(name),
-        abort=abort_of(scene, role).value,
+        abort=abort,
         lease_s=lease_s,
         guards=True,
         liveness=liveness_file(name) if has_pilot else "",
@@ -103,7 +105,7 @@ def guard(scene: Scene, role: Role, name: str, *, lease_s: float = LEASE_S, has_
     return planned(scene, role, name, plan, _GUARD_S)
 
 
-def rescue(scene: Scene, role: Role, name: str, guard_name: str) -> Job:
+def rescue(scene: Scene, role: Role, name: str, guard_name: str, *, abort: str) -> Job:
     """Return the job that ends the flight of a drone if neither its pilot nor its guard runs.
 
     Args:
@@ -111,11 +113,12 @@ def rescue(scene: Scene, role: Role, name: str, guard_name: str) -> Job:
         role: Role of the drone.
         name: Name of the job.
         guard_name: Name of the guard's job.
+        abort: As for `guard`.
     """
     plan = FlightPlan(
         connection=connection(scene.robot(role)),
         orders="",
-        abort=abort_of(scene, role).value,
+        abort=abort,
         lease_s=0.0,
         rescues=True,
         liveness=liveness_file(guard_name),

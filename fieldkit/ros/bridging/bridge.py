@@ -17,8 +17,8 @@ from typing import Final
 
 from rosbags.serde import SerdeError
 
-from fieldkit.agent import middleware
-from fieldkit.agent.middleware import Middleware, MiddlewareError, Network, Publisher, Topic
+from fieldkit.agent.messaging import middleware
+from fieldkit.agent.messaging.middleware import Middleware, MiddlewareError, Network, Publisher, Topic
 from fieldkit.core.errors import ConfigurationError, LinkError
 from fieldkit.ros.bridging import counterparts
 from fieldkit.ros.bridging.counterparts import Counterparts

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from fieldkit.agent.middleware import Network
+from fieldkit.agent.messaging.middleware import Network
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, show_note, table
 from fieldkit.cli.parser import Parser
@@ -30,7 +30,8 @@ from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 from fieldkit.ros.middlewares.ports import MAX_DOMAIN
 
 MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
-"""The adapters of `agent.middleware` without `ros2`, which needs the Python of a robot's ROS 2; a test compares them.
+"""The adapters of `agent.messaging.middleware` without `ros2`, which needs the Python of a robot's ROS 2; a test
+compares them.
 """
 
 

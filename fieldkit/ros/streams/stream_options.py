@@ -199,7 +199,7 @@ class StreamOptions(Strict):
         return tuning.recommended_settings(self.over, self.transport) if self.settings == "tuned" else {}
 
     def network(self, scene: Scene, role: Role) -> dict[str, Any]:
-        """Return the fields of a `fieldkit.agent.middleware.Network` for a robot."""
+        """Return the fields of a `fieldkit.agent.messaging.middleware.Network` for a robot."""
         other = self.receiver if role == self.sender else self.sender
         node_ports = ports.ros1_node(self.domain) if self.over is MiddlewareName.ROS1 else {}
         settings = {**{name: str(port) for name, port in node_ports.items()}, **self.middleware_settings}

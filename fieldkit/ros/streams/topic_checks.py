@@ -20,7 +20,8 @@ MAX_SLEW_NS: Final = 1_000_000
 """A slewed clock may reverse two consecutive times of one program by at most this."""
 
 SETTLES_NS: Final = 500_000_000
-"""Minimum time between the record of the match and the first sample (`fieldkit.agent.stream.SETTLING_S`)."""
+"""Minimum time between the record of the match and the first sample
+(`fieldkit.agent.messaging.stream.SETTLING_S`)."""
 
 PADDING_BYTES: Final = 3
 """DDS pads a sample to a multiple of 4 bytes, and some implementations do not report this."""

@@ -20,7 +20,7 @@ from fieldkit.steps.view import View, capture_around
 _ENVELOPE_BYTES: Final = 12
 _CDR_BYTES: Final = 16
 _ROS1_QUEUE: Final = 1000
-"""Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.ros1`)."""
+"""Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.messaging.ros1`)."""
 _LATE_S: Final = 0.1
 """If the first sample after discovery and the publisher's wait is later than this, the discovery time is withheld."""
 

@@ -1,12 +1,12 @@
 """Samples of topics: those in logs that the agent writes on a robot, and those in a capture, by their heads.
 
-Logs (`fieldkit.agent.records`) are fixed-size records after a magic. A log whose writer was killed ends with zeros,
-because the file grows by blocks.
+Logs (`fieldkit.agent.messaging.records`) are fixed-size records after a magic. A log whose writer was killed ends
+with zeros, because the file grows by blocks.
 
 The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
-by the head (`fieldkit.agent.stream`): magic, sequence number and time of sending. The head is visible if that part of
-the packet was captured: always if a sample starts a packet, but not if TCP or a middleware put it after another
-sample.
+by the head (`fieldkit.agent.messaging.stream`): magic, sequence number and time of sending. The head is visible if
+that part of the packet was captured: always if a sample starts a packet, but not if TCP or a middleware put it after
+another sample.
 """
 
 import struct

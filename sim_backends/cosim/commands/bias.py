@@ -3,12 +3,11 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from functools import partial
-from types import MappingProxyType
-from typing import Final
 
 from fieldkit.cli.display import show_note, showing_progress
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.commands import settings
+from sim_backends.cosim.commands.result_texts import BIAS_LABELS
 from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.policies.window_policies import EventDriven
@@ -16,11 +15,6 @@ from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.shootout import Bias, biases, outcomes
-
-LABELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
-    {"loss": ("packets lost (%)", 100.0), "delay_s": ("delay (ms)", 1e3), "apart_m": ("agents apart (m)", 1.0)}
-)
-"""For each measure: its label, and the factor from SI units to the label's unit."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -66,7 +60,7 @@ def _build(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
 
 def _sheet(title: str, by_policy: Mapping[str, Mapping[str, Bias]], form: str) -> Sheet:
     rows: list[Sequence[Value]] = []
-    for name, (label, factor) in LABELS.items():
+    for name, (label, factor) in BIAS_LABELS.items():
         scale, measure_label = (factor, label) if form in {"table", "markdown"} else (1.0, name)
         for policy, measures in by_policy.items():
             bias = measures[name]

@@ -28,7 +28,12 @@ def list_all(arguments: argparse.Namespace) -> int:
             scenarios.append((name, load_scenario(path).summary))
         except FieldkitError as error:
             show_note(f"{error.located}: this scenario is omitted")
-    listed = [(name, _summary(kind)) for name, kind in policies().items()]
+    listed = []
+    for name in policies():
+        try:
+            listed.append((name, _summary(policies()[name])))
+        except FieldkitError as error:
+            show_note(f"{error.located}: this sync policy is omitted")
     named = simulators()
     if arguments.format == "table":
         table([column.head for column in _SCENARIO], scenarios)

@@ -1,7 +1,6 @@
 """`fieldkit cosim shootout SCENARIO --orders`: local errors against the window, and the order of each sync policy."""
 
 import argparse
-import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
@@ -12,6 +11,7 @@ from fieldkit.core.events import Sink
 from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
+from sim_backends.cosim.commands.result_texts import order_text
 from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value
 from sim_backends.cosim.coordinator import Coordinator
@@ -142,12 +142,3 @@ def _order_sheet(by_policy: Mapping[str, LocalErrors]) -> Sheet:
         "order: the power of the window with which an error decreases, with its 95 % interval", ("policy", *MEASURES)
     )
     return Sheet(columns, rows, [part])
-
-
-def order_text(errors: LocalErrors, measure: str) -> str:
-    """Return the order of an error with its interval: `1.00 [0.98, 1.03]`; empty if there was no error."""
-    order = errors.order(measure)
-    if math.isnan(order.value):
-        return ""
-    interval = "" if math.isnan(order.low) else f" [{order.low:.2f}, {order.high:.2f}]"
-    return f"{order.value:.2f}{interval}"

@@ -14,9 +14,9 @@ from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.report.theme import Format
 from sim_backends.cosim import plots
-from sim_backends.cosim.commands import orders, settings
-from sim_backends.cosim.commands.bias import LABELS
+from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.replay import recording_at, scenario_of, title
+from sim_backends.cosim.commands.result_texts import BIAS_LABELS, order_text
 from sim_backends.cosim.plot_layout import Curve, FlowTrace, LogPanel, ObstacleOutline, outlines
 from sim_backends.cosim.plots import run_figure
 from sim_backends.cosim.recording.replay import Recording
@@ -113,7 +113,7 @@ def error_against_window(by_policy: Mapping[str, LocalErrors]) -> Callable[[Form
     panels = []
     for measure, (panel_title, label, factor) in _LOCAL_ERRORS.items():
         curves = [
-            Curve(name, x, y, f"{name}\norder {orders.order_text(errors, measure)}")
+            Curve(name, x, y, f"{name}\norder {order_text(errors, measure)}")
             for name, errors in by_policy.items()
             if len((points := _positive_points(errors, measure, factor))[0]) > 1
             for x, y in (points,)
@@ -127,7 +127,7 @@ def bias_of_policies(by_policy: Mapping[str, Mapping[str, Bias]]) -> Callable[[F
     """Return a function that draws the bias of each policy with its interval, a panel per measure."""
     panels = {
         label: {policy: _scaled(measures[name].bias, factor) for policy, measures in by_policy.items()}
-        for name, (label, factor) in LABELS.items()
+        for name, (label, factor) in BIAS_LABELS.items()
     }
     return lambda form: plots.interval_figure(panels, form)
 

@@ -3,13 +3,14 @@
 import inspect
 from collections.abc import Callable, Mapping
 from functools import cache
-from types import MappingProxyType
+from importlib.metadata import EntryPoint
 from typing import Final
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.lazy_mapping import LazyMapping
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
-from sim_backends.cosim.policies.sync_policy import SyncPolicy
+from sim_backends.cosim.policies.sync_policy import SyncPolicy, missing_members
 from sim_backends.cosim.policies.window_policies import (
     EventDriven,
     Scheduled,
@@ -23,23 +24,18 @@ from sim_backends.cosim.policies.window_policies import (
 PolicyKind = Callable[..., SyncPolicy]
 """Returns a new policy; its parameters are some of those of `make_policy`."""
 
-BUILTIN: Final[Mapping[str, PolicyKind]] = {
-    kind.name: kind
-    for kind in (
-        EventDriven,
-        VariableStepped,
-        TimeStepped,
-        Scheduled,
-        SlidingWindow,
-        VelocityAwareRaw,
-        VelocityAware,
-        ErrorBounded,
-    )
-}
+_KINDS: Final[tuple[type[SyncPolicy], ...]] = (
+    EventDriven,
+    VariableStepped,
+    TimeStepped,
+    Scheduled,
+    SlidingWindow,
+    VelocityAwareRaw,
+    VelocityAware,
+    ErrorBounded,
+)
+BUILTIN: Final[Mapping[str, PolicyKind]] = {kind.name: kind for kind in _KINDS}
 """Every built-in policy by its name, exact ones first."""
-
-_MEMBERS: Final = ("exact", "defers_sends", "uses_end_states", "defers_arrivals", "next_window")
-"""Members that a policy needs in addition to `name`."""
 
 _WINDOW_S: Final = 0.001
 """The paper's initial window, section V."""
@@ -47,31 +43,37 @@ _WINDOW_S: Final = 0.001
 
 @cache
 def policies() -> Mapping[str, PolicyKind]:
-    """Return every policy by its name: built-in ones, then those that other packages add.
+    """Return every policy by its name: built-in ones, then those of other packages, which are loaded on first use.
+
+    Reading a policy of a package raises `ConfigurationError` if it cannot be loaded, lacks a member, or has another
+    name than its entry point.
 
     Raises:
-        ConfigurationError: A policy of a package cannot be loaded, lacks a member, or its name is already used.
+        ConfigurationError: A policy of a package has the name of a built-in one.
     """
-    kinds = dict(BUILTIN)
-    for point in plugins.entry_points(plugins.POLICIES):
-        where = plugins.location(point)
-        if point.name in kinds:
-            raise ConfigurationError(
-                f"there is already a sync policy {point.name!r}", where=where, remedy="uninstall its package"
-            )
-        kind = plugins.load(point)
-        if missing := [member for member in _MEMBERS if not hasattr(kind, member)]:
-            raise ConfigurationError(
-                f"the sync policy lacks {', '.join(missing)}", where=where, remedy=plugins.REMEDY
-            )
-        if getattr(kind, "name", None) != point.name:
-            raise ConfigurationError(
-                f"the sync policy's name is {getattr(kind, 'name', None)!r}, but must be {point.name!r}",
-                where=where,
-                remedy=plugins.REMEDY,
-            )
-        kinds[point.name] = kind
-    return MappingProxyType(kinds)
+    points = {point.name: point for point in plugins.entry_points(plugins.POLICIES)}
+    for name in BUILTIN.keys() & points.keys():
+        raise ConfigurationError(
+            f"there is already a sync policy {name!r}",
+            where=plugins.location(points[name]),
+            remedy="uninstall its package",
+        )
+    builtin = {
+        kind.name: EntryPoint(kind.name, f"{kind.__module__}:{kind.__name__}", plugins.POLICIES) for kind in _KINDS
+    }
+    return LazyMapping({**builtin, **points}, _load)
+
+
+def _load(point: EntryPoint) -> PolicyKind:
+    kind: PolicyKind = plugins.load(point)
+    problem = ""
+    if missing := missing_members(kind):
+        problem = f"the sync policy lacks {', '.join(missing)}"
+    elif getattr(kind, "name", None) != point.name:
+        problem = f"the sync policy's name is {getattr(kind, 'name', None)!r}, but must be {point.name!r}"
+    if problem:
+        raise ConfigurationError(problem, where=plugins.location(point), remedy=plugins.REMEDY)
+    return kind
 
 
 def unknown_policy_remedy(name: str) -> str:

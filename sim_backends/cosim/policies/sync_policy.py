@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
@@ -115,6 +115,14 @@ class LookingAhead(SyncPolicy, Protocol):
             Time of the next call; `situation.now_ns` if the window must end now.
         """
         ...
+
+
+_MEMBERS: Final = ("name", "exact", "defers_sends", "uses_end_states", "defers_arrivals", "next_window")
+
+
+def missing_members(policy: object) -> list[str]:
+    """Return the names of the members of `SyncPolicy` that an object or a class lacks."""
+    return [member for member in _MEMBERS if not hasattr(policy, member)]
 
 
 class PolicyError(ConfigurationError):

@@ -19,8 +19,8 @@ from typing import Any, Final
 from rosbags.convert.converter import migrate_bytes
 from rosbags.serde import SerdeError
 
-from fieldkit.agent import middleware
-from fieldkit.agent.middleware import Network, Publisher, Topic
+from fieldkit.agent.messaging import middleware
+from fieldkit.agent.messaging.middleware import Network, Publisher, Topic
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES, QosProfile
 from fieldkit.ros.interfaces.types import Distribution, MessageTypes
@@ -151,7 +151,7 @@ def _network(address: str, node: str, spec: Ros2Spec) -> Network:
 
 
 def _route(address: str) -> None:
-    from fieldkit.agent import zenoh  # noqa: PLC0415 (only this command needs it)
+    from fieldkit.agent.messaging import zenoh  # noqa: PLC0415 (only this command needs it)
 
     services.name_process(services.ZENOH_ROUTER)
     running = zenoh.route(Network(address, discovery="none"))

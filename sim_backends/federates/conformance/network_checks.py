@@ -195,9 +195,9 @@ def check_window_length(target: Target) -> None:
         probe = target.open()
         probe.require(FederateCapability.DETERMINISTIC)
         arrivals.append(sorted(_run(probe, window_ns).arrivals, key=lambda arrival: arrival.packet_id))
-    for one, other in zip(*arrivals, strict=False):
-        if one != other:
-            raise CheckError(f"windows of another length changed an arrival: {one} and {other}")
+    for short, long in zip(*arrivals, strict=False):
+        if short != long:
+            raise CheckError(f"windows of another length changed an arrival: {short} and {long}")
     if len(arrivals[0]) != len(arrivals[1]):
         raise CheckError(f"windows of another length changed {len(arrivals[0])} arrivals into {len(arrivals[1])}")
 

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Final
 
-from fieldkit.agent.middleware import Middleware, MiddlewareError, Network, Quality, Topic, adapter
+from fieldkit.agent.messaging.middleware import Middleware, MiddlewareError, Network, Quality, Topic, adapter
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.transports import samples

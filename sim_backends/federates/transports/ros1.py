@@ -18,7 +18,8 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.transports import samples
 from sim_backends.federates.transports.contract import ChannelListener, FederateTransport, is_loopback
-from sim_backends.ros1.node import MasterError, RosMessageType, RosNode
+from sim_backends.ros1.node import RosMessageType, RosNode
+from sim_backends.ros1.node_calls import MasterError
 
 _DEFAULT_MASTER: Final = "http://localhost:11311"
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as d
 
-from fieldkit.agent.autopilot import AutopilotState
-from fieldkit.agent.flight_log import FlightLog
+from fieldkit.agent.autopilots.autopilot import AutopilotState
+from fieldkit.agent.flying.flight_log import FlightLog
 from fieldkit.agent.flying.origin import FlightOrigin
 from fieldkit.core.errors import EvidenceError
 from fieldkit.motion.logs import fly_log

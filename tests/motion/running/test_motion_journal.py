@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldkit.agent.drive_plan import BACK, OUT, START_M, DriveTask
-from fieldkit.agent.steering import Driver, DriveVelocity, OdometryPose
+from fieldkit.agent.driving.drive_plan import BACK, OUT, START_M, DriveTask
+from fieldkit.agent.driving.steering import Driver, DriveVelocity, OdometryPose
 from fieldkit.core import laptop_files
 from fieldkit.core.errors import MotionHeldError
 from fieldkit.core.model import Distance, Placement, Role, Scenario, Topology

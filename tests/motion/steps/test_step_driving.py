@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import pytest
 
-from fieldkit.agent.drive_plan import DriveTask
+from fieldkit.agent.driving.drive_plan import DriveTask
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
@@ -20,7 +20,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.motion.profile_sections import drive_of
 from fieldkit.motion.steps import driving
-from fieldkit.motion.steps.driving import DriveLease
+from fieldkit.motion.steps.drive_lease import DriveLease
 from fieldkit.motion.steps.move import MoveStep
 from fieldkit.remote import agent, jobs
 from fieldkit.remote.jobs import Job

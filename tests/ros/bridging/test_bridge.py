@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from fieldkit import cli
-from fieldkit.agent import middleware
-from fieldkit.agent.middleware import ADAPTERS, Deliver, Network, Topic
+from fieldkit.agent.messaging import middleware
+from fieldkit.agent.messaging.middleware import ADAPTERS, Deliver, Network, Topic
 from fieldkit.ros.bridging import bridge
 from fieldkit.ros.bridging.bridge import Side
 from fieldkit.ros.bridging.bridge_command import MIDDLEWARES
@@ -286,7 +286,7 @@ class FakeMiddleware:
 def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = FakeMiddleware(), FakeMiddleware()
     monkeypatch.setattr(
-        "fieldkit.agent.middleware.adapter", lambda over: lambda _: source if over == "ros1" else target
+        "fieldkit.agent.messaging.middleware.adapter", lambda over: lambda _: source if over == "ros1" else target
     )
     network = Network("127.0.0.1")
     sample = bytes.fromhex(scan(7))

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from rosbags.serde import SerdeError
 
-from fieldkit.agent.middleware import Deliver, Network, Topic
+from fieldkit.agent.messaging.middleware import Deliver, Network, Topic
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.ros.bridging import bridge, counterparts
 from fieldkit.ros.bridging.bridge import Side
@@ -56,7 +56,7 @@ def carried(
     """Return the converted sample, and the announced MD5 sum in ROS 1 and name in DDS."""
     of_ros1, of_dds = FakeMiddleware(), FakeMiddleware()
     monkeypatch.setattr(
-        "fieldkit.agent.middleware.adapter", lambda over: lambda _: of_ros1 if over == "ros1" else of_dds
+        "fieldkit.agent.messaging.middleware.adapter", lambda over: lambda _: of_ros1 if over == "ros1" else of_dds
     )
     network = Network("127.0.0.1")
     crossing = Crossing.parse(f"/t:{type_name}", back=back)

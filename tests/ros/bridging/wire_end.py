@@ -9,8 +9,8 @@ import sys
 import threading
 from pathlib import Path
 
-from fieldkit.agent import middleware
-from fieldkit.agent.middleware import Network, Topic
+from fieldkit.agent.messaging import middleware
+from fieldkit.agent.messaging.middleware import Network, Topic
 
 verb, over = sys.argv[1:3]
 network, described = map(json.loads, sys.argv[3:5])

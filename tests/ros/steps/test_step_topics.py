@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fieldkit.agent import ros1
-from fieldkit.agent.middleware import Network, Topic
-from fieldkit.agent.stream import MIN_BYTES, Stream
+from fieldkit.agent.messaging import ros1
+from fieldkit.agent.messaging.middleware import Network, Topic
+from fieldkit.agent.messaging.stream import MIN_BYTES, Stream
 from fieldkit.cli import main
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError

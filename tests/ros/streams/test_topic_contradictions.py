@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fieldkit.agent import records, stream
+from fieldkit.agent.messaging import records, stream
 from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role

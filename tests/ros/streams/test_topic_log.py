@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.agent import records
-from fieldkit.agent.records import Log
+from fieldkit.agent.messaging import records
+from fieldkit.agent.messaging.records import Log
 from fieldkit.core.errors import EvidenceError
 from fieldkit.ros.streams import topic_samples
 

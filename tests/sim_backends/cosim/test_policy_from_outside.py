@@ -68,7 +68,8 @@ def test_a_policy_that_cannot_be_used_is_refused_with_its_package(
     module = f"lazy_{len(message)}"
     install(source, "lazy", f"{module}:Lazy")
     with pytest.raises(ConfigurationError, match=message) as caught:
-        registry.make_policy("scheduled")
+        registry.make_policy("lazy")
+    assert registry.make_policy("scheduled").name == "scheduled"
     assert caught.value.where == f"entry point lazy = {module}:Lazy of contact-policy 1.0"
 
 
@@ -90,5 +91,5 @@ def test_an_end_that_is_not_a_whole_number_is_an_error(install: Install) -> None
     install(
         source.replace("return situation", "return 0.5 + situation"), name, target.replace("contact", "contact_end")
     )
-    with pytest.raises(FederateError, match=f"policy {name} failed .*'float' object cannot be interpreted as"):
+    with pytest.raises(FederateError, match=f"policy {name} returned [0-9.]+ as the end of the window"):
         build(load_scenario("convoy"), policy=name).run(10 * MS)

@@ -11,7 +11,8 @@ import pytest
 from fieldkit.core.deadline import Deadline
 from sim_backends.federates.transports.ros1 import MESSAGE
 from sim_backends.ros1.framing import pack, pack_header
-from sim_backends.ros1.node import MasterError, RosMessageType, RosNode, call
+from sim_backends.ros1.node import RosMessageType, RosNode
+from sim_backends.ros1.node_calls import MasterError, call
 from tests.helpers.federate_transports import ros_master
 from tests.helpers.sshd import wait_until
 

@@ -10,11 +10,11 @@ from contextlib import closing
 from dataclasses import dataclass
 from typing import Iterator
 
-from fieldkit.agent.autopilot import PREFLIGHT, AutopilotState
-from fieldkit.agent.dialect import PREARM_CHECKS
-from fieldkit.agent.flight_plan import FlightNeeds
+from fieldkit.agent.autopilots.autopilot import PREFLIGHT, AutopilotState
+from fieldkit.agent.autopilots.dialect import PREARM_CHECKS
+from fieldkit.agent.autopilots.mavlink_frames import HOME_POSITION, LOCAL_POSITION_NED, SYS_STATUS
+from fieldkit.agent.flying.flight_plan import FlightNeeds
 from fieldkit.agent.flying.session import AutopilotSession
-from fieldkit.agent.mavlink_frames import HOME_POSITION, LOCAL_POSITION_NED, SYS_STATUS
 
 _POLL_S = 0.1
 _RETRY_S = 0.4

@@ -19,7 +19,7 @@ except ImportError:
     import rospy
 from rosgraph import Master, MasterException
 
-from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Topic, version_of
+from fieldkit.agent.messaging.middleware import Deliver, MiddlewareError, Network, Topic, version_of
 
 MASTER_PORT = 11311
 PORTS = ("xmlrpc_port", "tcpros_port")

@@ -10,11 +10,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Callable, Iterator
 
-from fieldkit.agent.autopilot import AutopilotState, status_text
-from fieldkit.agent.dialect import ARM
+from fieldkit.agent.autopilots.autopilot import AutopilotState, status_text
+from fieldkit.agent.autopilots.dialect import ARM
+from fieldkit.agent.autopilots.mavlink_frames import ACCEPTED
+from fieldkit.agent.autopilots.px4 import Px4
 from fieldkit.agent.flying.session import AutopilotSession
-from fieldkit.agent.mavlink_frames import ACCEPTED
-from fieldkit.agent.px4 import Px4
 
 LEASE_EXPIRED, REFUSED, TAKEN_OVER, CANCELLED, PEER_STOPPED, FENCE_BREACHED = 4, 5, 6, 7, 8, 9
 """Exit codes: the lease expired; the autopilot refused a command or was silent; another party flies the drone; the

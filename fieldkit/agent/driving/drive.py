@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any, Callable, Mapping
 
 from fieldkit.agent.boot_clock import boot_id, now_s
-from fieldkit.agent.drive_plan import ORDERS, DriveTask
-from fieldkit.agent.middleware import Middleware, MiddlewareError, Publisher, Topic
+from fieldkit.agent.driving.drive_plan import ORDERS, DriveTask
+from fieldkit.agent.driving.standstill import Standstill
+from fieldkit.agent.driving.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
+from fieldkit.agent.messaging.middleware import Middleware, MiddlewareError, Publisher, Topic
 from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.agent.orders import Orders
-from fieldkit.agent.standstill import Standstill
-from fieldkit.agent.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
 
 RATE_HZ = 20.0
 _MIN_STOP_S = 0.5

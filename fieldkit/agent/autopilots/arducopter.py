@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Mapping, Sequence
 
-from fieldkit.agent.dialect import CHANGE_SPEED, CUSTOM_MODE, SET_MODE, TAKE_OFF, AutopilotLimits, Command
-from fieldkit.agent.mavlink_frames import EKF_STATUS_REPORT
+from fieldkit.agent.autopilots.dialect import CHANGE_SPEED, CUSTOM_MODE, SET_MODE, TAKE_OFF, AutopilotLimits, Command
+from fieldkit.agent.autopilots.mavlink_frames import EKF_STATUS_REPORT
 
 _ARDUPILOT = 3
 _COPTERS = frozenset((2, 3, 4, 13, 14, 15, 29, 35))

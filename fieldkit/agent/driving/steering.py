@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from fieldkit.agent.drive_plan import (
+from fieldkit.agent.driving.drive_plan import (
     ARRIVAL_TOLERANCE_M,
     BACK,
     END,

@@ -16,7 +16,7 @@ from typing import Any, Callable
 import zenoh
 import zenoh.ext
 
-from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Topic, version_of
+from fieldkit.agent.messaging.middleware import Deliver, MiddlewareError, Network, Topic, version_of
 
 PORT = 7447
 """Default port of Zenoh."""

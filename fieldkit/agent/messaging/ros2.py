@@ -18,7 +18,7 @@ from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Quality, Topic, version_of
+from fieldkit.agent.messaging.middleware import Deliver, MiddlewareError, Network, Quality, Topic, version_of
 
 _SPIN_S = 0.1
 

@@ -17,9 +17,7 @@ import zlib
 from dataclasses import dataclass
 from typing import Any, Mapping
 
-from fieldkit.agent.links.client import SharedLink
-from fieldkit.agent.links.intervals import RETRY_RESULTS
-from fieldkit.agent.mavlink_frames import (
+from fieldkit.agent.autopilots.mavlink_frames import (
     ACCEPTED,
     HEARTBEAT,
     NO_AUTOPILOT,
@@ -29,7 +27,9 @@ from fieldkit.agent.mavlink_frames import (
     is_intact,
     parse_frame,
 )
-from fieldkit.agent.mavlink_links import open_link
+from fieldkit.agent.autopilots.mavlink_links import open_link
+from fieldkit.agent.links.client import SharedLink
+from fieldkit.agent.links.intervals import RETRY_RESULTS
 
 MAX_BYTES = 256 << 20
 """Maximum size of a log, for example if another program floods the recorder."""

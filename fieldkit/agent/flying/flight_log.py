@@ -6,9 +6,9 @@ import time
 from contextlib import suppress
 from dataclasses import asdict
 
-from fieldkit.agent.autopilot import AutopilotState
+from fieldkit.agent.autopilots.autopilot import AutopilotState
+from fieldkit.agent.autopilots.mavlink_frames import LOCAL_POSITION_NED
 from fieldkit.agent.flying.origin import FlightOrigin
-from fieldkit.agent.mavlink_frames import LOCAL_POSITION_NED
 from fieldkit.agent.numbered_lines import NumberedLines
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Mapping, Sequence
 
-from fieldkit.agent.dialect import CUSTOM_MODE, LAND, RETURN, SET_MODE, AutopilotLimits, Command
-from fieldkit.agent.mavlink_frames import ESTIMATOR_STATUS
+from fieldkit.agent.autopilots.dialect import CUSTOM_MODE, LAND, RETURN, SET_MODE, AutopilotLimits, Command
+from fieldkit.agent.autopilots.mavlink_frames import ESTIMATOR_STATUS
 
 _PX4 = 12
 _OFFBOARD, _AUTO = 6, 4

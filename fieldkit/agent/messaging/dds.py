@@ -26,8 +26,8 @@ from cyclonedds.sub import DataReader
 from cyclonedds.sub import Subscriber as DdsSubscriber
 from cyclonedds.topic import Topic as DdsTopic
 
-from fieldkit.agent import graph
-from fieldkit.agent.middleware import Deliver, MiddlewareError, Network, Quality, Topic, version_of
+from fieldkit.agent.messaging import graph
+from fieldkit.agent.messaging.middleware import Deliver, MiddlewareError, Network, Quality, Topic, version_of
 
 MAX_BLOCKING_NS = 1_000_000_000
 """`max_blocking_time` of reliable writers: a write may block for this time if a reader is too slow and all samples

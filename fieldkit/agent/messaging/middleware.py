@@ -173,7 +173,7 @@ def adapter(name: str) -> Callable[[Network], Middleware]:
     if name not in ADAPTERS:
         raise MiddlewareError(f"{name!r} is not a middleware; choose one of {', '.join(ADAPTERS)}")
     try:
-        module = importlib.import_module(f"fieldkit.agent.{name}")
+        module = importlib.import_module(f"fieldkit.agent.messaging.{name}")
     except ImportError as error:
         raise MiddlewareError(f"{name} is not installed here: {error}") from error
     start: Callable[[Network], Middleware] = module.start

@@ -11,10 +11,9 @@ import time
 from dataclasses import dataclass
 from typing import Callable, Sequence
 
-from fieldkit.agent.arducopter import ArduCopter
-from fieldkit.agent.dialect import REQUEST, FlightDialect
-from fieldkit.agent.flying.reports import AutopilotTexts, printable
-from fieldkit.agent.mavlink_frames import (
+from fieldkit.agent.autopilots.arducopter import ArduCopter
+from fieldkit.agent.autopilots.dialect import REQUEST, FlightDialect
+from fieldkit.agent.autopilots.mavlink_frames import (
     ATTITUDE,
     COMMAND_ACK,
     EKF_STATUS_REPORT,
@@ -35,8 +34,9 @@ from fieldkit.agent.mavlink_frames import (
     is_intact,
     parse_frame,
 )
-from fieldkit.agent.mavlink_links import FlightLink
-from fieldkit.agent.px4 import Px4
+from fieldkit.agent.autopilots.mavlink_links import FlightLink
+from fieldkit.agent.autopilots.px4 import Px4
+from fieldkit.agent.flying.reports import AutopilotTexts, printable
 
 FRESH_S = 2.0
 """Maximum age of a report that describes the present state."""

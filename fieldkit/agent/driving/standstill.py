@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from fieldkit.agent.drive_plan import wrap_angle
-from fieldkit.agent.steering import OdometryPose
+from fieldkit.agent.driving.drive_plan import wrap_angle
+from fieldkit.agent.driving.steering import OdometryPose
 
 WINDOW_S = 0.2
 """Length of the time window of the compared poses."""

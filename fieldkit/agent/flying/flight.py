@@ -17,17 +17,25 @@ from dataclasses import asdict
 from functools import partial
 from typing import Callable, Sequence
 
-from fieldkit.agent.arming import ArmingCheck
+from fieldkit.agent.autopilots.dialect import ARM, Command, FlightDialect
+from fieldkit.agent.autopilots.mavlink_frames import ACCEPTED
 from fieldkit.agent.boot_clock import boot_id
-from fieldkit.agent.dialect import ARM, Command, FlightDialect
-from fieldkit.agent.flight_log import FlightLog
-from fieldkit.agent.flight_plan import CLIMB, GO, HOME, MISPLACED, FlightPlan, point_on_path
 from fieldkit.agent.flying import guard, rescue
+from fieldkit.agent.flying.arming import ArmingCheck
+from fieldkit.agent.flying.flight_log import FlightLog
+from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, MISPLACED, FlightPlan, point_on_path
+from fieldkit.agent.flying.landing import (
+    REFUSED,
+    TAKEN_OVER,
+    FlightError,
+    alarm,
+    bring_down,
+    landing_marker,
+    log_line,
+)
 from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING
 from fieldkit.agent.flying.loop import FlightLoop
 from fieldkit.agent.flying.origin import FRAME, FlightOrigin, OriginError, Position, frame_id, resolve_origin
-from fieldkit.agent.landing import REFUSED, TAKEN_OVER, FlightError, alarm, bring_down, landing_marker, log_line
-from fieldkit.agent.mavlink_frames import ACCEPTED
 
 _NEAR_M = 0.3
 _SLOW_M_S = 0.2

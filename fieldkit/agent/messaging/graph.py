@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from typing import Sequence
 
-from fieldkit.agent.middleware import Quality, Topic
+from fieldkit.agent.messaging.middleware import Quality, Topic
 
 GID_BYTES = 16
 """Length of a GID in the message since ROS 2 Iron; 24 until Humble (rmw/types.h, RMW_GID_STORAGE_SIZE)."""

@@ -12,9 +12,9 @@ import threading
 import time
 from dataclasses import dataclass
 
-from fieldkit.agent import records
-from fieldkit.agent.middleware import Middleware, Topic
-from fieldkit.agent.records import Log, LogError
+from fieldkit.agent.messaging import records
+from fieldkit.agent.messaging.middleware import Middleware, Topic
+from fieldkit.agent.messaging.records import Log, LogError
 
 HEAD = struct.Struct("<8sqq")
 """Magic number, sequence number, time in nanoseconds since 1970 UTC."""

@@ -1,0 +1,1 @@
+"""Communicate with an autopilot over MAVLink: frames, dialects, its state, recordings."""

@@ -1,0 +1,1 @@
+"""Drive a robot along a path by its velocity topic and its odometry."""

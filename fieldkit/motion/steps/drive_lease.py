@@ -1,0 +1,114 @@
+"""The lease of the program that drives a robot, and the status that the program reports."""
+
+import json
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final
+
+from typing_extensions import override
+
+from fieldkit.agent.driving import drive_plan
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import LinkError, RobotError
+from fieldkit.core.text import JSON_ERRORS, shorten
+from fieldkit.motion.logs import drive_log
+from fieldkit.motion.origins import MotionOrigin
+from fieldkit.motion.steps.lease import LeaseKeeper
+from fieldkit.remote.jobs import Job
+from fieldkit.remote.shell import Shell
+
+START_S: Final = 40.0
+"""Time for the start of Python, the middleware and both topics."""
+_RENEWALS: Final = 5
+"""Renewals per lease."""
+_SILENT_S: Final = 10.0
+STATUS: Final = "drive.status"
+"""File with the status of the driver; its name is prefixed as `driving.planned` describes."""
+
+
+class DriveLease(LeaseKeeper):
+    """Keeps the lease of the program that drives a robot. The first order is to wait.
+
+    Args:
+        shell: Connection to the robot.
+        job: The running program.
+        name: See `driving.planned`.
+        lease_s: The robot stops if the lease is not renewed for this time.
+    """
+
+    def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
+        super().__init__(
+            shell, job, output_file=name.format(STATUS), order=drive_plan.WAIT, lease_s=lease_s, renewals=_RENEWALS
+        )
+
+    def turn_back(self) -> None:
+        """Order the robot back to its place.
+
+        If the order is lost, the next renewal repeats it; without renewals the robot stops.
+        """
+        with suppress(LinkError, RobotError):
+            self.give_order(drive_plan.BACK)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the robot is stationary at its start position."""
+        return self.status.get("ready") is True
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the robot refused to start because it is not at its start position."""
+        return self.status.get("refused") is True
+
+    @property
+    def pose(self) -> MotionOrigin | None:
+        """The last reported pose of the robot in the frame of its odometry; None if there is no valid report."""
+        status = self.status
+        try:
+            x_m, y_m, yaw_rad = map(float, status["pose"])
+            frame_id = status["frame_id"]
+        except (KeyError, TypeError, ValueError):
+            return None
+        if not isinstance(frame_id, str) or not all(map(math.isfinite, (x_m, y_m, yaw_rad))):
+            return None
+        return MotionOrigin("odometry", shorten(frame_id), x_m, y_m, yaw_rad)
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """The last status of the program; empty before the first one."""
+        return _parse_status(self.output)
+
+    @property
+    def end_state(self) -> str:
+        """Why the drive has ended, `home` if the robot is back at its place; empty while it drives.
+
+        The driver writes its status ten times a second. A driver without a new status has exited or is out of reach.
+        """
+        status, silent_s = self.status, self.unchanged_s
+        if isinstance(ended := status.get("ended"), str) and ended:
+            return shorten(ended)
+        if silent_s > (_SILENT_S if status else START_S):
+            return f"its driver sent no status for {silent_s:.0f} s"
+        return super().end_reason
+
+    @property
+    @override
+    def end_reason(self) -> str:
+        return "" if self.end_state in {"", drive_log.HOME} else f"it stopped on its path: {self.end_state}"
+
+    def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
+        """Wait until a condition holds or the deadline has passed."""
+        while not condition() and not deadline.expired:
+            self.pause()
+            # Without the link the robot stops automatically and its driver reports why; the link may be restored.
+            with suppress(LinkError, RobotError):
+                self.renew()
+
+
+def _parse_status(text: bytes) -> dict[str, Any]:
+    """Return the status that a driver wrote; empty if it is incomplete."""
+    try:
+        status = json.loads(text)
+    except JSON_ERRORS:
+        return {}
+    return status if isinstance(status, dict) else {}
