@@ -135,6 +135,8 @@ class Agents:
         Raises:
             FederateError: The physics failed, did not answer in time, or has lost an agent and may not.
         """
+        if self._changes_ns:
+            self._read_changes(now_ns)
         commands = self._commands
         if commands:
             self._commands = {}
@@ -156,6 +158,15 @@ class Agents:
             ) from None
         self._states = states
         return states
+
+    def _read_changes(self, now_ns: int) -> None:
+        """Read the states before and at each change of a lifetime, so that last states do not depend on windows."""
+        while (change_ns := self.next_change_ns()) is not None and change_ns <= now_ns:
+            if self._at_ns < change_ns - 1:
+                self.states(change_ns - 1)
+            if change_ns == now_ns:
+                return  # the caller reads the states at this time
+            self.states(change_ns)
 
     def _without_hidden(self, states: Mapping[str, State], now_ns: int) -> Mapping[str, State]:
         """Return the states without those of agents outside of their lifetimes, which a physics may still move."""
