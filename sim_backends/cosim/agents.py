@@ -86,7 +86,7 @@ class Agents:
         physics: Moves the bodies.
         programs: The program of each agent; an agent may have none.
         lifetimes: The agents that do not exist during the whole run.
-        starts: The states of agents that are not there at time 0.
+        starts: The states of agents that are absent at time 0; None if there are none.
 
     Raises:
         FederateError: A program failed.
@@ -202,10 +202,11 @@ class Agents:
             self._commands.pop(name, None)
             self._wake_times_ns.pop(name, None)
         new = states.keys() - self._names
-        self._new_agents |= new
         for name in new:
             self.absent.pop(name, None)
-        self.has_changed |= bool(lost or new)
+        if self._states:  # the first states have the agents without a program, too
+            self._new_agents |= new
+            self.has_changed |= bool(lost or new)
         self._names = frozenset(states)
         self._schedule((name for name in sorted(new) if name in self.programs), now_ns)
 
