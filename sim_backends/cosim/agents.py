@@ -35,7 +35,7 @@ class Sent(NamedTuple):
     states: Mapping[str, State]
 
 
-class Absence(NamedTuple):
+class AgentAbsence(NamedTuple):
     """The absence of an agent, before it appears or after it has disappeared.
 
     Attributes:
@@ -109,7 +109,7 @@ class Agents:
         self.programs = dict(sorted(programs.items()))
         self._lifetimes = dict(lifetimes)
         self.absent = {
-            name: Absence(0, (starts or {})[name])
+            name: AgentAbsence(0, (starts or {})[name])
             for name, lifetime in self._lifetimes.items()
             if not lifetime.contains(0)
         }
@@ -196,7 +196,7 @@ class Agents:
             state = self._states[name]
             lifetime = self._lifetimes.get(name)
             ended_ns = None if lifetime is None or lifetime.contains(now_ns) else lifetime.disappears_ns
-            self.absent[name] = Absence(now_ns if ended_ns is None else ended_ns, State(state.position_m))
+            self.absent[name] = AgentAbsence(now_ns if ended_ns is None else ended_ns, State(state.position_m))
             self._lost[name] = state
             self._received.pop(name, None)
             self._commands.pop(name, None)
