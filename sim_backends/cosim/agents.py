@@ -35,7 +35,7 @@ class Sent(NamedTuple):
     states: Mapping[str, State]
 
 
-class Absence(NamedTuple):
+class AgentAbsence(NamedTuple):
     """The absence of an agent, before it appears or after it has disappeared.
 
     Attributes:
@@ -86,7 +86,7 @@ class Agents:
         physics: Moves the bodies.
         programs: The program of each agent; an agent may have none.
         lifetimes: The agents that do not exist during the whole run.
-        starts: The states of agents that are not there at time 0.
+        starts: The states of agents that are absent at time 0; None if there are none.
 
     Raises:
         FederateError: A program failed.
@@ -109,7 +109,7 @@ class Agents:
         self.programs = dict(sorted(programs.items()))
         self._lifetimes = dict(lifetimes)
         self.absent = {
-            name: Absence(0, (starts or {})[name])
+            name: AgentAbsence(0, (starts or {})[name])
             for name, lifetime in self._lifetimes.items()
             if not lifetime.contains(0)
         }
@@ -135,6 +135,8 @@ class Agents:
         Raises:
             FederateError: The physics failed, did not answer in time, or has lost an agent and may not.
         """
+        if self._changes_ns:
+            self._read_changes(now_ns)
         commands = self._commands
         if commands:
             self._commands = {}
@@ -156,6 +158,15 @@ class Agents:
             ) from None
         self._states = states
         return states
+
+    def _read_changes(self, now_ns: int) -> None:
+        """Read the states before and at each change of a lifetime, so that last states do not depend on windows."""
+        while (change_ns := self.next_change_ns()) is not None and change_ns <= now_ns:
+            if self._at_ns < change_ns - 1:
+                self.states(change_ns - 1)
+            if change_ns == now_ns:
+                return  # the caller reads the states at this time
+            self.states(change_ns)
 
     def _without_hidden(self, states: Mapping[str, State], now_ns: int) -> Mapping[str, State]:
         """Return the states without those of agents outside of their lifetimes, which a physics may still move."""
@@ -185,16 +196,17 @@ class Agents:
             state = self._states[name]
             lifetime = self._lifetimes.get(name)
             ended_ns = None if lifetime is None or lifetime.contains(now_ns) else lifetime.disappears_ns
-            self.absent[name] = Absence(now_ns if ended_ns is None else ended_ns, State(state.position_m))
+            self.absent[name] = AgentAbsence(now_ns if ended_ns is None else ended_ns, State(state.position_m))
             self._lost[name] = state
             self._received.pop(name, None)
             self._commands.pop(name, None)
             self._wake_times_ns.pop(name, None)
         new = states.keys() - self._names
-        self._new_agents |= new
         for name in new:
             self.absent.pop(name, None)
-        self.has_changed |= bool(lost or new)
+        if self._states:  # the first states have the agents without a program, too
+            self._new_agents |= new
+            self.has_changed |= bool(lost or new)
         self._names = frozenset(states)
         self._schedule((name for name in sorted(new) if name in self.programs), now_ns)
 

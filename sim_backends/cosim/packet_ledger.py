@@ -6,7 +6,7 @@ from itertools import combinations
 from typing import Any, Final
 
 from fieldkit.core.model import Vector
-from sim_backends.cosim.agents import Absence, Sent
+from sim_backends.cosim.agents import AgentAbsence, Sent
 from sim_backends.cosim.federates import FederateError, seconds_text
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
@@ -100,7 +100,7 @@ class PacketLedger:
         sent: Sent,
         enters_ns: int,
         assumed: Mapping[str, State],
-        absent: Mapping[str, Absence] | None = None,
+        absent: Mapping[str, AgentAbsence] | None = None,
     ) -> Fate:
         """Record a datagram as a packet that enters the network; it is dropped if one of its ends is absent.
 

@@ -31,8 +31,10 @@ class Disc:
         drops = []
         for packet in packets:
             current_states = states.at(packet.enters_ns) if isinstance(states, DeadReckoned) else states
-            ends = (current_states[name].position_m for name in (packet.source, packet.destination))
-            if math.dist(*ends) > self._range_m:
+            source, destination = current_states.get(packet.source), current_states.get(packet.destination)
+            if source is None or destination is None:
+                drops.append(Drop(packet.packet_id, "absent"))
+            elif math.dist(source.position_m, destination.position_m) > self._range_m:
                 drops.append(Drop(packet.packet_id, "out of range"))
             else:
                 arrival = packet.enters_ns + self._delay_ns, packet.packet_id, packet.destination

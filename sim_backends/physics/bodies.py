@@ -48,8 +48,8 @@ class Bodies:
         bodies: The bodies, by the name of their agent.
         world: Ground and obstacles; None for open flat ground.
         step_ns: Time step; states are those at whole steps.
-        lifetimes: Bodies that do not exist during the whole run; from the step in which a body appears, and until the
-            one in which it disappears, it is at least as long there as its lifetime.
+        lifetimes: Bodies that do not exist during the whole run. A body is there from the last step before its
+            lifetime begins to the first one after it ends.
 
     Attributes:
         step_ns: Time step.

@@ -94,7 +94,7 @@ class NetworkOptions(Strict):
 
     Attributes:
         federate: An [external federate](federates.md) that replaces the built-in network, as for the physics. It is
-            then responsible for the radio, `tcp` and the faults of radios; there are no captures.
+            then responsible for the radio, `tcp` and the faults of radios.
         options: Options of the federate, as for the physics.
     """
 

@@ -214,7 +214,10 @@ class ForgetsFarAway(Net):
 
 class KnowsNoNewAgents(Net):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
-        return super().advance(to_ns, packets, {name: states[name] for name in ("ann", "bob", "cy")})
+        for packet in packets:
+            if packet.destination not in {"ann", "bob", "cy"}:
+                raise KeyError(packet.destination)
+        return super().advance(to_ns, packets, states)
 
 
 class DeliversToAll(Net):
@@ -270,7 +273,8 @@ class LosesByKey(Net):
         self.seed = hello.seed
 
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
-        distance_m = math.dist(states["ann"].position_m, states["bob"].position_m)
+        ends_m = [states[name].position_m for name in ("ann", "bob") if name in states]
+        distance_m = math.dist(*ends_m) if len(ends_m) == 2 else 0.0
         lost = [packet for packet in packets if distance_m > 30 and self.draw(packet) < 0.5]
         arrivals, drops = super().advance(to_ns, [packet for packet in packets if packet not in lost], states)
         return arrivals, [*drops, *(Drop(packet.packet_id, "bad luck") for packet in lost)]
