@@ -48,8 +48,8 @@ class FederateCapability(IntFlag):
         NEXT_EVENT: Unless a packet enters, nothing arrives or is dropped and no position is used before its
             `next_event_ns`, which may be too early; -1: never.
         EXTRAPOLATES: It moves agents by dead reckoning.
-        AGENTS_APPEAR: Agents may appear during a run.
-        AGENTS_DISAPPEAR: Agents may disappear. The coordinator then ends the run.
+        AGENTS_APPEAR: Agents that are not in hello may appear.
+        AGENTS_DISAPPEAR: Agents may disappear, and return.
     """
 
     DETERMINISTIC = 1

@@ -16,8 +16,8 @@ class Ns3Options(SimulatorOptions):
             without discovery; if omitted, a scenario with topics is refused.
         delay_parts: File for the [parts of each delay](ns3.md#parts-of-the-delay); `{seed}` is replaced by the seed
             of the run.
-        pcap: Beginning of the names of captures of 802.11 frames with radiotap, one per radio, for example `air-{seed}-`;
-            with an access point, their times have 1 s more.
+        pcap: Beginning of the names of captures of 802.11 frames with radiotap, one per radio, for example
+            `air-{seed}-`; with an access point, their times have 1 s more.
     """
 
     standard: Literal["802.11a", "802.11g", "802.11n"] | None = None
