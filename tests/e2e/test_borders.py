@@ -109,6 +109,7 @@ def run_in(copy: Path) -> Iterator[Fieldkit]:
     """A function that runs `fieldkit` of the copy in a folder."""
     with subprocess.Popen(
         (sys.executable, "-c", RUNNER),
+        cwd=copy,  # it is the first folder in which modules are searched
         env=os.environ | {"PYTHONPATH": str(copy)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
