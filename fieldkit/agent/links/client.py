@@ -28,7 +28,8 @@ _POLL_S = 0.1
 _SUSPENDED_TIMEOUT_S = 0.5
 _TIMEOUT_S = 2.0
 """A server that does not answer for this time is replaced, even if it is not reported as suspended."""
-_START_TIMEOUT_S = 5.0
+_START_TIMEOUT_S = 15.0
+"""Timeout for the start of a server: a busy robot takes seconds to start Python."""
 _RETRY_S = 0.1
 _BUFFER_BYTES = 1 << 20
 _COMMAND_OFFSET, _TARGET_OFFSET = 28, 30
