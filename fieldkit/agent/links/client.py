@@ -232,11 +232,11 @@ class SharedLink:
         """
         deadline_s = time.monotonic() + _START_TIMEOUT_S
         while (server := self._try_connect()) is None:
+            if time.monotonic() > deadline_s:
+                raise TimeoutError(f"no link server serves {self._connection}")
             self._start()
             if self._stop_event.wait(0.01):
                 return
-            if time.monotonic() > deadline_s:
-                raise TimeoutError(f"no link server serves {self._connection}")
         with self._lock:
             self._server = server
             self._answered_s = time.monotonic()
