@@ -44,7 +44,7 @@ def measure(lab: RoverLab, out: str) -> dict[str, float]:
     with MotionSampler(lab.field_robots.testbed.robots[Role.SENDER].steered, lab.place_m) as sampler:
         trial = start(lab.folder, "trial", "drive", "5m", "--yes", "--allow-motion", "--out", out)
         try:
-            lab.wait_until_it_drives()
+            lab.wait_until_it_drives(trial)
             times = {"ssh": _duration_s(ssh_words(lab)), "idle": _duration_s(_stop_words("box-1"))}
             before_m_s = sampler.samples[-1].speed_m_s
             started_s = time.monotonic()

@@ -15,8 +15,8 @@ IN_CI = 3
 AT_NIGHT = (1, 2, 4, 5)
 DEBIAN = {1, 2}
 """Seeds with Debian's ROS on the robots, which takes a third of the processor time of all programs."""
-FAULTS = 8
-REPEATS = 6
+FAULTS = 6
+REPEATS = 5
 """Repeats per protocol; if a trial ends before the last fault, another trial gets the remaining faults."""
 LIMIT_S = 900
 

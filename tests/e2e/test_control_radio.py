@@ -19,6 +19,7 @@ from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.known_radio import make_lab, measured
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.runs import only_trial, run_here
 from tests.helpers.sshd import wait_until
 
@@ -47,7 +48,7 @@ def test_no_robot_may_have_the_laptops_name(tmp_path: Path) -> None:
     assert caught.value.where.endswith("fieldkit.yaml:7")
 
 
-@pytest.fixture(params=Topology)
+@pytest.fixture(scope="module", params=Topology)
 def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     cast = EmulatedBackend(None, None).cast(request.param)
     radio, ros = RadioOptions(fading=False), RosChoice.BUILTIN
@@ -90,7 +91,7 @@ def test_a_robot_out_of_range_is_unreachable_until_it_returns(up: EmulatedTestbe
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("radio", ["{fading: false}", "{loss: 10%}"])
+@pytest.mark.parametrize("radio", mark_nightly(["{fading: false}", "{loss: 10%}"]))
 def test_a_trial_ends_valid_and_captures_no_ssh_packets(tmp_path: Path, radio: str) -> None:
     folder = make_lab(tmp_path / "lab", radio)
     site = folder / "fieldkit.yaml"

@@ -57,6 +57,9 @@ emulated: {ros: debian}
 PLACEMENT = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 SPEED_M_S = 0.6
 LEASE_S = 2.0
+"""Lease of the tests in which it expires, and the time within which an order must stop a robot."""
+LONG_LEASE_S = 30.0
+"""Lease of the other tests, so that a busy machine does not stop a robot."""
 SETUP = ("/opt/ros/noetic/setup.bash",)
 DRIVE = texts.procedure(
     "drive",
@@ -100,7 +103,7 @@ RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
 def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
     """Robots that outlive fieldkit; one of them is fast, so that the tests take less time."""
     folder = tmp_path_factory.mktemp("rovers")
-    profile = rover_profile(fence_m=30.0, lease_s=LEASE_S)
+    profile = rover_profile(fence_m=30.0, lease_s=LONG_LEASE_S)
     for name in ("robots", "procedures"):
         (folder / name).mkdir()
     (folder / "robots" / "rover.yaml").write_text(profile, encoding="utf-8")
@@ -148,7 +151,7 @@ def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(fi
         role: track_of(field_robots, role)[-1].position_m for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)
     }
     run = run_here(field_robots.folder, *RUN)
-    assert run.code == 0, run.err
+    assert run.code == 0, run.err + run.out
     trial = only_trial(field_robots.folder)
     (repeat,) = (trial / "repeats").iterdir()
     (row,) = rows(trial)
@@ -214,6 +217,7 @@ def receiver_motion(field_robots: FieldRobots) -> Steered | None:
     return field_robots.testbed.robots[Role.RECEIVER].steered()
 
 
+@pytest.mark.usefixtures("_short_lease")
 def test_killing_fieldkit_stops_the_robot(field_robots: FieldRobots) -> None:
     (field_robots.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
     process = start(field_robots.folder, *RUN)
@@ -232,6 +236,13 @@ def test_killing_fieldkit_stops_the_robot(field_robots: FieldRobots) -> None:
     status = json.loads(shell.run(text, deadline=Deadline.after(30)).stdout)
     assert status["ended"] == f"no order from the laptop for {LEASE_S:g} s"
     assert status["x_m"] < 19.0, "long before its end"
+
+
+@pytest.fixture
+def _short_lease(field_robots: FieldRobots) -> Iterator[None]:
+    """Let the lease of the receiver expire soon after the laptop's last order."""
+    with changed_rover(field_robots, f"lease: {LONG_LEASE_S:g}s", f"lease: {LEASE_S:g}s"):
+        yield
 
 
 @contextmanager
@@ -302,7 +313,8 @@ def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(field_robots: FieldRob
     reader = threading.Thread(target=read)
     reader.start()
     try:
-        wait_until(lambda: drives(field_robots), Deadline.after(90))
+        wait_until(lambda: drives(field_robots) or process.poll() is not None, Deadline.after(180))
+        assert process.poll() is None, shown
         sent_ns = time.time_ns()
         os.write(master, b"\x03")
         took_s = standstill_s(field_robots, sent_ns)
@@ -375,8 +387,7 @@ def test_a_robot_outside_its_fence_does_not_start(field_robots: FieldRobots) -> 
 
 
 def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(field_robots: FieldRobots) -> None:
-    # A busy machine takes longer than two seconds to start the command, and then the lease has stopped the robot.
-    with changed_rover(field_robots, f"lease: {LEASE_S:g}s", "lease: 20s"), driving(field_robots) as process:
+    with driving(field_robots) as process:
         process.send_signal(signal.SIGSTOP)
         sent_ns = time.time_ns()
         run = run_here(field_robots.folder, "stop", "--all")
@@ -419,6 +430,7 @@ def test_ctrl_c_while_the_program_starts_prevents_motion(field_robots: FieldRobo
     ]
 
 
+@pytest.mark.usefixtures("_short_lease")
 def test_ctrl_c_with_an_unreachable_robot_reports_that_its_lease_stops_it(field_robots: FieldRobots) -> None:
     with driving(field_robots) as process:
         field_robots.links.cut(Role.RECEIVER)
@@ -481,6 +493,7 @@ def motions(trial: Path) -> list[str]:
     return [json.loads(line)["event"] for line in lines]
 
 
+@pytest.mark.usefixtures("_short_lease")
 def test_after_a_fault_nothing_moves_before_it_is_confirmed(field_robots: FieldRobots) -> None:
     (field_robots.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
     home_m = place_m(field_robots)

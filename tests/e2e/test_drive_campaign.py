@@ -78,7 +78,7 @@ def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_applies_to_all_tria
     home_m, begun_ns = lab.place_m, time.time_ns()
     process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
     try:
-        lab.wait_until_it_drives()
+        lab.wait_until_it_drives(process)
         process.send_signal(signal.SIGINT)
         stopped = finish(process)
     finally:
@@ -113,7 +113,7 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
     home_m = lab.place_m
     process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
     try:
-        lab.wait_until_it_drives()
+        lab.wait_until_it_drives(process)
         process.send_signal(signal.SIGINT)
         assert finish(process).code == 130
     finally:
@@ -164,7 +164,7 @@ def test_stop_stops_a_robot_after_fieldkit_was_killed(lab: RoverLab) -> None:
     lab.place_at("5m")
     process = start(lab.folder, "trial", "drive", "5m", "--out", "killed", *UNASKED)
     try:
-        lab.wait_until_it_drives()
+        lab.wait_until_it_drives(process)
     finally:
         process.kill()
         process.communicate()

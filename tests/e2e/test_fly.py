@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -122,6 +123,10 @@ NEAR_M = 0.6
 NEWEST = 'cat "$(ls -t .fieldkit/*/*/fly.log | head -n 1)"'
 
 
+START_M: dict[Role, Vector] = {}
+"""Initial positions of the drones of the fixture `field_robots`."""
+
+
 @pytest.fixture(scope="module")
 def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
     folder = tmp_path_factory.mktemp("drones")
@@ -136,6 +141,7 @@ def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobo
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)  # profiles are searched there
             field_robots = stack.enter_context(start_field_robots(folder, site=folder / "drones.yaml"))
+        START_M.update(places_m(field_robots))
         yield field_robots
 
 
@@ -235,12 +241,14 @@ def assert_landed(field_robots: FieldRobots, role: Role, why: str) -> None:
 
 def moved_m(field_robots: FieldRobots, role: Role) -> Vector:
     """Return the distance of the drone from its initial position, by the lab."""
-    (*_, now), (start, *_) = 2 * [
-        [point.position_m for point in field_robots.testbed.oracle.track(0) if point.role is role]
-    ]
-    assert now is not None
-    assert start is not None
-    return now[0] - start[0], now[1] - start[1], now[2] - start[2]
+    now_m, start_m = places_m(field_robots)[role], START_M[role]
+    return now_m[0] - start_m[0], now_m[1] - start_m[1], now_m[2] - start_m[2]
+
+
+def places_m(field_robots: FieldRobots) -> dict[Role, Vector]:
+    """Return the present positions, and discard earlier ones, because tests poll them a hundred times per second."""
+    track = field_robots.testbed.oracle.track(time.time_ns())
+    return {point.role: point.position_m for point in track if point.position_m is not None}
 
 
 def far_m(field_robots: FieldRobots, role: Role) -> float:

@@ -62,7 +62,7 @@ def farthest_m(flight: Sequence[Vector], start_m: Vector) -> tuple[float, float]
     return east_m - start_m[0], north_m - start_m[1]
 
 
-@pytest.mark.parametrize("repeats", [3, pytest.param(10, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("repeats", [2, pytest.param(10, marks=pytest.mark.nightly)])
 def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "robots").mkdir()
     (tmp_path / "procedures").mkdir()

@@ -19,7 +19,8 @@ out=$1 python=$2 lab=$3
 mount -t tmpfs -o size=150m tmpfs "$lab"
 cd "$lab"
 cp "$out/fieldkit.yaml" .
-"$python" -m fieldkit trial los 30ft --repeats 2 --record 1s --protocol tcp --json >"$out/first.json" 2>"$out/first" &
+words="--topology masterless --repeats 2 --record 1s --protocol tcp"
+"$python" -m fieldkit trial los 30ft $words --json >"$out/first.json" 2>"$out/first" &
 until grep -q '"transfer"' "$out/first.json"; do kill -0 $!; sleep 0.05; done
 head -c 1G /dev/zero >fill 2>/dev/null || true
 code=0

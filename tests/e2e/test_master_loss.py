@@ -84,6 +84,7 @@ def test_after_the_loss_of_drone_and_master_nothing_is_discovered(tmp_path: Path
     assert "the same bytes as before" in run_here(tmp_path, "rebuild", str(only_trial(tmp_path))).out
 
 
+@pytest.mark.nightly  # CI has the loss of a drone with the master, and robots without a shared master
 def test_without_a_shared_master_the_loss_of_the_drone_has_no_effect(tmp_path: Path) -> None:
     row = run_procedure(lab_with_one_master(tmp_path), "peerloss")
     assert {row[f"{name}.bag_discovered"] for name in ("before", "through", "after")} == {"true"}

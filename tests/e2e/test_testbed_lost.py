@@ -13,7 +13,8 @@ from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_f
 
 pytestmark = pytest.mark.emulated
 
-TRIAL = ("trial", "--repeats", "2", "--protocol", "tcp", "--record", "1s", "--json", "los", "30ft")
+OPTIONS = ("--repeats", "2", "--protocol", "tcp", "--topology", "masterless", "--record", "1s")
+TRIAL = ("trial", *OPTIONS, "--json", "los", "30ft")
 
 
 def process_of(family: set[int], module: str) -> int:

@@ -16,7 +16,7 @@ from tests.helpers.runs import LIMIT_S, Run, finish, only_trial, rows, run_here,
 pytestmark = pytest.mark.emulated
 
 REPEATS = 2
-TRIAL = ("trial", "--repeats", str(REPEATS), "--protocol", "tcp", "--json", "los", "30ft")
+TRIAL = ("trial", "--repeats", str(REPEATS), "--protocol", "tcp", "--topology", "masterless", "--json", "los", "30ft")
 
 
 @pytest.fixture(autouse=True)

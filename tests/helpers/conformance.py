@@ -26,7 +26,7 @@ from tests.helpers.sshd import wait_until
 
 SOON_S = 60.0
 # Larger than all transport windows: that of paramiko has 2 MiB.
-LARGE_BYTES = 5_000_000
+LARGE_BYTES = 3_000_000
 LARGE_FILE_BYTES = fetching.PIECE_BYTES + 100
 """Size of an evidence file that is fetched in two pieces."""
 

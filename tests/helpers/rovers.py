@@ -1,6 +1,7 @@
 """A lab with a ground robot that drives, `rover-1`, and `box-1` next to it; fieldkit uses them like real robots."""
 
 import math
+import subprocess
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from tests.helpers import texts
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import BOX, replace_text
 from tests.helpers.paths import ROOT
+from tests.helpers.runs import wait_during
 from tests.helpers.sshd import wait_until
 
 LONG_S: Final = 90.0
@@ -102,9 +104,9 @@ class RoverLab:
         """Place the stationary rover at a distance from the box, as a person would carry it."""
         self.field_robots.testbed.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance(distance)))
 
-    def wait_until_it_drives(self) -> None:
-        """Wait until the rover drives."""
-        wait_until(lambda: self.drives, Deadline.after(LONG_S))
+    def wait_until_it_drives(self, process: "subprocess.Popen[str]") -> None:
+        """Wait until the rover drives in a started run, which must not end before."""
+        wait_during(process, lambda: self.drives, within_s=2 * LONG_S)
 
     def drive_forward(self, distance_m: float) -> None:
         """Drive the rover forward with its velocity topic, as a remote control would."""

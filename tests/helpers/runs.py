@@ -65,7 +65,7 @@ def wait_for_line(process: "subprocess.Popen[str]", text: str) -> None:
     assert any(text in line for line in process.stdout), f"{text} was not printed"
 
 
-def wait_during(process: "subprocess.Popen[str]", condition: Callable[[], bool], *, within_s: float = 90.0) -> None:
+def wait_during(process: "subprocess.Popen[str]", condition: Callable[[], bool], *, within_s: float = 180.0) -> None:
     """Wait until a condition is true while a started run continues.
 
     Raises:

@@ -28,7 +28,8 @@ _POLL_S = 0.1
 _SUSPENDED_TIMEOUT_S = 0.5
 _TIMEOUT_S = 2.0
 """A server that does not answer for this time is replaced, even if it is not reported as suspended."""
-_START_TIMEOUT_S = 5.0
+_START_TIMEOUT_S = 15.0
+"""Timeout for the start of a server: a busy robot takes seconds to start Python."""
 _RETRY_S = 0.1
 _BUFFER_BYTES = 1 << 20
 _COMMAND_OFFSET, _TARGET_OFFSET = 28, 30
@@ -231,11 +232,11 @@ class SharedLink:
         """
         deadline_s = time.monotonic() + _START_TIMEOUT_S
         while (server := self._try_connect()) is None:
+            if time.monotonic() > deadline_s:
+                raise TimeoutError(f"no link server serves {self._connection}")
             self._start()
             if self._stop_event.wait(0.01):
                 return
-            if time.monotonic() > deadline_s:
-                raise TimeoutError(f"no link server serves {self._connection}")
         with self._lock:
             self._server = server
             self._answered_s = time.monotonic()

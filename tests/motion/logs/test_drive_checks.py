@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.agent.numbered_lines import NumberedLines
@@ -102,7 +102,6 @@ def test_a_deviation_from_the_planned_path_is_detected(tmp_path: Path) -> None:
     assert any("drove at 3.00 m/s instead of 1 m/s" in reason for reason in contradictions)
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     field=st.sampled_from(FIELDS[3:7]),
     some=st.tuples(st.integers(0, 90), st.integers(1, 100)),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.agent.numbered_lines import NumberedLines
@@ -88,7 +88,6 @@ def test_a_changed_line_is_detected(field: str, by: float, why: str, tmp_path: P
     assert any(why in reason for reason in contradictions) if why else contradictions == []
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     field=st.sampled_from(["ahead_m", "left_m", "up_m", "speed_m_s"]),
     some=st.tuples(st.integers(0, 200), st.integers(1, 200)),

@@ -24,6 +24,7 @@ from fieldkit.ros.bridging.crossings import Crossing, parse_qos
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
 from fieldkit.ros.interfaces.types import shipped
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
 TYPE = "sensor_msgs/msg/LaserScan"
@@ -187,7 +188,7 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, over: str)
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("over", ["dds", "zenoh"])
+@pytest.mark.parametrize("over", mark_nightly(["dds", "zenoh"]))
 def test_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, over: str) -> None:
     latched = ("rostopic", "pub", "--latch", "/scan", "sensor_msgs/LaserScan", "{header: {frame_id: once}}")
     late = "transient_local,depth=1"

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldkit.agent.messaging import records, stream
@@ -251,7 +251,6 @@ def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     )
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     kind=ANY,
     end=st.sampled_from(["sent", "received"]),
@@ -280,7 +279,6 @@ def test_a_change_in_any_range_of_a_field_is_noticed(
     require_noticed(reasons, measured, before)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     kind=ANY,
     end=st.sampled_from(["sent", "received"]),
@@ -305,7 +303,6 @@ def test_missing_or_duplicated_records_are_noticed(
     require_noticed(reasons, measured, before)
 
 
-@settings(max_examples=100, deadline=None)
 @given(end=st.sampled_from(["sender", "receiver"]), place=st.integers(0), bit=st.integers(0, 7))
 def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int, bit: int, folder: Path) -> None:
     made = KINDS["over TCP"]
