@@ -47,7 +47,7 @@ def make_bench(options: RadioOptions) -> Iterator[Bench]:
         yield medium, namespaces
 
 
-@pytest.fixture(scope="module", params=OPTIONS.values(), ids=OPTIONS)
+@pytest.fixture(scope="module", params=[*OPTIONS.values()], ids=[*OPTIONS])
 def module_bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
     with make_bench(request.param) as bench:
         yield bench
