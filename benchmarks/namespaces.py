@@ -1,17 +1,18 @@
 """Bare network namespaces for benchmarks and tests: without robots, removed with the process that made them."""
 
-import socket
+import ctypes
+import os
 import subprocess
-import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, Self
 
+from sim_backends.emulated.robot.network import open_tun
+
 _ROOT: Final = Path(__file__).resolve().parents[1]
-_OPEN_TUN: Final = (
-    "import socket, sys; from sim_backends.emulated.robot.network import open_tun; "
-    "socket.send_fds(socket.socket(fileno=int(sys.argv[1])), [b'x'], [open_tun(sys.argv[2])])"
-)
+_LIBC: Final = ctypes.CDLL(None, use_errno=True)
+_CLONE_NEWNET: Final = 0x40000000  # linux/sched.h
 
 
 class Namespace:
@@ -59,16 +60,19 @@ class Namespace:
 
     def tun(self, name: str, address: str) -> int:
         """Create the TUN interface `name` in the namespace, bring it up with `address`, return its descriptor."""
-        receiver, sender = socket.socketpair()
-        with receiver, sender:
-            argv = [sys.executable, "-c", _OPEN_TUN, str(sender.fileno()), name]
-            with self.start(*argv, pass_fds=[sender.fileno()]) as opener:
-                sender.close()
-                _, (fd,), _, _ = socket.recv_fds(receiver, 1, 1)
-            assert opener.returncode == 0
+        with ThreadPoolExecutor(1) as executor:
+            fd = executor.submit(self._open_tun, name).result()
         self.ip("address", "add", address, "dev", name)
         self.ip("link", "set", name, "up")
         return fd
+
+    def _open_tun(self, name: str) -> int:
+        """Create a TUN interface, in a thread that exits afterwards, because it joins the namespace."""
+        with Path(f"/proc/{self.pid}/ns/net").open("rb") as namespace:
+            if _LIBC.setns(namespace.fileno(), _CLONE_NEWNET):
+                number = ctypes.get_errno()
+                raise OSError(number, os.strerror(number))
+        return open_tun(name)
 
     def veth(self, peer: "Namespace", address: str, peer_address: str) -> None:
         """Connect this namespace with `peer` by a veth pair, both ends named `wire0`."""

@@ -22,6 +22,7 @@ from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
+from tests.helpers.nightly import examples
 from tests.helpers.tables import COMPARABLE, ROW, RepeatRow, repeats, replace, write
 
 
@@ -267,7 +268,7 @@ NUMBERS = [column for column in trial_columns() if column.type is not str]
 
 
 @given(st.sampled_from(NUMBERS).flatmap(lambda column: st.tuples(st.just(column), likely(column))))
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 def test_every_column_accepts_exactly_its_possible_values(drawn: tuple[Column, str]) -> None:
     column, text = drawn
     line = dict.fromkeys(COLUMNS, "") | {"status": "valid", column.name: text}

@@ -53,6 +53,18 @@ def edit(clone: Path, name: str, old: str, new: str) -> None:
     path.write_text(text.replace(old, new), encoding="utf-8")
 
 
+def test_a_number_is_a_difference_and_a_word_is_a_label(clone: Path) -> None:
+    edit(clone, "fieldkit/cli/commands/abort.py", "do not ask; required", "no question; required")
+    edit(clone, "fieldkit/cli/__init__.py", "130 interrupted", "131 interrupted")
+    done = prove(clone, "HEAD", "--only", "help")
+    assert done.returncode == 1
+    assert "DIFFERENT help texts: .: fieldkit --help" in done.stdout
+    assert " 1 different" in done.stdout
+    assert " 1 with other labels" in done.stdout
+    assert "CHANGED" in done.stdout
+
+
+@pytest.mark.nightly
 def test_a_label_passes_and_a_number_does_not(clone: Path) -> None:
     only = ("--only", "help")
     edit(clone, "fieldkit/cli/__init__.py", "Field trials of robots", "Outdoor trials of robots")

@@ -1,6 +1,7 @@
 """Search for inputs that break a reader: `python -m tests.fuzz --minutes 60`; repeat one with `--replay FILE`."""
 
 import argparse
+import json
 import sys
 import time
 from pathlib import Path
@@ -16,9 +17,11 @@ def main(argv: list[str]) -> int:
         harness.work(targets.select_targets(names), int(seed), range(int(start), int(stop)), Path(work_folder))
         return 0
     if argv[:1] == ["again"]:
-        input_file, folder = map(Path, argv[1:])
-        (target,) = targets.select_targets(input_file.name.partition(".")[0])
-        print(harness.try_input(target, input_file.read_bytes(), folder / "place") or "")
+        folder, *input_files = map(Path, argv[1:])
+        for input_file in input_files:
+            (target,) = targets.select_targets(input_file.name.partition(".")[0])
+            failure = harness.try_input(target, input_file.read_bytes(), folder / "place")
+            print(json.dumps(failure), flush=True)
         return 0
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--minutes", type=float, default=60.0)
@@ -33,7 +36,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--replay", type=Path, help="repeat a kept input")
     options = parser.parse_args(argv)
     if options.replay is not None:
-        failure = harness.replay(options.replay)
+        (failure,) = harness.replay([options.replay])
         print(failure or "nothing broke")
         return int(failure is not None)
     return _hunt(options)

@@ -156,8 +156,11 @@ def _run_worker(failure: Sequence[str], end_s: float) -> tuple[dict[str, Any], s
         return current, None
     if not current["target"]:
         raise RuntimeError(f"the worker does not start: {command}")
-    ending = signal.Signals(-worker.returncode).name if worker.returncode < 0 else f"exit code {worker.returncode}"
-    return current, f"ended by {ending}"
+    return current, f"ended by {_ending(worker.returncode)}"
+
+
+def _ending(code: int) -> str:
+    return signal.Signals(-code).name if code < 0 else f"exit code {code}"
 
 
 def _print_json(failure: dict[str, object]) -> None:
@@ -175,11 +178,15 @@ def _describe(error: BaseException) -> str:
     )
 
 
-def replay(input_file: Path) -> str | None:
-    """Try a kept input in a separate process; return the defect, if any."""
-    with tempfile.TemporaryDirectory() as place:
-        command = (sys.executable, "-m", "tests.fuzz", "again", str(input_file.absolute()), place)
-        process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    if process.returncode < 0:
-        return f"ended by {signal.Signals(-process.returncode).name}"
-    return process.stdout.strip() or None
+def replay(inputs: Sequence[Path]) -> list[str | None]:
+    """Try kept inputs in one separate process, or several if an input ends it; return the defect of each, if any."""
+    failures: list[str | None] = []
+    while len(failures) < len(inputs):
+        with tempfile.TemporaryDirectory() as place:
+            paths = [str(path.absolute()) for path in inputs[len(failures) :]]
+            command = (sys.executable, "-m", "tests.fuzz", "again", place, *paths)
+            process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        failures += map(json.loads, process.stdout.splitlines())
+        if len(failures) < len(inputs):
+            failures.append(f"ended by {_ending(process.returncode)}")
+    return failures

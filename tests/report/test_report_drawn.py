@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats
@@ -19,7 +20,7 @@ from fieldkit.report import distance, distribution, dots, figures
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.contents import build_contents
 from fieldkit.report.series import Identities, needs_log
-from fieldkit.report.theme import Style
+from fieldkit.report.theme import Format, Style
 from fieldkit.report.trial_folders import load_evidence
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
@@ -94,6 +95,17 @@ def test_line_is_broken_at_missing_values_and_very_wide_intervals() -> None:
     wide = [*near, *(replace(row, rtt_median_s=0.001 + 0.03 * n) for n, row in enumerate(at(25, 2)))]
     (series,) = panel_of(curves(parsed(wide), "rtt_median_s")).series
     assert set(series.breaks) == {1, 2}
+
+
+@pytest.mark.parametrize("form", ["svg", "png"])
+def test_a_figure_is_equal_to_one_that_matplotlib_draws_twice(form: Format, monkeypatch: pytest.MonkeyPatch) -> None:
+    x, y = [1.0, 2.0, 3.0], [0.5, 20.0, 3000.0]
+    series = [Series("sent", Style("blue", "o"), x, y), Series("received", Style("red", "s"), x, y)]
+    panel = Panel("a long title that needs several lines in a figure of one column", "distance", "ms", series, "")
+    chart = Chart("a", "A", "", [panel])
+    drawn = figures.paper(chart, form)
+    monkeypatch.setattr(figures, "_Figure", Figure)
+    assert figures.paper(chart, form) == drawn
 
 
 def test_broken_line_is_drawn_in_segments() -> None:

@@ -17,6 +17,7 @@ from tests.helpers import links
 from tests.helpers.captures import Frame, file_bytes, packets, segment, timed, transfer
 from tests.helpers.links import MS, RECEIVER_V6, SENDER_V6, Link, PacketFates
 from tests.helpers.measures import measure
+from tests.helpers.nightly import examples
 
 shares = st.sampled_from((0.0, 0.02, 0.2))
 lossy = st.builds(
@@ -60,7 +61,7 @@ def _fate(counts: udp.UdpCounts) -> PacketFates:
 
 
 @given(lossy, same_ids)
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 def test_content_distinguishes_packets_with_equal_headers(link: Link, ip_id: int | None) -> None:
     counts, truth = _udp(link, [link.draw.randbytes(40) for _ in range(120)], ids=[ip_id] * 120)
     assert _fate(counts) == truth
@@ -68,7 +69,7 @@ def test_content_distinguishes_packets_with_equal_headers(link: Link, ip_id: int
 
 
 @given(lossy, same_ids)
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 def test_without_content_a_count_is_correct_or_marked_as_ambiguous(link: Link, ip_id: int | None) -> None:
     counts, truth = _udp(link, [bytes(40)] * 120, ids=[ip_id] * 120)
     assert counts.packets_ambiguous == 120
@@ -160,7 +161,7 @@ def _is(counts: tcp.TcpCounts, truth: links.TcpTruth) -> None:
 
 
 @given(lossy, joined, shares, names)
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 def test_time_stamps_identify_retransmissions_with_any_offload(
     link: Link, offload: int, again: float, name: str
 ) -> None:
@@ -176,7 +177,7 @@ def test_time_stamps_identify_retransmissions_with_any_offload(
 
 
 @given(lossy, joined, shares, names)
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 def test_without_time_stamps_order_is_correct_or_empty(link: Link, offload: int, again: float, name: str) -> None:
     ipv6 = name == "v6"
     truth = links.tcp(link, 100, ids=name == "ids", ipv6=ipv6, offload=offload, again=again, stamped=False)

@@ -8,6 +8,7 @@ from scipy.optimize import linprog
 
 from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.transfers.clock_offset import MAX_SKEW, QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
+from tests.helpers.nightly import examples
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -61,7 +62,7 @@ def traffic(draw: st.DrawFn, largest: int = 40, smallest: int = 1) -> tuple[Floa
 
 
 @given(offsets_s, drifts, traffic(), traffic())
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 def test_offset_and_skew_are_within_their_errors(
     offset_s: float, drift: float, there: tuple[Floats, Floats], back: tuple[Floats, Floats]
 ) -> None:
@@ -111,7 +112,7 @@ def test_the_error_is_that_of_linear_programs_that_each_leave_out_one_packet(
 
 
 @given(offsets_s, drifts, traffic(smallest=2), traffic(smallest=2), st.data())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300), deadline=None)
 def test_the_truth_is_within_the_error_with_one_wrong_time_of_any_size(
     offset_s: float, drift: float, there: tuple[Floats, Floats], back: tuple[Floats, Floats], data: st.DataObject
 ) -> None:

@@ -20,6 +20,7 @@ from fieldkit.measure.transfers import delay, tcp, udp
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from tests.helpers.captures import RECEIVER, SENDER, TCPDUMP, Frame, datagram, ipv4, packets, segment, transfer
 from tests.helpers.measures import Measures
+from tests.helpers.nightly import examples
 
 TWO_WAY = TCPDUMP / "two-way"
 START_NS = 1_700_000_000_000_000_000
@@ -133,7 +134,7 @@ delays_ms = st.lists(st.floats(1, 400), min_size=2, max_size=30)
 
 
 @given(st.sampled_from(CLOCKS), delays_ms, st.floats(0.5, 50))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 def test_values_are_correct_within_their_error_or_withheld(
     wrong: Wrong, delay_ms: list[float], back_ms: float
 ) -> None:

@@ -13,6 +13,7 @@ from fieldkit.measure.captures.arrays import Ints
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers.match import NONE, assign, match, match_keys, match_payload
 from tests.helpers.captures import Frame, datagram, ipv4, packets, segment, timed
+from tests.helpers.nightly import examples
 
 moments = st.sets(st.integers(0, 30), min_size=1, max_size=12).map(
     lambda moments_ms: [4 * moment for moment in sorted(moments_ms)]
@@ -65,7 +66,7 @@ def test_packets_with_repeated_ids_are_matched_within_their_round(ids: int, roun
 
 
 @given(moments, moments)
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 def test_items_are_assigned_to_the_nearest_in_time(sent: list[int], received: list[int]) -> None:
     """Compared with a loop over one group; a second group, with all items received, gives the clock offset of 1."""
     positions, is_clear, _ = assign(
@@ -165,7 +166,7 @@ frames = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 15), st.integers(
 
 
 @given(st.integers(0, 2**32 - 1), frames, frames, st.sampled_from((0, 100)))
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 def test_each_byte_has_as_many_matches_as_copies_sent_and_received(
     isn: int, sent: list[tuple[int, int, int]], received: list[tuple[int, int, int]], other_ids: int
 ) -> None:

@@ -14,6 +14,7 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.transfers import tcp
 from tests.helpers.captures import PORT, RECEIVER, SENDER, TCPDUMP, Frame, packets, segment, timed, transfer
+from tests.helpers.nightly import examples
 
 TCP_TRANSFER = transfer(Protocol.TCP)
 SYN, FIN_ACK, ACK = 0x02, 0x11, 0x10
@@ -44,7 +45,7 @@ def _retransmitted(sent: Iterable[Range]) -> int:
 
 
 @given(initial, ranges, ranges, st.booleans())
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 def test_ranges_equal_a_model_of_single_bytes(isn: int, sent: list[Range], received: list[Range], syn: bool) -> None:
     """Any frames at either end: partial overlaps, reordering, duplicates, offload, wrapping sequence numbers."""
     counts = tcp.count(
@@ -72,7 +73,7 @@ def _slow_order(sent: list[Range], arrivals: list[int]) -> tuple[int, int]:
 
 
 @given(initial, ranges, st.data())
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 def test_counts_that_depend_on_the_order_equal_a_slow_count(isn: int, sent: list[Range], data: st.DataObject) -> None:
     """Complete frames with unique IP ids are lost, copied and reordered."""
     frames = timed([

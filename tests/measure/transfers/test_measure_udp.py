@@ -12,6 +12,7 @@ from scapy.packet import Raw
 from fieldkit.core.model import Protocol
 from fieldkit.measure.transfers import udp
 from tests.helpers.captures import PORT, RECEIVER, SENDER, Frame, datagram, ipv4, packets, timed, transfer
+from tests.helpers.nightly import examples
 
 UDP_TRANSFER = transfer(Protocol.UDP)
 
@@ -82,7 +83,7 @@ def len_of(packet: bytes) -> int:
 
 
 @given(st.integers(1, 6), st.integers(1, 6), st.data())
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 def test_packets_with_repeated_ids_are_distinguished_by_time(ids: int, rounds: int, data: st.DataObject) -> None:
     """The counter wraps: each id is used by `rounds` datagrams, seconds apart, with another clock and jitter."""
     clock_ns = data.draw(st.integers(-(10**12), 10**12))

@@ -26,6 +26,7 @@ from sim_backends.radio.model import RadioModel
 from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State, WayPoints
+from tests.helpers.nightly import examples
 from tests.helpers.radio_networks import MS, carry, fixed, network, outcome, packets, standing, wifi
 
 NAMES = "abcd"
@@ -158,7 +159,7 @@ FIXED = st.fixed_dictionaries(
 WIFI = st.fixed_dictionaries({"queue_packets": st.integers(0, 10)})
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(
     WIFI | FIXED,
     st.integers(0, 100),

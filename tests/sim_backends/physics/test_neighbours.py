@@ -13,6 +13,7 @@ from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDriv
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.neighbours import CellGrid, Neighbours
 from sim_backends.physics.quadrotor import IRIS, Quadrotor
+from tests.helpers.nightly import examples
 from tests.helpers.worlds import world
 
 COORDINATE = st.floats(-30, 30)
@@ -57,7 +58,7 @@ BODIES = st.lists(
 ).map(lambda bodies: {f"r{number:02}": body for number, body in enumerate(bodies)})
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(BODIES)
 def test_a_list_of_many_bodies_equals_the_lists_of_all_pairs(bodies: dict[str, Body[Any]]) -> None:
     whole_list = neighbour_list(bodies)

@@ -20,6 +20,7 @@ from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import Antenna
+from tests.helpers.nightly import examples
 from tests.helpers.stations import FixedPowers
 
 MS = 1_000_000
@@ -51,7 +52,7 @@ EVENTS = st.lists(
 ).map(lambda events: sorted(events, key=lambda event: event[0]))
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(
     WIFI | FIXED,
     st.integers(0, 100),

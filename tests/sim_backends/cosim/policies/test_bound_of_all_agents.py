@@ -24,6 +24,7 @@ from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import DeadReckoned, State, WayPoints
+from tests.helpers.nightly import examples
 
 STEP_NS: Final = 1_000_000
 END_NS: Final = 400 * STEP_NS
@@ -57,7 +58,7 @@ PLACES = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(0, 5))
 MOTIONS = st.tuples(st.lists(PLACES, min_size=1, max_size=5), st.floats(0.05, 20.0))
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(
     motions=st.tuples(MOTIONS, MOTIONS, MOTIONS, MOTIONS),
     transmitters=st.sets(st.sampled_from(["c", "d"])),

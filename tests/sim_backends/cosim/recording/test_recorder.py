@@ -38,10 +38,13 @@ from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.passing_robots import ABOUT, MS, passing_robots
 from tests.helpers.paths import ROOT
 
 END_NS = 4_000 * MS
+EXIT_S = 300.0
+"""Longest time until a child process has exited, on a busy machine."""
 
 
 def record(folder: Path, policy: SyncPolicy | None = None, part_every_s: float = 0.01, end_ns: int = END_NS) -> Run:
@@ -126,7 +129,7 @@ def test_a_run_that_is_killed_keeps_the_parts_written_before(tmp_path: Path, hun
         assert read_manifest(tmp_path / "run").ending is RunEnding.UNDER_WAY
         before = len(list((tmp_path / "run" / "windows").glob("*.parquet")))
         process.send_signal(signal.SIGKILL)
-        process.wait(30)
+        process.wait(EXIT_S)
     recording = read_recording(tmp_path / "run")
     assert (recording.manifest.ending, recording.run.digest) == (RunEnding.KILLED, "")
     assert len(list((tmp_path / "run" / "windows").glob("*.parquet"))) >= before
@@ -151,7 +154,7 @@ def test_a_run_that_is_interrupted_is_recorded_completely(tmp_path: Path) -> Non
         for _ in range(5):
             process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=30)
+        _, stderr = process.communicate(timeout=EXIT_S)
     assert "KeyboardInterrupt" in stderr
     recording = read_recording(tmp_path / "run")
     assert recording.manifest.ending is RunEnding.INTERRUPTED
@@ -163,7 +166,7 @@ def test_a_run_that_is_interrupted_is_recorded_completely(tmp_path: Path) -> Non
 def test_a_full_disk_ends_the_run_and_keeps_the_parts_written_before(tmp_path: Path) -> None:
     """A limit on the size of files stands in for a full disk."""
     with child(tmp_path / "run", 20_000) as process:
-        _, stderr = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=EXIT_S)
     assert "RecordingError" in stderr
     assert f"{tmp_path / 'run'}: the recording cannot be written: File too large" in stderr
     recording = read_recording(tmp_path / "run")
@@ -172,7 +175,7 @@ def test_a_full_disk_ends_the_run_and_keeps_the_parts_written_before(tmp_path: P
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("size", ["1300k", "3m"])
+@pytest.mark.parametrize("size", mark_nightly(["1300k", "3m"]))
 def test_a_full_disk_is_reported_and_the_packets_are_kept(tmp_path: Path, size: str, untouched: object) -> None:
     """Captures fill the disk; the tables, which are written after them, use the reserved space."""
     disk = tmp_path / "disk"
@@ -300,7 +303,6 @@ def test_a_recording_that_was_truncated_or_damaged_anywhere_is_refused(
             read_recording(recorded)
     finally:
         path.write_bytes(content)
-    read_recording(recorded)
 
 
 @pytest.fixture(scope="module")

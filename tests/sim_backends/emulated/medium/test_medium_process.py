@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -60,9 +60,9 @@ NO_PACKETS = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagati
 Bench = Callable[[str], tuple[MediumClient, dict[str, Namespace]]]
 
 
-@pytest.fixture
-def bench() -> Iterator[Bench]:
-    """Make three namespaces a, b, r on a medium with the given options."""
+@contextmanager
+def benches() -> Iterator[Bench]:
+    """Yield a function that makes three namespaces a, b, r on a medium with the given options."""
     with ExitStack() as stack:
 
         def make(text: str) -> tuple[MediumClient, dict[str, Namespace]]:
@@ -76,6 +76,22 @@ def bench() -> Iterator[Bench]:
             return medium, spaces
 
         yield make
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    with benches() as make:
+        yield make
+
+
+@pytest.fixture(scope="module")
+def plain() -> Iterator[tuple[MediumClient, dict[str, Namespace]]]:
+    """Namespaces with default routes, for tests that depend on no counters."""
+    with benches() as make:
+        medium, spaces = make(PLAIN)
+        for space in spaces.values():
+            space.ip("route", "add", "default", "dev", "wlan0")
+        yield medium, spaces
 
 
 def ping(space: Namespace, address: str, *options: str, count: int = 20) -> list[float]:
@@ -265,11 +281,11 @@ def test_packets_that_waited_to_be_read_count_as_late(bench: Bench) -> None:
 
 @pytest.mark.parametrize("address", ["239.1.1.1", "10.9.0.255", "255.255.255.255"])
 @pytest.mark.parametrize("relay", [None, "r"])
-def test_multicast_and_broadcast_reach_everyone(bench: Bench, address: str, relay: str | None) -> None:
-    medium, spaces = bench(PLAIN)
+def test_multicast_and_broadcast_reach_everyone(
+    plain: tuple[MediumClient, dict[str, Namespace]], address: str, relay: str | None
+) -> None:
+    medium, spaces = plain
     medium.place(PLACES, relay=relay)
-    for space in spaces.values():
-        space.ip("route", "add", "default", "dev", "wlan0")
     listeners = {name: spaces[name].start(sys.executable, "-c", LISTEN, ADDRESSES[name]) for name in ("b", "r")}
     for listener in listeners.values():
         assert listener.stdout is not None
@@ -331,8 +347,8 @@ def test_the_medium_continues_between_the_other_robots(bench: Bench) -> None:
     assert len(ping(spaces["a"], ADDRESSES["b"], count=5)) == 5
 
 
-def test_invalid_requests_are_rejected(bench: Bench) -> None:
-    medium, spaces = bench(PLAIN)
+def test_invalid_requests_are_rejected(plain: tuple[MediumClient, dict[str, Namespace]]) -> None:
+    medium, spaces = plain
     fd = spaces["a"].tun("wlan1", "10.9.1.1/24")
     with pytest.raises(RobotError, match="attached already"):
         medium.attach("a", "10.9.1.1/24", RADIO, fd)

@@ -13,6 +13,7 @@ from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.connection import Tcp
 from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
 from sim_backends.network.wire import IpPacket
+from tests.helpers.nightly import examples
 from tests.helpers.scripted_wire import Script, ScriptedWire, losing
 
 MS = 1_000_000
@@ -212,7 +213,7 @@ def scripted(forward: Sequence[Sequence[int]], reverse: Sequence[Sequence[int]])
     return script
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(
     forward=deliveries,
     reverse=deliveries,
