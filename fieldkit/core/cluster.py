@@ -1,5 +1,6 @@
 """The workers of a Dask cluster as an executor. Only this module imports `distributed`."""
 
+import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -18,6 +19,9 @@ except ImportError as error:
     raise ConfigurationError(
         f"a Dask cluster needs the package distributed: {error}", remedy='pip install "fieldkit[cluster]"'
     ) from error
+
+# It warns of lost workers, which `tasks` reports.
+logging.getLogger("distributed").setLevel(logging.ERROR)
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
