@@ -222,6 +222,10 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
         )
     for folder in folders:
         if (folder / laptop_files.SWEEP).is_file():
+            if rebuild:
+                raise ConfigurationError(
+                    "a sweep has no raw evidence", where=str(folder), remedy="leave out --rebuild"
+                )
             if (folder / laptop_files.SWEEP_RESULTS).is_dir():
                 yield folder / laptop_files.SWEEP_RESULTS
             else:
