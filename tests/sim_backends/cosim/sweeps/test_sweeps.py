@@ -16,6 +16,7 @@ import pytest
 import fieldkit
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, LinkError
+from sim_backends.cosim.commands.execution import simulate
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.sweeps import sweep_runner
 from sim_backends.cosim.sweeps.factors import parse_factors, settings_of
@@ -93,7 +94,7 @@ def test_a_list_is_one_value() -> None:
 def test_a_failed_run_states_its_reason_and_is_tried_a_limited_number_of_times(
     lab: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    simulate, calls = sweep_runner.simulate, list[int]()
+    calls: list[int] = []
 
     def failing(scenario: CosimScenario, policy: str, seed: int, folder: None) -> Any:  # noqa: ANN401 (as simulate)
         calls.append(seed)
@@ -158,7 +159,8 @@ def test_pandas_polars_and_duckdb_read_the_dataset(lab: Path) -> None:
     counts = pl.read_parquet(results, hive_partitioning=True).group_by("policy", "window").len()
     assert {(row[0], row[1]): row[2] for row in counts.iter_rows()} == expected
     query = f"SELECT policy, \"window\", count(*) FROM '{results}/**/*.parquet' GROUP BY ALL"
-    assert {(row[0], row[1]): row[2] for row in duckdb.sql(query).fetchall()} == expected
+    rows: Any = duckdb.sql(query)
+    assert {(row[0], row[1]): row[2] for row in rows.fetchall()} == expected
 
 
 def test_aggregate_compare_and_load_read_the_folder_like_trials(lab: Path) -> None:
