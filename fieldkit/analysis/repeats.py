@@ -12,7 +12,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis import datasets, parsing
+from fieldkit.analysis import parsing
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.quantities import Quantity, quantities, word_columns
 from fieldkit.core.columns import SCHEMA_VERSION, Column
@@ -263,6 +263,8 @@ def names(path: Path) -> tuple[str, ...]:
         EvidenceError: As for `datasets.names`.
     """
     if path.is_dir():
+        from fieldkit.analysis import datasets  # noqa: PLC0415 (as above)
+
         return datasets.names(path)
     with _readable(path), path.open("rb") as file:
         return _names(file.readline(_MAX_HEADER_BYTES))
@@ -311,6 +313,8 @@ class _Batch:
 
 def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
     """Return the rows of a dataset of Parquet files; errors as `datasets.read`, or if a value is not possible."""
+    from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
+
     numbers, texts, rows = datasets.read(path, declared)
     table = Repeats(numbers, texts, tuple(declared.values()))
     if not _is_valid(table, declared):

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, ClassVar, Final, ParamSpec, TypeVar
 
 from typing_extensions import override
 
@@ -39,6 +39,8 @@ class ClusterExecutor(WorkerExecutor):
     Raises:
         LinkError: The scheduler does not answer.
     """
+
+    MIN_SUBMITTED: ClassVar[int] = 100  # they hide the delay of the network; the scheduler holds them back
 
     def __init__(self, address: str) -> None:
         if address.endswith(".json") and not Path(address).is_file():
