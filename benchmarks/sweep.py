@@ -6,13 +6,12 @@ two workers, and the cost of state on disk with many finished runs.
 """
 
 import argparse
-import json
 import random
 import resource
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import chdir
 from multiprocessing import get_context
@@ -108,9 +107,13 @@ def state_costs(plan: SweepPlan, folder: Path) -> dict[str, float]:
     state = SweepFolder(folder, "")
     content = execute(plan.runs[0]).content
     with state.opened(plan):
-        write_s = timed(lambda: [state.write_result(run, content) for run in plan.runs]) / len(plan.runs)
+        start_s = time.monotonic()
+        for run in plan.runs:
+            state.write_result(run, content)
+        write_s = (time.monotonic() - start_s) / len(plan.runs)
         continue_s = timed(lambda: run_sweep(plan, state, Workers(2), sink=lambda _: None))
-        return {"write_s": write_s, "continue_s": continue_s, "dataset_s": timed(lambda: write_dataset(plan, state))}
+        dataset_s = timed(lambda: write_dataset(plan, state))
+        return {"to write a result": write_s, "to continue if all are finished": continue_s, "dataset": dataset_s}
 
 
 def main() -> None:
@@ -120,38 +123,37 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=50, help="seeds of each of 4 windows")
     parser.add_argument("--tasks", type=int, default=10_000)
     parser.add_argument("--duration", default="2s", help="duration of a run")
-    parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     factors = parse_factors([WINDOWS])
     with tempfile.TemporaryDirectory() as name, chdir(name):
         Path("pair.yaml").write_text(SCENARIO.format(duration=arguments.duration), encoding="utf-8")
         plan = plan_sweep("pair.yaml", factors, range(1, arguments.seeds + 1), {})
-        rates = runs_per_s(plan, Path("sweeps"), arguments.rounds)
-        costs = {
-            "bare pool": bare_empty_task_s(arguments.tasks),
-            "processes": empty_task_s(Workers(2), arguments.tasks),
-        }
+        show_rates(runs_per_s(plan, Path("sweeps"), arguments.rounds))
+        show_empty("bare pool", arguments.tasks, bare_empty_task_s(arguments.tasks))
+        show_empty("processes", arguments.tasks, empty_task_s(Workers(2), arguments.tasks))
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(f"largest memory of the submitting process: {memory_mb:.0f} MB", flush=True)
         with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:  # type: ignore[no-untyped-call]
-            costs["dask"] = empty_task_s(Workers(cluster=cluster.scheduler_address), arguments.tasks)
+            show_empty(
+                "dask", arguments.tasks, empty_task_s(Workers(cluster=cluster.scheduler_address), arguments.tasks)
+            )
         many = plan_sweep("pair.yaml", factors, range(1, max(arguments.tasks // 4, 1) + 1), {})
-        state = state_costs(many, Path("many"))
-    if arguments.json:
-        print(json.dumps({"rates": rates, "empty_s": costs, "state": state, "memory_mb": memory_mb}))
-        return
+        for what, cost_s in state_costs(many, Path("many")).items():
+            print(f"{len(many.runs)} runs, {what}: {cost_s:.6f} s", flush=True)
+
+
+def show_rates(rates: Mapping[str, Sequence[float]]) -> None:
+    """Print runs per second, and the ratio of both methods in each round."""
     for key, values in rates.items():
         print(f"{key}: {statistics.median(values):.1f} runs/s ({min(values):.1f} to {max(values):.1f})")
     for count in (1, 2):
         ratios = [ours / bare for ours, bare in zip(rates[f"sweep {count}"], rates[f"bare {count}"], strict=True)]
         print(f"sweep / bare, {count}: {statistics.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})")
-    for key, cost_s in costs.items():
-        print(f"an empty task of {arguments.tasks}, {key}: {cost_s * 1e6:.0f} us")
-    print(f"a result written: {state['write_s'] * 1e6:.0f} us")
-    print(
-        f"{len(many.runs)} finished runs: continued in {state['continue_s']:.2f} s, "
-        f"dataset in {state['dataset_s']:.2f} s"
-    )
-    print(f"largest memory of the submitting process: {memory_mb:.0f} MB")
+
+
+def show_empty(method: str, tasks: int, cost_s: float) -> None:
+    """Print the cost of an empty task."""
+    print(f"an empty task of {tasks}, {method}: {cost_s * 1e6:.0f} us", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ condition (`by`), and declarations of columns that trials do not have.
 
 import json
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 
 import pyarrow as pa
@@ -20,7 +19,6 @@ from fieldkit.core.errors import EvidenceError
 _REMEDY = "run the command of the sweep again, which writes its dataset"
 
 
-@cache
 def _schema(folder: Path) -> pa.Schema:
     """Return the schema of a dataset.
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis import datasets, parsing
+from fieldkit.analysis import parsing
 from fieldkit.analysis.repeats import SOURCE, Repeats, by_name, header_names, parse_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
@@ -105,6 +105,8 @@ def names(path: Path) -> tuple[str, ...]:
         EvidenceError: As for `datasets.names`.
     """
     if path.is_dir():
+        from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
+
         return datasets.names(path)
     with _readable(path), path.open("rb") as file:
         return header_names(file.readline(_MAX_HEADER_BYTES))
@@ -153,6 +155,8 @@ class _Batch:
 
 def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
     """Return the rows of a dataset of Parquet files; errors as `datasets.read`, or if a value is not possible."""
+    from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
+
     numbers, texts, rows = datasets.read(path, declared)
     table = Repeats(numbers, texts, tuple(declared.values()))
     if not _is_valid(table, declared):

@@ -1,10 +1,11 @@
 """The workers of a Dask cluster as an executor. Only this module imports `distributed`."""
 
+import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, ClassVar, Final, ParamSpec, TypeVar
 
 from typing_extensions import override
 
@@ -18,6 +19,9 @@ except ImportError as error:
     raise ConfigurationError(
         f"a Dask cluster needs the package distributed: {error}", remedy='pip install "fieldkit[cluster]"'
     ) from error
+
+# It warns of lost workers, which `tasks` reports.
+logging.getLogger("distributed").setLevel(logging.ERROR)
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -35,6 +39,8 @@ class ClusterExecutor(WorkerExecutor):
     Raises:
         LinkError: The scheduler does not answer.
     """
+
+    MIN_SUBMITTED: ClassVar[int] = 100  # they hide the delay of the network; the scheduler holds them back
 
     def __init__(self, address: str) -> None:
         if address.endswith(".json") and not Path(address).is_file():

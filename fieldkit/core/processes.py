@@ -9,7 +9,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from typing import ParamSpec, TypeVar
+from typing import ClassVar, ParamSpec, TypeVar
 
 from typing_extensions import override
 
@@ -18,7 +18,13 @@ Result = TypeVar("Result")
 
 
 class WorkerExecutor(Executor):
-    """An executor that reports the number of its workers and their deaths."""
+    """An executor that reports the number of its workers and their deaths.
+
+    Attributes:
+        MIN_SUBMITTED: Number of tasks that are submitted to any number of workers.
+    """
+
+    MIN_SUBMITTED: ClassVar[int] = 4
 
     @abstractmethod
     def capacity(self) -> int:

@@ -24,7 +24,6 @@ ALONE_AFTER: Final = 2
 
 _PER_WORKER: Final = 2
 """Submitted tasks per worker: one that runs and one that waits, so that no worker is idle."""
-_MIN_SUBMITTED: Final = 4
 _POLL_S: Final = 1.0
 """Interval in which the number of workers of a cluster is read."""
 
@@ -121,7 +120,7 @@ class _Submission(Generic[Task, Result]):
         if not capacity and not self._is_without_worker:
             self._note(f"no worker is connected to {self._workers.cluster} yet; waiting for one")
         self._is_without_worker = not capacity
-        limit = max(_PER_WORKER * capacity, _MIN_SUBMITTED)
+        limit = max(_PER_WORKER * capacity, self._executor.MIN_SUBMITTED)
         while not self._executor.is_broken():
             if self._alone:
                 if self._submitted:

@@ -78,7 +78,8 @@ def _panel(
         row, column = up.index(cell.key[axes[1]]), across.index(cell.key[axes[0]])
         values[row][column] = cell.estimates[quantity.name].value
     texts = [["" if math.isnan(value) else scale.number(value) for value in row] for row in values]
-    heat = HeatMap(*([columns.cell(key) for key in keys] for keys in (across, up)), values, texts, limits)
+    across_labels, up_labels = ([columns.cell(key) for key in keys] for keys in (across, up))
+    heat = HeatMap(across_labels, up_labels, values, texts, limits)
     words = "; ".join(
         f"{axes[0]} {x}, {axes[1]} {y}: {text} {scale.unit}"
         for y, row in zip(heat.rows, texts, strict=True)

@@ -7,7 +7,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Final
 
-from fieldkit.analysis import datasets, expectations, table_files
+from fieldkit.analysis import expectations, table_files
 from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities, word_columns
@@ -87,6 +87,8 @@ class Sources:
         """The columns that define a condition: the flow and the factors of sweeps; empty if not all are sweeps."""
         if not all(table.is_dir() for table in self.tables):
             return ()
+        from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
+
         return tuple(dict.fromkeys(name for table in self.tables for name in datasets.condition(table)))
 
     def chosen(
@@ -247,6 +249,10 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
         )
     for folder in folders:
         if (folder / laptop_files.SWEEP).is_file():
+            if rebuild:
+                raise ConfigurationError(
+                    "a sweep has no raw evidence", where=str(folder), remedy="leave out --rebuild"
+                )
             if (folder / laptop_files.SWEEP_RESULTS).is_dir():
                 yield folder / laptop_files.SWEEP_RESULTS
             else:

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fieldkit.analysis import datasets, table_files
+from fieldkit.analysis import table_files
 from fieldkit.analysis.repeats import SOURCE
 from fieldkit.core import files
 from fieldkit.core.columns import Column, plain_name, with_step_name
@@ -79,6 +79,8 @@ def _other_column_names(table: Path, everywhere: Iterable[str]) -> list[str]:
 def _frozen_columns(table: Path) -> tuple[Column, ...]:
     """Return the columns that a dataset declares, or those in the plan in the folder of a table."""
     if table.is_dir():
+        from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
+
         return datasets.declared_columns(table)
     plan = table.parent / PLAN_FILE
     return frozen.read(plan) if plan.exists() and not files.unexpected_type(plan) else ()

@@ -134,19 +134,15 @@ def _require_setting(factor: Factor, scenario: CosimScenario) -> None:
     """
     document = schema.parse(schema.dump(scenario), source="").data
     names = [*_SHORT_NAMES, DISTANCE, *(key for key, _ in _leaves(document) if key not in _NOT_SETTINGS)]
-    *parents, last = factor.key.split(".")
+    *parents, _ = factor.key.split(".")
     parent: Any = document
     try:
         for key in parents:
             parent = parent[int(key) if isinstance(parent, list) else key]
     except (KeyError, IndexError, ValueError, TypeError):
         parent = None
-    known = type(scenario).model_fields if not parents else parent
-    if (
-        factor.name in names
-        or (isinstance(parent, dict) and parents)
-        or (isinstance(known, list) and last.isdecimal())
-    ):
+    is_optional = factor.name in type(scenario).model_fields.keys() - _NOT_SETTINGS
+    if factor.name in names or is_optional or (parents and isinstance(parent, dict)):
         return
     raise ConfigurationError(
         f"--over: {scenario.name} has no setting {factor.name!r}",

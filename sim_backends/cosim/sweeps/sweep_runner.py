@@ -119,7 +119,8 @@ def run_sweep(
         again: Whether failed runs without an attempt left are tried again.
 
     Raises:
-        ConfigurationError: A result cannot be written; the message has the command that continues.
+        ConfigurationError: A result cannot be written; the message has the command that continues. Or a worker has
+            another version or other files.
         LinkError: The scheduler of the cluster does not answer.
     """
     finished = folder.finished()
@@ -134,6 +135,8 @@ def run_sweep(
     while tasks := [run for run in missing if attempts[run.name] < ATTEMPTS and run.name not in finished]:
         for end in completed(work, tasks, workers, lambda text: sink(Note(text))):
             run = tasks[end.number]
+            if isinstance(end.error, ConfigurationError):  # all scenarios are valid, so it is an error of the worker
+                raise end.error
             attempts[run.name] += 1
             failure = _failure(end, attempts[run.name])
             if failure is None and end.result is not None:

@@ -1,0 +1,110 @@
+"""Tasks on an executor: few are submitted at a time, lost ones are run again, a cluster is optional."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typing_extensions import override
+
+from fieldkit.core.errors import ConfigurationError, LinkError
+from fieldkit.core.executors import Workers
+from fieldkit.core.processes import WorkerExecutor
+from fieldkit.core.tasks import MAX_DEATHS, TaskEnd, completed
+
+
+class ScriptedWorkers(WorkerExecutor):
+    """Two workers that finish tasks when four are submitted; records the largest number submitted."""
+
+    def __init__(self, *, cancels: bool = False) -> None:
+        self.largest = 0
+        self.capacities = [0, 2]
+        self._cancels = cancels
+        self._open: list[tuple[Future[Any], Callable[[], Any]]] = []
+
+    @override
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self._open.append((future, lambda: fn(*args, **kwargs)))
+        self.largest = max(self.largest, len(self._open))
+        if len(self._open) == 4 or self._cancels:
+            for ready, call in self._open:
+                if self._cancels:
+                    ready.cancel()
+                    ready.set_running_or_notify_cancel()
+                else:
+                    ready.set_result(call())
+            self._open.clear()
+        return future
+
+    @override
+    def capacity(self) -> int:
+        return self.capacities.pop(0) if len(self.capacities) > 1 else self.capacities[0]
+
+    @override
+    def is_worker_death(self, error: BaseException) -> bool:
+        return False
+
+    @override
+    def is_broken(self) -> bool:
+        return False
+
+    @override
+    def stop(self) -> None:
+        self.capacities = [-1]
+
+
+def scripted(monkeypatch: pytest.MonkeyPatch, executor: ScriptedWorkers) -> Workers:
+    monkeypatch.setattr(Workers, "open", lambda *_: executor)
+    return Workers(cluster="tcp://scripted:1")
+
+
+def test_many_tasks_are_submitted_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    executor, notes = ScriptedWorkers(), list[str]()
+    ends = list(completed(abs, range(4_000), scripted(monkeypatch, executor), notes.append))
+    assert sorted(end.number for end in ends) == list(range(4_000))
+    assert all(end.result == end.number for end in ends)
+    assert executor.largest == 4
+    assert notes == ["no worker is connected to tcp://scripted:1 yet; waiting for one"]
+    assert executor.capacities == [-1], "it is stopped"
+
+
+def test_a_lost_scheduler_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(LinkError, match="tcp://scripted:1 was lost"):
+        list(completed(abs, range(4), scripted(monkeypatch, ScriptedWorkers(cancels=True))))
+
+
+def kill_once(path: Path) -> str:
+    """Kill this process unless the file exists."""
+    if path.name == "stays" or path.exists():
+        return path.name
+    path.touch()
+    os.kill(os.getpid(), signal.SIGKILL)
+    return ""
+
+
+def test_a_task_whose_process_died_is_run_again(tmp_path: Path) -> None:
+    notes: list[str] = []
+    tasks = [tmp_path / "stays", tmp_path / "dies", tmp_path / "stays"]
+    ends = list(completed(kill_once, tasks, Workers(2), notes.append))
+    assert sorted((end.number, end.result) for end in ends) == [(0, "stays"), (1, "dies"), (2, "stays")]
+    assert any("a worker died" in note for note in notes)
+    assert MAX_DEATHS > 1
+
+
+def test_an_error_is_returned_and_the_others_run() -> None:
+    zero, two = completed(lambda number: 1 // number, [0, 2], Workers(1))
+    assert isinstance(zero.error, ZeroDivisionError)
+    assert two == TaskEnd(1, 0)
+
+
+def test_a_cluster_without_its_package_names_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "fieldkit.core.cluster", raising=False)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigurationError, match="needs the package distributed") as raised:
+        Workers(cluster="tcp://127.0.0.1:1").open(1)
+    assert raised.value.remedy == 'pip install "fieldkit[cluster]"'

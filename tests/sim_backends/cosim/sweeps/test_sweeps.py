@@ -1,0 +1,185 @@
+"""Sweeps: their settings, their state on disk, and their dataset for fieldkit and other programs."""
+
+import csv
+import errno
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pandas as pd
+import polars as pl
+import pytest
+
+import fieldkit
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError, LinkError
+from sim_backends.cosim.commands.execution import simulate
+from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.sweeps import sweep_runner
+from sim_backends.cosim.sweeps.factors import parse_factors, settings_of
+from tests.helpers.runs import run_here
+from tests.helpers.task_workers import PAIR
+
+SWEEP = (
+    "cosim",
+    "sweep",
+    "pair.yaml",
+    "--over",
+    "policy=sliding_window,scheduled",
+    "window=7ms,13ms",
+    "--seeds",
+    "2",
+)
+RUNS = 8
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished sweep."""
+    folder = tmp_path_factory.mktemp("lab")
+    (folder / "pair.yaml").write_text(PAIR, encoding="utf-8")
+    done = run_here(folder, *SWEEP, "--jobs", "1", "-o", "sweep")
+    assert (done.code, f"{RUNS} runs: 4 settings with 2 seeds" in done.out) == (0, True), done.err
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("over", "message"),
+    [
+        ("polcy=scheduled", "did you mean 'policy'"),
+        ("policy=schedule", "did you mean 'scheduled'"),
+        ("window=1xs", "unknown unit 'xs'"),
+        ("radio.exponnt=2", "did you mean 'exponent'"),
+        ("agents.husky-9.along=1m", "did you mean 'agents.husky-"),
+        ("window=1ms,1ms", "has a value twice"),
+        ("window=1ms,0.001s", "are the same setting: window=1ms; and window=0.001s"),
+        ("window", "is not NAME=VALUE"),
+        ("distance=20kg", "unit 'kg'"),
+    ],
+)
+def test_a_wrong_setting_is_refused_before_any_run(over: str, message: str, tmp_path: Path) -> None:
+    done = run_here(tmp_path, "cosim", "sweep", "baylands", "--over", over, "-o", "out")
+    assert done.code == 2
+    assert message in done.err
+    assert not (tmp_path / "out").exists()
+
+
+def placed(scenario: str, *over: str) -> list[Mapping[str, float | None]]:
+    """Return the positions of agents along the line in each setting."""
+
+    def along_m(setting: CosimScenario) -> dict[str, float | None]:
+        return {name: plan.along for name, plan in setting.agents.items()}
+
+    return [along_m(setting) for _, setting in settings_of(scenario, parse_factors(over), {})]
+
+
+def test_a_distance_moves_the_agents_on_the_line() -> None:
+    assert placed("baylands", "distance=30m,40m") == [
+        {"husky-1": 0, "husky-2": 30, "iris": 30},
+        {"husky-1": 0, "husky-2": 40, "iris": 40},
+    ]
+    assert placed("field_30ft", "distance=10m") == [{"sender": 0, "receiver": 20, "drone": 10}]
+    with pytest.raises(ConfigurationError, match="distance needs a first flow"):
+        placed("convoy", "distance=10m")
+
+
+def test_a_list_is_one_value() -> None:
+    (factor,) = parse_factors(["agents.a.at_m=[1,2],[3,4]"])
+    assert (factor.values, factor.column) == (("[1,2]", "[3,4]"), "agents_a_at_m")
+
+
+def test_a_failed_run_states_its_reason_and_is_tried_a_limited_number_of_times(
+    lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+
+    def failing(scenario: CosimScenario, policy: str, seed: int, folder: None) -> Any:  # noqa: ANN401 (as simulate)
+        calls.append(seed)
+        if seed == 2 and policy == "scheduled":
+            raise LinkError("no answer", where="network", remedy="start it")
+        return simulate(scenario, policy, seed, folder)
+
+    arguments = (*SWEEP, "--jobs", "1", "-o", "failing")
+    with monkeypatch.context() as patch:
+        patch.setattr(sweep_runner, "simulate", failing)
+        done = run_here(lab, *arguments)
+        assert (done.code, len(calls)) == (3, RUNS + 2 * 2)
+        assert "2 of 8 runs failed 3 times; the first: network: no answer" in done.err
+        assert f"start it; to try them again: fieldkit {' '.join(SWEEP[:6])}" in done.err
+        failures = [json.loads(path.read_text()) for path in (lab / "failing" / "failed").iterdir()]
+        assert {(failure["attempts"], failure["reason"]) for failure in failures} == {(3, "network: no answer")}
+        assert run_here(lab, *arguments).code == 3
+        assert len(calls) == RUNS + 2 * 2, "no attempt is left"
+    assert run_here(lab, *arguments, "--again").code == 0
+    assert not list((lab / "failing" / "failed").iterdir())
+    assert dataset(lab / "failing") == dataset(lab / "sweep")
+
+
+def dataset(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of each file of a sweep's dataset."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.glob("results/**/*.parquet")}
+
+
+def test_a_full_disk_is_one_error_and_loses_no_finished_run(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = (*SWEEP, "--jobs", "1", "-o", "full")
+    write, written = files.write, list[Path]()
+
+    def write_until_full(path: Path, content: bytes) -> None:
+        if len(written) == 4:
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write(path, content)
+        written.append(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "write", write_until_full)
+        done = run_here(lab, *arguments)
+    assert (done.code, done.err.count("error:")) == (2, 1)
+    assert "No space left on device" in done.err
+    assert "then continue: fieldkit cosim sweep pair.yaml" in done.err
+    assert len(list((lab / "full" / "runs").iterdir())) == 3  # the first file is sweep.json
+    done = run_here(lab, *arguments)
+    assert (done.code, "3 are done" in done.out) == (0, True)
+    assert dataset(lab / "full") == dataset(lab / "sweep")
+
+
+def test_another_sweep_is_refused(lab: Path) -> None:
+    done = run_here(lab, *SWEEP[:4], "policy=scheduled", "-o", "sweep")
+    assert (done.code, "this is a sweep with other factors" in done.err) == (2, True)
+
+
+def test_pandas_polars_and_duckdb_read_the_dataset(lab: Path) -> None:
+    results = lab / "sweep" / "results"
+    expected = {("scheduled", "7ms"): 2, ("scheduled", "13ms"): 2, ("sliding_window", "7ms"): 2}
+    expected |= {("sliding_window", "13ms"): 2}
+    frame = pd.read_parquet(results)
+    assert frame.groupby(["policy", "window"], observed=True).size().to_dict() == expected
+    counts = pl.read_parquet(results, hive_partitioning=True).group_by("policy", "window").len()
+    assert {(row[0], row[1]): row[2] for row in counts.iter_rows()} == expected
+    query = f"SELECT policy, \"window\", count(*) FROM '{results}/**/*.parquet' GROUP BY ALL"
+    rows: Any = duckdb.sql(query)
+    assert {(row[0], row[1]): row[2] for row in rows.fetchall()} == expected
+
+
+def test_aggregate_compare_and_load_read_the_folder_like_trials(lab: Path) -> None:
+    done = run_here(lab, "aggregate", "sweep", "--quantity", "added_delay_mean_s", "--format", "csv")
+    cells = list(csv.DictReader(done.out.splitlines()))
+    assert (done.code, done.err, len(cells)) == (0, "", 4)
+    conditions = {(cell["flow"], cell["policy"], cell["window_s"], cell["n_valid"]) for cell in cells}
+    assert ("pose/b", "scheduled", "0.013", "2") in conditions
+    cell = fieldkit.load(lab / "sweep").cell(policy="scheduled", window="13ms")
+    assert cell.n_valid == 2
+    assert 0.003 < cell["added_delay_mean_s"].value < 0.013
+    compared = run_here(lab, "compare", "sweep", "sweep", "--format", "csv")
+    assert compared.code == 0, compared.err
+    assert {float(row["difference"] or 0) for row in csv.DictReader(compared.out.splitlines())} == {0}
+
+
+def test_a_report_has_heat_maps_over_two_factors(lab: Path) -> None:
+    done = run_here(lab, "report", "sweep", "-o", "sweep.html")
+    assert done.code == 0, done.err
+    page = (lab / "sweep.html").read_text(encoding="utf-8")
+    assert 'id="map-added_delay_mean_s"' in page
+    assert re.search(r"policy scheduled, window_s 0\.013: \d", page), "values for screen readers"
