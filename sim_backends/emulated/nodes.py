@@ -316,7 +316,8 @@ def _cosimulated(
     from sim_backends.emulated.cosimulated.client import CosimulatedClient  # noqa: PLC0415 (as above)
 
     simulators = cosimulation.resolve(options)
-    policy = cosimulation.sync_of(options).policy
+    sync = cosimulation.sync_of(options)
+    policy = {"name": sync.name, **sync.parameters}
     bodies = cosimulation.bodies_of(robots.values())
     return CosimulatedClient(
         options.radio, world, seed=seed, framing=framing, bodies=bodies, simulators=simulators, policy=policy

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from fieldkit.backends.protocols import Backend, Cast, Testbed, Transient
+from fieldkit.backends.protocols import Backend, Cast, Testbed, Transient, simulators_of
 from fieldkit.core import runtime
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
@@ -15,7 +15,7 @@ from fieldkit.trial import session_jobs, step_packages, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import locks, motion_control, preflight, runner
 from fieldkit.trial.running.locks import Holder
-from fieldkit.trial.running.resumption import require_backend, require_cast, resumable
+from fieldkit.trial.running.resumption import require_backend, require_cast, require_simulators, resumable
 from fieldkit.trial.running.runner import Outcome
 from fieldkit.trial.running.stop import Stop
 
@@ -116,6 +116,7 @@ def resume(
     for change in step_packages.changes(plan.step_packages):
         sink(Note(change))
     require_backend(plan, name, folder)
+    require_simulators(plan, simulators_of(backend), folder)
     require_cast(plan, backend.cast(plan.topology))
     with opened(
         backend, plan.cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
