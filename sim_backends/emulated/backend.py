@@ -96,9 +96,9 @@ class EmulatedBackend:
         """Implement `Simulating.simulators`."""
         if not self._options.is_cosimulated:
             return {}
-        from sim_backends.emulated.cosimulated import options  # noqa: PLC0415 (other labs import no simulator)
+        from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
 
-        return options.summary(self._options)
+        return simulator_choice.summary(self._options)
 
     @property
     def lab_bytes(self) -> int:

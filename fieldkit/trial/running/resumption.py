@@ -71,7 +71,7 @@ def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) 
         raise ConfigurationError(
             f"it was started on {_simulators_text(plan.simulators)}, not on {_simulators_text(simulators)}",
             where=str(folder),
-            remedy="restore physics, network and sync of emulated in the site file, or start a new trial",
+            remedy="restore physics, network and sync in the site file, or start a new trial",
         )
 
 
