@@ -24,6 +24,8 @@ from typing import Final
 
 from benchmarks.namespaces import Namespace
 from fieldkit.config.profiles import Radio
+from sim_backends.emulated.cosimulated.client import CosimulatedClient
+from sim_backends.emulated.cosimulated.simulators import Simulators
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.radio_options import RadioOptions
 
@@ -43,15 +45,23 @@ def radio(delay: str) -> RadioOptions:
 
 
 @contextmanager
-def medium_path(options: RadioOptions, seed: int = 1) -> Iterator[tuple[Namespace, Namespace]]:
+def medium_path(
+    options: RadioOptions, seed: int = 1, *, on_cosimulation: bool = False
+) -> Iterator[tuple[Namespace, Namespace]]:
     """Yield two namespaces 9 m apart on a medium with `options`; the second has the address 10.9.0.2."""
-    with Namespace() as near, Namespace() as far, MediumClient(options, seed=seed) as medium:
+    client = _cosimulated(options, seed) if on_cosimulation else MediumClient(options, seed=seed)
+    with Namespace() as near, Namespace() as far, client as medium:
         for name, namespace, address in (("near", near, "10.9.0.1/24"), ("far", far, "10.9.0.2/24")):
             fd = namespace.tun("wlan0", address)
             medium.attach(name, address, RADIO, fd)
             os.close(fd)
         medium.place({"near": (0.0, 0.0, 0.0), "far": (9.0, 0.0, 0.0)})
         yield near, far
+
+
+def _cosimulated(options: RadioOptions, seed: int) -> MediumClient:
+    simulators, policy = Simulators("kinematic", "builtin"), {"name": "event_driven"}
+    return CosimulatedClient(options, seed=seed, bodies={}, simulators=simulators, policy=policy)
 
 
 @contextmanager
@@ -168,15 +178,15 @@ def errors(name: str, errors_ms: Sequence[float]) -> Figures:
     return {f"{name}_median_ms": statistics.median(magnitudes), f"{name}_p99_ms": quantile(magnitudes, 0.99)}
 
 
-def measure_round(seconds: float, probes: int) -> dict[str, Figures]:
+def measure_round(seconds: float, probes: int, *, on_cosimulation: bool = False) -> dict[str, Figures]:
     """Return the figures of one round per path."""
     with ExitStack() as stack:
         ends = stack.enter_context(veth_path())
         veth = measure_throughput(*ends, seconds)
         veth |= errors("delay_error", measure_delay(*ends, probes))
-    with medium_path(radio("0ms")) as (near, far):
+    with medium_path(radio("0ms"), on_cosimulation=on_cosimulation) as (near, far):
         medium = measure_throughput(near, far, seconds)
-    with medium_path(radio(f"{DELAY_MS}ms")) as (near, far):
+    with medium_path(radio(f"{DELAY_MS}ms"), on_cosimulation=on_cosimulation) as (near, far):
         delays_ms = measure_delay(near, far, probes)
         medium |= errors("delay_error", [value - DELAY_MS for value in delays_ms])
     return {"veth": veth, "medium": medium, "timer": errors("delay_error", timer_lateness_ms(500))}
@@ -188,6 +198,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=3.0, help="length of each throughput run")
     parser.add_argument("--probes", type=int, default=2000, help="datagrams per delay measurement")
+    parser.add_argument("--on-cosimulation", action="store_true", help="measure the medium of a co-simulation")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--probe", choices=("send", "receive"), help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -195,7 +206,10 @@ def main() -> None:
         (send_probes if options.probe == "send" else receive_probes)(options.probes)
         return
     load_before = os.getloadavg()[0]
-    rounds = [measure_round(options.seconds, options.probes) for _ in range(options.rounds)]
+    rounds = [
+        measure_round(options.seconds, options.probes, on_cosimulation=options.on_cosimulation)
+        for _ in range(options.rounds)
+    ]
     if options.json:
         print(json.dumps({"load_before": load_before, "rounds": rounds}, indent=2))
         return

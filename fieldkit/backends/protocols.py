@@ -310,6 +310,23 @@ class Backend(Protocol):
         ...
 
 
+@runtime_checkable
+class Simulating(Protocol):
+    """Optional capability of a `Backend` whose robots run on simulators.
+
+    Attributes:
+        simulators: What each simulator is, by its purpose: `physics`, `network`, and `sync`, the policy between them.
+            Empty if there are none.
+    """
+
+    simulators: Mapping[str, str]
+
+
+def simulators_of(backend: Backend) -> dict[str, str]:
+    """Return the simulators of a backend, empty if its robots are real or on a radio model only."""
+    return dict(backend.simulators) if isinstance(backend, Simulating) else {}
+
+
 class BackendFactory(Protocol):
     """The object of an entry point of the group `fieldkit.backends`, usually the backend's class."""
 

@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from fieldkit.backends.protocols import Backend, Cast, Testbed
+from fieldkit.backends.protocols import Backend, Cast, Testbed, simulators_of
 from fieldkit.campaign.journal import CampaignJournal, TrialProgress
 from fieldkit.campaign.order import PlannedTrial, walk_m
 from fieldkit.campaign.plan import CampaignPlan
@@ -249,5 +249,6 @@ class CampaignRun:
             now=datetime.now(UTC),
             session=self._plan.session,
             lab_bytes=self._backend.lab_bytes,
+            simulators=simulators_of(self._backend),
         )
         return plan.with_note(self._set_up_note)

@@ -8,6 +8,7 @@ from typing import Final
 from fieldkit.analysis import wording
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.api.trials import Trials, load
+from fieldkit.backends.protocols import simulators_of
 from fieldkit.cli import cli_options as command_line
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Topology
@@ -85,6 +86,7 @@ class TrialRunner:
             now=datetime.now(UTC),
             session=self._lab.session,
             lab_bytes=self._lab.backend.lab_bytes,
+            simulators=simulators_of(self._lab.backend),
         )
         out = self._lab.keeper.folder.path / FOLDER
         store.prepare(out)

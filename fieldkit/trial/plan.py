@@ -48,6 +48,7 @@ class Plan(Strict):
         cast: The robot in each role.
         procedure: The procedure.
         lab_bytes: Maximum number of bytes that the lab itself adds to an attempt.
+        simulators: Physics, network and sync policy of a backend that simulates them; empty otherwise.
         step_packages: The package of each kind of step that does not ship with fieldkit.
         columns: Columns of its steps that not every trial has; None if there are none, or if an earlier fieldkit
             planned the trial.
@@ -71,6 +72,7 @@ class Plan(Strict):
     cast: dict[Role, Robot]
     procedure: Procedure
     lab_bytes: Int = 0
+    simulators: dict[str, str] = Field(default_factory=dict, exclude_if=schema.is_empty)
     step_packages: dict[str, StepPackage] = Field(default_factory=dict, exclude_if=schema.is_empty)
     columns: Columns | None = None
 

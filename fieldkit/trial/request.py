@@ -1,8 +1,10 @@
 """The operator's request for a trial, and the plan that is made of it."""
 
 import platform
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from types import MappingProxyType
 
 from fieldkit import __version__
 from fieldkit.backends.protocols import Cast
@@ -56,6 +58,7 @@ def make_plan(
     now: datetime,
     session: str | None = None,
     lab_bytes: int = 0,
+    simulators: Mapping[str, str] = MappingProxyType({}),
 ) -> Plan:
     """Return the plan of a request.
 
@@ -66,6 +69,7 @@ def make_plan(
         now: Start of the trial; it becomes part of its name.
         session: The run of fieldkit that the trial belongs to; None if it contains only this trial.
         lab_bytes: Maximum number of bytes that the lab itself adds to an attempt (`Backend.lab_bytes`).
+        simulators: Those of the backend (`simulators_of`).
 
     Raises:
         ConfigurationError: No robot has a role that the procedure or the topology needs, or the procedure needs a
@@ -108,6 +112,7 @@ def make_plan(
         cast={role: robot for role, robot in cast.items() if role in FIXED_ROLES or role in procedure.roles()},
         procedure=procedure,
         lab_bytes=lab_bytes,
+        simulators=dict(simulators),
         step_packages=step_packages.of_kinds(placed.kind for placed in procedure.walk()),
         columns=freeze((*others, *of_steps(placed.step for placed in procedure.walk()))) or None,
     )

@@ -93,6 +93,15 @@ class EmulatedBackend:
         self._addresses = dict(zip(site.robots, hosts, strict=False))
 
     @property
+    def simulators(self) -> Mapping[str, str]:
+        """Implement `Simulating.simulators`."""
+        if not self._options.is_cosimulated:
+            return {}
+        from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
+
+        return simulator_choice.summary(self._options)
+
+    @property
     def lab_bytes(self) -> int:
         """Implement `Backend.lab_bytes`: fixed links have no transmission attempts to record."""
         if not self._options.record_air or self._options.radio.fixed:
@@ -140,6 +149,7 @@ class EmulatedBackend:
         _check_bridges(cast, ros)
         if any(robot.ros_master for robot in cast.values()):
             requirements.check_shared_master(ros)
+        self._note_simulators(sink)
         sink(PhaseStarted("start robots", expected_s=_START_S[ros]))
         with testbed.bring_up(
             cast,
@@ -168,6 +178,7 @@ class EmulatedBackend:
         members = self._members()
         ros = self._checked_ros(members)
         _check_bridges(members, ros)
+        self._note_simulators(sink)
         sink(PhaseStarted("start robots"))
         with interactive_lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
             yield up
@@ -191,6 +202,11 @@ class EmulatedBackend:
             _check_ros(robot, self._options)
             for sensor in sensors_of(robot):
                 sensor_specs.check(sensor)
+
+    def _note_simulators(self, sink: Sink) -> None:
+        if self.simulators:
+            texts = (f"{purpose} {simulator}" for purpose, simulator in self.simulators.items())
+            sink(Note(f"the robots run on the co-simulation: {', '.join(texts)}"))
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""

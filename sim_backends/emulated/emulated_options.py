@@ -119,9 +119,9 @@ class SyncOptions(Strict):
         return {"name": value} if isinstance(value, str) else value
 
     @property
-    def policy(self) -> dict[str, str | float]:
-        """Name and parameters of the policy, as `make_policy` accepts them."""
-        return {"name": self.name, "window_s": self.window, "longest_s": self.longest, "bound_m": self.bound}
+    def parameters(self) -> dict[str, float]:
+        """The parameters with the names that policies use, in SI units."""
+        return {"window_s": self.window, "longest_s": self.longest, "bound_m": self.bound}
 
     @property
     def step_ns(self) -> int:

@@ -312,12 +312,13 @@ def running_robots(
 def _cosimulated(
     options: EmulatedOptions, world: World, robots: Mapping[RobotKey, Robot | LabRobot], seed: int, framing: Framing
 ) -> MediumClient:
-    from sim_backends.emulated.cosimulated import options as cosimulation  # noqa: PLC0415 (other labs import no simulator)
+    from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
     from sim_backends.emulated.cosimulated.client import CosimulatedClient  # noqa: PLC0415 (as above)
 
-    simulators = cosimulation.resolve(options)
-    policy = cosimulation.sync_of(options).policy
-    bodies = cosimulation.bodies_of(robots.values())
+    simulators = simulator_choice.resolve(options)
+    sync = simulator_choice.sync_of(options)
+    policy = {"name": sync.name, **sync.parameters}
+    bodies = simulator_choice.bodies_of(robots.values())
     return CosimulatedClient(
         options.radio, world, seed=seed, framing=framing, bodies=bodies, simulators=simulators, policy=policy
     )

@@ -115,7 +115,7 @@ def cosim_bench(
                 seed=1,
                 bodies={"a": BODY, "b": BODY},
                 simulators=Simulators(physics, network, sync.step_ns),
-                policy=sync.policy,
+                policy={"name": sync.name, **sync.parameters},
             )
         )
         spaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}

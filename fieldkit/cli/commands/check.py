@@ -37,6 +37,7 @@ _CLOSE = Distance(metres=1.0, label="check")
 
 def run(arguments: argparse.Namespace) -> int:
     """Check, print every finding, and return 0 if a trial could start."""
+    from fieldkit.backends.protocols import simulators_of
     from fieldkit.cli import cli_options
     from fieldkit.trial.request import make_plan
     from fieldkit.trial.running import preflight
@@ -45,7 +46,14 @@ def run(arguments: argparse.Namespace) -> int:
     with showing_events(as_json=arguments.json) as sink:
         name, backend = cli_options.backend(arguments, sink)
         cast = backend.cast(request.chosen_topology)
-        plan = make_plan(request, backend=name, cast=cast, now=datetime.now(UTC), lab_bytes=backend.lab_bytes)
+        plan = make_plan(
+            request,
+            backend=name,
+            cast=cast,
+            now=datetime.now(UTC),
+            lab_bytes=backend.lab_bytes,
+            simulators=simulators_of(backend),
+        )
         with backend.open(plan.cast, seed=plan.seed, sink=sink, operator=Unattended()) as lab:
             lab.place(plan.placement)
             sink(PhaseStarted("check"))

@@ -46,6 +46,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the trial at each distance and print the table of each."""
+    from fieldkit.backends.protocols import simulators_of
     from fieldkit.cli import cli_options
     from fieldkit.trial.request import make_plan
 
@@ -66,6 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
                 now=datetime.now(UTC),
                 session=run_id,
                 lab_bytes=backend.lab_bytes,
+                simulators=simulators_of(backend),
             )
             for request in requests
         ]

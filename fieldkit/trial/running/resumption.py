@@ -1,8 +1,9 @@
 """Resume a trial: code, backend and robots must be those with which it started."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
-from fieldkit.backends.protocols import Backend, Cast, Testbed
+from fieldkit.backends.protocols import Backend, Cast, Testbed, simulators_of
 from fieldkit.core import permissions, plugins
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import Note, Sink
@@ -40,6 +41,7 @@ def resume(
     for change in step_packages.changes(plan.step_packages):
         sink(Note(change))
     require_backend(plan, name, folder)
+    require_simulators(plan, simulators_of(backend), folder)
     require_cast(plan, backend.cast(plan.topology))
     with opened(
         backend, plan.cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
@@ -128,6 +130,29 @@ def require_backend(plan: Plan, name: str, folder: Path) -> None:
             where=str(folder),
             remedy=shell_command("fieldkit", "resume", folder, "--backend", plan.backend),
         )
+
+
+def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) -> None:
+    """Raise an error if a trial would be resumed on other simulators: one table has the results of one of them.
+
+    Args:
+        plan: The trial.
+        simulators: The simulators on which it would be resumed.
+        folder: The trial's folder.
+
+    Raises:
+        ConfigurationError: It was started on others.
+    """
+    if simulators != plan.simulators:
+        raise ConfigurationError(
+            f"it was started on {_simulators_text(plan.simulators)}, not on {_simulators_text(simulators)}",
+            where=str(folder),
+            remedy="restore physics, network and sync in the site file, or start a new trial",
+        )
+
+
+def _simulators_text(simulators: Mapping[str, str]) -> str:
+    return ", ".join(f"{purpose} {name}" for purpose, name in simulators.items()) or "no simulators"
 
 
 def require_cast(plan: Plan, cast: Cast) -> None:

@@ -2,7 +2,6 @@
 
 | module | purpose | imports |
 | --- | --- | --- |
-| `options` | a lab's choice of simulators and policy, and its check before a run | named federates |
 | `client` | the lab's client: starts the process, and passes it bodies, devices and places | medium client |
 | `cosim_process` | the process: requests of the lab, reading and delivery of packets | medium server, all below |
 | `session` | one run of the coordinator, with its physics and network | cosim, all below |

@@ -215,7 +215,16 @@ class CosimulatedMedium(MediumServer):
         lag_ns = time.monotonic_ns() - end_ns
         self._late_windows[rounded_up(max(lag_ns, 0))] += 1
         if lag_ns > _GIVE_UP_NS:
-            self._clock.give_up(lag_ns)
+            self._give_up(lag_ns)
+
+    def _give_up(self, lag_ns: int) -> None:
+        """Delay simulated time, with the packets that were read and have not entered the network."""
+        self._clock.give_up(lag_ns)
+        now_ns = self._clock.now_ns()
+        self._queue = deque(
+            packet._replace(at_ns=min(packet.at_ns, now_ns), waited_ns=packet.waited_ns + lag_ns)
+            for packet in self._queue
+        )
 
     def _write(
         self, session: CosimSession, fate: Fate, packet: RealPacket, end_ns: int, end_monotonic_ns: int
@@ -301,7 +310,7 @@ class CosimulatedMedium(MediumServer):
         self._session = session
         if (spent_ns := time.monotonic_ns() - begin_ns) > _START_NS:
             # A simulator was started. The lab waits for this, so no measurement is in progress.
-            self._clock.give_up(spent_ns)
+            self._give_up(spent_ns)
 
     @override
     def _log_attempts(self, log: AttemptLog | None) -> None:

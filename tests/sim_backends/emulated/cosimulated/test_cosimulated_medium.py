@@ -1,13 +1,18 @@
 """The co-simulated medium between real namespaces: every policy, delays, motion by the physics, lateness."""
 
 import math
+import re
+import shlex
 import socket
+import sys
 from pathlib import Path
 
 import pytest
 
+from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
-from fieldkit.core.model import Vector
+from fieldkit.core.model import Lateness, Vector
+from fieldkit.measure.evidence import oracle_delays
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.spec import ANTENNA_M
@@ -15,6 +20,7 @@ from sim_backends.federates.frames import NETWORK
 from sim_backends.federates.named import command_line
 from sim_backends.world.world import load_world
 from tests.helpers.cosim_benches import BODY, PLACES, cosim_bench, distance_m
+from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
 
@@ -46,17 +52,66 @@ def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
         assert stats.ports["a"].written == 20
 
 
+DISC = """
+import sys, time
+from sim_backends.federates.serving import serve
+from sim_backends.network.disc import Disc
+
+class Slow(Disc):
+    def __init__(self, hello):
+        super().__init__(1e5, 30_000_000)
+
+    def advance(self, *request):
+        time.sleep(float(sys.argv[1]))
+        return super().advance(*request)
+
+serve(Slow, name="slow")
+"""
+SEND = """
+import socket, time
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
+    for _ in range(20):
+        speaker.sendto(b"hello", ("10.9.0.2", 7000))
+        time.sleep(0.013)
+"""
+
+
+def disc_command(folder: Path, spent_s: float) -> str:
+    """Return the command of a network with a delay of 30 ms that takes a time for each answer."""
+    program = folder / "slow.py"
+    program.write_text(DISC, encoding="utf-8")
+    return shlex.join((sys.executable, str(program), str(spent_s)))
+
+
 def test_the_delay_of_the_network_and_of_the_policy_are_separate(tmp_path: Path) -> None:
-    """With a window of 20 ms a packet waits for 10 ms on average, and the network takes less than 2 ms."""
+    """Packets arrive within windows of 20 ms: they wait for 10 ms on average."""
     sync = SyncOptions.model_validate({"name": "sliding_window", "window": "20ms"})
-    with cosim_bench(tmp_path, sync=sync) as bench:
-        listener = bench.spaces["b"].start("ncat", "-l", "7000")
-        ends = "a", "b", socket.IPPROTO_TCP, 7000
+    with cosim_bench(tmp_path, network=disc_command(tmp_path, 0), sync=sync) as bench:
+        ends = "a", "b", socket.IPPROTO_UDP, 7000
         bench.medium.delays(*ends)
-        rtt_ms = bench.ping()
-        assert 15 < sum(rtt_ms) / len(rtt_ms) < 60
-        listener.kill()
-        listener.communicate()
+        bench.spaces["a"].run(sys.executable, "-c", SEND)
+        wait_until(lambda: bench.medium.delays(*ends).packets == 20, Deadline.after(30))
+        parts = bench.medium.delays(*ends)
+        assert parts.undivided_ns == 20 * 30_000_000
+        assert parts.policy_ns is not None
+        assert 4e6 < parts.policy_ns / parts.packets < 16e6
+
+
+def test_a_network_that_cannot_keep_up_makes_packets_and_windows_late(tmp_path: Path) -> None:
+    """Each window of 1 ms takes 20 ms; after 1 s of lag the rest is given up, so that the lab still answers."""
+    sync = SyncOptions.model_validate({"name": "sliding_window", "window": "1ms"})
+    with cosim_bench(tmp_path, network=disc_command(tmp_path, 0.02), sync=sync) as bench:
+        wait_until(lambda: max(bench.medium.stats().late_windows, default=0) > 100_000_000, Deadline.after(60))
+        bench.ping(count=2)
+        stats = bench.medium.stats()
+        assert max(stats.late) > 100_000_000
+        late = Lateness(bound_ns=100_000_000, packets={}, windows=stats.late_windows)
+        reason = oracle_delays.lateness_problem(late)
+        assert reason is not None
+        assert re.fullmatch(r"\d+ windows of the .* too late, by up to [\d.e+]+ ms; the bound is 100 ms", reason)
+        text = oracle_delays.lateness_text(Lateness(bound_ns=100_000_000, packets={}, windows={}), late)
+        (tmp_path / "lateness.txt").write_text(text, encoding="ascii")
+        assert oracle_delays.read_lateness(tmp_path / "lateness.txt") == late
 
 
 def test_a_multicast_and_a_station_out_of_range(tmp_path: Path) -> None:

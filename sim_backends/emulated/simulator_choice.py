@@ -1,5 +1,6 @@
 """A lab's choice of simulators and sync policy: what it needs, and its check before a run."""
 
+import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
@@ -35,7 +36,7 @@ def resolve(options: EmulatedOptions) -> Simulators:
         ConfigurationError: A simulator is not installed, does not support the lab, or the policy is invalid.
     """
     sync = sync_of(options)
-    policy = make_policy(**sync.policy)  # type: ignore[arg-type] # the name is a text, the others are numbers
+    policy = make_policy(sync.name, **sync.parameters)
     if isinstance(policy, FixedWindow) and sync.window < sync.step:
         raise ConfigurationError(
             f"emulated.sync has a window of {sync.window:g} s, which is shorter than the step of the physics, "
@@ -98,8 +99,15 @@ def _body(profile: RobotProfile) -> RobotBody:
 def summary(options: EmulatedOptions) -> Mapping[str, str]:
     """Return the simulators and the policy of a lab, by what they are."""
     sync = sync_of(options)
+    policy = make_policy(sync.name, **sync.parameters)
+    defaults = {name: parameter.default for name, parameter in inspect.signature(type(policy)).parameters.items()}
+    values = sync.parameters
+    used = [
+        f"{name.rpartition('_')[0]} {values[name]:g} {name.rpartition('_')[2]}" for name in defaults if name in values
+    ]
     return {
         "physics": options.physics or KINEMATIC,
         "network": options.network or BUILTIN,
-        "sync": sync.name,
+        "sync": ", ".join([sync.name, *used]),
+        "step": f"{sync.step:g} s",
     }

@@ -1,0 +1,101 @@
+"""Trials and labs on the co-simulation: their numbers, real `cmd_vel` at a wall, and nothing that remains."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.emulated.emulated_options import EmulatedOptions
+from sim_backends.emulated.simulator_choice import resolve
+from tests.helpers.host import Untouched
+from tests.helpers.runs import fieldkit, only_trial, rows, run_here
+from tests.helpers.sshd import wait_until
+
+pytestmark = pytest.mark.emulated
+
+SITE = """\
+backend: emulated
+robots:
+  robot-1: {profile: turtlebot3_burger}
+  robot-2: {profile: turtlebot3_burger}
+roles:
+  masterless: {sender: robot-1, receiver: robot-2}
+emulated: EMULATED
+"""
+TWIST = "'{linear: {x: 0.2}}'"
+DRIVE = f"timeout 60 rostopic pub -r 10 /cmd_vel geometry_msgs/Twist {TWIST}"
+
+
+def make_site(folder: Path, emulated: str) -> Path:
+    (folder / "fieldkit.yaml").write_text(SITE.replace("EMULATED", emulated), encoding="utf-8")
+    return folder
+
+
+def trial_row(folder: Path, emulated: str) -> dict[str, str]:
+    """Return the row of the valid attempt of a short `los 30ft`."""
+    make_site(folder, emulated)
+    words = ("--topology", "masterless", "--repeats", "1", "--record", "1s", "--protocol", "udp")
+    run = run_here(folder, "trial", "los", "30ft", *words)
+    assert run.code == 0, run.err
+    (row,) = [row for row in rows(only_trial(folder)) if row["status"] == "valid"]
+    return row
+
+
+def test_a_trial_on_the_built_in_network(tmp_path: Path, untouched: Untouched) -> None:
+    sync = "{name: sliding_window, window: 4ms}"
+    row = trial_row(tmp_path, f"{{physics: kinematic, ros: builtin, sync: {sync}}}")
+    assert 0.0005 < float(row["delay_policy_s"]) < 0.0045, "half a window on average"
+    assert float(row["delay_transmission_s"]) > 0
+    assert float(row["cosim_late_max_s"]) < 0.1
+    plan = (only_trial(tmp_path) / "trial.yaml").read_text(encoding="utf-8")
+    assert "simulators:\n  physics: kinematic\n  network: builtin\n  sync: sliding_window, window 0.004 s\n" in plan
+
+
+def test_a_trial_on_ns3(tmp_path: Path) -> None:
+    try:
+        resolve(EmulatedOptions.model_validate({"network": "ns3"}))
+    except ConfigurationError as error:
+        pytest.skip(error.what)
+    row = trial_row(tmp_path, "{network: ns3, ros: builtin}")
+    assert float(row["delay_s"]) > float(row["delay_policy_s"]) > 0
+    assert row["delay_transmission_s"] == ""
+
+
+def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
+    """The wall of the lawn begins at 3.9 m east, and the robot has a radius of 0.113 m."""
+    make_site(tmp_path, "{physics: kinematic, ros: debian}")
+    assert fieldkit(tmp_path, "lab", "up").code == 0
+    try:
+        assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "3.5m", "18m").code == 0
+        refused = fieldkit(tmp_path, "lab", "move", "robot-2", "--to", "4m", "18m")
+        assert "robot-2 would be within wall" in refused.err
+        assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0
+
+        def east_m() -> float:
+            listed = json.loads(fieldkit(tmp_path, "lab", "ps", "--json").out)
+            return float(listed["robots"][0]["place_m"][0])
+
+        wait_until(lambda: east_m() > 3.78, Deadline.after(90))
+        assert east_m() == pytest.approx(3.787, abs=0.002)
+    finally:
+        assert fieldkit(tmp_path, "lab", "down").code == 0
+
+
+@pytest.mark.parametrize(
+    ("emulated", "reason"),
+    [
+        ("{network: ns3, record_air: true}", "does not support record_air"),
+        ("{network: ns3, radio: {loss: 5%}}", "does not support fixed links"),
+        ("{physics: gazebo}", "a running Gazebo cannot put robots at the places of a trial"),
+        ("{physics: kinematic, sync: slidding_window}", "there is no sync policy 'slidding_window'"),
+        ("{sync: sliding_window}", "`sync` needs a co-simulation"),
+        ("{physics: kinematic, sync: {name: scheduled, window: 0.1ms}}", "shorter than the step of the physics"),
+    ],
+)
+def test_a_combination_that_cannot_work_is_refused(emulated: str, reason: str, tmp_path: Path) -> None:
+    run = run_here(make_site(tmp_path, emulated), "trial", "los", "30ft", "--topology", "masterless")
+    assert run.code == 2
+    assert reason in run.err
+    assert "remedy" in run.err
