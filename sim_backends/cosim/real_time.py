@@ -23,7 +23,7 @@ class RealTimeError(EvidenceError):
 
 
 @dataclass
-class Lateness:
+class WindowLateness:
     """Lateness of the windows of a run: wall time from the deadline of a window until its end was computed.
 
     Attributes:
@@ -66,7 +66,7 @@ class Pace:
     factor: float
     late_bound_s: float = LATE_BOUND_S
 
-    def run(self, simulation: Simulation, lateness: Lateness, progress: Progress | None = None) -> None:
+    def run(self, simulation: Simulation, lateness: WindowLateness, progress: Progress | None = None) -> None:
         """Run a simulation until its end; the deadline of the time t is the start of the run plus t / factor.
 
         Args:

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
             partial(_build, scenario),
             policies,
             seeds,
-            workers=settings.workers(arguments),
+            workers=settings.workers(arguments, scenario.packets * runs),
             progress=partial(progress_reporter(sink), "bias", runs),
         )
     by_policy = {name: measures for name, measures in biases(all_outcomes).items() if name in policies}

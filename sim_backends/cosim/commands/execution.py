@@ -15,7 +15,7 @@ from sim_backends.cosim.commands.results import SeedResult, seed_result
 from sim_backends.cosim.commands.run_folder import RunFolder
 from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.coordinator import Coordinator
-from sim_backends.cosim.real_time import Lateness, Pace
+from sim_backends.cosim.real_time import Pace, WindowLateness
 from sim_backends.cosim.recording.manifest import RunSettings
 from sim_backends.cosim.recording.recorder import RunRecorder, StateSamples
 from sim_backends.cosim.run_record import WindowObserver
@@ -24,7 +24,7 @@ from sim_backends.cosim.scenario.emane import EmaneObserver, emane_observer
 from sim_backends.cosim.scenario.external import has_addresses
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
-from sim_backends.cosim.studies.seeds import ALL_PROCESSORS, Task, as_completed_tasks
+from sim_backends.cosim.studies.seeds import Task, as_completed_tasks, workers_for
 from sim_backends.cosim.wall_time import DEADLINE_S
 
 
@@ -92,7 +92,7 @@ def simulate(
     agents = simulation.agents
     starts = {name: absence.state for name, absence in agents.absent.items()} | dict(agents.states(0).items())
     ended_by: FieldkitError | KeyboardInterrupt | None = None
-    lateness = None if pace is None else Lateness()
+    lateness = None if pace is None else WindowLateness()
     try:
         with simulation, publisher, recorder or nullcontext(), between_windows(simulation.coordinator):
             if pace is None or lateness is None:
@@ -164,7 +164,9 @@ def simulate_all(
     interrupted = False
     try:
         # A federate with an address serves one run at a time, and parallel runs would delay each other.
-        workers = Workers(1) if has_addresses(scenario) or pace is not None else ALL_PROCESSORS
+        workers = (
+            Workers(1) if has_addresses(scenario) or pace is not None else workers_for(scenario.packets * len(seeds))
+        )
         work = partial(_simulate, scenario, folder, deadline_s, pace)
         for number, result in as_completed_tasks(work, tasks, workers=workers):
             results[number] = result

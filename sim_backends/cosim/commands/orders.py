@@ -67,7 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
     draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     with showing_progress() as sink:
-        workers = settings.workers(arguments)
+        runs = len(policies) * len(seeds) * len(windows_s)
+        workers = settings.workers(arguments, scenario.packets * runs)
         by_policy, failures = _measure(scenario, policies, seeds, windows_s, workers=workers, sink=sink)
     title = f"{scenario.name}, {scenario.topology}, {format_count(len(seeds), 'seed')}"
     _error_sheet(title, by_policy).show(arguments.format)

@@ -11,7 +11,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Topology, Vector
 from sim_backends.cosim.commands.sheets import SheetColumn, Value
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.real_time import Lateness
+from sim_backends.cosim.real_time import WindowLateness
 from sim_backends.cosim.run_record import Fate, Run
 from sim_backends.cosim.scenario.faults import Fault, JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -316,7 +316,7 @@ class SeedResult:
     formation: Formation
     stopped: str = ""
     error: FieldkitError | None = None
-    lateness: Lateness | None = None
+    lateness: WindowLateness | None = None
 
     @property
     def is_interrupted(self) -> bool:
@@ -332,7 +332,7 @@ def seed_result(
     *,
     ended_by: FieldkitError | KeyboardInterrupt | None = None,
     starts: Mapping[str, State] | None = None,
-    lateness: Lateness | None = None,
+    lateness: WindowLateness | None = None,
 ) -> SeedResult:
     """Return the result of a run.
 

@@ -22,6 +22,7 @@ from sim_backends.cosim.real_time import LATE_BOUND_S, Pace
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.phases import commensurate_events, incommensurate_window_s
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.cosim.studies.seeds import workers_for
 from sim_backends.cosim.wall_time import DEADLINE_S
 
 
@@ -85,9 +86,14 @@ def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ..
     return chosen.seeds if arguments.seed is None else (arguments.seed,)
 
 
-def workers(arguments: argparse.Namespace) -> Workers:
-    """Return the workers that the options choose."""
-    return Workers(arguments.jobs, arguments.cluster)
+def workers(arguments: argparse.Namespace, packets: float = math.inf) -> Workers:
+    """Return the workers that the options choose; without options, this process if there are few packets.
+
+    Args:
+        arguments: The options.
+        packets: Approximate number of packets in all runs.
+    """
+    return workers_for(packets, Workers(arguments.jobs, arguments.cluster))
 
 
 def policies(arguments: argparse.Namespace) -> list[str]:

@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, windows_s, len(seeds))
     with showing_progress() as sink:
-        workers = settings.workers(arguments)
+        workers = settings.workers(arguments, scenario.packets * (len(policies) + 1) * len(seeds))
         all_rows = _all_rows(scenario, policies, seeds, windows_s, workers=workers, sink=sink)
     _sheet(scenario, all_rows, seeds).show(arguments.format)
     for window_s, row in all_rows:

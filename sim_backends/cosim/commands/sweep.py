@@ -16,6 +16,7 @@ from fieldkit.core.executors import Workers
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.external import has_addresses, without_federates
+from sim_backends.cosim.studies.seeds import workers_for
 from sim_backends.cosim.sweeps.factors import parse_factors
 from sim_backends.cosim.sweeps.sweep_dataset import write_dataset
 from sim_backends.cosim.sweeps.sweep_folder import RunFailure, SweepFolder
@@ -74,7 +75,7 @@ def _workers(plan: SweepPlan, workers: Workers) -> Workers:
     if any(scenario.emane is not None for scenario in scenarios):
         raise ConfigurationError("only one run can publish events of EMANE", remedy="use fieldkit cosim run")
     if not any(map(has_addresses, scenarios)):
-        return workers
+        return workers_for(sum(scenario.packets for scenario in scenarios) * len(plan.seeds), workers)
     if workers.cluster:
         raise ConfigurationError(
             "a federate with an address serves one run at a time", remedy="give its command instead of its address"

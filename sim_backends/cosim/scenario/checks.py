@@ -38,9 +38,8 @@ MEMINFO: Final = Path("/proc/meminfo")
 
 def needed_bytes(scenario: CosimScenario) -> int:
     """Return the approximate maximum memory that a run needs for its record and its radio, with any policy."""
-    packets = sum(traffic.packets(scenario.duration) for traffic in scenario.traffic)
-    windows = scenario.duration / scenario.physics.step + packets * EVENTS_PER_PACKET
-    return round(packets * PACKET_BYTES + windows * WINDOW_BYTES) + radio_bytes(scenario)
+    windows = scenario.duration / scenario.physics.step + scenario.packets * EVENTS_PER_PACKET
+    return round(scenario.packets * PACKET_BYTES + windows * WINDOW_BYTES) + radio_bytes(scenario)
 
 
 def radio_bytes(scenario: CosimScenario) -> int:

@@ -236,6 +236,11 @@ class CosimScenario(Named):
         return {name: lifetime for name, lifetime in lifetimes.items() if lifetime != Lifetime()}
 
     @property
+    def packets(self) -> float:
+        """The approximate maximum number of packets of its programs in a run."""
+        return sum(traffic.packets(self.duration) for traffic in self.traffic)
+
+    @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Sender and receiver of all flows, including the replies to pings, sorted."""
         return tuple(sorted({(source, to) for traffic in self.traffic for _, source, to in traffic.flow_ends}))

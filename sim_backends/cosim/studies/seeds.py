@@ -13,6 +13,19 @@ Result = TypeVar("Result")
 
 ALL_PROCESSORS: Final = Workers()
 
+_FEW_PACKETS: Final = 400
+"""Number of packets whose simulation takes about as long as the start of two processes: 2 s of processor time."""
+
+
+def workers_for(packets: float, chosen: Workers = ALL_PROCESSORS) -> Workers:
+    """Return the chosen workers, or this process if none were chosen and it is faster.
+
+    Args:
+        packets: Approximate number of packets in all runs.
+        chosen: The workers that the user chose.
+    """
+    return Workers(1) if chosen.is_default and packets <= _FEW_PACKETS else chosen
+
 
 @dataclass(frozen=True)
 class Task:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.real_time import Lateness, Pace, RealTimeError
+from sim_backends.cosim.real_time import Pace, RealTimeError, WindowLateness
 from tests.helpers.runs import rows, run_here
 
 SHORT = {"duration": "400ms", "policy.name": "sliding_window", "policy.window": "20ms"}
@@ -16,7 +16,7 @@ SHORT = {"duration": "400ms", "policy.name": "sliding_window", "policy.window": 
 
 @given(st.lists(st.integers(-(10**10), 10**10), min_size=1))
 def test_the_histogram_counts_every_window_below_its_limit(late_ns: list[int]) -> None:
-    lateness = Lateness()
+    lateness = WindowLateness()
     for value_ns in late_ns:
         lateness.add(value_ns)
     assert lateness.windows.total() == len(late_ns)
@@ -31,7 +31,7 @@ def test_the_histogram_counts_every_window_below_its_limit(late_ns: list[int]) -
 def test_a_run_takes_as_long_as_its_factor_states_and_has_the_events_of_a_fast_run() -> None:
     scenario = load_scenario("field_30ft", SHORT)
     fast = build(scenario).run()
-    lateness, simulation, began_s = Lateness(), build(scenario), time.monotonic()
+    lateness, simulation, began_s = WindowLateness(), build(scenario), time.monotonic()
     Pace(2.0, late_bound_s=60).run(simulation, lateness)
     assert time.monotonic() - began_s >= 0.2 - 0.001
     assert simulation.coordinator.run.digest == fast.digest
@@ -41,7 +41,7 @@ def test_a_run_takes_as_long_as_its_factor_states_and_has_the_events_of_a_fast_r
 def test_a_stall_is_counted_and_the_run_catches_up() -> None:
     stall = {"kind": "stalled-federate", "federate": "network", "from": "200ms", "stall": "150ms"}
     simulation = build(load_scenario("field_30ft", {**SHORT, "faults": [stall]}))
-    lateness, began_s = Lateness(), time.monotonic()
+    lateness, began_s = WindowLateness(), time.monotonic()
     Pace(1.0, late_bound_s=60).run(simulation, lateness)
     assert lateness.largest_ns >= 100_000_000
     assert time.monotonic() - began_s >= 0.4 - 0.001
@@ -50,7 +50,7 @@ def test_a_stall_is_counted_and_the_run_catches_up() -> None:
 def test_a_run_that_cannot_keep_up_is_stopped_with_the_amount() -> None:
     simulation = build(load_scenario("field_30ft", SHORT))
     with pytest.raises(RealTimeError, match=r"ends at 0\.\d+ s was \d+\.\d{3} s late, and the bound is 1e-06 s"):
-        Pace(1e6, late_bound_s=1e-6).run(simulation, Lateness())
+        Pace(1e6, late_bound_s=1e-6).run(simulation, WindowLateness())
 
 
 def test_the_command_refuses_results_and_shows_the_histogram(tmp_path: Path) -> None:
