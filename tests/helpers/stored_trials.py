@@ -178,7 +178,9 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 (whatever a chart is made of)
     """Lists, texts and numbers with 9 digits, without field names, so that names and processors have no effect."""
 
     if dataclasses.is_dataclass(value):
-        return [_plain(getattr(value, field.name)) for field in dataclasses.fields(value)]
+        values = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        # The recorded outputs are older than heat maps, which stored trials do not have.
+        return [_plain(item) for name, item in values.items() if (name, item) != ("heat", None)]
     if isinstance(value, Mapping):
         return [[_plain(key), _plain(item)] for key, item in value.items()]
     if isinstance(value, np.ndarray | np.generic):
