@@ -38,7 +38,7 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
     repeats = evidence.repeats
     trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")
     return (
-        f"{trials} of {wording.join_words(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
+        f"{trials} of {wording.join_names(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
         f"{wording.join_words([name.upper() for name in _values(cells, 'protocol')])}; "
         f"{_topologies(cells)}{wording.join_words(_values(cells, 'backend'))} robots. "
         f"{format_count(len(repeats), 'attempt')}: {status_counts(Counter(repeats.texts['status']))}. "
@@ -119,7 +119,7 @@ def _counted(reasons: Sequence[str]) -> list[str]:
 
 def title(cells: Sequence[Cell]) -> str:
     """Return the default title of a report."""
-    return f"Loss and delay: {wording.join_words(_values(cells, 'procedure'))}"
+    return f"Loss and delay: {wording.join_names(_values(cells, 'procedure'))}"
 
 
 @dataclass(frozen=True)

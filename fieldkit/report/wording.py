@@ -1,6 +1,7 @@
 """Numbers, conditions and quantities as text, the same in the summary, in tables and below figures."""
 
 from collections.abc import Collection, Sequence
+from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.wording import Scale, amount, incomplete, scale_of
@@ -95,3 +96,13 @@ def differing(cells: Sequence[Cell]) -> frozenset[str]:
 def join_words(parts: list[str]) -> str:
     """Return `a`, `a and b`, or `a, b and c`."""
     return " and ".join(filter(None, (", ".join(parts[:-1]), *parts[-1:])))
+
+
+_MAX_NAMES: Final = 4
+
+
+def join_names(names: list[str]) -> str:
+    """Return names joined like `join_words`; of more than four, the first two and the number of others."""
+    if len(names) > _MAX_NAMES:
+        names = [*names[:2], f"{len(names) - 2} others"]
+    return join_words(names)

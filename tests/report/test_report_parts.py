@@ -369,3 +369,9 @@ def test_los_and_nlos_keep_their_style_among_other_procedures(tmp_path: Path, pr
 def test_edited_table_cannot_refer_to_other_folders(tmp_path: Path) -> None:
     evidence = load_evidence(table(tmp_path, [lawns.row(1, protocol="../../../etc")]))
     assert evidence.attempt(0) is None
+
+
+def test_a_title_names_few_procedures(tmp_path: Path) -> None:
+    rows = [tables.replace(tables.COMPARABLE, procedure=f"run {number}") for number in range(6)]
+    assert summary.title(aggregate(table(tmp_path, rows))) == "Loss and delay: run 0, run 1 and 4 others"
+    assert summary.title(aggregate(table(tmp_path / "three", rows[:3]))) == "Loss and delay: run 0, run 1 and run 2"
