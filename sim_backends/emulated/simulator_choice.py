@@ -14,7 +14,7 @@ from sim_backends.emulated.cosimulated.simulators import BUILTIN, KINEMATIC, Rob
 from sim_backends.emulated.emulated_options import EmulatedOptions, SyncOptions
 from sim_backends.emulated.motion_sections import drive_of, mavlink_of
 from sim_backends.federates.frames import NETWORK, PHYSICS
-from sim_backends.federates.named import PythonFederate, command_line, named
+from sim_backends.federates.named import PythonFederate, command_line, default_options, named
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
 from sim_backends.physics.robot_limits import BODIES
 
@@ -43,7 +43,8 @@ def resolve(options: EmulatedOptions) -> Simulators:
             f"{sync.step:g} s",
             remedy=f"write window: {sync.step * 1e3:g}ms, or a shorter step",
         )
-    return Simulators(_physics(options), _network(options), sync.step_ns)
+    network_options = default_options(options.network or BUILTIN, NETWORK)
+    return Simulators(_physics(options), _network(options), sync.step_ns, network_options)
 
 
 def _physics(options: EmulatedOptions) -> str:

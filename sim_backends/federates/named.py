@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
-from typing import Final
+from typing import Any, Final
 
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError, did_you_mean
@@ -87,6 +87,16 @@ def named(where: str, role: int) -> NamedFederate | None:
             remedy=f"use --{ROLES[federate.role]} {where}",
         )
     return federate
+
+
+def default_options(where: str, role: int) -> dict[str, Any]:
+    """Return the defaults of the options that the federate of a name declares; empty for a command or an address.
+
+    Raises:
+        ConfigurationError: As for `named`.
+    """
+    federate = named(where, role)
+    return {} if federate is None or federate.options is None else federate.options().to_json()
 
 
 def _load(point: EntryPoint) -> NamedFederate:

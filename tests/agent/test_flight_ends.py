@@ -160,7 +160,7 @@ def test_drone_with_stopped_motors_is_released(tmp_path: Path) -> None:
 
 SLOW_MACHINE = """\
 import sys
-from fieldkit.agent import landing
+from fieldkit.agent.flying import landing
 from fieldkit.agent.flying import guard, liveness, loop
 landing._MODE_WAIT_S = guard.GAP_S = loop.GAP_S = liveness.SILENCE_TIMEOUT_S = 60.0
 from fieldkit.agent.__main__ import main

@@ -4,10 +4,11 @@ import math
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from benchmarks.namespaces import Namespace
 from fieldkit.config.profiles import Radio
@@ -100,6 +101,7 @@ def cosim_bench(
     *,
     physics: str = "kinematic",
     network: str = "builtin",
+    network_options: Mapping[str, Any] | None = None,
     sync: SyncOptions | None = None,
     radio: RadioOptions | None = None,
     world: World | None = None,
@@ -114,7 +116,7 @@ def cosim_bench(
                 world,
                 seed=1,
                 bodies={"a": BODY, "b": BODY},
-                simulators=Simulators(physics, network, sync.step_ns),
+                simulators=Simulators(physics, network, sync.step_ns, network_options),
                 policy={"name": sync.name, **sync.parameters},
             )
         )

@@ -44,11 +44,13 @@ class Simulators(NamedTuple):
         physics: `kinematic`, or a name or command of a physics federate.
         network: `builtin`, or a command of a network federate.
         step_ns: Step of the physics.
+        network_options: Options of the network federate; None if it has none.
     """
 
     physics: str
     network: str
     step_ns: int = 1_000_000
+    network_options: Mapping[str, Any] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,7 +173,8 @@ def _hello(settings: LabSettings, role: int, states: Mapping[str, State]) -> Hel
         )
         for name, state in states.items()
     ]
-    configuration = _configuration(settings, states)
+    options = (settings.simulators.network_options or {}) if role == NETWORK else {}
+    configuration = _configuration(settings, states) | {"options": options}
     return Hello(
         role, agents, settings.seed, settings.simulators.step_ns, _END_NS, "lab", json.dumps(configuration).encode()
     )
@@ -205,5 +208,4 @@ def _configuration(settings: LabSettings, states: Mapping[str, State]) -> dict[s
             }
             for name in states
         },
-        "options": {},
     }

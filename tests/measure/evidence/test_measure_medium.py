@@ -21,7 +21,7 @@ NOTHING = DelayParts(packets=0, processing_ns=0, transmission_ns=0, propagation_
 
 
 def text(parts: DelayParts) -> str:
-    return "".join(f"{name} {value}\n" for name, value in vars(parts).items())
+    return oracle_delays.air_delay_text(NOTHING, parts)
 
 
 def file(folder: Path, content: bytes) -> Path:

@@ -17,7 +17,7 @@ from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.federates.frames import NETWORK
-from sim_backends.federates.named import command_line
+from sim_backends.federates.named import command_line, default_options
 from sim_backends.world.world import load_world
 from tests.helpers.cosim_benches import BODY, PLACES, cosim_bench, distance_m
 from tests.helpers.sshd import wait_until
@@ -44,7 +44,8 @@ def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
         network = command_line("ns3", NETWORK)
     except ConfigurationError as error:
         pytest.skip(error.what)
-    with cosim_bench(tmp_path, network=network) as bench:
+    options = default_options("ns3", NETWORK)
+    with cosim_bench(tmp_path, network=network, network_options=options) as bench:
         assert len(bench.ping()) == 20
         bench.ping("-b", count=3, address="10.9.0.255")
         stats = bench.medium.stats()

@@ -251,7 +251,7 @@ def test_the_layout_by_hand() -> None:
 
 
 def test_the_example_of_the_page() -> None:
-    page = (ROOT / "docs" / "federates.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "reference" / "federate-protocol.md").read_text(encoding="utf-8")
     header = DatagramHeader(DatagramKind.DATA, 0x1122334455667788, 0xA1B2C3D4E5F60718, 5, 4)
     datagram = pack_datagram(header, encode(MessageKind.PING, 3, 0, encode_number(42)))
-    assert re.findall(r"^    ([0-9a-f]+)$", page, re.MULTILINE) == [datagram.hex()]
+    assert re.findall(r"^(464b5544[0-9a-f]+)$", page, re.MULTILINE) == [datagram.hex()]
