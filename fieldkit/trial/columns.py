@@ -17,7 +17,11 @@ IDENTITY: Final = columns.columns(
     ("procedure", "text", "Name of the procedure."),
     ("scenario", "text", "los (line of sight) or nlos (no line of sight)."),
     ("topology", "text", "master (packets pass a relay) or masterless."),
-    ("backend", "text", "Backend that provided the robots."),
+    (
+        "backend",
+        "text",
+        "Backend that provided the robots; on a co-simulation with physics, network and sync policy in brackets.",
+    ),
     ("distance_m", "m", "Planned distance."),
     ("distance", "text", "Distance as the operator wrote it."),
     ("protocol", "text", "Transport protocol: tcp or udp."),

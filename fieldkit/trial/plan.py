@@ -76,6 +76,11 @@ class Plan(Strict):
     step_packages: dict[str, StepPackage] = Field(default_factory=dict, exclude_if=schema.is_empty)
     columns: Columns | None = None
 
+    @property
+    def backend_with_simulators(self) -> str:
+        """Name of the backend, with its simulators if it has any: results of others are another condition."""
+        return f"{self.backend} ({', '.join(self.simulators.values())})" if self.simulators else self.backend
+
     @cached_property
     def table(self) -> tuple[Column, ...]:
         """The columns of the trial's trial.csv, in order."""

@@ -46,7 +46,7 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
         "procedure": plan.procedure.name,
         "scenario": plan.procedure.scenario,
         "topology": plan.topology,
-        "backend": plan.backend,
+        "backend": plan.backend_with_simulators,
         "distance_m": plan.distance_m,
         "distance": plan.distance,
         "protocol": attempt.repeat.protocol,
