@@ -26,6 +26,11 @@ from fieldkit.trial.step_packages import StepPackage
 PLAN_FILE: Final = laptop_files.PLAN
 
 
+def simulators_text(simulators: Mapping[str, str]) -> str:
+    """Return the simulators of a backend as text: `physics mujoco, network ns3`; empty if there are none."""
+    return ", ".join(f"{purpose} {name}" for purpose, name in simulators.items())
+
+
 class Plan(Strict):
     """A trial's frozen inputs.
 
@@ -79,7 +84,7 @@ class Plan(Strict):
     @property
     def backend_with_simulators(self) -> str:
         """Name of the backend, with its simulators if it has any: results of others are another condition."""
-        return f"{self.backend} ({', '.join(self.simulators.values())})" if self.simulators else self.backend
+        return f"{self.backend} ({simulators_text(self.simulators)})" if self.simulators else self.backend
 
     @cached_property
     def table(self) -> tuple[Column, ...]:

@@ -49,7 +49,8 @@ def test_a_trial_on_the_built_in_network(tmp_path: Path, untouched: Untouched) -
     assert 0.0005 < float(row["delay_policy_s"]) < 0.0045, "half a window on average"
     assert float(row["delay_transmission_s"]) > 0
     assert float(row["cosim_late_max_s"]) < 0.1
-    assert row["backend"] == "emulated (kinematic, builtin, sliding_window, window 0.004 s)"
+    simulators = "physics kinematic, network builtin, sync sliding_window, window 0.004 s, step 0.001 s"
+    assert row["backend"] == f"emulated ({simulators})"
     plan = (only_trial(tmp_path) / "trial.yaml").read_text(encoding="utf-8")
     assert "simulators:\n  physics: kinematic\n  network: builtin\n  sync: sliding_window, window 0.004 s\n" in plan
 

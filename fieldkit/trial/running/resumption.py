@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Final
 
 from fieldkit.backends.protocols import Backend, Cast, Testbed, simulators_of
 from fieldkit.core import permissions, plugins
@@ -10,7 +11,7 @@ from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
 from fieldkit.trial import journal, step_packages, store
 from fieldkit.trial.hashes import code_hash
-from fieldkit.trial.plan import Plan
+from fieldkit.trial.plan import Plan, simulators_text
 from fieldkit.trial.running.opening import opened
 from fieldkit.trial.running.runner import Outcome, converting_write_errors, place, run_repeats
 from fieldkit.trial.running.stop import Stop
@@ -132,6 +133,9 @@ def require_backend(plan: Plan, name: str, folder: Path) -> None:
         )
 
 
+_NO_SIMULATORS: Final = "no simulators"
+
+
 def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) -> None:
     """Raise an error if a trial would be resumed on other simulators: one table has the results of one of them.
 
@@ -145,14 +149,11 @@ def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) 
     """
     if simulators != plan.simulators:
         raise ConfigurationError(
-            f"it was started on {_simulators_text(plan.simulators)}, not on {_simulators_text(simulators)}",
+            f"it was started on {simulators_text(plan.simulators) or _NO_SIMULATORS}, not on "
+            f"{simulators_text(simulators) or _NO_SIMULATORS}",
             where=str(folder),
             remedy="restore physics, network and sync in the site file, or start a new trial",
         )
-
-
-def _simulators_text(simulators: Mapping[str, str]) -> str:
-    return ", ".join(f"{purpose} {name}" for purpose, name in simulators.items()) or "no simulators"
 
 
 def require_cast(plan: Plan, cast: Cast) -> None:
