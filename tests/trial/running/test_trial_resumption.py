@@ -33,6 +33,16 @@ def test_robots_of_another_backend_are_rejected() -> None:
     assert caught.value.remedy == shell_command("fieldkit", "resume", TRIAL, "--backend", PLAN.backend)
 
 
+def test_other_simulators_are_rejected() -> None:
+    resumption.require_simulators(PLAN, {}, TRIAL)
+    simulated = PLAN.model_copy(update={"simulators": {"physics": "mujoco", "network": "ns3"}})
+    resumption.require_simulators(simulated, {"network": "ns3", "physics": "mujoco"}, TRIAL)
+    with pytest.raises(ConfigurationError, match="was started on physics mujoco, network ns3, not on no simulators"):
+        resumption.require_simulators(simulated, {}, TRIAL)
+    with pytest.raises(ConfigurationError, match="was started on no simulators, not on network ns3"):
+        resumption.require_simulators(PLAN, {"network": "ns3"}, TRIAL)
+
+
 @pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])
 def test_other_robots_are_rejected(change: dict[str, str] | None) -> None:
     resumption.require_cast(PLAN, PLAN.cast)
