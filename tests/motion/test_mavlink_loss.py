@@ -14,9 +14,9 @@ from tests.helpers.paths import ROOT
 pytestmark = pytest.mark.emulated
 
 LASTS_S = 6
-EDGE = 3
-"""Messages that may differ: one of each stream is in flight when the counters begin, and one when they end."""
 REQUESTED = (("ATTITUDE", 50_000), ("LOCAL_POSITION_NED", 50_000))
+EDGE = 2 * len(REQUESTED)
+"""Messages that may differ: one of each stream is in flight when the counters begin, and one when they end."""
 
 
 @pytest.mark.quiet
