@@ -41,6 +41,7 @@ class WindowLateness:
         self.largest_ns = max(self.largest_ns, late_ns)
 
 
+_PROGRESS_EVERY_NS: Final = 200_000_000
 _SHORTEST_NS: Final = 100_000
 """Smallest limit above 0; a sleeping process is woken up with about this lateness."""
 
@@ -72,7 +73,7 @@ class Pace:
         Args:
             simulation: The simulation at time 0.
             lateness: Receives the lateness of each window.
-            progress: As for `Simulation.run`, but called after every window.
+            progress: As for `Simulation.run`.
 
         Raises:
             RealTimeError: A window was later than the bound.
@@ -80,7 +81,7 @@ class Pace:
         """
         coordinator, end_ns = simulation.coordinator, simulation.scenario.duration_ns
         bound_ns = round(self.late_bound_s * 1e9)
-        started_ns = time.monotonic_ns()
+        started_ns = reported_ns = time.monotonic_ns()
         while (now_ns := coordinator.situation.now_ns) < end_ns:
             coordinator.advance(end_ns, max_windows=1)
             ended_ns, wall_ns = coordinator.situation.now_ns, time.monotonic_ns()
@@ -88,7 +89,8 @@ class Pace:
                 continue  # an empty window has the deadline of the one before
             late_ns = wall_ns - started_ns - round(ended_ns / self.factor)
             lateness.add(late_ns)
-            if progress is not None:
+            if progress is not None and wall_ns - reported_ns >= _PROGRESS_EVERY_NS:
+                reported_ns = wall_ns
                 progress(ended_ns, (wall_ns - started_ns) / 1e9)
             if late_ns > bound_ns:
                 raise RealTimeError(
