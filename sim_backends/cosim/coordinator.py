@@ -144,7 +144,7 @@ class Coordinator:
             FederateError: Physics, network or a program failed, did not answer in time, or gave an impossible answer.
         """
         try:
-            self._run_windows(to_ns, max_windows, None if progress is None else _rate_limited(progress))
+            self._run_windows(to_ns, max_windows, None if progress is None else rate_limited(progress))
         finally:
             self._wall_time.window()
             self.run.digest = self._digest.hexdigest()
@@ -409,8 +409,8 @@ class Coordinator:
             raise KeyboardInterrupt
 
 
-def _rate_limited(progress: Progress) -> Callable[[int], None]:
-    """Return a function of the simulated time that calls `progress` at most every `_PROGRESS_EVERY_S`."""
+def rate_limited(progress: Progress) -> Callable[[int], None]:
+    """Return a function of the simulated time that calls `progress` at most every 0.2 s of wall time."""
     started_s = reported_s = time.perf_counter()
 
     def report(now_ns: int) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
-from sim_backends.cosim.coordinator import Progress
+from sim_backends.cosim.coordinator import Progress, rate_limited
 from sim_backends.cosim.federates import seconds_text
 from sim_backends.cosim.scenario.build import Simulation
 
@@ -41,7 +41,6 @@ class WindowLateness:
         self.largest_ns = max(self.largest_ns, late_ns)
 
 
-_PROGRESS_EVERY_NS: Final = 200_000_000
 _SHORTEST_NS: Final = 100_000
 """Smallest limit above 0; a sleeping process is woken up with about this lateness."""
 
@@ -81,7 +80,8 @@ class Pace:
         """
         coordinator, end_ns = simulation.coordinator, simulation.scenario.duration_ns
         bound_ns = round(self.late_bound_s * 1e9)
-        started_ns = reported_ns = time.monotonic_ns()
+        report = None if progress is None else rate_limited(progress)
+        started_ns = time.monotonic_ns()
         while (now_ns := coordinator.situation.now_ns) < end_ns:
             coordinator.advance(end_ns, max_windows=1)
             ended_ns, wall_ns = coordinator.situation.now_ns, time.monotonic_ns()
@@ -89,9 +89,8 @@ class Pace:
                 continue  # an empty window has the deadline of the one before
             late_ns = wall_ns - started_ns - round(ended_ns / self.factor)
             lateness.add(late_ns)
-            if progress is not None and wall_ns - reported_ns >= _PROGRESS_EVERY_NS:
-                reported_ns = wall_ns
-                progress(ended_ns, (wall_ns - started_ns) / 1e9)
+            if report is not None:
+                report(ended_ns)
             if late_ns > bound_ns:
                 raise RealTimeError(
                     f"the run could not keep up with real time: the window that ends at {seconds_text(ended_ns)} was "

@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | `client` | the lab's client: starts the process, and passes it bodies, devices and places | medium client |
 | `cosim_process` | the process: requests of the lab, reading and delivery of packets | medium server, all below |
-| `session` | one run of the coordinator, with its physics and network | cosim, all below |
+| `cosim_session` | one run of the coordinator, with its physics and network | cosim, all below |
 | `clock` | simulated time as real time | nothing |
 | `real_agents` | the agents of the coordinator: packets read from devices, in windows that end in real time | cosim |
 | `lab_physics` | the physics, with robots that the lab has put at a place | steering, federates |

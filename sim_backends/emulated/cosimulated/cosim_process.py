@@ -24,8 +24,8 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.cosim.run_record import Fate, Window
 from sim_backends.emulated.cosimulated.clock import RealTime
+from sim_backends.emulated.cosimulated.cosim_session import CosimSession
 from sim_backends.emulated.cosimulated.real_agents import RealPacket
-from sim_backends.emulated.cosimulated.session import CosimSession
 from sim_backends.emulated.cosimulated.simulators import LabSettings, RobotBody, Simulators
 from sim_backends.emulated.cosimulated.steering import Steering
 from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing

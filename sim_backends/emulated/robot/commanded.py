@@ -3,12 +3,11 @@
 Only the standard library is imported, because the base process is imported under Debian's Python, too.
 """
 
-import os
 from pathlib import Path
 from typing import Final, NamedTuple, Self
 
 from sim_backends.emulated.robot.spec import STATE
-from sim_backends.emulated.ros.slots import Slots
+from sim_backends.emulated.ros.slots import Slots, open_record
 
 COMMANDED: Final = Path(STATE, "commanded")
 """The file of the record in the robot."""
@@ -45,7 +44,7 @@ class CommandedRecord:
         Raises:
             OSError: It cannot be created.
         """
-        return cls(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+        return cls(open_record(path))
 
     def write(self, commanded: Commanded) -> None:
         """Write a commanded velocity.

@@ -7,10 +7,20 @@ being written, and after the writer was killed.
 import os
 import struct
 import zlib
+from pathlib import Path
 from typing import Any, Final
 
 _NUMBER: Final = struct.Struct("<Q")
 _CRC: Final = struct.Struct("<I")
+
+
+def open_record(path: Path) -> int:
+    """Return a descriptor of the file of a record, which is created if it is missing.
+
+    Raises:
+        OSError: It cannot be created.
+    """
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
 
 class Slots:

@@ -5,12 +5,11 @@ a time of the monotonic clock, which all processes of a machine share; readers e
 """
 
 import math
-import os
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.ros.slots import Slots
+from sim_backends.emulated.ros.slots import Slots, open_record
 from sim_backends.world.motion import STILL, State
 
 SILENT_NS: Final = 500_000_000
@@ -96,7 +95,7 @@ class SteeredRecord:
         Raises:
             OSError: It cannot be created.
         """
-        return cls(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+        return cls(open_record(path))
 
     def write(self, motion: Steered) -> None:
         """Write the robot's motion.
