@@ -14,7 +14,7 @@ from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello
 from sim_backends.federates.named import PythonFederate, named
-from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
+from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, BareBroadcast, BareIp
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
@@ -149,7 +149,7 @@ def builtin_network(settings: LabSettings) -> BuiltinNetwork:
     return BuiltinNetwork(RadioNetwork(radio, tuple(antennas), transports=transports, relay=settings.relay), radio)
 
 
-def start_network(settings: LabSettings, states: Mapping[str, State]) -> NetworkFederate:
+def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.RemoteNetwork:
     """Start a network that is a program; arguments and errors as `start_physics`, with all stations."""
     network = remote.open_network(settings.simulators.network, _hello(settings, NETWORK, states), DEADLINE_S)
     supported = network.welcome.transports
