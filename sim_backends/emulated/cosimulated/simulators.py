@@ -20,10 +20,10 @@ from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.motion import State
 from sim_backends.world.world import World
 
