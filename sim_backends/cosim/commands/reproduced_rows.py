@@ -41,6 +41,7 @@ class ReproducedRows:
     def __init__(self, scenario: CosimScenario, trial: ReproducedTrial, policy: str) -> None:
         self._scenario = scenario
         self._policy = policy
+        self._has_captures = scenario.network.federate is None or writes_captures(scenario)
         self._repeats = trial.repeats(scenario.traffic, scenario.duration_ns)
         first = self._repeats[0]
         self._agents = {Role.SENDER: first.transfer.source, Role.RECEIVER: first.transfer.to[0]}
@@ -126,7 +127,7 @@ class ReproducedRows:
 
     def _captures(self, repeat: ReproducedRepeat, recording: Path) -> dict[Role, bytes]:
         """Return the captures of both ends, if the network wrote those of its IP packets."""
-        if self._scenario.network.federate is not None and not writes_captures(self._scenario):
+        if not self._has_captures:
             return {}
         paths = {role: recording / CAPTURES / f"{self._agents[role]}.pcap" for role in (Role.SENDER, Role.RECEIVER)}
         return {
@@ -162,7 +163,7 @@ class ReproducedRows:
         }
         if ping is not None:
             values |= motion_columns("rtt", ping)
-        if repeat.protocol is Protocol.TCP and self._scenario.network.federate is None:
+        if repeat.protocol is Protocol.TCP and self._has_captures:
             values["tcp_congestion_control"] = self._scenario.tcp.congestion
         if repeat.protocol is Protocol.UDP:
             values |= {

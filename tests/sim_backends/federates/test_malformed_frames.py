@@ -26,7 +26,8 @@ BODIES = {name: frame[HEADER_BYTES:] for name, frame in example_frames().items()
 
 @pytest.mark.parametrize("name", sorted(DECODERS))
 def test_each_cut_frame_is_refused_with_its_position(name: str) -> None:
-    for length in range(len(BODIES[name])):
+    whole = {len(BODIES["outcomes"]) - 24} if name == "outcomes" else set()  # delay parts are optional
+    for length in set(range(len(BODIES[name]))) - whole:
         with pytest.raises(MalformedFrameError, match=r"^byte \d+: ") as raised:
             DECODERS[name](BODIES[name][:length])
         assert 0 <= raised.value.position <= HEADER_BYTES + length

@@ -46,6 +46,7 @@ def test_rows_have_the_identity_and_the_columns_of_the_trial(run: tuple[Path, Ru
     first_s = next(float(frame.time) for frame in arrived if TCP in frame and frame[TCP].dport == 1234)
     last_s = max(float(frame.time) for frame in arrived if TCP in frame and len(frame[TCP].payload))
     assert float(tcp["completion_s"]) == pytest.approx(last_s - first_s, abs=1e-5)
+    assert tcp["tcp_congestion_control"] == "cubic"
     for row in (udp, tcp):
         assert float(row["goodput_bit_s"]) == pytest.approx(8 * 230989 / float(row["completion_s"]), rel=1e-6)
 
