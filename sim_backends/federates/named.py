@@ -28,12 +28,14 @@ class ProgramFederate:
             something is not installed; the remedy is the command that installs it.
         summary: What it is, in one line.
         options: Model of its options in a scenario; None if it has any options, which are not validated.
+        writes_captures: True for a network that writes the captures that `captures` of its configuration describes.
     """
 
     role: int
     command: Callable[[], str]
     summary: str = ""
     options: type[SimulatorOptions] | None = None
+    writes_captures: bool = False
 
 
 @dataclass(frozen=True)
