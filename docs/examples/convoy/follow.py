@@ -1,7 +1,7 @@
 """Follow the leader, 2 m and 1 s behind it, by the odometry that arrives over the radio.
 
 The control law and its period are those of the scenario `convoy` (`sim_backends/cosim/programs/follow.py`): an error
-of the distance decays at 1/s, states are extrapolated to the present time, and without a state for 1 s the robot stops.
+of the distance decays at 1/s, states are extrapolated to the present time, and it stops without a state for 1 s.
 Both robots start in one direction; the argument is how many metres the leader starts ahead.
 """
 
