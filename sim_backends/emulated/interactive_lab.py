@@ -24,7 +24,8 @@ from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.ros.own_motion import AssignedPath
-from sim_backends.radio.world_channel import WorldChannel, antenna_of
+from sim_backends.radio.antennas import antenna_of
+from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.motion import State
 from sim_backends.world.world import World
 

@@ -58,7 +58,13 @@ def test_a_trial_on_ns3(tmp_path: Path) -> None:
     resolve(EmulatedOptions.model_validate({"network": "ns3"}))  # compiles it before the trial
     row = trial_row(tmp_path, "{network: ns3, ros: builtin}")
     assert float(row["delay_s"]) > float(row["delay_policy_s"]) > 0
-    assert row["delay_transmission_s"] == ""
+    parts_s = [float(row[f"delay_{part}_s"]) for part in ("processing", "transmission", "propagation", "queuing")]
+    assert parts_s[1] > 0
+    assert sum(parts_s) == pytest.approx(float(row["delay_s"]), rel=1e-6)
+    assert int(row["sender_link_samples"]) > 1
+    assert int(row["sender_radio_tx_packets"]) >= int(row["ip_packets_sent"])
+    assert int(row["receiver_radio_rx_packets"]) >= int(row["ip_packets_received"])
+    assert -90 < float(row["sender_signal_median_dbm"]) < -20
 
 
 def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:

@@ -319,10 +319,7 @@ class CosimulatedMedium(MediumServer):
 
     @override
     def _sample_links(self, now_ns: int) -> Mapping[str, LinkSample]:
-        session = self._session
-        if session is None or session.builtin is None:
-            return {}
-        return session.sample_links()
+        return {} if self._session is None else self._session.sample_links()
 
     @override
     def _link_counters(self) -> dict[Pair, LinkCounters]:

@@ -14,16 +14,16 @@ from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello
 from sim_backends.federates.named import PythonFederate, named
-from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
+from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, BareBroadcast, BareIp
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.motion import State
 from sim_backends.world.world import World
 
@@ -149,7 +149,7 @@ def builtin_network(settings: LabSettings) -> BuiltinNetwork:
     return BuiltinNetwork(RadioNetwork(radio, tuple(antennas), transports=transports, relay=settings.relay), radio)
 
 
-def start_network(settings: LabSettings, states: Mapping[str, State]) -> NetworkFederate:
+def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.RemoteNetwork:
     """Start a network that is a program; arguments and errors as `start_physics`, with all stations."""
     network = remote.open_network(settings.simulators.network, _hello(settings, NETWORK, states), DEADLINE_S)
     supported = network.welcome.transports

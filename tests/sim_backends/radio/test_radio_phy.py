@@ -10,16 +10,8 @@ from hypothesis import strategies as st
 from scipy import special, stats
 
 from sim_backends.radio import propagation
-from sim_backends.radio.modes import (
-    G_MODES,
-    N_MODES,
-    WifiMode,
-    ack_ns,
-    bit_error,
-    control_mode,
-    decoded_bit_error,
-    packet_error,
-)
+from sim_backends.radio.error_rates import bit_error, decoded_bit_error, packet_error
+from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode, ack_ns, control_mode
 from sim_backends.radio.propagation import Fading, Shadowing
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from sim_backends.radio.contention import CCA_TIME_NS
+from sim_backends.radio.error_rates import packet_error
 from sim_backends.radio.frames import HEADER_BYTES, TransmissionAttempt
 from sim_backends.radio.links import (
     Delivery,
@@ -24,7 +25,6 @@ from sim_backends.radio.modes import (
     SLOT_NS,
     WifiMode,
     ack_ns,
-    packet_error,
 )
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import HEADERS_BYTES, NOISE_MW, STRONG_MW, FixedPowers, saturate

@@ -44,10 +44,28 @@ def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
     options = default_options("ns3", NETWORK)
     with cosim_bench(tmp_path, network=network, network_options=options) as bench:
         assert len(bench.ping()) == 20
+        parts = bench.medium.stats().delays["a", "b"]
+        (sample,) = bench.medium.links(continue_sampling=False)["a"]
         bench.ping("-b", count=3, address="10.9.0.255")
         stats = bench.medium.stats()
         assert stats.ports["b"].written == 23
         assert stats.ports["a"].written == 20
+    assert parts.packets == 20
+    assert 20 * 30_000 < parts.transmission_ns < 20 * 20_000_000, "84 bytes, from 65 Mbit/s to 1 Mbit/s with retries"
+    assert 20 * 20 < parts.propagation_ns < 20 * 40, "9 m at the speed of light"
+    (peer,) = sample.stations
+    assert (peer.station, peer.tx_packets, peer.rx_packets, peer.tx_failures) == ("b", 20, 20, 0)
+    assert peer.tx_rate_bit_s is not None
+    assert peer.rx_rate_bit_s is not None
+    assert 1e6 <= min(peer.tx_rate_bit_s, peer.rx_rate_bit_s) <= 65e6
+    assert sample.busy_ns is not None
+    assert sample.active_ns is not None
+    assert parts.transmission_ns < sample.busy_ns < sample.active_ns
+    (tmp_path / "builtin").mkdir()
+    with cosim_bench(tmp_path / "builtin") as bench:
+        (expected,) = bench.medium.links(continue_sampling=False)["a"]
+    assert peer.signal_dbm == pytest.approx(expected.stations[0].signal_dbm, abs=1e-6)
+    assert sample.noise_dbm == pytest.approx(expected.noise_dbm)
 
 
 DISC = """

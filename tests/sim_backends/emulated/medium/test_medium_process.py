@@ -22,8 +22,9 @@ from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.core.model import DelayParts, Vector
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.robot.network import open_tun
+from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import WorldChannel, antenna_of
+from sim_backends.radio.world_channel import WorldChannel
 from tests.helpers.host import alive
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
@@ -387,7 +388,8 @@ OWN_A_MEDIUM = """
 import time
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import WorldChannel, antenna_of
+from sim_backends.radio.antennas import antenna_of
+from sim_backends.radio.world_channel import WorldChannel
 medium = MediumClient(RadioOptions(), seed=1)
 medium.stats()
 print(medium.pid, flush=True)
