@@ -35,7 +35,13 @@ def escaped(text: str) -> str:
 def step_columns() -> str:
     """Return the table of the columns of steps that not every trial has."""
     lines = (
-        (f"`{column.name}`", column.unit, str(column.figure.kind) if column.figure else "", step, escaped(column.meaning))
+        (
+            f"`{column.name}`",
+            column.unit,
+            str(column.figure.kind) if column.figure else "",
+            step,
+            escaped(column.meaning),
+        )
         for step, columns in STEP_COLUMNS.items()
         for column in columns
     )
