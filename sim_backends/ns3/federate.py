@@ -61,4 +61,5 @@ NS3: Final = ProgramFederate(
     "ns-3: its Wi-Fi, TCP and UDP, over the path loss of the world",
     Ns3Options,
     writes_captures=True,
+    is_single_threaded=True,
 )
