@@ -1,4 +1,4 @@
-"""Steering of one robot by the programs in it: commanded velocities in, the record of its motion out."""
+"""Steering of one robot: reads the velocities that its programs command, and writes the record of its motion."""
 
 import math
 from collections import deque
@@ -118,7 +118,7 @@ class Steering:
 
 _STILL_M_S: Final = 1e-3
 _NO_TURN_RAD_S: Final = 1e-3
-"""Slower motions are those of a simulated contact: a robot that stands in MuJoCo is never exactly at rest."""
+"""Slower motions are those of a simulated contact: in MuJoCo a stationary robot is never exactly at rest."""
 
 
 def _path(fd: int) -> Path:
