@@ -1,8 +1,10 @@
 """A lab's choice of simulators and sync policy: what it needs, and its check before a run."""
 
 import inspect
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any, Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import RobotProfile
@@ -14,7 +16,13 @@ from sim_backends.emulated.cosimulated.simulators import BUILTIN, KINEMATIC, Rob
 from sim_backends.emulated.emulated_options import EmulatedOptions, SyncOptions
 from sim_backends.emulated.motion_sections import drive_of, mavlink_of
 from sim_backends.federates.frames import NETWORK, PHYSICS
-from sim_backends.federates.named import PythonFederate, command_line, default_options, named
+from sim_backends.federates.named import (
+    ProgramFederate,
+    PythonFederate,
+    command_line,
+    default_options,
+    named,
+)
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
 from sim_backends.physics.robot_limits import BODIES
 
@@ -23,10 +31,18 @@ _EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "windo
 ns-3 has about 14 events per packet, and an exchange takes 0.2 ms."""
 
 
+GAZEBO: Final = "gazebo"
+_EXTERNAL_PHYSICS = SyncOptions.model_validate({"name": "sliding_window", "window": "10ms"})
+"""Default for Gazebo: an exchange for each step of 1 ms would take too long for real time."""
+
+
 def sync_of(options: EmulatedOptions) -> SyncOptions:
     """Return the sync policy of a lab."""
-    default = SyncOptions.defaults() if options.network in {None, BUILTIN} else _EXTERNAL_NETWORK
-    return options.sync or default
+    if options.sync is not None:
+        return options.sync
+    if options.physics == GAZEBO:
+        return _EXTERNAL_PHYSICS
+    return SyncOptions.defaults() if options.network in {None, BUILTIN} else _EXTERNAL_NETWORK
 
 
 def resolve(options: EmulatedOptions) -> Simulators:
@@ -44,22 +60,29 @@ def resolve(options: EmulatedOptions) -> Simulators:
             remedy=f"write window: {sync.step * 1e3:g}ms, or a shorter step",
         )
     network_options = default_options(options.network or BUILTIN, NETWORK)
-    return Simulators(_physics(options), _network(options), sync.step_ns, network_options)
+    physics_options = _gazebo_options() if options.physics == GAZEBO else None
+    return Simulators(_physics(options), _network(options), sync.step_ns, network_options, physics_options)
 
 
 def _physics(options: EmulatedOptions) -> str:
     name = options.physics or KINEMATIC
     if name == KINEMATIC:
         return name
-    if name == "gazebo":
-        raise ConfigurationError(
-            "a running Gazebo cannot put robots at the places of a trial",
-            remedy="write physics: kinematic or physics: mujoco under emulated; fieldkit cosim run supports Gazebo",
-        )
     federate = named(name, PHYSICS)
+    if isinstance(federate, ProgramFederate):
+        return federate.command()
     if isinstance(federate, PythonFederate):
         federate.load()
     return name
+
+
+def _gazebo_options() -> dict[str, Any]:
+    """Return the options of Gazebo, with its partition and address from the environment, which the medium lacks."""
+    set_options = {
+        option: os.environ.get(f"GZ_{variable}") or os.environ.get(f"IGN_{variable}")
+        for option, variable in (("partition", "PARTITION"), ("ip", "IP"))
+    }
+    return default_options(GAZEBO, PHYSICS) | {option: value for option, value in set_options.items() if value}
 
 
 def _network(options: EmulatedOptions) -> str:

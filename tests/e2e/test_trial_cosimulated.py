@@ -10,6 +10,10 @@ import pytest
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.emulated.simulator_choice import resolve
+from sim_backends.gazebo.sdf import SdfRobot, world_sdf
+from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER
+from sim_backends.world.world import load_world
+from tests.helpers.gazebo_server import gazebo_server, missing_libraries
 from tests.helpers.host import Untouched, descendants
 from tests.helpers.runs import fieldkit, only_trial, rows, run_here
 from tests.helpers.sshd import wait_until
@@ -102,7 +106,6 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
     [
         ("{network: ns3, record_air: true}", "does not support record_air"),
         ("{network: ns3, radio: {loss: 5%}}", "does not support fixed links"),
-        ("{physics: gazebo}", "a running Gazebo cannot put robots at the places of a trial"),
         ("{physics: kinematic, sync: slidding_window}", "there is no sync policy 'slidding_window'"),
         ("{sync: sliding_window}", "`sync` needs a co-simulation"),
         ("{physics: kinematic, sync: {name: scheduled, window: 0.1ms}}", "shorter than the step of the physics"),
@@ -113,3 +116,29 @@ def test_a_combination_that_cannot_work_is_refused(emulated: str, reason: str, t
     assert run.code == 2
     assert reason in run.err
     assert "remedy" in run.err
+
+
+@pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries())
+def test_real_ros_drives_a_robot_in_gazebo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The world is that of the lab, with robots at other places."""
+    robots = {f"robot-{number}": SdfRobot(TURTLEBOT3_BURGER, (number, 2.0, 0.0), 0.0) for number in (1, 2)}
+    make_site(tmp_path, "{physics: gazebo, ros: debian, world: lawn}")
+    (tmp_path / "gazebo").mkdir()
+    with gazebo_server(tmp_path / "gazebo", world_sdf(load_world("lawn"), robots)) as server:
+        monkeypatch.setenv("IGN_PARTITION", server.options["partition"])
+        monkeypatch.setenv("IGN_IP", server.options["ip"])
+        up = fieldkit(tmp_path, "lab", "up")
+        assert up.code == 0, up.err
+        try:
+            assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "10m", "18m").code == 0
+            assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0
+
+            def place_m() -> list[float]:
+                listed = json.loads(fieldkit(tmp_path, "lab", "ps", "--json").out)
+                place: list[float] = listed["robots"][0]["place_m"]
+                return place
+
+            wait_until(lambda: place_m()[0] > 10.3, Deadline.after(90))
+            assert place_m()[1] == pytest.approx(18.0, abs=0.05)
+        finally:
+            assert fieldkit(tmp_path, "lab", "down").code == 0

@@ -102,6 +102,7 @@ def cosim_bench(
     physics: str = "kinematic",
     network: str = "builtin",
     network_options: Mapping[str, Any] | None = None,
+    physics_options: Mapping[str, Any] | None = None,
     sync: SyncOptions | None = None,
     radio: RadioOptions | None = None,
     world: World | None = None,
@@ -116,7 +117,7 @@ def cosim_bench(
                 world,
                 seed=1,
                 bodies={"a": BODY, "b": BODY},
-                simulators=Simulators(physics, network, sync.step_ns, network_options),
+                simulators=Simulators(physics, network, sync.step_ns, network_options, physics_options),
                 policy={"name": sync.name, **sync.parameters},
             )
         )

@@ -45,12 +45,14 @@ class Simulators(NamedTuple):
         network: `builtin`, or a command of a network federate.
         step_ns: Step of the physics.
         network_options: Options of the network federate; None if it has none.
+        physics_options: Options of the physics federate; None if it has none.
     """
 
     physics: str
     network: str
     step_ns: int = 1_000_000
     network_options: Mapping[str, Any] | None = None
+    physics_options: Mapping[str, Any] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,8 +175,9 @@ def _hello(settings: LabSettings, role: int, states: Mapping[str, State]) -> Hel
         )
         for name, state in states.items()
     ]
-    options = (settings.simulators.network_options or {}) if role == NETWORK else {}
-    configuration = _configuration(settings, states) | {"options": options}
+    simulators = settings.simulators
+    options = simulators.network_options if role == NETWORK else simulators.physics_options
+    configuration = _configuration(settings, states) | {"options": options or {}}
     return Hello(
         role, agents, settings.seed, settings.simulators.step_ns, _END_NS, "lab", json.dumps(configuration).encode()
     )
