@@ -66,6 +66,7 @@ def test_an_outcome_within_its_limits_has_no_problems() -> None:
     assert problems(ROUTED, replace(LANDED, link_lost=True)) == []
     assert problems(OUT, GOOD) == []
     assert problems(FLYING, LANDED) == []
+    assert problems(OUT, replace(GOOD, begins_s=3.3, scheduling_s=0.5)) == []
 
 
 @pytest.mark.parametrize(
@@ -73,6 +74,7 @@ def test_an_outcome_within_its_limits_has_no_problems() -> None:
     [
         (OUT, replace(GOOD, begins_s=None), "never"),
         (OUT, replace(GOOD, begins_s=20.0), "stops after 20.0 s"),
+        (OUT, replace(GOOD, begins_s=3.3, scheduling_s=0.3), "bound 2.9 s and 0.3 s without a processor"),
         (OUT, replace(GOOD, again_m=0.2), "moves again"),
         (OUT, replace(GOOD, attempts=2), "set in motion 2 times"),
         (OUT, replace(GOOD, farthest_m=31.5), "beyond its fence"),
