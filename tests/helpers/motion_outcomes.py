@@ -4,7 +4,17 @@ import json
 from dataclasses import asdict, dataclass
 from typing import Self
 
-from tests.helpers.motion_cells import ALARM_S, FENCE_M, Expectation, MotionCell, expected
+from tests.helpers.motion_cells import (
+    ALARM_S,
+    DRIVE_LEASE_S,
+    FENCE_M,
+    FLIGHT_LEASE_S,
+    OPERATOR_S,
+    Expectation,
+    MotionCell,
+    expected,
+)
+from tests.helpers.motion_parties import Party
 
 
 @dataclass(frozen=True)
@@ -71,9 +81,11 @@ def problems(cell: MotionCell, outcome: MotionOutcome) -> list[str]:
         result.append("the link to the autopilot was not lost: the fault had no effect")
     if not expectation.judged:
         return [*result, *_alarm_problems(expectation, outcome), *_program_problems(expectation, outcome)]
-    name = "descends" if cell.craft.flies else "stops"
-    result += _time_problems(name, expectation.begins_s, outcome.begins_s, outcome.scheduling_s)
-    result += _time_problems("on the ground", expectation.ends_s, outcome.ends_s, outcome.scheduling_s)
+    name, scheduling_s = "descends" if cell.craft.flies else "stops", outcome.scheduling_s
+    if Party.FIELDKIT in cell.parties:  # the lease, which it does not renew, stops the robot without the command
+        scheduling_s = min(scheduling_s, (FLIGHT_LEASE_S if cell.craft.flies else DRIVE_LEASE_S) - OPERATOR_S)
+    result += _time_problems(name, expectation.begins_s, outcome.begins_s, scheduling_s)
+    result += _time_problems("on the ground", expectation.ends_s, outcome.ends_s, scheduling_s)
     if expectation.begins_s is not None and outcome.again_m > 0:
         result.append(f"moves again, by {outcome.again_m:.2f} m")
     if expectation.begins_s is not None and outcome.attempts > 1:
