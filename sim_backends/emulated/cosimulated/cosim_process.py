@@ -57,7 +57,7 @@ _START_NS: Final = 5_000_000
 
 
 class _NewSession(BaseException):
-    """Raised through the coordinator of an old session."""
+    """Ends the coordinator of an old session."""
 
 
 class CosimulatedMedium(MediumServer):
