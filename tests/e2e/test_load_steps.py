@@ -70,11 +70,16 @@ def flows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]
     return {name: rows(only_trial(lab_folder))[-1] for name, lab_folder in labs.items()}
 
 
+RTO_SHARE = 0.2 / 5
+"""Bytes behind a lost segment reach iperf3 up to a retransmission timeout later than the capture: at least 200 ms in
+Linux, of a test of 5 s."""
+
+
 @pytest.mark.parametrize("name", FLOWS)
 def test_iperf3_and_captures_agree_on_the_throughput(flows: dict[str, dict[str, str]], name: str) -> None:
     row = flows[name]
     own, captured = (float(row[f"iperf3_{what}_bit_s"]) for what in ("throughput", "captured"))
-    assert captured == pytest.approx(own, rel=0.02)
+    assert captured == pytest.approx(own, rel=0.02 + (RTO_SHARE if name == "tcp-lossy" else 0.0))
     if name == "tcp":
         assert own == pytest.approx(4e6, rel=0.05)
     assert float(row["iperf3_interval_min_bit_s"]) <= float(row["iperf3_interval_median_bit_s"])

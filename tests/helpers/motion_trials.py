@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from tests.helpers.motion_truth import (
     moved_again_m,
     stopped_s,
 )
-from tests.helpers.runs import fieldkit
+from tests.helpers.runs import finish, start
 from tests.helpers.sshd import wait_until
 
 REACHES_S: Final = 60.0
@@ -90,6 +91,7 @@ class MotionTrial:
     _programs_s: float | None = None
     _servers: set[int] = field(default_factory=set)
     _link_lost: bool = False
+    _scheduling_s: float = 0.0
 
     def run(self) -> MotionOutcome:
         """Run the trial, and restore the lab."""
@@ -210,8 +212,14 @@ class MotionTrial:
     def _run_command(self, fault: InjectedFault) -> None:
         """Run `fieldkit stop` or `fieldkit abort`, as from another terminal."""
         name = self.lab.robot(self.cell.craft).name
-        completed = fieldkit(self.folder, *(("stop", name) if fault is InjectedFault.STOP else ("abort", "--yes")))
-        (self.folder / "stop").write_text(completed.out + completed.err, encoding="utf-8")
+        words = ("stop", name) if fault is InjectedFault.STOP else ("abort", "--yes")
+        process = start(self.folder, *words)
+        with ThreadPoolExecutor(1) as pool:
+            completed = pool.submit(finish, process)
+            while not completed.done():
+                self._scheduling_s = max(self._scheduling_s, scheduling_delay_s(process.pid))
+                time.sleep(0.01)
+        (self.folder / "stop").write_text(completed.result().out + completed.result().err, encoding="utf-8")
 
     def _observe(self, sampler: MotionSampler, at_s: float) -> None:
         """Observe the robot until some time after it has stopped or landed; end a pause in time."""
@@ -288,6 +296,7 @@ class MotionTrial:
             alarm_s=_rounded(self._alarm_s),
             programs_s=_rounded(self._programs_s),
             link_lost=self._link_lost if cell.cuts_link else None,
+            scheduling_s=round(self._scheduling_s, 2),
             message=(printed.strip().splitlines() or [""])[-1][:300],
             load=round(os.getloadavg()[0], 2),
         )
@@ -316,6 +325,18 @@ class MotionTrial:
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
             process.wait(LONG_S)
+
+
+def scheduling_delay_s(pid: int) -> float:
+    """Return the time for which the main thread of a process waited for a processor (Linux, /proc/PID/schedstat).
+
+    It is 0 if the process has ended.
+    """
+    try:
+        _, waited_ns, _ = Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()
+    except (OSError, ValueError):
+        return 0.0
+    return int(waited_ns) / 1e9
 
 
 def _rounded(value_s: float | None) -> float | None:

@@ -58,6 +58,7 @@ def test_a_drone_descends_and_is_on_the_ground() -> None:
     assert descended_s(course(lambda _: 1.0), 4.0) is None
 
 
+(STOPPED,) = select_cells("rover/fieldkit+operator/stop/out")
 GOOD = MotionOutcome(OUT.name, 1, begins_s=2.2, farthest_m=5.0)
 LANDED = MotionOutcome(FLYING.name, 1, begins_s=1.5, ends_s=9.0, farthest_m=5.0, disarmed=True, alarm_s=2.0)
 
@@ -66,6 +67,7 @@ def test_an_outcome_within_its_limits_has_no_problems() -> None:
     assert problems(ROUTED, replace(LANDED, link_lost=True)) == []
     assert problems(OUT, GOOD) == []
     assert problems(FLYING, LANDED) == []
+    assert problems(STOPPED, replace(GOOD, begins_s=2.2, scheduling_s=0.4)) == []
 
 
 @pytest.mark.parametrize(
@@ -73,6 +75,8 @@ def test_an_outcome_within_its_limits_has_no_problems() -> None:
     [
         (OUT, replace(GOOD, begins_s=None), "never"),
         (OUT, replace(GOOD, begins_s=20.0), "stops after 20.0 s"),
+        (STOPPED, replace(GOOD, begins_s=2.2, scheduling_s=0.2), "bound 1.9 s and 0.2 s without a processor"),
+        (STOPPED, replace(GOOD, begins_s=3.0, scheduling_s=8.0), "bound 1.9 s and 1.0 s without a processor"),
         (OUT, replace(GOOD, again_m=0.2), "moves again"),
         (OUT, replace(GOOD, attempts=2), "set in motion 2 times"),
         (OUT, replace(GOOD, farthest_m=31.5), "beyond its fence"),
