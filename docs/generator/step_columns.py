@@ -35,7 +35,13 @@ def escaped(text: str) -> str:
 def step_columns() -> str:
     """Return the table of the columns of steps that not every trial has."""
     lines = (
-        (f"`{column.name}`", column.unit, str(column.figure.kind) if column.figure else "", step, escaped(column.meaning))
+        (
+            f"`{column.name}`",
+            column.unit,
+            str(column.figure.kind) if column.figure else "",
+            step,
+            escaped(column.meaning),
+        )
         for step, columns in STEP_COLUMNS.items()
         for column in columns
     )
@@ -52,8 +58,8 @@ def table_rows() -> str:
     )
     return page(
         "Rows of tables",
-        "Rows of the tables of `trial`, `aggregate`, `compare` and `report`, with their columns in `trial.csv`. FLOW is "
-        "`transfer`, `iperf3`, `soak` or `topic`. After a reboot; other faults have the same rows. "
+        "Rows of the tables of `trial`, `aggregate`, `compare` and `report`, with their columns in `trial.csv`. FLOW "
+        "is `transfer`, `iperf3`, `soak` or `topic`. After a reboot; other faults have the same rows. "
         "[Losses and marks](../glossary.md).",
         table(("row", "column", "meaning"), lines),
     )

@@ -134,7 +134,7 @@ def open_physics(
     hello = make_hello(scenario, world, bodies, seed, PHYSICS)
     federate = named(where, PHYSICS)
     if isinstance(federate, PythonFederate):
-        physics: PhysicsFederate = _made(federate, where, hello)
+        physics: PhysicsFederate = _make_federate(federate, where, hello)
         return physics
     return remote.open_physics(where, hello, deadline_s)
 
@@ -149,8 +149,8 @@ def open_network(
     hello = make_hello(scenario, world, bodies, seed, NETWORK)
     federate = named(where, NETWORK)
     if isinstance(federate, PythonFederate):
-        made: NetworkFederate = _made(federate, where, hello)
-        return made
+        network: NetworkFederate = _make_federate(federate, where, hello)
+        return network
     network = remote.open_network(where, hello, deadline_s)
     supported = network.welcome.transports
     used = sorted({traffic.transport for traffic in scenario.traffic})
@@ -164,7 +164,7 @@ def open_network(
     return network
 
 
-def _made(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
+def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
     """Return a federate in this process.
 
     Raises:
