@@ -90,9 +90,8 @@ def main() -> None:
     if arguments.json:
         json.dump({"airtime_difference_ns": differences, "packet_error": curves}, sys.stdout)
         return
-    print(
-        f"airtimes of {len(differences)} modes: largest unexplained difference {max(differences.values(), key=abs)} ns"
-    )
+    largest_ns = max(differences.values(), key=abs)
+    print(f"airtimes of {len(differences)} modes: largest unexplained difference {largest_ns} ns")
     print("packet error against ratio, largest shift at errors of 50, 10 and 1 % (dB):")
     print("  " + ", ".join(f"{name} {shift_db(curve):+.2f}" for name, curve in curves.items()))
 

@@ -98,7 +98,7 @@ def _exit_code(channel: Execution, stderr: bytes, robot: str) -> int:
     code = channel.recv_exit_status()
     if code >= 0:
         return code
-    if (error := connection_error(channel)) is not None:
+    if (error := connection_error(channel.get_transport())) is not None:
         raise error
     raise RobotError(
         f"a signal ended the command: {printable(stderr) or 'no message'}",

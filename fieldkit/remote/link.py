@@ -49,7 +49,6 @@ _WEAK_ALGORITHMS: Final = ("cbc", "md5", "-96")
 
 _REFUSED: Final = "Unable to open channel"
 
-
 # RFC 4253, section 6.1 requires support for packets of 35,000 bytes, and OpenSSH accepts 256 KiB.
 _PACKET_BYTES: Final = 1 << 18
 _BANNER_BYTES: Final = 1 << 16
@@ -369,13 +368,12 @@ class Link:
         return self._stream, self._transport
 
 
-def connection_error(channel: Channel) -> BaseException | None:
+def connection_error(transport: paramiko.Transport) -> BaseException | None:
     """Return the error of the connection of a closed channel, or None if the server has closed only the channel.
 
     paramiko stores its exception, closes the channels of the connection, and only then marks the connection as
     inactive. On a busy computer this takes any time.
     """
-    transport = channel.get_transport()
     assert isinstance(transport.packetizer, _Packetizer)
     error = transport.saved_exception
     if isinstance(error, paramiko.ChannelException):  # the server has refused another channel

@@ -7,6 +7,7 @@
 #include "fieldkit/handshake.h"
 #include "fieldkit/links.h"
 #include "fieldkit/packets.h"
+#include "captures.h"
 #include "transports.h"
 
 #include "ns3/rng-seed-manager.h"
@@ -80,6 +81,10 @@ class Network
         if (to_ns >= NowNs())
         {
             RunUntil(to_ns);
+        }
+        if (m_captures != nullptr)
+        {
+            m_captures->Flush();
         }
         return m_outcomes.TakeBody(to_ns, NextEventNs());
     }
@@ -240,6 +245,13 @@ class Network
                     [this](uint64_t id, const std::string& reason) { Drop(id, reason); }};
         m_udp = std::make_unique<UdpTransport>(m_stations, fates);
         m_tcp = std::make_unique<TcpTransport>(m_stations, fates);
+        if (configuration.contains("captures"))
+        {
+            m_captures = std::make_unique<IpCaptures>(configuration["captures"], m_stations);
+            m_tcp->on_connect = [this](Ipv4Address source, uint16_t port, const std::string& flow) {
+                m_captures->Connect(source, port, flow);
+            };
+        }
         for (const Json& fault : scenario.at("faults"))
         {
             AddFault(fault);
@@ -465,6 +477,10 @@ class Network
         {
             throw Refusal("packet " + std::to_string(packet.id) + " has entered before");
         }
+        if (m_captures != nullptr)
+        {
+            m_captures->Enter(packet.id, packet.flow, packet.number);
+        }
         Time after = NanoSeconds(std::max<int64_t>(packet.enters_ns - NowNs(), 0));
         uint32_t context = m_stations[packet.source].node->GetId();
         Simulator::ScheduleWithContext(context, after, [this, id = packet.id] { Send(m_pending.at(id)); });
@@ -565,6 +581,7 @@ class Network
     FrameTracker m_tracker;
     std::unique_ptr<UdpTransport> m_udp;
     std::unique_ptr<TcpTransport> m_tcp;
+    std::unique_ptr<IpCaptures> m_captures; // null if there are none
     int64_t m_toNs = -1;
     std::unordered_map<uint64_t, CoordinatorPacket> m_pending;
     protocol::Outcomes m_outcomes;

@@ -15,7 +15,7 @@ from sim_backends.radio.links import (
     Delay,
     Payload,
 )
-from sim_backends.radio.modes import WifiMode
+from sim_backends.radio.modes import SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0
@@ -127,6 +127,7 @@ class Frame(Generic[Payload]):
         before: Sum of the delays before this hop, in the packed form of `links.Delay`; 0 for none.
         first_attempt_ns: Start of its first attempt.
         attempts: Number of attempts so far.
+        max_attempts: Number of attempts after which it is given up.
     """
 
     payload: Payload
@@ -140,6 +141,7 @@ class Frame(Generic[Payload]):
     before: Delay = 0
     first_attempt_ns: int = 0
     attempts: int = 0
+    max_attempts: int = SHORT_RETRY_LIMIT
 
     def total_delay(self, now_ns: int, propagation_ns: int) -> Delay:
         """Return the delay over all hops so far, for a frame decoded at `now_ns`."""

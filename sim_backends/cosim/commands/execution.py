@@ -17,7 +17,7 @@ from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.real_time import Pace, WindowLateness
 from sim_backends.cosim.recording.manifest import RunSettings
-from sim_backends.cosim.recording.recorder import RunRecorder, StateSamples
+from sim_backends.cosim.recording.recorder import CAPTURES, RunRecorder, StateSamples
 from sim_backends.cosim.run_record import WindowObserver
 from sim_backends.cosim.scenario.build import build, captured_flows
 from sim_backends.cosim.scenario.emane import EmaneObserver, emane_observer
@@ -88,7 +88,10 @@ def simulate(
     publisher: EmaneObserver | nullcontext[None] = nullcontext()
     if scenario.emane is not None:
         observer = publisher = emane_observer(scenario, seed, observer)
-    simulation = build(scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s)
+    captures = None if folder is None else folder.recording(seed) / CAPTURES
+    simulation = build(
+        scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s, captures=captures
+    )
     agents = simulation.agents
     starts = {name: absence.state for name, absence in agents.absent.items()} | dict(agents.states(0).items())
     ended_by: FieldkitError | KeyboardInterrupt | None = None

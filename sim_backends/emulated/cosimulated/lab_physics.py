@@ -124,8 +124,8 @@ class LabPhysics:
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (read here)
         """Implement `PhysicsFederate.advance`; the commands are those of the robots' programs."""
-        if to_ns - self._polled_ns >= _POLL_NS:
-            self._poll_placements(to_ns)
+        if (now_ns := self._clock.now_ns()) - self._polled_ns >= _POLL_NS:
+            self._poll_placements(now_ns)
         if self._physics is not None:
             for at_ns, name, twist in sorted(self._commands(to_ns), key=lambda command: command[0]):
                 self._drive(name, max(at_ns, self._now_ns), twist)
