@@ -21,8 +21,8 @@ from sim_backends.linux_wifi.hwsim_messages import (
     encode_sent,
 )
 from sim_backends.linux_wifi.netlink import NLMSG_ERROR, NetlinkMessage, decode_generic, encode_generic
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna
 
 NAMES = "abc"
 START_NS = 10_000_000
