@@ -87,9 +87,9 @@ def scenario_of(count: int, seconds: float, rate_hz: float, folder: Path) -> Cos
     return load_scenario(path)
 
 
-def used_s(who: int) -> float:
+def used_s(usage_of: int) -> float:
     """Return the processor time of this process, or of its ended children, in seconds."""
-    usage = resource.getrusage(who)
+    usage = resource.getrusage(usage_of)
     return usage.ru_utime + usage.ru_stime
 
 

@@ -26,7 +26,7 @@ BIMODAL: Final = "bimodal"
 
 IMAGE_BYTES: Final = 1_000_000
 _SAMPLES: Final = {True: (10, 2.0), False: (40, 10.0)}
-"""Samples per repeat and rate in Hz of a stream, by True for images of 1 MB."""
+"""Samples per repeat and rate in Hz of a stream; the key is True for images of 1 MB."""
 
 
 def samples_of(size_bytes: int, streams: int, repeats: int) -> int:

@@ -67,19 +67,19 @@ class Expectation:
         return (value < self.bound) is self.is_below
 
 
-def parse(text: str, known: Iterable[Quantity]) -> Expectation:
+def parse(text: str, quantities: Iterable[Quantity]) -> Expectation:
     """Parse the text of an expectation.
 
     Args:
         text: `NAME < AMOUNT`, with `<`, `<=`, `>` or `>=`. The prefix `every` (or `max` with `<`, `min`
             with `>`) refers to each repeat. The prefix `90 % of` refers to a share of all repeats, and the suffix `of
             all packets` to all packets together. `tcp` or `udp` at the start restricts it to one protocol.
-        known: The possible figures.
+        quantities: The possible figures.
 
     Raises:
         ConfigurationError: The text is not an expectation, or its figure is unknown.
     """
-    by_name = {quantity.name: quantity for quantity in known}
+    by_name = {quantity.name: quantity for quantity in quantities}
     match = _TEXT.fullmatch(text.strip())
     if match is None:
         raise ConfigurationError(f"{text[:60]!r} is not an expectation", remedy=f"write for example: {_FORMS}")

@@ -83,5 +83,5 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
         sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
     name = backend_name(arguments, site)
     chosen = load_backend(name, site, document)
-    chosen.permissions = permissions.given(arguments)
+    chosen.permissions = permissions.granted(arguments)
     return name, chosen

@@ -38,8 +38,8 @@ class CliOptions:
             value = getattr(arguments, name, None)
             values = value if isinstance(value, list) else [] if value is None else [value]
             self._options += [(f"--{name}", str(item)) for item in values]
-        if given := permissions.given(arguments):
-            self._options += [(permissions.option(name), "") for name in permissions.repeated(given)]
+        if granted_names := permissions.granted(arguments):
+            self._options += [(permissions.option(name), "") for name in permissions.repeated(granted_names)]
 
     def completed(self, match: re.Match[str]) -> str:
         """Return the matched command with those of the given options that it accepts."""

@@ -290,7 +290,7 @@ class ProfileSection(Strict):
     placement: ClassVar[str] = ""
 
     def contradiction(self, profile: "RobotProfile") -> str | None:  # noqa: ARG002 (most fit every profile)
-        """Return why the section contradicts the rest of the profile; None if it does not."""
+        """Return the reason why the section contradicts the rest of the profile; None if it does not."""
         return None
 
 

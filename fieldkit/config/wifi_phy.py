@@ -59,7 +59,7 @@ class WifiPhy(Strict):
         return self
 
     def standard_error(self, standard: str) -> str | None:
-        """Return why a radio of this standard, `802.11ac 5 GHz`, cannot have this layer; None if it can."""
+        """Return the reason why a radio of a standard, `802.11ac 5 GHz`, cannot have this layer; None if it can."""
         match = _STANDARD.fullmatch(standard)
         if match is None:
             return f"phy needs a standard with its band, not {standard!r}; write one of: {_STANDARD_EXAMPLES}"

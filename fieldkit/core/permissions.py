@@ -43,7 +43,7 @@ def repeated(names: Iterable[str]) -> list[str]:
     return sorted(name for name in names if permissions[name].is_repeated)
 
 
-def given(arguments: argparse.Namespace) -> frozenset[str]:
+def granted(arguments: argparse.Namespace) -> frozenset[str]:
     """Return the names of the permissions that the operator gave; commands without these options give none."""
     names = (point.name for point in plugins.entry_points(plugins.PERMISSIONS))
     return frozenset(name for name in names if getattr(arguments, f"allow_{name.replace('-', '_')}", False))

@@ -82,7 +82,7 @@ class Drive(ProfileSection):
         return "a robot with drive needs a fence; set limits.fence_m" if profile.limits.fence_m is None else None
 
     def topic_conflict(self, robot: Robot, others: Iterable[Robot]) -> str | None:
-        """Return why a robot cannot be driven by this section next to other robots; None if it can.
+        """Return the reason why a robot cannot be driven by this section next to other robots; None if it can.
 
         Robots that share a ROS master or a ROS 2 domain receive each other's topics. No other robot may subscribe to
         the robot's velocity topic or publish its odometry topic.

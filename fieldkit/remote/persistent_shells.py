@@ -196,12 +196,12 @@ class RunningCommand:
             self._out.feed(self._channel.recv(_CHUNK))
         if self._channel.recv_stderr_ready():
             self._err.feed(self._channel.recv_stderr(_CHUNK))
-        return self._ended or self._is_cut_off
+        return self._has_ended or self._is_cut_off
 
     @property
     def status_event(self) -> threading.Event:
         """An event that is set when the exit code is known, or cannot become known."""
-        return self._end_event if self._ended else self._channel.status_event
+        return self._end_event if self._has_ended else self._channel.status_event
 
     def fileno(self) -> int:
         """Return a descriptor that is readable when data have arrived that `eof_received` has not read."""
@@ -254,13 +254,13 @@ class RunningCommand:
     def close(self) -> None:
         """Release the shell if the command has ended; otherwise close the shell."""
         reservation, self._reservation = self._reservation, None
-        if not self._ended:
+        if not self._has_ended:
             self._channel.close()
         elif reservation is not None:
             reservation.release()
 
     @property
-    def _ended(self) -> bool:
+    def _has_ended(self) -> bool:
         if self._out.code is not None and self._err.code is not None:
             self._end_event.set()
         return self._end_event.is_set()

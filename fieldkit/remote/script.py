@@ -110,9 +110,9 @@ def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> 
         or f"`{completed.argv[0]}` ended with exit code {completed.exit_code}: {output}"
     )
     match completed.exit_code:
-        case 75 if held := _HELD.match(what):  # exit codes of the script, see common.sh
-            age, remaining = (format_duration(float(held[name])) for name in ("age", "rest"))
-            holder = f"{held['who']} holds it since {_start_time(held)}, {age} ago, for {held['what']}"
+        case 75 if match := _HELD.match(what):  # exit codes of the script, see common.sh
+            age, remaining = (format_duration(float(match[name])) for name in ("age", "rest"))
+            holder = f"{match['who']} holds it since {_start_time(match)}, {age} ago, for {match['what']}"
             what = f"{holder}; expires in {remaining}"
             remedy = HELD_REMEDY
         case 76 if lost := _LOST.match(what):

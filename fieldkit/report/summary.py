@@ -38,7 +38,7 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
     repeats = evidence.repeats
     trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")
     return (
-        f"{trials} of {wording.join_names(_values(cells, 'procedure'))}{_when(repeats)}: {_distances(cells)}; "
+        f"{trials} of {wording.join_names(_values(cells, 'procedure'))}{_start_text(repeats)}: {_distances(cells)}; "
         f"{wording.join_words([name.upper() for name in _values(cells, 'protocol')])}; "
         f"{_topologies(cells)}{wording.join_words(_values(cells, 'backend'))} robots. "
         f"{format_count(len(repeats), 'attempt')}: {status_counts(Counter(repeats.texts['status']))}. "
@@ -83,24 +83,24 @@ def _values(cells: Sequence[Cell], name: str) -> list[str]:
 
 
 def _topologies(cells: Sequence[Cell]) -> str:
-    known = sorted({name for cell in cells if (name := wording.text(cell, "topology"))})
-    return f"{wording.join_words(known)}; " if known else ""
+    topologies = sorted({name for cell in cells if (name := wording.text(cell, "topology"))})
+    return f"{wording.join_words(topologies)}; " if topologies else ""
 
 
 def _distances(cells: Sequence[Cell]) -> str:
-    known = sorted((cell for cell in cells if cell.key["distance_m"] is not None), key=wording.metres)
-    if not known:
+    with_distance = sorted((cell for cell in cells if cell.key["distance_m"] is not None), key=wording.metres)
+    if not with_distance:
         return "distances unknown"
-    ends = list(dict.fromkeys(wording.distance(cell) for cell in (known[0], known[-1])))
+    ends = list(dict.fromkeys(wording.distance(cell) for cell in (with_distance[0], with_distance[-1])))
     return " to ".join(ends)
 
 
-def _when(repeats: Repeats) -> str:
+def _start_text(repeats: Repeats) -> str:
     started = repeats.numbers["started_utc_ns"]
-    known = started[np.isfinite(started)]
-    if not len(known):
+    known_starts = started[np.isfinite(started)]
+    if not len(known_starts):
         return ""
-    first, last = (utc(float(end)) for end in (known.min(), known.max()))
+    first, last = (utc(float(end)) for end in (known_starts.min(), known_starts.max()))
     if first[:10] == last[:10]:
         return f" on {first[:10]} from {first[11:]} to {last[11:]} UTC" if first != last else f" on {first} UTC"
     return f" from {first} to {last} UTC"

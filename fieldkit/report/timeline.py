@@ -198,18 +198,20 @@ def _spread_over_job(
 
 
 def estimate_send_times(
-    number: NDArray[np.int64], known: NDArray[np.float64], at_s: NDArray[np.float64]
+    number: NDArray[np.int64], answered: NDArray[np.float64], at_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return approximate send times of requests without a reply, interpolated by sequence number.
 
     Args:
         number: Sequence numbers of those requests.
-        known: Sequence numbers of answered requests, ascending.
+        answered: Sequence numbers of answered requests, ascending.
         at_s: Times of the replies to these.
     """
-    step_s = (at_s[-1] - at_s[0]) / (known[-1] - known[0]) if len(known) > 1 else 1.0  # default interval of ping
-    interpolated: NDArray[np.float64] = np.interp(number, known, at_s)
-    steps_outside: NDArray[np.float64] = np.minimum(number - known[0], 0) + np.maximum(number - known[-1], 0)
+    step_s = (
+        (at_s[-1] - at_s[0]) / (answered[-1] - answered[0]) if len(answered) > 1 else 1.0
+    )  # default interval of ping
+    interpolated: NDArray[np.float64] = np.interp(number, answered, at_s)
+    steps_outside: NDArray[np.float64] = np.minimum(number - answered[0], 0) + np.maximum(number - answered[-1], 0)
     return interpolated + step_s * steps_outside
 
 

@@ -60,7 +60,7 @@ def roles(word: str) -> list[str]:
 
 
 def problem(word: str, *, has_program: bool) -> str | None:
-    """Return why an argument has an invalid variable; None if all are valid.
+    """Return the reason why an argument has an invalid variable; None if all are valid.
 
     Args:
         word: The argument.

@@ -122,7 +122,7 @@ class ChecksPlacement(Capability):
 
     @abstractmethod
     def placement_error(self, earlier: "Sequence[Step]", within: "Sequence[Nest]") -> str | None:
-        """Return why the step is not allowed at its position in the procedure; None if it is.
+        """Return the reason why the step is not allowed at its position in the procedure; None if it is.
 
         Args:
             earlier: The steps that start before it.

@@ -165,7 +165,7 @@ class EmulatedBackend:
             yield up
 
     def persistent_shells(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:  # noqa: ARG002 (none)
-        """Implement `Backend.standing`: emulated robots stop with their lab, so there are none."""
+        """Implement `Backend.persistent_shells`: emulated robots stop with their lab, so there are none."""
         return nullcontext({})
 
     @contextmanager

@@ -21,7 +21,7 @@ class DriveSection(Protocol):
     acceleration_m_s2: float
 
     def topic_conflict(self, robot: Robot, others: Iterable[Robot]) -> str | None:
-        """Return why a robot cannot be driven by this section next to other robots; None if it can."""
+        """Return the reason why a robot cannot be driven by this section next to other robots; None if it can."""
         ...
 
 

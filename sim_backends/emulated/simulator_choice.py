@@ -112,8 +112,8 @@ def bodies_of(robots: Iterable[Robot | LabRobot]) -> dict[str, RobotBody]:
 
 def _body(profile: RobotProfile) -> RobotBody:
     """Return the body of a profile, or of a TurtleBot3 if there is none, with the limits of its base."""
-    known = BODIES.get(profile.name)
-    limits = known if isinstance(known, DriveLimits) else TURTLEBOT3_BURGER
+    body = BODIES.get(profile.name)
+    limits = body if isinstance(body, DriveLimits) else TURTLEBOT3_BURGER
     limits = replace(limits, speed_m_s=float(profile.limits.max_speed_m_s))
     if (drive := drive_of(profile)) is not None:
         limits = replace(limits, acceleration_m_s2=drive.acceleration_m_s2, turn_rad_s=drive.turn_rad_s)

@@ -213,7 +213,7 @@ def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
     """
     count = reader.count(STATE.size)
     begin = reader.position
-    return unpack_states(reader.take(count * STATE.size), begin, agents)
+    return unpack_states(reader.read_bytes(count * STATE.size), begin, agents)
 
 
 def unpack_states(data: bytes, begin: int, agents: AgentTable) -> ReceivedStates:

@@ -144,14 +144,14 @@ def read_header(data: bytes | bytearray, max_bytes: int = MAX_FRAME_BYTES) -> He
         MalformedFrameError: The size, the kind or the reserved field is invalid.
     """
     size, kind, reserved, request, copy = _HEADER.unpack_from(data)
-    known = _KINDS.get(kind)
-    if known is None:
+    message_kind = _KINDS.get(kind)
+    if message_kind is None:
         raise UnknownKindError(4, f"there is no kind of message {kind}")
     if size > max_bytes:
         raise MalformedFrameError(0, f"a size of {size} bytes is above {max_bytes}")
     if reserved:
         raise MalformedFrameError(6, f"the reserved field is {reserved}, not 0")
-    return Header(size, known, request, copy)
+    return Header(size, message_kind, request, copy)
 
 
 class FrameReader:
@@ -186,7 +186,7 @@ class FrameReader:
             self._fail_at_end()
         return layout.unpack_from(self._body, at)
 
-    def take(self, size: int) -> bytes:
+    def read_bytes(self, size: int) -> bytes:
         """Return the next bytes.
 
         Raises:
@@ -208,7 +208,7 @@ class FrameReader:
         if length > MAX_TEXT_BYTES:
             raise MalformedFrameError(position, f"a text of {length} bytes is longer than {MAX_TEXT_BYTES}")
         try:
-            return self.take(length).decode()
+            return self.read_bytes(length).decode()
         except UnicodeDecodeError as error:
             raise MalformedFrameError(position + 2 + error.start, "the text is not UTF-8") from None
 

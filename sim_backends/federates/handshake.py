@@ -199,7 +199,7 @@ class Hello:
         table = AgentTable()
         agents = [_read_agent(reader, table) for _ in range(reader.count(_AGENT_BYTES))]
         position = reader.position
-        configuration = reader.take(reader.count(1))
+        configuration = reader.read_bytes(reader.count(1))
         reader.end()
         hello = Hello(role, agents, seed, step_ns, end_ns, name, configuration, heartbeat_ms, token)
         if configuration_hash != hello.configuration_hash:
@@ -216,7 +216,7 @@ def _read_agent(reader: FrameReader, table: AgentTable) -> AgentStart:
             position, f"the agent's name {name!r} is empty or not unique, or there are too many"
         )
     table.add([name])
-    states = read_states(FrameReader(count_bytes(1) + reader.take(STATE.size)), table)
+    states = read_states(FrameReader(count_bytes(1) + reader.read_bytes(STATE.size)), table)
     if name not in states:
         raise MalformedFrameError(position, f"the start of {name} has the index of another agent")
     return AgentStart(name, profile, states[name], bool(flies), antenna_m, states.limits_m_s2[name])
@@ -284,13 +284,13 @@ class Welcome:
         reader.end()
         if not all(math.isfinite(sum(position)) for position in emitters_m):
             raise MalformedFrameError(reader.position, "the position of an emitter is not finite")
-        known = FederateCapability(bits & int(~FederateCapability(0)))
+        capabilities_known = FederateCapability(bits & int(~FederateCapability(0)))
         return Welcome(
             role,
             name,
             configuration_hash,
             software,
-            known,
+            capabilities_known,
             step_ns,
             next_event_ns,
             commands,

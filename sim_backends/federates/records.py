@@ -145,7 +145,7 @@ def read_arrivals(reader: FrameReader, agents: AgentTable) -> list[Arrival]:
     count = reader.count(_ARRIVAL.size)
     begin, names = reader.position, agents.names
     arrivals: list[Arrival] = []
-    for packet_id, at_ns, index, reserved in _ARRIVAL.iter_unpack(reader.take(count * _ARRIVAL.size)):
+    for packet_id, at_ns, index, reserved in _ARRIVAL.iter_unpack(reader.read_bytes(count * _ARRIVAL.size)):
         if reserved or index >= len(names):
             position = begin + len(arrivals) * _ARRIVAL.size
             if reserved:
@@ -196,7 +196,9 @@ def read_arrival_delays(reader: FrameReader, count: int) -> list[ArrivalDelay]:
         MalformedFrameError: There are not as many, or a part is negative.
     """
     begin = reader.position
-    delays = [ArrivalDelay(*parts) for parts in _DELAY_PARTS.iter_unpack(reader.take(count * _DELAY_PARTS.size))]
+    delays = [
+        ArrivalDelay(*parts) for parts in _DELAY_PARTS.iter_unpack(reader.read_bytes(count * _DELAY_PARTS.size))
+    ]
     for number, parts in enumerate(delays):
         if min(parts) < 0:
             raise MalformedFrameError(begin + number * _DELAY_PARTS.size, f"a part of a delay is {min(parts)} ns")

@@ -43,7 +43,7 @@ class GazeboOptions(SimulatorOptions):
         velocity: Velocities are the difference of positions over the last `step`, or over the `window` at half the
             cost.
         gravity_m_s2: Gravity that is compensated for robots that fly; 0 if their links have no gravity.
-        yaw_gain_per_s: Turning rate of robots that fly per difference of their direction.
+        yaw_gain_per_s: Commanded yaw rate of robots that fly, per radian of heading error.
         control_period_s: Interval between commands to robots that fly, in simulated time.
         limit_m_s2: Largest acceleration, for `error_bounded`; if omitted, that policy exchanges every step while an
             agent sends.

@@ -354,8 +354,8 @@ def _limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | 
             ) from error
     if agent.flies:
         return quadrotor(agent.profile)
-    known = BODIES.get(agent.profile)
-    return known if isinstance(known, DriveLimits) else TURTLEBOT3_BURGER
+    built_in_limits = BODIES.get(agent.profile)
+    return built_in_limits if isinstance(built_in_limits, DriveLimits) else TURTLEBOT3_BURGER
 
 
 def _model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: World | None) -> Model:

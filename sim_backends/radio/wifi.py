@@ -193,8 +193,8 @@ class Wifi(Generic[Payload]):
         if relay is None or relay in {station.index, receiver}:
             frame = Frame(payload, size_bytes, source, receiver, (), True, identity, now_ns, before)
         else:
-            kept = receiver is None
-            frame = Frame(payload, size_bytes, source, relay, (receiver,), kept, identity, now_ns, before)
+            is_broadcast = receiver is None
+            frame = Frame(payload, size_bytes, source, relay, (receiver,), is_broadcast, identity, now_ns, before)
         frame.max_attempts = max_attempts
         self._enqueue(now_ns, station, frame)
 

@@ -145,7 +145,7 @@ class RosSubscriber:
         for uri in new:
             threading.Thread(target=self._receive, args=(uri,), daemon=True).start()
 
-    def take(self, deadline_s: float | None) -> bytes:
+    def receive(self, deadline_s: float | None) -> bytes:
         """Return the next message.
 
         Raises:

@@ -104,11 +104,11 @@ def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> Non
     left, arrived = topic_logs.rows(sent), topic_logs.rows(came)
     kinds = [row[0] for row in left if row[0] != records.SKIPPED]
     assert kinds[:3] == [records.ORIGIN, records.BEGUN, records.MATCHED]
-    wanted = [row[2:5] for row in left if row[0] == records.SAMPLE]
-    assert wanted
-    assert [row[2:5] for row in arrived if row[0] == records.SAMPLE] == wanted
+    expected = [row[2:5] for row in left if row[0] == records.SAMPLE]
+    assert expected
+    assert [row[2:5] for row in arrived if row[0] == records.SAMPLE] == expected
     kind, _, _, count, checked, _ = arrived[-1]
-    assert (kind, count, checked) == (records.END, len(wanted), records.CHECKED)
+    assert (kind, count, checked) == (records.END, len(expected), records.CHECKED)
 
 
 @pytest.mark.emulated

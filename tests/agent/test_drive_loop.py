@@ -59,10 +59,10 @@ def test_messages_are_those_of_rosbags(names: tuple[str, str], cdr: bool) -> Non
     assert read == pytest.approx(pose)
     kinds = STORES[cdr].types
     vector = kinds["geometry_msgs/msg/Vector3"]
-    wanted = kinds["geometry_msgs/msg/Twist"](vector(0.25, 0.0, 0.0), vector(0.0, 0.0, -0.5))
+    expected = kinds["geometry_msgs/msg/Twist"](vector(0.25, 0.0, 0.0), vector(0.0, 0.0, -0.5))
     serialize = STORES[cdr].serialize_cdr if cdr else STORES[cdr].serialize_ros1
     twist = drive.twist(DriveVelocity(0.25, -0.5), cdr=cdr)
-    assert twist == bytes(serialize(wanted, "geometry_msgs/msg/Twist"))
+    assert twist == bytes(serialize(expected, "geometry_msgs/msg/Twist"))
 
 
 @given(st.binary(max_size=300), st.booleans())

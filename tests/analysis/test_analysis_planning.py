@@ -58,11 +58,11 @@ def test_the_planned_number_gives_the_wanted_width(rate: float, spread: float) -
         return shares(random.binomial(36, rates), np.full((400, n), 36))
 
     now = cells(20)
-    wanted = float(np.median(now.high - now.low)) / 2 / 3
-    more = int(np.median(sample_size.additional_repeats(now, 20, wanted, Kind.COUNTED)))
+    expected = float(np.median(now.high - now.low)) / 2 / 3
+    more = int(np.median(sample_size.additional_repeats(now, 20, expected, Kind.COUNTED)))
     then = cells(20 + more)
     assert 100 < more < 260
-    assert float(np.median(then.high - then.low)) / 2 == pytest.approx(wanted, rel=0.05)
+    assert float(np.median(then.high - then.low)) / 2 == pytest.approx(expected, rel=0.05)
 
 
 def test_the_planned_repeats_without_losses_give_the_required_width() -> None:

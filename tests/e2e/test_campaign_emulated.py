@@ -67,7 +67,7 @@ def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path
     assert run.code == 0, run.err
     (planned,) = run.events("campaign_planned")
     assert (len(planned["trials"]), planned["total"]) == (3, 4)
-    assert trials(folder)[:2] == before, "the trial that was killed goes on in its folder"
+    assert trials(folder)[:2] == before, "the killed trial continues in its folder"
     assert len(trials(folder)) == 4
     assert "recover" in {event["name"] for event in run.events("phase_started")}
     order = [f"los {distance} {topology}" for topology in Topology for distance in ("10ft", "20ft")]

@@ -32,9 +32,9 @@ pytestmark = pytest.mark.emulated
 
 UnderWay = Callable[[EmulatedTestbed], bool]
 
-# Longer than the time for noticing it, so that the connection is given up, and opened again when the sender is back.
+# Longer than the time until an outage is detected, so that fieldkit closes the connection and reconnects afterwards.
 OUTAGE_S = 8.0
-# So slow that a transfer takes about a second.
+# At this rate a transfer takes about a second.
 RADIO = "{rate: 500kbit/s}"
 RECORD_S = 2.0
 

@@ -182,8 +182,8 @@ def test_the_output_of_a_vendors_tool_fills_columns(lab_results: Mapping[str, La
 def test_a_program_of_the_lab_gets_the_distance_and_the_repeat(lab_results: Mapping[str, LabResults]) -> None:
     results = lab_results["vendor"]
     values = [(row["probe.words"], row["probe.copies"]) for row in results.rows()]
-    wanted = [f"<{at}><no {number}><{{repeat}}><${{distance}}>" for at in ("10m", "20m") for number in (1, 2)]
-    assert values == [(words, "1") for words in wanted], "the copy of each attempt is deleted after it"
+    expected = [f"<{at}><no {number}><{{repeat}}><${{distance}}>" for at in ("10m", "20m") for number in (1, 2)]
+    assert values == [(words, "1") for words in expected], "the copy of each attempt is deleted after it"
     assert not [path for trial in results.trials for path in trial.rglob("probe.sh")]
 
 
@@ -221,8 +221,8 @@ LABELS = {
 def test_the_aggregate_contains_all_values(lab_results: Mapping[str, LabResults], name: str) -> None:
     results = lab_results[name]
     cells = list(csv.DictReader(io.StringIO(results.outputs["aggregate"])))
-    wanted = {quantity: unit for quantity, (unit, *_) in LABELS[name].items()}
-    assert {cell["quantity"]: cell["unit"] for cell in cells}.items() >= wanted.items()
+    expected = {quantity: unit for quantity, (unit, *_) in LABELS[name].items()}
+    assert {cell["quantity"]: cell["unit"] for cell in cells}.items() >= expected.items()
     for cell in cells:
         column, _, _ = cell["quantity"].partition("=")  # a text has a line per word
         values = [row[column] for row in results.rows() if row["distance"] == cell["distance"]]

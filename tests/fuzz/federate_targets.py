@@ -41,7 +41,7 @@ class _OneSample:
     def __init__(self, sample: bytes) -> None:
         self._samples = [sample]
 
-    def take(self, deadline_s: float | None) -> bytes:
+    def receive(self, deadline_s: float | None) -> bytes:
         if not self._samples:
             raise ClosedError("the bus is empty")
         return self._samples.pop()

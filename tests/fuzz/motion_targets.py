@@ -131,11 +131,11 @@ def _tracks() -> dict[str, bytes]:
         "fix": [fix(BEGAN_NS + n * S, 48 + n / 1e5, 11.0) for n in range(9)],
         "transform": [transform(BEGAN_NS + n * S, float(n), 0.0, "base") for n in range(9)],
     }
-    found = {}
+    actual = {}
     for name, messages in messages_by_kind.items():
         with tempfile.TemporaryDirectory() as folder:
-            found[name] = write_bag(Path(folder), messages).read_bytes()
-    return found
+            actual[name] = write_bag(Path(folder), messages).read_bytes()
+    return actual
 
 
 def _check_samples(samples: Samples) -> None:
@@ -173,8 +173,8 @@ def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
     (folder / position_sources.FILE).write_bytes(data)
     evidence = AttemptEvidence(attempt)
     times_ns = [BEGAN_NS + S, BEGAN_NS + 3 * S]
-    found = position_columns.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
-    assert all(math.isfinite(float(value)) for value in found.values.values())  # gates reject excessive distances
+    actual = position_columns.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
+    assert all(math.isfinite(float(value)) for value in actual.values.values())  # gates reject excessive distances
     position_columns.distances_m(evidence, _ENDS)
     recorded_positions.readable_samples(evidence)
     output_text = position_sources.read(folder / position_sources.FILE)

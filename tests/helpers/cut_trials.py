@@ -140,7 +140,7 @@ def cuts_at_every_sync(disk: Disk, place: Path, *, without: str = "") -> tuple[l
 
 
 @contextmanager
-def at_call(number: int, then: Callable[[], None]) -> Iterator[None]:
+def at_call(number: int, action: Callable[[], None]) -> Iterator[None]:
     """Call a function after the body has made `number` function calls and returns.
 
     The count measures the progress of a trial reproducibly, unlike time.
@@ -152,7 +152,7 @@ def at_call(number: int, then: Callable[[], None]) -> Iterator[None]:
         remaining_calls -= 1
         if remaining_calls < 0:
             sys.setprofile(None)
-            then()
+            action()
 
     sys.setprofile(count_call)
     try:

@@ -31,7 +31,7 @@ SERVER: Final = CompiledProgram(
 
 
 def missing_libraries() -> str:
-    """Return why the server cannot be compiled here; empty if it can."""
+    """Return the reason why the server cannot be compiled here; empty if it can."""
     packages = (*SERVER.packages, "nlohmann_json")
     try:
         missing = [

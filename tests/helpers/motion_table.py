@@ -29,15 +29,16 @@ _FAULTS: Final = {
 _CELLS: Final = {cell.name: cell for cell in CELLS}
 
 
-def tables(outcomes: Sequence[MotionOutcome], made: str) -> str:
+def tables(outcomes: Sequence[MotionOutcome], observed_on: str) -> str:
     """The tables of outcomes.
 
     Args:
         outcomes: Outcomes of any cells, in any order.
-        made: Date and machine of the observations.
+        observed_on: Date and machine of the observations.
     """
+    beyond = sum(bool(outcome.problems) for outcome in outcomes)
     lines = [
-        f"{made}: {len(outcomes)} trials, {sum(bool(outcome.problems) for outcome in outcomes)} beyond their bounds."
+        f"{observed_on}: {len(outcomes)} trials, {beyond} beyond their bounds.",
     ]
     for craft, title in _TITLES.items():
         rows = list(_rows(craft, outcomes))

@@ -13,7 +13,7 @@ from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
 
-LASTS_S = 6
+DURATION_S = 6
 REQUESTED = (("ATTITUDE", 50_000), ("LOCAL_POSITION_NED", 50_000))
 EDGE = 2 * len(REQUESTED)
 """Messages that may differ: one of each stream is in flight when the counters begin, and one when they end."""
@@ -25,7 +25,7 @@ def test_loss_behind_a_router_is_that_of_the_kernel(percent: int, tmp_path: Path
     log = tmp_path / "mavlink.tlog"
     words = ("unshare", "--net", "--", sys.executable, "-m", "tests.helpers.mavlink_loss")
     done = subprocess.run(
-        (*words, str(log), str(LASTS_S), str(percent)),
+        (*words, str(log), str(DURATION_S), str(percent)),
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -37,8 +37,8 @@ def test_loss_behind_a_router_is_that_of_the_kernel(percent: int, tmp_path: Path
     assert counted["periodic"] > 200
     assert counted["withheld"] > 10, "numbers have gaps that are not losses"
     values = tlog.measure(tlog.read(log, drones.SYSTEM, counted["ended_us"], REQUESTED), 0.0).values
-    came, sent = int(values["mavlink_periodic"]), int(values["mavlink_periodic_sent"])
-    assert abs(sent - came - counted["dropped"]) <= EDGE
-    assert came >= counted["periodic"] - counted["dropped"]
-    assert float(values["mavlink_loss"]) == pytest.approx(1 - came / sent)
+    received, sent = int(values["mavlink_periodic"]), int(values["mavlink_periodic_sent"])
+    assert abs(sent - received - counted["dropped"]) <= EDGE
+    assert received >= counted["periodic"] - counted["dropped"]
+    assert float(values["mavlink_loss"]) == pytest.approx(1 - received / sent)
     assert float(values["mavlink_loss_most"]) > float(values["mavlink_loss"])

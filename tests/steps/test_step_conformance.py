@@ -179,12 +179,14 @@ class Bench:
     def run(self, plan: Plan, sink: Callable[[Event], None] = lambda event: None) -> tuple[str, str, Path]:
         """Run a trial of one attempt; return its status, the reason, and the folder of its evidence."""
         self.testbed.place(plan.placement)
-        with locks.held(self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=sink):
+        with locks.locked_exclusively(
+            self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=sink
+        ):
             runner.begin(plan, self.testbed, self.out, sink, Stop())
         return self.ended(plan)
 
     def resume(self, plan: Plan) -> tuple[str, str, Path]:
-        with locks.held(
+        with locks.locked_exclusively(
             self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=lambda event: None
         ):
             resumption.continue_trial(self.out / plan.trial, self.testbed, lambda event: None, Stop())
@@ -309,7 +311,7 @@ def test_check_finds_missing_program(
     for module in (iperf3, soak):
         monkeypatch.setattr(module, "PROGRAM", "no-such-iperf3")
     plan = bench.plan(kind, _without_tools, EXAMPLES[kind].absent)
-    findings = preflight.check(plan, bench.testbed.shells, tmp_path, whole=False).findings
+    findings = preflight.check(plan, bench.testbed.shells, tmp_path, all_checks=False).findings
     failed = {(finding.robot, finding.check) for finding in findings if finding.status is Verdict.FAIL}
     programs = {(planned.role, planned.program) for planned in own_jobs(kind, plan)}
     expected = {(plan.cast[role].name, program) for role, program in programs if program.startswith("no-such")}

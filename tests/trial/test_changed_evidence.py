@@ -170,8 +170,8 @@ def test_bytes_that_are_consistent_in_their_file_are_compared_with_captures(
             content = everywhere(key, factor)(content)
         (tmp_path / name).unlink()
         (tmp_path / name).write_bytes(content)
-    found = gates.judge(stored_one.plan, stored_one.repeat, AttemptEvidence(tmp_path)).problems
-    assert any("capture" in one for one in found), found
+    actual = gates.judge(stored_one.plan, stored_one.repeat, AttemptEvidence(tmp_path)).problems
+    assert any("capture" in one for one in actual), actual
 
 
 def lines(keep: Callable[[str], bool]) -> Change:

@@ -23,25 +23,25 @@ def at(distance: str, topology: Topology = LOS.topology) -> Plan:
 
 
 def test_the_first_estimate_assumes_a_good_link_and_has_the_time_with_a_dead_link() -> None:
-    lasts = of_repeats(LOS, TCP, 20, [])
-    assert lasts.likely_s == pytest.approx(20 * LOS.procedure.expected_s(TCP))
-    assert lasts.most_s == pytest.approx(lasts.likely_s + 20 * 120.0), "a transfer waits for its limit of 120 s"
+    estimate = of_repeats(LOS, TCP, 20, [])
+    assert estimate.likely_s == pytest.approx(20 * LOS.procedure.expected_s(TCP))
+    assert estimate.most_s == pytest.approx(estimate.likely_s + 20 * 120.0), "a transfer waits for its limit of 120 s"
     assert of_trial(LOS, []).likely_s == pytest.approx(
         LOS.repeats * sum(LOS.procedure.expected_s(protocol) for protocol in LOS.protocols)
     )
-    assert ", up to 4" in str(lasts)
+    assert ", up to 4" in str(estimate)
 
 
 def test_finished_repeats_of_the_same_trial_are_preferred() -> None:
     here, elsewhere = at("30ft"), at("10ft")
-    known = [
+    finished = [
         FinishedRepeat(here, TCP, 130.0),
         FinishedRepeat(here, TCP, 150.0),
         FinishedRepeat(elsewhere, TCP, 9.0),
         FinishedRepeat(here, UDP, 8.0),
     ]
-    assert of_repeats(here, TCP, 3, known) == TimeEstimate(3 * 140.0, 3 * 150.0)
-    assert of_repeats(here, UDP, 3, known) == TimeEstimate(24.0, 24.0), "each protocol by its own repeats"
+    assert of_repeats(here, TCP, 3, finished) == TimeEstimate(3 * 140.0, 3 * 150.0)
+    assert of_repeats(here, UDP, 3, finished) == TimeEstimate(24.0, 24.0), "each protocol by its own repeats"
 
 
 def test_a_trial_reports_batteries_that_do_not_last_for_it() -> None:
@@ -54,21 +54,21 @@ def test_a_trial_reports_batteries_that_do_not_last_for_it() -> None:
 
 
 def test_a_larger_distance_than_any_before_may_have_a_dead_link() -> None:
-    known = [FinishedRepeat(at("10m"), TCP, 9.0), FinishedRepeat(at("20m"), TCP, 12.0)]
-    farther = of_repeats(at("30m"), TCP, 1, known)
+    finished = [FinishedRepeat(at("10m"), TCP, 9.0), FinishedRepeat(at("20m"), TCP, 12.0)]
+    farther = of_repeats(at("30m"), TCP, 1, finished)
     assert farther.likely_s == 12.0, "as at the farthest place so far"
     assert farther.most_s == estimates.dead_link_s(LOS.procedure, TCP)
-    assert of_repeats(at("15m"), TCP, 1, known) == TimeEstimate(10.5, 12.0), (
+    assert of_repeats(at("15m"), TCP, 1, finished) == TimeEstimate(10.5, 12.0), (
         "between two places, no longer than they took"
     )
-    assert of_repeats(at("5m"), TCP, 1, known) == TimeEstimate(9.0, 12.0)
+    assert of_repeats(at("5m"), TCP, 1, finished) == TimeEstimate(9.0, 12.0)
 
 
 def test_another_topology_is_used_if_the_same_has_no_repeats() -> None:
     other = next(topology for topology in Topology if topology is not LOS.topology)
-    known = [FinishedRepeat(at("10m", other), TCP, 50.0)]
-    assert of_repeats(at("10m"), TCP, 2, known) == TimeEstimate(100.0, 100.0)
-    assert of_repeats(at("10m"), TCP, 2, [*known, FinishedRepeat(at("10m"), TCP, 7.0)]) == TimeEstimate(14.0, 14.0)
+    finished = [FinishedRepeat(at("10m", other), TCP, 50.0)]
+    assert of_repeats(at("10m"), TCP, 2, finished) == TimeEstimate(100.0, 100.0)
+    assert of_repeats(at("10m"), TCP, 2, [*finished, FinishedRepeat(at("10m"), TCP, 7.0)]) == TimeEstimate(14.0, 14.0)
 
 
 def test_finished_repeats_with_a_dead_link_are_used() -> None:
@@ -114,11 +114,11 @@ TIMES = st.lists(
 )
 
 
-@given(known=TIMES, distance=st.sampled_from(["5m", "10m", "30m", "50m"]), count=st.integers(0, 50))
+@given(finished=TIMES, distance=st.sampled_from(["5m", "10m", "30m", "50m"]), count=st.integers(0, 50))
 def test_an_upper_end_is_never_below_what_is_expected(
-    known: list[tuple[str, Protocol, float]], distance: str, count: int
+    finished: list[tuple[str, Protocol, float]], distance: str, count: int
 ) -> None:
-    lasts = of_repeats(
-        at(distance), TCP, count, [FinishedRepeat(at(where), what, took_s) for where, what, took_s in known]
+    estimate = of_repeats(
+        at(distance), TCP, count, [FinishedRepeat(at(where), what, took_s) for where, what, took_s in finished]
     )
-    assert 0 <= lasts.likely_s <= lasts.most_s * (1 + 1e-9)
+    assert 0 <= estimate.likely_s <= estimate.most_s * (1 + 1e-9)

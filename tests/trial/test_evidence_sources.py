@@ -68,8 +68,8 @@ def test_the_page_has_the_table() -> None:
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)
-    wanted = f"{before}{BEGIN}{evidence_sources.markdown()}{END}{after}"
+    expected = f"{before}{BEGIN}{evidence_sources.markdown()}{END}{after}"
     if os.environ.get("FIELDKIT_WRITE_DOCS"):
-        PAGE.write_text(wanted, encoding="utf-8")
-    if text != wanted:
+        PAGE.write_text(expected, encoding="utf-8")
+    if text != expected:
         pytest.fail("docs/evidence.md differs from the rows; run this test with FIELDKIT_WRITE_DOCS=1")

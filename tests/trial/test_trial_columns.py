@@ -219,8 +219,8 @@ def write_trial(folder: Path, name: str, columns: Sequence[Column], *, with_plan
 
 
 def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Path) -> None:
-    found = tables.declared_in([write_trial(tmp_path, "one", vendor_trials.VENDOR_COLUMNS)])
-    assert found == (
+    actual = tables.declared_in([write_trial(tmp_path, "one", vendor_trials.VENDOR_COLUMNS)])
+    assert actual == (
         *trial_columns(),
         *(Column(**{**vars(column), "rank": 100}) for column in vendor_trials.VENDOR_COLUMNS),
     )
@@ -237,11 +237,11 @@ def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path:
     alone = write_trial(
         tmp_path, "one", (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS), with_plan=False
     )
-    found = {column.name: column for column in tables.declared_in([alone])}
+    actual = {column.name: column for column in tables.declared_in([alone])}
     for column in vendor_trials.NAMED_STEP_COLUMNS:
-        assert found[column.name] == column
+        assert actual[column.name] == column
     for column in vendor_trials.VENDOR_COLUMNS:
-        assert found[column.name] == table_files.undeclared(column.name)
+        assert actual[column.name] == table_files.undeclared(column.name)
 
 
 def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: Path) -> None:
@@ -313,9 +313,9 @@ def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:
     path = table.with_name("trial.yaml")
     spoiled = path.read_text(encoding="utf-8").replace("name: probe.level", "name: status", 1)
     path.write_text(spoiled, encoding="utf-8")
-    found = [column for column in tables.declared_in([table]) if column.name in {"status", "probe.level"}]
-    assert found[0] in IDENTITY
-    assert found[1] == table_files.undeclared("probe.level")
+    actual = [column for column in tables.declared_in([table]) if column.name in {"status", "probe.level"}]
+    assert actual[0] in IDENTITY
+    assert actual[1] == table_files.undeclared("probe.level")
 
 
 def test_a_plan_that_is_a_link_is_not_read(tmp_path: Path) -> None:

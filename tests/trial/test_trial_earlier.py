@@ -58,9 +58,9 @@ def _waiting(attempt: Attempt, role: str, chosen: Chosen) -> list[Packet]:
     """Return packets sent in the other repeat, as if they were delayed until the start of this one."""
     other = Attempt(LOSSLESS / "repeats" / f"{attempt.protocol}-02", attempt.protocol)
     began_us, _ = attempt.packets("receiver.pcap")[0]
-    found = [(began_us, rest) for _, rest in _left(other.packets(f"{role}.pcap"), role, chosen)]
-    assert found
-    return found
+    actual = [(began_us, rest) for _, rest in _left(other.packets(f"{role}.pcap"), role, chosen)]
+    assert actual
+    return actual
 
 
 def _changed(packet: Packet, at: int, by: bytes) -> Packet:

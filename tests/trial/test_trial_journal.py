@@ -29,10 +29,10 @@ def test_a_torn_journal_gives_every_complete_entry(
     folder = tmp_path_factory.mktemp("trial")
     journal.append(folder, *written)
     path = folder / journal.JOURNAL_FILE
-    whole = path.read_bytes()
-    kept = whole[: max(0, len(whole) - cut)]
-    path.write_bytes(kept)
-    complete = kept.count(b"\n")
+    content = path.read_bytes()
+    torn = content[: max(0, len(content) - cut)]
+    path.write_bytes(torn)
+    complete = torn.count(b"\n")
     read = journal.read(folder)
     # A last line that lost only its line end is still complete.
     assert read in (written[:complete], written[: complete + 1])
@@ -54,7 +54,7 @@ def test_no_journal_is_an_error(tmp_path: Path) -> None:
         journal.read(tmp_path)
 
 
-def test_ended_pairs_start_and_end(tmp_path: Path) -> None:
+def test_ended_attempts_have_the_times_of_their_start(tmp_path: Path) -> None:
     journal.append(
         tmp_path,
         JournalEntry(1, Protocol.UDP, 1, 0, Status.PLANNED),

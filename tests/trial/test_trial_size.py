@@ -16,7 +16,7 @@ def test_a_longer_recording_leaves_more_on_both_ends_and_nothing_on_the_relay() 
     short, long = los_plan(record_s=15), los_plan(record_s=150)
     for role in (Role.SENDER, Role.RECEIVER):
         grown = size.evidence_bytes(long, role) - size.evidence_bytes(short, role)
-        assert grown > 9 * size.SPARE * 224_000, "nine times 15 s more, of 15 kB a second"
+        assert grown > 9 * size.SPARE * 224_000, "135 s more at 15 kB/s are 9 * 224 kB"
     assert size.evidence_bytes(long, Role.RELAY) == 0
 
 

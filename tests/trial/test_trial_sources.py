@@ -24,12 +24,12 @@ def trial(folder: Path, name: str) -> Path:
 
 
 def test_trials_below_a_folder_are_sorted_without_hidden_ones(tmp_path: Path) -> None:
-    wanted = [trial(tmp_path / "campaign_lawn", "3"), trial(tmp_path, "ones/1"), trial(tmp_path, "ones/2")]
+    expected = [trial(tmp_path / "campaign_lawn", "3"), trial(tmp_path, "ones/1"), trial(tmp_path, "ones/2")]
     trial(tmp_path, ".trash")
     trial(tmp_path, "copy.partial")
     trial(tmp_path, "ones/1/repeats/udp-01")
     write(tmp_path, [ROW], "notes.csv")
-    assert read_from(tmp_path) == [str(table) for table in wanted]
+    assert read_from(tmp_path) == [str(table) for table in expected]
 
 
 def test_a_table_with_several_paths_counts_once(tmp_path: Path) -> None:

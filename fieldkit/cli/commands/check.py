@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         with backend.open(plan.cast, seed=plan.seed, sink=sink, operator=Unattended()) as lab:
             lab.place(plan.placement)
             sink(PhaseStarted("check"))
-            findings = preflight.check(plan, lab.shells, Path("trials"), whole=True).findings
+            findings = preflight.check(plan, lab.shells, Path("trials"), all_checks=True).findings
         if arguments.json:
             for finding in findings:
                 sink(finding)

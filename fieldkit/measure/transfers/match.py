@@ -347,7 +347,7 @@ def _nearest(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns:
 
 
 def _clock_offset_ns(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> tuple[int, bool]:
-    """Return the receiver's clock minus the sender's, including the delay; False if it is only a rough estimate.
+    """Return the receiver's clock minus the sender's, including the delay, and False if it is only a rough estimate.
 
     It is known from items with a unique key or, if there are none, from groups of which all items arrived.
     """

@@ -58,7 +58,7 @@ def contradictions(log: Sequence[FlightMoment], plan: FlyPlan) -> Iterator[str]:
 
 
 def telemetry_contradiction(log: Sequence[FlightMoment], places_m: Floats) -> str | None:
-    """Return why telemetry cannot be of the same flight as the log; None if it can.
+    """Return the reason why telemetry cannot be of the same flight as the log; None if it can.
 
     Args:
         log: The log.

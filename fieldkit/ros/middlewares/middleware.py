@@ -92,7 +92,7 @@ _RMW: Final = re.compile(r"rmw_\w+", re.ASCII)
 
 
 def invalid_setting_reason(name: str) -> str:
-    """Return why `name` is not a setting of ROS 2; empty if it is valid."""
+    """Return the reason why `name` is not a setting of ROS 2; empty if it is valid."""
     if not _VARIABLE.fullmatch(name):
         return f"settings of ros2 are environment variables, not {name!r}"
     return f"{name} is set by the key {_KEY_OF_VARIABLE[name]}, not in settings" if name in _KEY_OF_VARIABLE else ""

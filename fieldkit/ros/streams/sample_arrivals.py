@@ -81,8 +81,8 @@ def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
     at_ns = samples.at_ns[first]
     rank = np.minimum(np.searchsorted(heads.sequence, numbers), len(heads) - 1)
     is_captured = heads.sequence[rank] == numbers
-    known = np.concatenate((numbers, heads.sequence))
-    after_gap = (numbers > 0) & ~np.isin(numbers - 1, known)
+    all_numbers = np.concatenate((numbers, heads.sequence))
+    after_gap = (numbers > 0) & ~np.isin(numbers - 1, all_numbers)
     released_ns = np.where(is_captured, 0, at_ns)
     released_ns[after_gap & is_captured] = np.minimum(at_ns, heads.at_ns[rank] + _MAX_RELEASE_WAIT_NS)[
         after_gap & is_captured

@@ -202,11 +202,11 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
     """Yield a contradiction if a log has samples more often than the capture."""
     numbers, copies = np.unique(samples.sequence, return_counts=True)
     captured_numbers, captured_copies = np.unique(subscriber.heads.sequence, return_counts=True)
-    known = np.isin(numbers, captured_numbers)
+    is_captured = np.isin(numbers, captured_numbers)
     max_copies = np.ones(len(numbers), dtype=np.int64)
     if not subscriber.is_tcp:  # TCP delivers every byte once, even if it arrived several times
-        max_copies[known] = captured_copies[np.searchsorted(captured_numbers, numbers[known])]
-    if surplus := int(((copies > max_copies) & (known | subscriber.is_tcp)).sum()):
+        max_copies[is_captured] = captured_copies[np.searchsorted(captured_numbers, numbers[is_captured])]
+    if surplus := int(((copies > max_copies) & (is_captured | subscriber.is_tcp)).sum()):
         yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"
 
 

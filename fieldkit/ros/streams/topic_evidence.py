@@ -71,7 +71,7 @@ def captured(step: StreamOptions, view: View) -> CapturedTopic:
 
 
 def dropped(step: StreamOptions, view: View) -> str:
-    """Return why columns that need captures are withheld; empty if the kernel dropped no packet before tcpdump."""
+    """Return the reason why columns of captures are withheld; empty if the kernel dropped no packet."""
     counts = {role: view.dropped(role) for role in (step.sender, step.receiver)}
     return " and ".join(
         f"the capture of {role} lacks {format_count(count, 'packet')} that its kernel dropped"

@@ -100,12 +100,12 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
     @schema.model_validator(mode="after")
     def _fits_its_kind(self) -> "FaultStep":
-        for key, given, wanted in (
+        for key, is_given, is_required in (
             ("for", self.lasts is not None, self.kind in _LASTING),
             ("process", self.process is not None, self.kind is FaultKind.KILL),
         ):
-            if given != wanted:
-                raise schema.validation_error(f"a {self.kind} {'needs' if wanted else 'does not allow'} {key}:")
+            if is_given != is_required:
+                raise schema.validation_error(f"a {self.kind} {'needs' if is_required else 'does not allow'} {key}:")
         return self
 
     @property

@@ -114,7 +114,7 @@ def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]
 
 
 def placement_error(what: str, within: Sequence[Nest]) -> str | None:
-    """Return why a step `what`, which records positions, must not be inside the steps `within`; None if it may."""
+    """Return the reason why the step `what`, which records positions, must not be inside `within`; None if it may."""
     if any(nest.has_path for nest in within):
         return f"a {what} starts where robots were placed: put the move into the {what}"
     if any(nest.disturbs or nest.parallel for nest in within):

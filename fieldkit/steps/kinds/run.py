@@ -114,7 +114,7 @@ class Bounds(Strict):
     max: Number | Int | None = None
 
     def problem(self, value: Value) -> str | None:
-        """Return why a value is out of bounds; None if it is within."""
+        """Return the reason why a value is out of bounds; None if it is within."""
         if isinstance(value, str):
             return None
         if self.min is not None and value < self.min:

@@ -41,7 +41,7 @@ class Holder:
 
 
 @contextmanager
-def held(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
+def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
     """Lock all robots while the body runs, as the only process of this machine with the holder's token.
 
     Raises:

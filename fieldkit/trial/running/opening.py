@@ -45,7 +45,9 @@ def opened(
         # Failure to unlock a transient robot does not matter, because the robot ends now.
         on_lost_lock = (lambda _: None) if isinstance(testbed, Transient) else sink
         with (
-            locks.held(testbed.shells, Holder(session, runtime.user_at_host(), what), sink=on_lost_lock),
+            locks.locked_exclusively(
+                testbed.shells, Holder(session, runtime.user_at_host(), what), sink=on_lost_lock
+            ),
             session_jobs.running(cast, testbed.shells, session, sink=sink),
         ):
             yield testbed

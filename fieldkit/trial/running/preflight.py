@@ -68,20 +68,20 @@ class Checked:
     variants: Mapping[Role, Variants]
 
 
-def check(plan: Plan, shells: Shells, out: Path, *, whole: bool) -> Checked:
+def check(plan: Plan, shells: Shells, out: Path, *, all_checks: bool) -> Checked:
     """Check every robot of the cast and this machine, and install the job script on each robot.
 
     Args:
         plan: The trial.
         shells: The robots.
         out: Folder of the trial.
-        whole: Whether to also check locks, and to run the checks that packages add (`plugins.CHECKS`).
+        all_checks: Whether to also check locks, and to run the checks that packages add (`plugins.CHECKS`).
     """
     reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
     variants_by_role: dict[Role, Variants] = {}
 
     def check_robot(role: Role) -> None:
-        _check(plan, role, shells[role], variants_by_role, reports[role], whole=whole)
+        _check(plan, role, shells[role], variants_by_role, reports[role], all_checks=all_checks)
 
     run_parallel(check_robot, plan.cast)
     for refusal in plan.refusals(variants_by_role):
@@ -100,7 +100,7 @@ def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[R
     Raises:
         RobotError: A check failed; the message lists each with its remedy.
     """
-    checked = check(plan, shells, folder.parent, whole=False)
+    checked = check(plan, shells, folder.parent, all_checks=False)
     findings = checked.findings
     fields = ((finding.robot, finding.check, finding.status, finding.detail, finding.remedy) for finding in findings)
     lines = map("\t".join, fields)
@@ -130,7 +130,7 @@ def require_passed(findings: Sequence[Finding]) -> None:
 
 
 def _check(
-    plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, whole: bool
+    plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, all_checks: bool
 ) -> None:
     stage, robot = _CONNECTION, plan.cast[role]
     try:
@@ -145,12 +145,12 @@ def _check(
         stage = "jobs"
         jobs.install(shell, Deadline.after(JOBS_S))
         # A trial has locked its robots already. A recording would disturb jobs of another user.
-        if whole and not _judge_lock(locks.holder(shell), report):
+        if all_checks and not _judge_lock(locks.holder(shell), report):
             return
         _judge_jobs(plan, jobs.list_running(shell, Deadline.after(JOBS_S)), report)
         stage = "agent"
         software.check_agent(plan, role, sections, shell, report)
-        if not whole:
+        if not all_checks:
             return
         for point in plugins.entry_points(plugins.CHECKS):
             stage = point.name
@@ -170,12 +170,12 @@ def _judge_jobs(plan: Plan, running_jobs: Sequence[str], report: Report) -> None
         report.ok("jobs", "no job of an earlier trial runs")
 
 
-def _judge_lock(held: LockState | None, report: Report) -> bool:
+def _judge_lock(lock: LockState | None, report: Report) -> bool:
     """Report the lock of a robot; return True if it is not locked."""
-    if held is None:
+    if lock is None:
         report.ok("lock", "the robot is not locked")
         return True
-    holder, remaining = held.holder, format_duration(held.left_s)
+    holder, remaining = lock.holder, format_duration(lock.left_s)
     report.fail("lock", f"{holder.user} holds the robot for {holder.purpose}, at most {remaining} more", HELD_REMEDY)
     return False
 

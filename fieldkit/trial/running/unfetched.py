@@ -53,11 +53,11 @@ class UnfetchedEvidence:
         for role in self.folders:
             self.mark(role, remote, into, reason)
 
-    def restore(self, ended: Attempt, kept: Path) -> None:
+    def restore(self, ended: Attempt, stored_folder: Path) -> None:
         """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder is marked so."""
         if ended.status is not Status.VALID and not self._transient:
             for role, folders in self.folders.items():
-                if (kept / unfetched_file(role)).is_file():
+                if (stored_folder / unfetched_file(role)).is_file():
                     folders.append(ended.remote(self._plan.trial))
 
     def by_robot(self) -> Mapping[str, Sequence[str]]:

@@ -141,7 +141,7 @@ def open_physics(
     hello = make_hello(scenario, world, bodies, seed, PHYSICS)
     federate = named(where, PHYSICS)
     if isinstance(federate, PythonFederate):
-        physics: PhysicsFederate = _made(federate, where, hello)
+        physics: PhysicsFederate = _make_federate(federate, where, hello)
         return physics
     return remote.open_physics(where, hello, deadline_s)
 
@@ -174,8 +174,8 @@ def open_network(
         hello = dataclasses.replace(hello, configuration=json.dumps(configuration).encode())
     federate = named(where, NETWORK)
     if isinstance(federate, PythonFederate):
-        made: NetworkFederate = _made(federate, where, hello)
-        return made
+        network: NetworkFederate = _make_federate(federate, where, hello)
+        return network
     network = remote.open_network(where, hello, deadline_s)
     supported = network.welcome.transports
     used = sorted({traffic.transport for traffic in scenario.traffic})
@@ -189,7 +189,7 @@ def open_network(
     return network
 
 
-def _made(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
+def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
     """Return a federate in this process.
 
     Raises:

@@ -61,10 +61,10 @@ class LocalErrors:
         """
         sums, counts = self.sums[measure], self.counts[measure]
         value = _slope(self.window_s.mean(axis=1), sums.sum(axis=1), counts.sum(axis=1))
-        begins = range(sums.shape[1])
+        begin_indices = range(sums.shape[1])
         without = [
             _slope(*(np.delete(values, begin, axis=1).sum(axis=1) for values in (self.window_s, sums, counts)))
-            for begin in begins
+            for begin in begin_indices
         ]
         return jackknife(value, np.array(without))
 

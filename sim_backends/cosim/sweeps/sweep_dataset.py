@@ -49,7 +49,7 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
     partitions = [factor.column for factor in plan.factors]
     schema = _schema((row for setting_rows in rows.values() for row in setting_rows), plan.factors)
     new, old = (folder.path / f".{folder.results.name}.{suffix}" for suffix in ("new", "old"))
-    with folder.explained():
+    with folder.error_conversion():
         for leftover in (new, old):
             shutil.rmtree(leftover, ignore_errors=True)
         for setting in plan.settings:
@@ -104,8 +104,8 @@ def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> p
             declarations[name] = {"unit": unit, "meaning": meaning.replace("as in the command", "as a number")}
             by.append(name)
     fields = [
-        pa.field(name, _arrow_type(found), metadata=declarations.get(name))
-        for name, found in types.items()
+        pa.field(name, _arrow_type(column_type), metadata=declarations.get(name))
+        for name, column_type in types.items()
         if name not in partitions
     ]
     metadata = {

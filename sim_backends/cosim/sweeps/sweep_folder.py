@@ -154,7 +154,7 @@ class SweepFolder:
                 remedy=f"all finished runs are saved; free some space, then continue: {self._continue_command}",
             ) from error
 
-    def explained(self) -> Any:  # noqa: ANN401 (a context manager)
+    def error_conversion(self) -> Any:  # noqa: ANN401 (a context manager)
         """Return a context manager that converts an `OSError` to a `ConfigurationError` with the way to continue."""
         return self._explained()
 

@@ -105,7 +105,7 @@ class Vehicle(VehicleBase):
             raise self._refusal("Takeoff denied: already in the air")
         if self.firmware.is_ardupilot and (self.mode is not Mode.OFFBOARD or height_m <= self.body.position_m[2]):
             raise self._refusal("Takeoff denied: not in GUIDED, or not upwards")
-        self._go(Mode.TAKEOFF, (*self.body.position_m[:2], height_m))
+        self._fly_to(Mode.TAKEOFF, (*self.body.position_m[:2], height_m))
 
     def go_to(self, goal_m: Vector) -> None:
         """Fly to a point relative to home, and stay there.
@@ -119,7 +119,7 @@ class Vehicle(VehicleBase):
             self.change_mode(Mode.OFFBOARD)
             self.accept_set_point(SetPoint(goal_m, is_place=True))
         else:
-            self._go(Mode.LOITER, goal_m)
+            self._fly_to(Mode.LOITER, goal_m)
             self.failsafes.mode_changed(self.body.now_ns)
 
     def accept_set_point(self, set_point: SetPoint) -> None:
@@ -232,7 +232,7 @@ class Vehicle(VehicleBase):
             self.report(_CRITICAL, refusal.reason)
         raise Refused(refusal.text)
 
-    def _go(self, mode: Mode, goal_m: Vector) -> None:
+    def _fly_to(self, mode: Mode, goal_m: Vector) -> None:
         if not all(map(math.isfinite, goal_m)) or not self.fence.contains(goal_m):
             raise self._refusal(f"{mode.name} denied: beyond the fence")
         self.mode, self.guidance.goal_m = mode, goal_m

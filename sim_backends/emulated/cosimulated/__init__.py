@@ -1,4 +1,4 @@
-"""The medium of a co-simulation: a physics moves emulated robots, and a network delivers their packets.
+"""The medium of a co-simulation: a physics moves emulated robots, and a network carries their packets.
 
 | module | purpose | imports |
 | --- | --- | --- |

@@ -126,8 +126,8 @@ class CosimulatedMedium(MediumServer):
         """Implement `Devices.first_ns`."""
         return self._queue[0].at_ns if self._queue else None
 
-    def take(self, last_ns: int) -> list[RealPacket]:
-        """Implement `Devices.take`."""
+    def pop_packets(self, last_ns: int) -> list[RealPacket]:
+        """Implement `Devices.pop_packets`."""
         packets, read = [], self._queue
         while read and read[0].at_ns <= last_ns:
             packets.append(read.popleft())
@@ -211,7 +211,7 @@ class CosimulatedMedium(MediumServer):
                 self._write(session, fate, packet, window.end_ns, end_ns)
             delivered.clear()
             for fate in window.ended:
-                session.forget(fate.packet)
+                session.remove_packet(fate.packet)
         lag_ns = time.monotonic_ns() - end_ns
         self._late_windows[rounded_up(max(lag_ns, 0))] += 1
         if lag_ns > _GIVE_UP_NS:

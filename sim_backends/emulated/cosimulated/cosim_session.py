@@ -95,7 +95,7 @@ class CosimSession:
         if close := getattr(self.network, "close", None):
             close()
 
-    def forget(self, packet: Packet) -> None:
+    def remove_packet(self, packet: Packet) -> None:
         """Remove a packet whose fate is decided from the record of the coordinator."""
         del self.coordinator.run.fates[packet.identity]
         self._arrival_delays.pop(packet.packet_id, None)

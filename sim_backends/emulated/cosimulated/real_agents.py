@@ -51,7 +51,7 @@ class Devices(Protocol):
         """Return the time of the first packet that `packets` has not returned yet, or None."""
         ...
 
-    def take(self, last_ns: int) -> list[RealPacket]:
+    def pop_packets(self, last_ns: int) -> list[RealPacket]:
         """Return the packets that were read up to a time and not taken before, in order of time."""
         ...
 
@@ -106,7 +106,7 @@ class RealAgents(Agents):
     @override
     def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[Sent], Mapping[str, State]]:
         self._devices.wait(end_ns)
-        packets = self._devices.take(last_ns)
+        packets = self._devices.pop_packets(last_ns)
         states = self.states(end_ns)
         self._reached_ns = end_ns
         return ([sent for packet in packets for sent in self._sent(packet, states)] if packets else []), states

@@ -114,8 +114,8 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
     hello = _hello(settings, PHYSICS, states)
     federate = named(name, PHYSICS)
     if isinstance(federate, PythonFederate):
-        made: PhysicsFederate = federate.load().make(hello)
-        return made
+        python_physics: PhysicsFederate = federate.load().make(hello)
+        return python_physics
     physics = remote.open_physics(name, hello, DEADLINE_S)
     if physics.step_ns != step_ns:
         physics.close()

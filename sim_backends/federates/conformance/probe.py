@@ -121,13 +121,13 @@ class FederateProbe:
         """Advance a physics; the commands apply from the time of the last call on, or from `from_ns`."""
         begin_ns = self.last_ns if from_ns is None else from_ns
         body = encode_advance_physics(to_ns, begin_ns, commands or {}, self.agents)
-        known = set(self.agents.names)
+        names_before = set(self.agents.names)
         decode = partial(_decode_advanced, agents=self.agents)
         advanced: Advanced = self.request(MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, decode, copy=copy)
         self.last_ns = to_ns
-        if set(self.agents.names) - known and not self.has(FederateCapability.AGENTS_APPEAR):
+        if set(self.agents.names) - names_before and not self.has(FederateCapability.AGENTS_APPEAR):
             raise CheckError(f"an agent appeared, {self.agents.names[-1]}, which it does not declare")
-        missing = known - advanced.states.keys()
+        missing = names_before - advanced.states.keys()
         if missing and not self.has(FederateCapability.AGENTS_DISAPPEAR):
             raise CheckError(f"there is no state of {', '.join(sorted(missing))}, and it does not declare this")
         return advanced

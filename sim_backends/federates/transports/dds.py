@@ -118,8 +118,8 @@ class DdsBus:
             if deadline_s is not None and time.monotonic() >= deadline_s:
                 raise DeadlineError("the wait reached its deadline")
 
-    def take(self, deadline_s: float | None) -> bytes:
-        """Implement `SampleBus.take`."""
+    def receive(self, deadline_s: float | None) -> bytes:
+        """Implement `SampleBus.receive`."""
         try:
             return self._samples.get(timeout=None if deadline_s is None else max(deadline_s - time.monotonic(), 0))
         except queue.Empty:

@@ -77,11 +77,11 @@ class Ros1Bus:
         if not count:
             raise ClosedError("the connection was closed")
 
-    def take(self, deadline_s: float | None) -> bytes:
-        """Implement `SampleBus.take`; messages with another layout are ignored."""
+    def receive(self, deadline_s: float | None) -> bytes:
+        """Implement `SampleBus.receive`; messages with another layout are ignored."""
         while True:
             try:
-                message = self._subscriber.take(deadline_s)
+                message = self._subscriber.receive(deadline_s)
             except TimeoutError as error:
                 raise DeadlineError("the wait reached its deadline") from error
             if len(message) >= _MESSAGE_HEAD.size:

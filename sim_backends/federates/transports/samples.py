@@ -46,7 +46,7 @@ class SampleBus(Protocol):
         """
         ...
 
-    def take(self, deadline_s: float | None) -> bytes:
+    def receive(self, deadline_s: float | None) -> bytes:
         """Return the next sample.
 
         Raises:
@@ -105,7 +105,7 @@ class SampleChannel:
         while not self._is_closed and not self._is_closed_by_peer:
             check_s = time.monotonic() + _CHECK_S
             try:
-                sample = self._bus.take(check_s if deadline_s is None else min(check_s, deadline_s))
+                sample = self._bus.receive(check_s if deadline_s is None else min(check_s, deadline_s))
             except DeadlineError:
                 if deadline_s is not None and time.monotonic() >= deadline_s:
                     raise
@@ -149,7 +149,7 @@ class SampleListener:
     def accept(self, deadline_s: float | None) -> SampleChannel:
         """Implement `ChannelListener.accept`."""
         while not self._waiting:
-            sample = self._bus.take(deadline_s)
+            sample = self._bus.receive(deadline_s)
             if _is_hello(sample):
                 self._waiting.append(sample)
         first = self._waiting.popleft()

@@ -96,7 +96,7 @@ class Ros1:
             self._published.add(name)
             if name in self._subscribed:
                 self._update(name)
-            return CallResponse(sizes.PUBLISHER_REGISTERED_BYTES, _nothing)
+            return CallResponse(sizes.PUBLISHER_REGISTERED_BYTES, _do_nothing)
 
         publisher = self._flows[name].publisher
         self._calls.call(publisher, self._master, sizes.REGISTER_PUBLISHER_BYTES, serve, self._options.register)
@@ -105,7 +105,7 @@ class Ros1:
         def serve() -> CallResponse:
             self._subscribed.add(name)
             if name not in self._published:
-                return CallResponse(sizes.SUBSCRIBER_REGISTERED_BYTES, _nothing)
+                return CallResponse(sizes.SUBSCRIBER_REGISTERED_BYTES, _do_nothing)
             size_bytes = sizes.SUBSCRIBER_REGISTERED_BYTES + sizes.PUBLISHER_BYTES
             return CallResponse(size_bytes, partial(self._request_topic, name))
 
@@ -117,7 +117,7 @@ class Ros1:
 
         def serve() -> CallResponse:
             self._request_topic(name)
-            return CallResponse(sizes.PUBLISHER_UPDATED_BYTES, _nothing)
+            return CallResponse(sizes.PUBLISHER_UPDATED_BYTES, _do_nothing)
 
         size_bytes = sizes.PUBLISHER_UPDATE_BYTES + sizes.PUBLISHER_BYTES
         self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
@@ -157,5 +157,5 @@ class Ros1:
         self._calls.call(subscriber, self._master, sizes.GET_KEEPALIVE_BYTES, serve, self._options.request)
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     """Ignore a response."""

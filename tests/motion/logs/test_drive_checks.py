@@ -29,9 +29,9 @@ FIELDS = ("utc_ns", "at_s", "phase", "x_m", "y_m", "forward_m_s", "driven_m", "e
 
 def lines() -> list[dict[str, Any]]:
     """Lines of a robot that drives 2 m and returns."""
-    made = [*drive(4.0, 0.5, 1.0)]
-    made[-1] = {**made[-1], "x_m": 0.0, "y_m": 0.0}
-    return [{**line, "utc_ns": START_NS + round(1e9 * line["at_s"])} for line in made]
+    entries = [*drive(4.0, 0.5, 1.0)]
+    entries[-1] = {**entries[-1], "x_m": 0.0, "y_m": 0.0}
+    return [{**line, "utc_ns": START_NS + round(1e9 * line["at_s"])} for line in entries]
 
 
 def write_log(folder: Path, lines_: list[dict[str, Any]], *, numbered: bool = True) -> Path:

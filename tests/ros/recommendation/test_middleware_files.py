@@ -59,9 +59,9 @@ def test_zenoh_reads_its_file(tmp_path: Path, transport: str) -> None:
     path.write_text(configurations.configuration_text("zenoh", transport, settings, COMMENT), encoding="utf-8")
     config = zenoh.Config.from_file(str(path))
     for where, text in settings.items():
-        read, wanted = json.loads(config.get_json(where)), json.loads(text)
-        pairs = zip(read, wanted, strict=True) if isinstance(wanted, list) else []
-        assert read == wanted or all(
+        read, expected = json.loads(config.get_json(where)), json.loads(text)
+        pairs = zip(read, expected, strict=True) if isinstance(expected, list) else []
+        assert read == expected or all(
             {key: printed["config"][key] for key in other["config"]} == other["config"] for printed, other in pairs
         )
     zenoh.open(config).close()
@@ -74,12 +74,12 @@ def test_fast_dds_reads_its_file(tmp_path: Path, transports: str, *, loads: bool
     settings = {"FASTDDS_BUILTIN_TRANSPORTS": transports}
     path.write_text(configurations.configuration_text("ros2", "tcp", settings, COMMENT), encoding="utf-8")
     python = str(ROOT / ".ros2" / "bin" / "python")
-    wanted = str(int(transports == "LARGE_DATA"))
+    expected = str(int(transports == "LARGE_DATA"))
     completed = run(
         python,
         "-c",
         SOCKETS,
-        wanted,
+        expected,
         FASTDDS_DEFAULT_PROFILES_FILE=str(path),
         ROS_DOMAIN_ID="73",
         HOME=str(tmp_path),
@@ -88,7 +88,7 @@ def test_fast_dds_reads_its_file(tmp_path: Path, transports: str, *, loads: bool
     assert completed.returncode == 0, completed.stderr
     assert ("XML" not in completed.stderr + completed.stdout) == loads, completed.stderr
     # Only LARGE_DATA listens on TCP.
-    assert completed.stdout.splitlines()[-1] == wanted, completed.stdout
+    assert completed.stdout.splitlines()[-1] == expected, completed.stdout
 
 
 def test_setting_that_a_file_cannot_contain_is_rejected() -> None:

@@ -154,8 +154,8 @@ def test_a_share_of_repeats_needs_confidence(lost: list[float], passed: bool, fa
 def test_every_cell_must_pass_and_none_may_be_missing() -> None:
     good, bad = cell(5 * [0]), cell(5 * [9], size_bytes=1e6)
     assert judge(good, bad).failed == (f"{PLACE}, 1e+06 B: loss <= 0.01 in 0 of 5 repeats, up to 0.09",)
-    wanted = {(PLACE, SIZE), (PLACE, 1e6)}
-    assessment = candidates.assess_candidate(DDS, [good], wanted, ONE_PERCENT)
+    expected = {(PLACE, SIZE), (PLACE, 1e6)}
+    assessment = candidates.assess_candidate(DDS, [good], expected, ONE_PERCENT)
     assert assessment.lacking == (f"{PLACE}, 1e+06 B: not measured, although other candidates were",)
 
 

@@ -40,9 +40,9 @@ def _package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def federate() -> PythonFederate:
-    found = named("jsbsim", PHYSICS)
-    assert isinstance(found, PythonFederate)
-    return found
+    jsbsim = named("jsbsim", PHYSICS)
+    assert isinstance(jsbsim, PythonFederate)
+    return jsbsim
 
 
 def test_the_module_is_short() -> None:

@@ -40,7 +40,7 @@ def test_messages_pass_between_nodes_and_to_ros(master: str) -> None:
         until(lambda: publisher.connections == 1 and subscriber.connections == 1)
         for body in (b"", b"\0" * 12, bytes(200_000)):
             assert publisher.publish(body, after_s(30)) == 1
-            assert subscriber.take(after_s(30)) == body
+            assert subscriber.receive(after_s(30)) == body
         subscriber.close()
         until(lambda: publisher.connections == 0)
         shown = subprocess.run(("rostopic", "info", "/data"), capture_output=True, text=True, timeout=60, check=True)
@@ -48,7 +48,7 @@ def test_messages_pass_between_nodes_and_to_ros(master: str) -> None:
         assert " * /a (http://127.0.0.1:" in shown.stdout
         assert publisher.publish(b"", after_s(30)) == 0
         with pytest.raises(TimeoutError):
-            subscriber.take(after_s(0.01))
+            subscriber.receive(after_s(0.01))
 
 
 def test_another_type_and_a_node_that_has_exited_are_ignored(master: str) -> None:

@@ -16,7 +16,7 @@ from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.trial.running import locks
-from fieldkit.trial.running.locks import Holder, held, locked
+from fieldkit.trial.running.locks import Holder, locked, locked_exclusively
 from fieldkit.trial.running.robots import Robots
 from tests.helpers.casts import plain_plan
 from tests.helpers.idle_testbed import IdleTestbed
@@ -382,15 +382,15 @@ def test_the_user_of_this_machine_has_a_name() -> None:
 def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[Role, Unreachable]) -> None:
     # A trial without a session uses its name as the token, which may be longer than the name of a socket.
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
-    with held(cast, anna, sink=quiet):
+    with locked_exclusively(cast, anna, sink=quiet):
         with (
             pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
-            held(cast, anna, sink=quiet),
+            locked_exclusively(cast, anna, sink=quiet),
         ):
             raise AssertionError("two run it")
         for shell in cast.values():
             begin(shell, anna)
-    with held(cast, anna, sink=quiet):
+    with locked_exclusively(cast, anna, sink=quiet):
         begin(cast[Role.SENDER], anna)
 
 

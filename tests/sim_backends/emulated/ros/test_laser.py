@@ -36,10 +36,10 @@ def scan(*targets: LaserTarget, east_m: float, north_m: float, heading_rad: floa
 def test_a_wall_ahead_is_its_distance_by_the_cosine_away() -> None:
     wall = LaserTarget(((5.0, -1.0), (5.2, -1.0), (5.2, 1.0), (5.0, 1.0)), 0.0, 0.0, 2.0)
     ranges = scan(wall, east_m=2.0, north_m=0.0)
-    sees = math.degrees(math.atan2(1.0, 3.0))  # 18.4 degrees to either side
+    half_angle_deg = math.degrees(math.atan2(1.0, 3.0))  # 18.4 degrees to either side
     for beam, range_m in enumerate(ranges):
         angle = (beam + 180) % 360 - 180
-        expected_m = 3.0 / math.cos(math.radians(angle)) if abs(angle) <= sees else math.inf
+        expected_m = 3.0 / math.cos(math.radians(angle)) if abs(angle) <= half_angle_deg else math.inf
         assert range_m == pytest.approx(expected_m), angle
 
 
