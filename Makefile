@@ -73,6 +73,7 @@ bench: ## run the benchmarks; copy results with date and machine to docs/benchma
 	@.venv/bin/python -m benchmarks.startup
 	@.venv/bin/python -m benchmarks.pcap
 	@.venv/bin/python -m benchmarks.aggregate
+	@.venv/bin/python -m benchmarks.archive
 	@.venv/bin/python -m benchmarks.ledger
 	@.venv/bin/python -m benchmarks.tcp_vs_kernel
 	@.venv/bin/python -m benchmarks.radio_vs_ns3

@@ -108,9 +108,10 @@ ONE_IMPORTER = {
     "yaml": "fieldkit/config/documents.py",
     "pydantic": "fieldkit/config/schema.py",
     "pydantic_core": "fieldkit/config/schema.py",
-    # One module per format: CSV is read into columns, columns are written as Parquet. Simulators, which may import
-    # neither, write their own tables.
-    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/analysis/datasets.py fieldkit/export/table.py "
+    # One module per format: CSV is read into columns, columns are written as Parquet or into an index. Simulators,
+    # which may import none of these, write their own tables.
+    "pyarrow": "fieldkit/analysis/parsing.py fieldkit/analysis/datasets.py fieldkit/analysis/table_index.py "
+    "fieldkit/export/table.py "
     "sim_backends/cosim/recording/packet_tables.py sim_backends/cosim/sweeps/sweep_dataset.py",
     "distributed": "fieldkit/core/cluster.py",
     # Messages of trials, messages of co-simulation recordings, and recovery of truncated bags.

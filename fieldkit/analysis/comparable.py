@@ -87,19 +87,22 @@ class Concern:
         return f"{text} ({self.cells[0]}{more})"
 
 
-def concerns(pairs: Iterable[tuple[str, Repeats, Repeats]], by: Collection[str] = ()) -> tuple[Concern, ...]:
+def concerns(
+    pairs: Iterable[tuple[str, Repeats, Repeats]], by: Collection[str] = (), varied: Collection[str] = ()
+) -> tuple[Concern, ...]:
     """Return the concerns about comparing two runs, refusals first.
 
-    A column of `VARIED` that is not in `by` is the variable of the comparison if it has a single value in each run;
-    it causes no refusal then.
+    A column of `varied`, or one of `VARIED` that is not in `by`, is the variable of the comparison if it has a single
+    value in each run; it causes no refusal then.
 
     Args:
         pairs: Name of each condition, and its valid repeats in A and in B, at least one each.
         by: Columns that identify a condition.
+        varied: Further columns that may be the variable of the comparison.
     """
     names_by_concern: dict[Concern, list[str]] = {}
     for name, a, b in pairs:
-        for concern in _pair_concerns(a, b, VARIED - set(by)):
+        for concern in _pair_concerns(a, b, (VARIED - set(by)).union(varied)):
             names_by_concern.setdefault(concern, []).append(name)
     merged = (
         Concern(concern.what, concern.a, concern.b, tuple(names), concern.refuses)

@@ -1,6 +1,6 @@
 """Comparison of two runs A and B: differences per condition and quantity."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -142,6 +142,7 @@ def compare(
     by: Sequence[str] = PAIRED_BY,
     *,
     thresholds: Mapping[str, float] | None = None,
+    varied: Collection[str] = (),
 ) -> Comparison:
     """Compare two runs, with repeats as sampling units; the runs are assumed to be independent.
 
@@ -150,6 +151,7 @@ def compare(
         b: All attempts of B.
         by: Columns that identify a condition.
         thresholds: Largest acceptable difference by name of the quantity, in its unit.
+        varied: Columns that may differ, because they are the variable of the comparison.
     """
     compared = _quantities(a, b)
     cells_a, cells_b = (_cells(rows, by) for rows in (a, b))
@@ -160,7 +162,7 @@ def compare(
         differences = _differences(sides, (rows_a.get(key), rows_b.get(key)), compared, thresholds or {})
         pairs.append(Pair(_condition_name(by, key), dict(zip(by, key, strict=True)), *sides, differences))
     both = [(_condition_name(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
-    return Comparison(tuple(by), _with_holm(pairs), (*comparable.concerns(both, by), *comparable.notes(a, b)))
+    return Comparison(tuple(by), _with_holm(pairs), (*comparable.concerns(both, by, varied), *comparable.notes(a, b)))
 
 
 def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:

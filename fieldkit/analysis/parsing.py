@@ -19,6 +19,7 @@ from fieldkit.core.text import unescape_formula
 
 Numbers = NDArray[np.float64]
 Texts = NDArray[np.object_]
+ArrowColumn = pa.ChunkedArray
 
 _MAX_SHOWN: Final = 40
 _TOLERANCE: Final = 1e-6  # coarser than the digits of a table
@@ -42,22 +43,31 @@ def columns(
     Raises:
         ValueError: A line or a value is invalid.
     """
-    present = [name for name in declared if name in names]
-    by_name: Mapping[str, pa.ChunkedArray] = {}
-    rows = 0
-    if body and present:
-        table = pa.csv.read_csv(
-            pa.BufferReader(body),
-            read_options=pa.csv.ReadOptions(column_names=names, block_size=max(len(body) // 8, 1 << 20)),
-            convert_options=pa.csv.ConvertOptions(
-                column_types={name: arrow_type(declared[name]) for name in present},
-                include_columns=present,
-                null_values=MISSING,
-                strings_can_be_null=False,
-            ),
-        )
-        by_name, rows = dict(zip(present, table.columns, strict=True)), len(table)
+    by_name, rows = csv_columns(names, body, declared)
     return *arrow_columns(by_name, declared, rows), rows
+
+
+def csv_columns(
+    names: Sequence[str], body: bytes, declared: Mapping[str, Column]
+) -> tuple[Mapping[str, pa.ChunkedArray], int]:
+    """Return the columns of a table that are declared, with the types of `arrow_type`, and the number of rows.
+
+    Arguments and errors as for `columns`.
+    """
+    present = [name for name in declared if name in names]
+    if not body or not present:
+        return {}, 0
+    table = pa.csv.read_csv(
+        pa.BufferReader(body),
+        read_options=pa.csv.ReadOptions(column_names=names, block_size=max(len(body) // 8, 1 << 20)),
+        convert_options=pa.csv.ConvertOptions(
+            column_types={name: arrow_type(declared[name]) for name in present},
+            include_columns=present,
+            null_values=MISSING,
+            strings_can_be_null=False,
+        ),
+    )
+    return dict(zip(present, table.columns, strict=True)), len(table)
 
 
 def arrow_columns(

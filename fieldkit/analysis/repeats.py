@@ -3,7 +3,7 @@
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final, Self
 
 import numpy as np
@@ -172,6 +172,7 @@ def by_name(declared: Iterable[Column]) -> dict[str, Column]:
     return {column.name: column for column in declared}
 
 
+@lru_cache(maxsize=16)  # thousands of tables have the same header
 def header_names(header: bytes) -> tuple[str, ...]:
     """Return the names in a header line; an empty tuple if a name exceeds the 128 kB limit of the csv module."""
     try:

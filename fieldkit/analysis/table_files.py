@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fieldkit.analysis import parsing
 from fieldkit.analysis.repeats import SOURCE, Repeats, by_name, header_names, parse_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column
-from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
+from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
 from fieldkit.core.model import ENDED
 
 IDENTITY: Final = ("schema_version", "trial", "protocol", "repeat", "attempt", "status")
@@ -33,6 +33,7 @@ def read(
     declared: Iterable[Column],
     columns: Collection[str] | None = None,
     content: Callable[[Path], bytes] = Path.read_bytes,
+    indexed: "IndexedRows | None" = None,
 ) -> Repeats:
     """Return the rows of many tables, in the order of `paths`; columns that a table does not have are missing.
 
@@ -44,6 +45,7 @@ def read(
         declared: The columns of trial.csv.
         columns: Names of the columns to read, None for all; those of `IDENTITY` are always read.
         content: Function that reads the bytes of a table.
+        indexed: Rows of some of the tables, which are used instead.
 
     Raises:
         ConfigurationError: A file cannot be read, is not a table of repeats, or was written by a newer fieldkit.
@@ -60,7 +62,15 @@ def read(
         parts.append(part)
         order.append(np.repeat(batch.numbers, counts))
 
+    known = frozenset[Path]()
+    paths = list(paths)
+    if indexed is not None and (from_index := _read_indexed(indexed, paths, named)) is not None:
+        known = indexed.tables
+        parts.append(from_index[0])
+        order.append(from_index[1])
     for number, path in enumerate(paths):
+        if path in known:
+            continue
         if path.is_dir():
             dataset = _read_dataset(path, named)
             parts.append(dataset)
@@ -82,6 +92,64 @@ def read(
     rows = _concatenated(parts or [parse_rows((), b"", named)])
     numbers = np.concatenate(order) if order else np.empty(0, np.int64)
     return rows if (np.diff(numbers) >= 0).all() else rows.where(np.argsort(numbers, kind="stable"))
+
+
+class IndexedRows(Protocol):
+    """Rows of tables that were parsed and checked before."""
+
+    @property
+    def tables(self) -> frozenset[Path]:
+        """The tables."""
+
+    def read(
+        self, tables: Sequence[Path], declared: Mapping[str, Column]
+    ) -> tuple[dict[str, parsing.Numbers], dict[str, parsing.Texts], list[int]] | None:
+        """Return columns as `parsing.columns`, and the number of rows of each table; None if they cannot be used."""
+
+
+def _read_indexed(
+    indexed: IndexedRows, paths: Sequence[Path], declared: Mapping[str, Column]
+) -> tuple[Repeats, NDArray[np.int64]] | None:
+    """Return the rows of the indexed tables, and for each row the index of its table in `paths`."""
+    numbers = [number for number, path in enumerate(paths) if path in indexed.tables]
+    tables = [paths[number] for number in numbers]
+    columns = indexed.read(tables, declared) if tables else None
+    if columns is None:
+        return None
+    values, texts, counts = columns
+    sources = np.array([_source(table) for table in tables], dtype=np.object_)
+    rows = Repeats(values, {**texts, SOURCE: np.repeat(sources, counts)}, tuple(declared.values()))
+    return (rows, np.repeat(np.array(numbers), counts)) if _is_valid(rows, declared) else None
+
+
+def typed_tables(
+    tables: Iterable[tuple[Path, bytes]], declared: Mapping[str, Column]
+) -> Iterator[tuple[Mapping[str, parsing.ArrowColumn], list[tuple[Path, int]]]]:
+    """Yield the columns of many tables as Arrow columns, some tens of megabytes at a time.
+
+    Args:
+        tables: Tables and their bytes.
+        declared: The columns of all tables; all values of a table must be valid.
+
+    Yields:
+        The columns, and the tables in the order of their rows with their numbers of rows. The number is -1 for a
+        table that is invalid, or that must be read line by line.
+    """
+    batches: dict[bytes, _Batch] = {}
+    for number, (path, content) in enumerate(tables):
+        header, _, body = content.partition(b"\n")
+        try:
+            names = _header(path, header)
+            _check_line_end(path, body)
+        except FieldkitError:
+            yield {}, [(path, -1)]
+            continue
+        batch = batches.setdefault(header, _Batch(header, names))
+        batch.add(number, path, body)
+        if batch.size >= _BATCH_BYTES:
+            yield from batches.pop(header).typed(declared)
+    for batch in batches.values():
+        yield from batch.typed(declared)
 
 
 _UNDECLARED: Final = "No declaration: the unchanged text of the table."
@@ -144,6 +212,20 @@ class _Batch:
         sources = np.array([_source(path) for path in self.paths], dtype=np.object_)
         return replace(rows, texts={**rows.texts, SOURCE: np.repeat(sources, counts)}), counts
 
+    def typed(
+        self, declared: Mapping[str, Column]
+    ) -> Iterator[tuple[Mapping[str, parsing.ArrowColumn], list[tuple[Path, int]]]]:
+        """Yield the items of `typed_tables`: one for all tables, or one per table if any of them is invalid."""
+        present = {name: column for name, column in declared.items() if name in self.names}
+        counts = [body.count(b"\n") for body in self.bodies]
+        columns = _typed(self.names, b"".join(self.bodies), present, sum(counts))
+        if columns is not None:
+            yield columns, list(zip(self.paths, counts, strict=True))
+            return
+        for path, body, rows in zip(self.paths, self.bodies, counts, strict=True):
+            columns = _typed(self.names, body, present, rows)
+            yield (columns or {}), [(path, -1 if columns is None else rows)]
+
     def _parse_single(self, path: Path, body: bytes, declared: Mapping[str, Column]) -> Repeats:
         if (error := parsing.first_problem(str(path), self.header + b"\n" + body, declared)) is not None:
             raise error
@@ -151,6 +233,19 @@ class _Batch:
             return parse_rows(self.names, body, declared)
         except ValueError as error:
             raise EvidenceError(str(error), where=str(path), remedy="correct the file") from error
+
+
+def _typed(
+    names: Sequence[str], body: bytes, declared: Mapping[str, Column], rows: int
+) -> Mapping[str, parsing.ArrowColumn] | None:
+    """Return the Arrow columns of lines; None if a value is invalid or a line is not a row."""
+    try:
+        columns, parsed = parsing.csv_columns(names, body, declared)
+        values, texts = parsing.arrow_columns(columns, declared, parsed)
+    except ValueError:
+        return None
+    is_valid = parsed == rows and _is_valid(Repeats(values, texts, tuple(declared.values())), declared)
+    return columns if is_valid else None
 
 
 def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:

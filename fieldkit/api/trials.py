@@ -16,6 +16,7 @@ from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import SOURCE
 from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean
+from fieldkit.core.executors import Workers
 from fieldkit.core.model import Protocol
 from fieldkit.export import table
 from fieldkit.export.table import Table
@@ -236,7 +237,7 @@ def _note(sentence: str, stacklevel: int = 2) -> None:
     warnings.warn(sentence, stacklevel=stacklevel)
 
 
-def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "") -> Trials:
+def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "", use_index: bool = True) -> Trials:
     """Return the trials at some paths.
 
     Notes of `fieldkit aggregate`, for example on a trial that is left out, are issued as `UserWarning`.
@@ -245,6 +246,7 @@ def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "") ->
         paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
         rebuild: Whether to measure the raw evidence again instead of reading trial.csv; nothing is written.
         where: Condition of the attempts to use, `distance_m < 20 and topology == "master"`; empty for all.
+        use_index: Whether to read many tables from an index in the user's cache; the result is the same.
 
     Raises:
         ConfigurationError: A path does not exist or has no trial, or a file is not a table of repeats. It is a
@@ -253,4 +255,7 @@ def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "") ->
     """
     if not paths:
         raise ConfigurationError("no path is given", remedy='write for example fieldkit.load("trials")')
-    return Trials(sources.find([Path(path) for path in paths], _note, rebuild=rebuild).with_filter(where))
+    # Processes that read plans would import the main module of a script, which may not be prepared for it.
+    workers = sources.ALL_PROCESSORS if rebuild else Workers(jobs=1)
+    found = sources.find([Path(path) for path in paths], _note, rebuild=rebuild, workers=workers, use_index=use_index)
+    return Trials(found.with_filter(where))

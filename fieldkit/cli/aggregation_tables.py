@@ -46,7 +46,11 @@ def show(arguments: argparse.Namespace) -> int:
     """Print the cells."""
     output_format = arguments.format
     data = sources.find(
-        arguments.paths, show_note, rebuild=arguments.rebuild, workers=Workers(arguments.jobs, arguments.cluster)
+        arguments.paths,
+        show_note,
+        rebuild=arguments.rebuild,
+        workers=Workers(arguments.jobs, arguments.cluster),
+        use_index=arguments.use_index,
     ).with_filter(arguments.where)
     by = (arguments.by == CONDITION and data.sweep_condition) or data.condition(arguments.by)
     selected, words = data.chosen(arguments.quantity)

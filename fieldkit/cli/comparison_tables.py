@@ -1,20 +1,19 @@
 """Tables of `fieldkit compare`."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Final
 
 from fieldkit.analysis import comparison_results, paper_tables, wording
 from fieldkit.analysis.cells import Estimate
 from fieldkit.analysis.comparable import VARIED, Concern
-from fieldkit.analysis.compare import PAIRED_BY, Comparison, Difference, Pair, compare
+from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
+from fieldkit.cli import comparison_sides
 from fieldkit.cli.display import show_note, table
 from fieldkit.core.errors import ConfigurationError, did_you_mean, shell_command
 from fieldkit.core.text import print_text
-from fieldkit.trial import sources
 
 THRESHOLD_MISSED: Final = 1
 
@@ -30,13 +29,9 @@ _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 
 def show(arguments: argparse.Namespace) -> int:
     """Print the comparison."""
-    _require_two([arguments.a, arguments.b, *arguments.more])
-    a, b = sources.find_each([[arguments.a], [arguments.b]], show_note, rebuild=arguments.rebuild)
-    by = a.condition(arguments.by)
-    if arguments.by == ",".join(PAIRED_BY) and a.sweep_condition:  # only sweeps have common factors
-        by = tuple(name for name in a.sweep_condition if name in b.sweep_condition) or by
-    thresholds = dict(_threshold(text, a.quantities) for text in arguments.threshold)
-    comparison = compare(a.read(also=by), b.read(also=by), by, thresholds=thresholds)
+    sides = comparison_sides.read(arguments)
+    thresholds = dict(_threshold(text, sides.sources.quantities) for text in arguments.threshold)
+    comparison = compare(sides.a, sides.b, sides.by, thresholds=thresholds, varied=sides.varied)
     _require_common_condition(comparison, arguments)
     _require_measured(comparison, thresholds)
     if comparison.refusals and not arguments.force:
@@ -52,16 +47,6 @@ def show(arguments: argparse.Namespace) -> int:
     else:
         print_text(_FORMATS[arguments.format](comparison), end="")
     return THRESHOLD_MISSED if comparison.exceeds_threshold else 0
-
-
-def _require_two(paths: Sequence[Path]) -> None:
-    if len(paths) > 2:
-        command = shell_command("fieldkit", "aggregate", *paths, "--by", "trial,protocol")
-        raise ConfigurationError(
-            f"compare takes two runs, A and B, and {len(paths)} are given",
-            remedy="for a run of several trials give their folder, or their table from fieldkit export; "
-            f"to show all of these in one table: {command}",
-        )
 
 
 def _threshold(text: str, quantities: Mapping[str, Quantity]) -> tuple[str, float]:
@@ -112,7 +97,9 @@ def _pairing_remedy(comparison: Comparison, arguments: argparse.Namespace) -> st
     disjoint = [name for name, (in_a, in_b) in values.items() if in_a.isdisjoint(in_b)]
     distinguishing = [name for name, (in_a, in_b) in values.items() if name not in disjoint and len(in_a | in_b) > 1]
     by = ("--by", ",".join(distinguishing) or "protocol")
-    words = ("fieldkit", "compare", arguments.a, arguments.b, *by)
+    options = ("--between", arguments.between) if arguments.between else ()
+    paths = [arguments.a] if arguments.b is None else [arguments.a, arguments.b]
+    words = ("fieldkit", "compare", *paths, *options, *by)
     if (
         len(disjoint) == 1
         and set(disjoint) <= VARIED

@@ -104,7 +104,7 @@ def add_trial(parser: Parser, help_line: str = "folder of a trial") -> None:
 
 
 def add_paths(parser: Parser) -> None:
-    """Add PATH... and `--rebuild`, which `sources.find` reads."""
+    """Add PATH..., `--rebuild` and `--no-index`, which `sources.find` reads."""
     parser.add_argument("paths", type=Path, nargs="+", metavar="PATH", help=PATH_HELP)
     add_rebuild(parser)
 
@@ -121,9 +121,15 @@ def add_where(parser: Parser) -> None:
 
 
 def add_rebuild(parser: Parser) -> None:
-    """Add `--rebuild`."""
+    """Add `--rebuild` and `--no-index`."""
     parser.add_argument(
         "--rebuild", action="store_true", help="measure the raw evidence again instead of reading trial.csv"
+    )
+    parser.add_argument(
+        "--no-index",
+        dest="use_index",
+        action="store_false",
+        help="read all tables instead of an index of their rows; takes longer, the result is the same",
     )
 
 

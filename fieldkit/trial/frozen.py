@@ -1,9 +1,11 @@
 """The part of `trial.yaml` that describes its table: columns that not every trial has, and expectations."""
 
+import json
 import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -111,3 +113,14 @@ def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:
         )
         for column in columns
     )
+
+
+def to_json(columns: Iterable[Column]) -> str:
+    """Return columns as JSON."""
+    return json.dumps([column.model_dump(mode="json") for column in freeze(columns)])
+
+
+@lru_cache  # the trials of a procedure have the same columns
+def from_json(text: str) -> tuple[Column, ...]:
+    """Return the columns that `to_json` wrote."""
+    return tuple(FrozenColumn.model_validate_json(json.dumps(item)).column for item in json.loads(text))

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -15,10 +16,11 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.analysis.row_filters import RowFilter, parse_filter
 from fieldkit.core import files, laptop_files
 from fieldkit.core.columns import Column
-from fieldkit.core.errors import ConfigurationError, EvidenceError, did_you_mean, shell_command
+from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, did_you_mean, shell_command
 from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
-from fieldkit.trial import frozen, rows, store, tables
+from fieldkit.trial import indexed_tables, rows, store, tables
+from fieldkit.trial.indexed_tables import NO_INDEX, IndexedTables
 from fieldkit.trial.plan import PLAN_FILE
 
 ALL_PROCESSORS: Final = Workers()
@@ -42,6 +44,7 @@ class Sources:
         note: Receives notes.
         workers: Where raw evidence is measured again.
         row_filter: Chooses rows; None for all.
+        indexed: The tables that are in an index.
     """
 
     where: str
@@ -51,6 +54,7 @@ class Sources:
     note: Note
     workers: Workers = ALL_PROCESSORS
     row_filter: RowFilter | None = None
+    indexed: IndexedTables = NO_INDEX
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
@@ -124,15 +128,15 @@ class Sources:
             ConfigurationError: A plan cannot be read.
         """
         by_source: dict[str, list[Expectation]] = {}
-        for folder in (table.parent for table in self.tables if table.name == store.TRIAL_CSV):
-            if (folder / PLAN_FILE).is_file() and not files.unexpected_type(folder / PLAN_FILE):
-                for text in frozen.expected(folder / PLAN_FILE):
-                    try:
-                        expectation = expectations.parse(text, self.quantities.values())
-                    except ConfigurationError as error:  # the plan is of an earlier version, or was edited
-                        self.note(f"{folder}: an expectation is left out: {error.what}")
-                    else:
-                        by_source.setdefault(str(folder), []).append(expectation)
+        for table in self.tables:
+            facts = self.indexed.facts(table)
+            for text in tables.expected(table) if facts is None else facts.expected:
+                try:
+                    expectation = expectations.parse(text, self.quantities.values())
+                except ConfigurationError as error:  # the plan is of an earlier version, or was edited
+                    self.note(f"{table.parent}: an expectation is left out: {error.what}")
+                else:
+                    by_source.setdefault(str(table.parent), []).append(expectation)
         return by_source
 
     def read(
@@ -158,7 +162,7 @@ class Sources:
         if self.row_filter is not None:
             columns = {*columns, *self.row_filter.names}
         content = _remeasured_tables(self.tables, self.workers, self.note) if self.rebuild else Path.read_bytes
-        attempts, notes = deduplicated(table_files.read(self.tables, self.columns, columns, content))
+        attempts, notes = deduplicated(self._rows(columns, content))
         for note in notes:
             self.note(note)
         if not len(attempts):
@@ -169,6 +173,13 @@ class Sources:
                 remedy=shell_command("fieldkit", "resume", started) if started else "name a trial that ran",
             )
         return attempts if self.row_filter is None else self._chosen_rows(attempts, self.row_filter)
+
+    def _rows(self, columns: Collection[str], content: Callable[[Path], bytes]) -> Repeats:
+        if self.indexed.tables:
+            # Without the index, another of several invalid tables may be the first one, so the error is not used.
+            with suppress(FieldkitError):
+                return table_files.read(self.tables, self.columns, columns, content, self.indexed)
+        return table_files.read(self.tables, self.columns, columns, content)
 
     def _chosen_rows(self, attempts: Repeats, row_filter: RowFilter) -> Repeats:
         chosen = attempts.where(row_filter.mask(attempts))
@@ -190,31 +201,46 @@ class Sources:
         return replace(self, row_filter=parse_filter(text, columns)) if text else self
 
 
-def find(paths: Sequence[Path], note: Note, *, rebuild: bool = False, workers: Workers = ALL_PROCESSORS) -> Sources:
+def find(
+    paths: Sequence[Path],
+    note: Note,
+    *,
+    rebuild: bool = False,
+    workers: Workers = ALL_PROCESSORS,
+    use_index: bool = True,
+) -> Sources:
     """Return the tables of the trials and CSV files at or below `paths`, with their columns.
 
     Args:
         paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
         note: Receives notes.
         rebuild: Whether to measure raw evidence again.
-        workers: Where it is measured.
+        workers: Where it is measured, and where many plans are read.
+        use_index: Whether to read many tables from an index; the result is the same.
 
     Raises:
         ConfigurationError: A path does not exist or has no trial below, or as for `tables.declared_in`.
         EvidenceError: No trial has its table.
     """
-    return find_each([paths], note, rebuild=rebuild, workers=workers)[0]
+    return find_each([paths], note, rebuild=rebuild, workers=workers, use_index=use_index)[0]
 
 
 def find_each(
-    runs: Sequence[Sequence[Path]], note: Note, *, rebuild: bool = False, workers: Workers = ALL_PROCESSORS
+    runs: Sequence[Sequence[Path]],
+    note: Note,
+    *,
+    rebuild: bool = False,
+    workers: Workers = ALL_PROCESSORS,
+    use_index: bool = True,
 ) -> list[Sources]:
     """Return the sources at the paths of each run, as `find`; all have the columns of all runs."""
     tables_by_run = [_find_tables(paths, note, rebuild=rebuild) for paths in runs]
-    all_tables = [table for run_tables in tables_by_run for table in run_tables]
-    columns = tables.planned(all_tables) if rebuild else tables.declared_in(all_tables)
+    all_tables = list(dict.fromkeys(table for run_tables in tables_by_run for table in run_tables))
+    indexed = indexed_tables.find(all_tables, workers, note) if use_index and not rebuild else NO_INDEX
+    columns = tables.planned(all_tables) if rebuild else tables.declared_in(all_tables, indexed.facts)
+    indexed = indexed_tables.write(indexed, columns, note)
     return [
-        Sources(_paths_text(paths), run_tables, columns, rebuild, note, workers)
+        Sources(_paths_text(paths), run_tables, columns, rebuild, note, workers, indexed=indexed)
         for paths, run_tables in zip(runs, tables_by_run, strict=True)
     ]
 
@@ -248,6 +274,7 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
             remedy=f"name the folder that trials are in, or CSV files: {shell_command(path)}/*.csv",
         )
     for folder in folders:
+        table = folder / store.TRIAL_CSV
         if (folder / laptop_files.SWEEP).is_file():
             if rebuild:
                 raise ConfigurationError(
@@ -257,11 +284,10 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
                 yield folder / laptop_files.SWEEP_RESULTS
             else:
                 note(f"{folder}: has no results yet; run its command again")
-            continue
-        if not rebuild and (reason := files.unexpected_type(folder / store.TRIAL_CSV)):
-            note(f"{folder / store.TRIAL_CSV}: {reason}; it is left out")
-        elif rebuild or (folder / store.TRIAL_CSV).is_file():
-            yield folder / store.TRIAL_CSV
+        elif not rebuild and (reason := files.unexpected_type(table)):
+            note(f"{table}: {reason}; it is left out")
+        elif rebuild or table.is_file():
+            yield table
         else:
             command = shell_command("fieldkit", "rebuild", folder)
             note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {command}")
@@ -269,31 +295,36 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
 
 def trial_folders(path: Path) -> list[Path]:
     """Return the folders of trials at or below a path; empty if there are none, or if it is not a folder."""
-    return list(_trials(path, set())) if path.is_dir() else []
+    return [Path(folder) for folder in _trials(str(path), set())] if path.is_dir() else []
 
 
-def _trials(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
+_MARKS: Final = frozenset({PLAN_FILE, store.TRIAL_CSV, laptop_files.SWEEP})
+"""Files in the folder of a trial or a sweep."""
+
+
+def _trials(folder: str, seen: set[tuple[int, int]]) -> Iterator[str]:
     """Yield the folders of trials and sweeps at or below a folder, sorted.
 
     Links are followed, each folder is visited once.
     """
-    status = folder.stat()
+    status = os.stat(folder)  # noqa: PTH116 (a path object per folder takes longer than the call)
     if (status.st_dev, status.st_ino) in seen:
         return
     seen.add((status.st_dev, status.st_ino))
     with os.scandir(folder) as scan:
         entries = sorted(scan, key=lambda entry: entry.name)
-    if any(entry.name in {PLAN_FILE, store.TRIAL_CSV, laptop_files.SWEEP} for entry in entries):
+    if not _MARKS.isdisjoint(entry.name for entry in entries):
         yield folder
         return
     for entry in entries:
         if not entry.name.startswith(".") and not entry.name.endswith(".partial") and entry.is_dir():
-            yield from _trials(folder / entry.name, seen)
+            yield from _trials(entry.path, seen)
 
 
 def _identity(table: Path) -> object:
     """Return the identity of a table, which is the same for two paths to it."""
-    status = table.parent.stat() if table.name == store.TRIAL_CSV or table.is_dir() else table.stat()
+    is_folder = table.name == store.TRIAL_CSV or table.is_dir()
+    status = (table.parent if is_folder else table).stat()
     return status.st_dev, status.st_ino
 
 

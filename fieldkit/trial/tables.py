@@ -1,11 +1,13 @@
 """The combined columns of the tables of trials whose procedures differ."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 from fieldkit.analysis import table_files
 from fieldkit.analysis.repeats import SOURCE
+from fieldkit.analysis.table_index import TableFacts
 from fieldkit.core import files
 from fieldkit.core.columns import Column, plain_name, with_step_name
 from fieldkit.core.errors import ConfigurationError
@@ -13,8 +15,15 @@ from fieldkit.trial import frozen, store
 from fieldkit.trial.columns import installed, trial_columns
 from fieldkit.trial.plan import PLAN_FILE
 
+Facts = Callable[[Path], TableFacts | None]
+"""Returns the properties of a table that are known without reading it; None if they are not."""
 
-def declared_in(tables: Sequence[Path]) -> tuple[Column, ...]:
+
+def unknown(_: Path) -> None:
+    """Return no properties."""
+
+
+def declared_in(tables: Sequence[Path], facts: Facts = unknown) -> tuple[Column, ...]:
     """Return every column of the tables: those of every trial first, then others in the order of the tables.
 
     A column that is not in every trial is declared by the `trial.yaml` next to the table; otherwise by an installed
@@ -23,13 +32,18 @@ def declared_in(tables: Sequence[Path]) -> tuple[Column, ...]:
 
     Args:
         tables: CSV files with the columns of trial.csv.
+        facts: Properties that are already known.
 
     Raises:
         ConfigurationError: A table or a plan cannot be read, or plans contradict each other.
     """
-    everywhere = {column.name for column in trial_columns()} | {"", SOURCE}
-    others = {table: names for table in tables if (names := _other_column_names(table, everywhere))}
-    planned_columns = merge_columns((table.parent / PLAN_FILE, _frozen_columns(table)) for table in others)
+    others = {table: names for table in tables if (names := _other_names_of(table, facts(table)))}
+    planned_columns = merge_columns(
+        (table.parent / PLAN_FILE, columns)
+        for table in others
+        for known in [facts(table)]
+        for columns in [frozen_columns(table) if known is None else frozen.from_json(known.declarations)]
+    )
     installed_columns = {column.name: column for column in installed()}
     other_names = dict.fromkeys(name for names in others.values() for name in names)
     return trial_columns(planned_columns.get(name) or _by_name(name, installed_columns) for name in other_names)
@@ -72,18 +86,40 @@ def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str
     return {name: column for name, (_, column) in merged.items()}
 
 
-def _other_column_names(table: Path, everywhere: Iterable[str]) -> list[str]:
-    return [name for name in table_files.names(table) if name not in everywhere]
+def _other_names_of(table: Path, known: TableFacts | None) -> tuple[str, ...]:
+    return other_names(table_files.names(table) if known is None else known.names)
 
 
-def _frozen_columns(table: Path) -> tuple[Column, ...]:
-    """Return the columns that a dataset declares, or those in the plan in the folder of a table."""
+@lru_cache  # thousands of tables have the same columns
+def other_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of a table's columns that are not in every trial."""
+    everywhere = {column.name for column in trial_columns()} | {"", SOURCE}
+    return tuple(name for name in names if name not in everywhere)
+
+
+def frozen_columns(table: Path) -> tuple[Column, ...]:
+    """Return the columns that a dataset declares, or those in the plan in the folder of a table.
+
+    Raises:
+        ConfigurationError: The plan cannot be read.
+    """
     if table.is_dir():
         from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
 
         return datasets.declared_columns(table)
     plan = table.parent / PLAN_FILE
     return frozen.read(plan) if plan.exists() and not files.unexpected_type(plan) else ()
+
+
+def expected(table: Path) -> tuple[str, ...]:
+    """Return the expectations in the plan of a trial's table; a CSV file without its trial has none.
+
+    Raises:
+        ConfigurationError: The plan cannot be read.
+    """
+    plan = table.parent / PLAN_FILE
+    has_plan = table.name == store.TRIAL_CSV and plan.is_file() and not files.unexpected_type(plan)
+    return frozen.expected(plan) if has_plan else ()
 
 
 def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:

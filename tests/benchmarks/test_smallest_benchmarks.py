@@ -16,6 +16,8 @@ NOT_RUN = {
 """Benchmarks that need more than CI has, with their tests; only their help is printed here."""
 
 PARTS = {
+    "archive_peers",
+    "archive_trials",
     "bash_peer",
     "cosim_peers",
     "footprint",

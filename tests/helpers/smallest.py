@@ -259,6 +259,7 @@ def _short_detour(module: ModuleType, folder: Path) -> None:
 
 CASES: Final[Mapping[str, MinimalRun]] = {
     "aggregate": MinimalRun("--rounds 1 --tables 1 --rows 80"),
+    "archive": MinimalRun("--rounds 1 --trials 100 --repeats 2", {"AGE_S": 2.5}),
     "bridge": MinimalRun(
         "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLING_S": 0.5}, shrink=_two_bridge_paths, emulated=True
     ),

@@ -28,8 +28,15 @@ def add(parser: Parser) -> None:
     parser.epilog = _EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("a", type=Path, metavar="A", help=shared.PATH_HELP)
-    parser.add_argument("b", type=Path, metavar="B", help="the same")
+    parser.add_argument("b", type=Path, metavar="B", nargs="?", help="the same (default: A, with --between)")
     parser.add_argument("more", type=Path, nargs="*", default=[], help=argparse.SUPPRESS)  # a glob may match more
+    parser.add_argument(
+        "--between",
+        default="",
+        metavar="COLUMN=A,B",
+        help="compare attempts with two values of a column, for example policy=sliding_window,scheduled of a sweep",
+    )
+    shared.add_where(parser)
     shared.add_cells(parser, PAIRED_BY)
     parser.add_argument(
         "--threshold",

@@ -71,7 +71,8 @@ def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
 def _load(arguments: argparse.Namespace) -> "Repeats":
     from fieldkit.trial import sources
 
-    return sources.find(arguments.paths, show_note, rebuild=arguments.rebuild).read(undeclared=True)
+    data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild, use_index=arguments.use_index)
+    return data.read(undeclared=True)
 
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:

@@ -67,7 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     out, folder = arguments.out, arguments.figures
     _require_writable(out)
-    data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild).with_filter(arguments.where)
+    data = sources.find(
+        arguments.paths, show_note, rebuild=arguments.rebuild, use_index=arguments.use_index
+    ).with_filter(arguments.where)
     selected_names = [data.quantity(name).name for name in arguments.quantity]
     repeats = data.read()
     report_contents = contents.build_contents(

@@ -13,6 +13,7 @@ from fieldkit.core.errors import (
     shell_command,
 )
 from fieldkit.core.executors import Workers
+from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.external import has_addresses, without_federates
@@ -103,7 +104,8 @@ def _error(failures: Sequence[tuple[SweepRun, RunFailure]], total: int, command:
     run, failure = failures[0]
     family = _FAMILIES.get(failure.exit_code, FieldkitError)
     return family(
-        f"{len(failures)} of {total} runs failed {failure.attempts} times; the first: {failure.reason}",
+        f"{len(failures)} of {total} runs failed; the first, after {format_count(failure.attempts, 'attempt')}: "
+        f"{failure.reason}",
         where=str(run),
         remedy=f"{f'{failure.remedy}; ' if failure.remedy else ''}to try them again: {command} --again",
     )

@@ -36,6 +36,7 @@ class RunFailure:
         remedy: What to do; may be empty.
         exit_code: Exit code of the error.
         rows: Columns of its flows until then.
+        is_final: Whether another attempt would end in the same way.
     """
 
     attempts: int
@@ -43,6 +44,7 @@ class RunFailure:
     remedy: str
     exit_code: int
     rows: Rows = field(default_factory=tuple)
+    is_final: bool = False
 
 
 class SweepFolder:
@@ -136,7 +138,7 @@ class SweepFolder:
         if not path.exists():
             return None
         content = self._read(path)
-        return RunFailure(**{name: content[name] for name in RunFailure.__dataclass_fields__})
+        return RunFailure(**{name: content[name] for name in RunFailure.__dataclass_fields__ if name in content})
 
     def write_failure(self, run: SweepRun, failure: RunFailure) -> None:
         """Write the failure of a run; errors as for `write_result`."""

@@ -1,4 +1,4 @@
-"""Runs a sweep: submits the missing runs, writes each result when it arrives, tries failed runs again."""
+"""Runs a sweep: submits the missing runs, writes each result when it arrives, repeats runs that a crash ended."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -7,20 +7,25 @@ from functools import partial
 from typing import Any, Final
 
 from fieldkit.core.columns import Value
-from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
+from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, describe_exception
 from fieldkit.core.events import Note, Progress, Sink, SweepEnded, SweepPlanned, SweepRunEnded
 from fieldkit.core.executors import Workers
-from fieldkit.core.tasks import TaskEnd, completed
+from fieldkit.core.tasks import TaskEnd, WorkerDiedError, completed
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate
 from sim_backends.cosim.commands.flow_rows import flow_rows
 from sim_backends.cosim.commands.results import FlowResult, SeedResult
+from sim_backends.cosim.federates import FederateError
 from sim_backends.cosim.sweeps.factors import DISTANCE
 from sim_backends.cosim.sweeps.sweep_folder import RunFailure, SweepFolder
 from sim_backends.cosim.sweeps.sweep_plan import SweepPlan, SweepRun, digest
 
 ATTEMPTS: Final = 3
 """Largest number of attempts at a run."""
+
+_TRANSIENT: Final = (LinkError, FederateError, WorkerDiedError, OSError, MemoryError)
+"""Errors after which a run is tried again: a worker or simulator died or did not answer, or a resource was exhausted.
+Other errors occur again, because a run depends only on its settings and seed."""
 
 _IN_OTHER_COLUMNS: Final = frozenset({"policy", DISTANCE, "line", "topology"})
 """Factors that the name of the procedure need not contain."""
@@ -125,14 +130,16 @@ def run_sweep(
     """
     finished = folder.finished()
     missing = [run for run in plan.runs if run.name not in finished]
-    attempts = {
-        run.name: 0 if again or (failure := folder.failure(run)) is None else failure.attempts for run in missing
-    }
+    before = {} if again else {run.name: folder.failure(run) for run in missing}
+    attempts = {run.name: 0 if (failure := before.get(run.name)) is None else failure.attempts for run in missing}
+    final = {name for name, failure in before.items() if failure is not None and failure.is_final}
     done = len(plan.runs) - len(missing)
     sink(SweepPlanned(str(folder.path), done, len(plan.runs), len(plan.settings), len(plan.seeds)))
     report = _Reporter(sink, done, len(plan.runs))
     work = partial(execute, verify=bool(workers.cluster))
-    while tasks := [run for run in missing if attempts[run.name] < ATTEMPTS and run.name not in finished]:
+    while tasks := [
+        run for run in missing if attempts[run.name] < ATTEMPTS and run.name not in finished and run.name not in final
+    ]:
         for end in completed(work, tasks, workers, lambda text: sink(Note(text))):
             run = tasks[end.number]
             if isinstance(end.error, ConfigurationError):  # all scenarios are valid, so it is an error of the worker
@@ -144,6 +151,7 @@ def run_sweep(
                 finished.add(run.name)
             elif failure is not None:
                 folder.write_failure(run, failure)
+                final |= {run.name} if failure.is_final else set()
             report.ended(run, failure)
     failures = [(run, failure) for run in missing if run.name not in finished and (failure := folder.failure(run))]
     sink(SweepEnded(str(folder.path), len(finished & attempts.keys()) + done, len(failures), len(plan.runs)))
@@ -156,9 +164,10 @@ def _failure(end: TaskEnd[RunResult], attempts: int) -> RunFailure | None:
     if error is None:
         return None
     rows = () if end.result is None else end.result.content["rows"]
+    is_final = not isinstance(error, _TRANSIENT)
     if isinstance(error, FieldkitError):
-        return RunFailure(attempts, error.located, error.remedy, error.exit_code, rows)
-    return RunFailure(attempts, describe_exception(error), "", FieldkitError.exit_code, rows)
+        return RunFailure(attempts, error.located, error.remedy, error.exit_code, rows, is_final)
+    return RunFailure(attempts, describe_exception(error), "", FieldkitError.exit_code, rows, is_final)
 
 
 class _Reporter:

@@ -161,7 +161,7 @@ def test_more_than_two_runs_suggest_aggregate(lab: Path, capsys: pytest.CaptureF
     capsys.readouterr()
     with pytest.raises(SystemExit):
         main(["compare", "--help"])
-    assert "A B\n" in capsys.readouterr().out, "it accepts two runs"
+    assert "A [B]\n" in capsys.readouterr().out, "it accepts two runs"
 
 
 def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> None:

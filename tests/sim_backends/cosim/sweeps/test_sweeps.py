@@ -15,7 +15,7 @@ import pytest
 
 import fieldkit
 from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, LinkError
+from fieldkit.core.errors import ConfigurationError, EvidenceError, LinkError
 from sim_backends.cosim.commands.execution import simulate
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.sweeps import sweep_runner
@@ -107,7 +107,7 @@ def test_a_failed_run_states_its_reason_and_is_tried_a_limited_number_of_times(
         patch.setattr(sweep_runner, "simulate", failing)
         done = run_here(lab, *arguments)
         assert (done.code, len(calls)) == (3, RUNS + 2 * 2)
-        assert "2 of 8 runs failed 3 times; the first: network: no answer" in done.err
+        assert "2 of 8 runs failed; the first, after 3 attempts: network: no answer" in done.err
         assert f"start it; to try them again: fieldkit {' '.join(SWEEP[:6])}" in done.err
         failures = [json.loads(path.read_text()) for path in (lab / "failing" / "failed").iterdir()]
         assert {(failure["attempts"], failure["reason"]) for failure in failures} == {(3, "network: no answer")}
@@ -116,6 +116,30 @@ def test_a_failed_run_states_its_reason_and_is_tried_a_limited_number_of_times(
     assert run_here(lab, *arguments, "--again").code == 0
     assert not list((lab / "failing" / "failed").iterdir())
     assert dataset(lab / "failing") == dataset(lab / "sweep")
+
+
+@pytest.mark.parametrize("error", [EvidenceError("no such flow"), ValueError("a defect"), ConfigurationError("bad")])
+def test_a_failure_that_would_occur_again_is_tried_once(
+    lab: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: Exception
+) -> None:
+    calls: list[int] = []
+
+    def failing(scenario: CosimScenario, policy: str, seed: int, folder: None) -> Any:  # noqa: ANN401 (as simulate)
+        calls.append(seed)
+        if seed == 2:
+            raise error
+        return simulate(scenario, policy, seed, folder)
+
+    monkeypatch.setattr(sweep_runner, "simulate", failing)
+    arguments = (*SWEEP, "--jobs", "1", "-o", str(tmp_path / "once"))
+    for _ in range(2):
+        done = run_here(lab, *arguments)
+        assert (done.code, str(error) in done.err) == (getattr(error, "exit_code", 1), True)
+    if isinstance(error, ConfigurationError):
+        assert calls == [1, 2, 2], "it is an error of the worker, which ends the sweep"
+    else:
+        assert len(calls) == RUNS
+        assert "4 of 8 runs failed; the first, after 1 attempt:" in done.err
 
 
 def dataset(folder: Path) -> dict[str, bytes]:
@@ -175,6 +199,44 @@ def test_aggregate_compare_and_load_read_the_folder_like_trials(lab: Path) -> No
     compared = run_here(lab, "compare", "sweep", "sweep", "--format", "csv")
     assert compared.code == 0, compared.err
     assert {float(row["difference"] or 0) for row in csv.DictReader(compared.out.splitlines())} == {0}
+
+
+def test_two_settings_of_a_sweep_are_compared(lab: Path) -> None:
+    between = ("--between", "policy=sliding_window,scheduled")
+    done = run_here(lab, "compare", "sweep", *between, "--format", "csv")
+    assert done.code == 0, done.err
+    rows = list(csv.DictReader(done.out.splitlines()))
+    assert {(row["flow"], row["window_s"], row["n_a"], row["n_b"]) for row in rows} == {
+        ("pose/b", "0.007", "2", "2"),
+        ("pose/b", "0.013", "2", "2"),
+    }
+    cells = {
+        policy: fieldkit.load(lab / "sweep").cell(policy=policy, window="13ms")["added_delay_mean_s"].value
+        for policy in ("sliding_window", "scheduled")
+    }
+    (difference,) = (
+        float(row["difference"])
+        for row in rows
+        if row["quantity"] == "added_delay_mean_s" and row["window_s"] == "0.013"
+    )
+    assert difference == pytest.approx(cells["scheduled"] - cells["sliding_window"], rel=1e-6)
+    some = run_here(lab, "compare", "sweep", *between, "--where", "window_s > 0.01", "--format", "csv")
+    assert {row["window_s"] for row in csv.DictReader(some.out.splitlines())} == {"0.013"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((), "compare takes two runs"),
+        (("--between", "policy=sliding_window"), "write two values"),
+        (("--between", "policy=scheduled,scheduled"), "two different values"),
+        (("--between", "policy=scheduled,slidingwindow"), "did you mean 'sliding_window'"),
+        (("--between", "polcy=a,b"), "did you mean 'policy'"),
+    ],
+)
+def test_a_wrong_comparison_of_two_settings_is_explained(lab: Path, options: tuple[str, ...], message: str) -> None:
+    done = run_here(lab, "compare", "sweep", *options)
+    assert (done.code, message in done.err) == (2, True), done.err
 
 
 def test_a_report_has_heat_maps_over_two_factors(lab: Path) -> None:

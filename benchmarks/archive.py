@@ -1,0 +1,139 @@
+"""Aggregate an archive of 10,000 trials, compared with pandas and DuckDB: `python -m benchmarks.archive`.
+
+Each round runs `fieldkit aggregate ARCHIVE --where ...` as a user would: without an index, the first time (which
+writes the index), and with the index. The peers read the same tables in the same round, choose the same rows, and
+compute count, mean and median of one quantity per condition without intervals: pandas concatenates all tables, DuckDB
+reads them in one query (`read_csv` with `union_by_name`), and DuckDB reads a Parquet file that was written before.
+The benchmark stops if their figures differ from those of fieldkit.
+"""
+
+import argparse
+import json
+import math
+import os
+import statistics
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from benchmarks.aggregate import ROOT, Run, run
+from benchmarks.archive_peers import BY, QUANTITY
+from benchmarks.archive_trials import write_archive
+
+WHERE: Final = 'distance_m < 20 and topology == "master"'
+AGE_S: Final = 3.0
+"""Tables must not be new, or they get no entry in the index."""
+
+
+def _fieldkit(archive: Path, out: Path, *options: str) -> Run:
+    words = ("aggregate", str(archive), "--where", WHERE, "--by", ",".join(BY), "--quantity", QUANTITY)
+    return run([sys.executable, "-m", "fieldkit", *words, "--format", "json", *options], out)
+
+
+def _peer(name: str, archive: Path, out: Path) -> Run:
+    return run([sys.executable, "-m", "benchmarks.archive_peers", name, str(archive)], out)
+
+
+def figures(output: Path) -> dict[tuple[str, ...], tuple[float, ...]]:
+    """Return number, mean and median by condition from the JSON of fieldkit or of a peer."""
+    content = json.loads(output.read_bytes())
+    if isinstance(content, list):
+        return {tuple(map(str, row[:-3])): tuple(row[-3:]) for row in content}
+    return {
+        tuple(str(value) for value in cell["key"].values()): tuple(
+            cell["estimates"][QUANTITY][part] for part in ("n", "mean", "median")
+        )
+        for cell in content["cells"]
+        if QUANTITY in cell["estimates"]
+    }
+
+
+def check(ours: Path, theirs: Path) -> None:
+    """Compare the figures of two outputs.
+
+    Raises:
+        RuntimeError: They differ.
+    """
+    our_figures, peer_figures = figures(ours), figures(theirs)
+    same = our_figures.keys() == peer_figures.keys() and all(
+        math.isclose(a, b, rel_tol=1e-6)
+        for key in our_figures
+        for a, b in zip(our_figures[key], peer_figures[key], strict=True)
+    )
+    if not same or not our_figures:
+        raise RuntimeError(f"{ours.name} and {theirs.name} differ: {our_figures} {peer_figures}")
+
+
+def run_round(archive: Path, work: Path) -> dict[str, Run]:
+    """Return the runs of one round by name."""
+    cache = work / "cache"
+    for file in cache.rglob("*.index"):
+        file.unlink()
+    os.environ["XDG_CACHE_HOME"] = str(cache)
+    programs: Mapping[str, Callable[[Path], Run]] = {
+        "fieldkit, no index": lambda out: _fieldkit(archive, out, "--no-index"),
+        "fieldkit, first run": lambda out: _fieldkit(archive, out),
+        "fieldkit, with index": lambda out: _fieldkit(archive, out),
+        "pandas": lambda out: _peer("pandas", archive, out),
+        "DuckDB": lambda out: _peer("duckdb", archive, out),
+        "DuckDB, Parquet": lambda out: _peer("parquet", archive, out),
+    }
+    runs = {}
+    outputs = {name: work / f"{name.replace(', ', '-').replace(' ', '-')}.json" for name in programs}
+    for name, program in programs.items():
+        runs[name] = program(outputs[name])
+    first, *others = outputs.values()
+    for output in others:
+        check(first, output)
+    if len({outputs[name].read_bytes() for name in programs if name.startswith("fieldkit")}) != 1:
+        raise RuntimeError("the outputs with and without the index differ")
+    return runs
+
+
+def show(rounds: Sequence[Mapping[str, Run]]) -> None:
+    """Print a table; ratios are medians over the rounds of the ratio in each round."""
+    names = list(rounds[0])
+    print("| | s, median (lowest to highest) | processor time (s) | peak memory (MB) | of pandas | of DuckDB |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for name in names:
+        runs = [result[name] for result in rounds]
+        walls = [result.wall_s for result in runs]
+        ratios = [
+            statistics.median(result[name].wall_s / result[peer].wall_s for result in rounds)
+            for peer in ("pandas", "DuckDB")
+        ]
+        print(
+            f"| {name} | {statistics.median(walls):.2f} ({min(walls):.2f} to {max(walls):.2f}) "
+            f"| {statistics.median(result.processor_s for result in runs):.2f} "
+            f"| {max(result.peak_mb for result in runs):.0f} | {ratios[0]:.2f} | {ratios[1]:.2f} |"
+        )
+
+
+def main() -> None:
+    """Make the archive, run the rounds, print a table or JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--trials", type=int, default=10_000)
+    parser.add_argument("--repeats", type=int, default=20, help="rows per trial")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    os.chdir(ROOT)
+    with tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as name:
+        archive, work = Path(name) / "archive", Path(name)
+        write_archive(archive, arguments.trials, arguments.repeats)
+        run([sys.executable, "-c", f"import time; time.sleep({AGE_S})"], work / "slept")
+        run([sys.executable, "-m", "benchmarks.archive_peers", "write", str(archive)], work / "written")
+        load = os.getloadavg()[0]
+        rounds = [run_round(archive, work) for _ in range(arguments.rounds)]
+    if arguments.json:
+        values = [{label: vars(result) for label, result in runs.items()} for runs in rounds]
+        print(json.dumps({"load": load, "rounds": values}))
+        return
+    print(f"load average before: {load:.2f} on {os.cpu_count()} cores\n")
+    show(rounds)
+
+
+if __name__ == "__main__":
+    main()

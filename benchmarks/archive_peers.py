@@ -1,0 +1,61 @@
+"""Aggregation of an archive without fieldkit: `python -m benchmarks.archive_peers NAME FOLDER` prints JSON.
+
+NAME is pandas, duckdb, parquet (DuckDB reads the Parquet file), or write, which writes the Parquet file.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+BY: Final = ("procedure", "scenario", "topology", "backend", "distance_m", "protocol")
+QUANTITY: Final = "rtt_median_s"
+PARQUET: Final = "archive.parquet"
+
+
+def by_pandas(folder: Path) -> list[list[Any]]:
+    """Return conditions with number, mean and median."""
+    import pandas as pd  # noqa: PLC0415 (the peers must not import each other)
+
+    tables = sorted(folder.glob("**/trial.csv"))
+    rows = pd.concat([pd.read_csv(table, dtype={"distance_m": float}) for table in tables], ignore_index=True)
+    rows = rows[(rows["distance_m"] < 20) & (rows["topology"] == "master") & (rows["status"] == "valid")]
+    cells = rows.dropna(subset=[QUANTITY]).groupby(list(BY))[QUANTITY].agg(["count", "mean", "median"])
+    return [[*key, *map(float, figures)] for key, figures in zip(cells.index, cells.to_numpy(), strict=True)]
+
+
+def by_duckdb(source: str) -> list[list[Any]]:
+    """Return conditions with number, mean and median of a table that DuckDB reads."""
+    import duckdb  # noqa: PLC0415 (as above)
+
+    keys = ", ".join(BY)
+    query = (
+        f"SELECT {keys}, count({QUANTITY}), avg({QUANTITY}), median({QUANTITY}) FROM {source} "
+        "WHERE CAST(distance_m AS DOUBLE) < 20 AND topology = 'master' AND status = 'valid' "
+        f"AND {QUANTITY} IS NOT NULL GROUP BY {keys}"
+    )
+    rows: Any = duckdb.sql(query)
+    return [
+        [str(float(value)) if name == "distance_m" else value for name, value in zip(BY, row, strict=False)]
+        + list(row[len(BY) :])
+        for row in rows.fetchall()
+    ]
+
+
+def main() -> None:
+    """Print the figures."""
+    name, folder = sys.argv[1], Path(sys.argv[2])
+    tables = f"read_csv('{folder}/**/trial.csv', union_by_name=true, sample_size=-1)"
+    parquet = folder.parent / PARQUET
+    if name == "write":
+        import duckdb  # noqa: PLC0415 (as above)
+
+        duckdb.sql(f"COPY (SELECT * FROM {tables}) TO '{parquet}' (FORMAT parquet)")
+    elif name == "pandas":
+        print(json.dumps(by_pandas(folder)))
+    else:
+        print(json.dumps(by_duckdb(tables if name == "duckdb" else f"'{parquet}'")))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,342 @@
+"""An index of many tables: their rows, parsed and typed, in one file of the user's cache.
+
+The index is never trusted over the tables: an entry is used only if device, inode, size, modification time and
+change time of the table and of the `trial.yaml` next to it are those of the files that were read. A program can
+restore a modification time, but not the change time. A file that changed less than `SETTLED_S` before it was read
+gets no entry, because a later change within the resolution of the time stamps would not be detected.
+
+The file consists of a Parquet file, a JSON description of the tables, the length of the description, a digest
+(BLAKE2b) of all of these, and `MAGIC`. A file that is damaged or belongs to another user is ignored.
+"""
+
+import hashlib
+import json
+import os
+import stat
+import tempfile
+import time
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+from numpy.typing import NDArray
+
+from fieldkit.analysis.parsing import Numbers, Texts, arrow_columns, arrow_type
+from fieldkit.core.columns import Column
+
+MAGIC: Final = b"fkindex1"
+SETTLED_S: Final = 2.0
+"""The coarsest resolution of time stamps (FAT)."""
+MAX_FILES: Final = 20
+"""Number of indexes that are kept."""
+_DIGEST_BYTES: Final = 32
+_LENGTH_BYTES: Final = 8
+_SUFFIX: Final = ".index"
+_TEMPORARY_SUFFIX: Final = ".new"
+_LEFT_OVER_S: Final = 86_400
+"""Age of a temporary file that a killed process left behind."""
+
+
+class FileStamp(NamedTuple):
+    """Properties of a file that change if its content changes."""
+
+    device: int
+    inode: int
+    size: int
+    modified_ns: int
+    changed_ns: int
+
+    @classmethod
+    def of(cls, status: os.stat_result) -> "FileStamp":
+        """Return the stamp of a file."""
+        return cls(status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
+
+    def is_settled(self, now_ns: int) -> bool:
+        """Return True if the file did not change in the last `SETTLED_S`."""
+        return max(self.modified_ns, self.changed_ns) < now_ns - SETTLED_S * 1e9
+
+
+TableStamp = tuple[FileStamp, FileStamp | None]
+"""Stamps of a table and of the `trial.yaml` next to it; None if there is no such file."""
+
+
+def stamp(table: Path, plan: Path) -> TableStamp | None:
+    """Return the stamps of a table and its plan; None if either is not a regular file, which is not indexed."""
+    try:
+        table_status = table.stat()
+    except OSError:
+        return None
+    try:
+        plan_status = plan.lstat()
+    except FileNotFoundError:
+        return FileStamp.of(table_status), None
+    except OSError:
+        return None
+    if not (stat.S_ISREG(table_status.st_mode) and stat.S_ISREG(plan_status.st_mode)):
+        return None
+    return FileStamp.of(table_status), FileStamp.of(plan_status)
+
+
+@dataclass(frozen=True)
+class TableFacts:
+    """The properties of a table that are needed before its rows.
+
+    Attributes:
+        names: Names of its columns.
+        declarations: The columns that its plan declares, as JSON.
+        expected: Expectations in its plan.
+    """
+
+    names: tuple[str, ...]
+    declarations: str
+    expected: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A table in an index.
+
+    Attributes:
+        path: Its absolute path when it was read.
+        stamp: Its stamps.
+        facts: Its properties.
+        start: Index of its first row.
+        rows: Number of its rows; negative if a value is invalid, so that the table is always read itself.
+    """
+
+    path: str
+    stamp: TableStamp
+    facts: TableFacts
+    start: int
+    rows: int
+
+
+@dataclass(frozen=True, eq=False)
+class TableIndex:
+    """The content of an index file.
+
+    Attributes:
+        entries: The tables by their stamps.
+        content: The Parquet file.
+        types: Types of the columns by name, as text.
+    """
+
+    entries: Mapping[TableStamp, Entry] = field(default_factory=dict)
+    content: pa.Buffer | None = None
+    types: Mapping[str, str] = field(default_factory=dict)
+
+    def has_types(self, declared: Iterable[Column]) -> bool:
+        """Return True if no column has another type than in the index."""
+        return all(self.types.get(column.name, kind) == kind for column in declared for kind in [type_name(column)])
+
+    def read(
+        self, entries: Sequence[Entry], declared: Mapping[str, Column]
+    ) -> tuple[dict[str, Numbers], dict[str, Texts]]:
+        """Return the rows of some tables in order, as `parsing.columns`.
+
+        Raises:
+            pa.ArrowException: The index is damaged.
+        """
+        file = pa.parquet.ParquetFile(pa.BufferReader(self.content))
+        present = [name for name in declared if name in self.types]
+        table = file.read(columns=present, use_threads=True)
+        by_name = {name: table.column(name).cast(arrow_type(declared[name])) for name in present}
+        numbers, texts = arrow_columns(by_name, declared, len(table))
+        chosen = _ranges(entries)
+        if len(chosen) == len(table) and (chosen == np.arange(len(table))).all():
+            return numbers, texts
+        return (
+            {name: column[chosen] for name, column in numbers.items()},
+            {name: column[chosen] for name, column in texts.items()},
+        )
+
+
+def _ranges(entries: Iterable[Entry]) -> NDArray[np.int64]:
+    return np.concatenate(
+        [np.arange(entry.start, entry.start + entry.rows) for entry in entries] or [np.empty(0, np.int64)]
+    )
+
+
+_TYPES: Final = {
+    "text": pa.dictionary(pa.int32(), pa.string()),
+    **{str(kind): kind for kind in (pa.bool_(), pa.int64(), pa.float64())},
+}
+
+
+def type_name(column: Column) -> str:
+    """Return the type of a column in an index, as text."""
+    kind = arrow_type(column)
+    return next(name for name, arrow_kind in _TYPES.items() if arrow_kind == kind)
+
+
+def cache_folder() -> Path:
+    """Return the folder of indexes: `fieldkit/tables` in `XDG_CACHE_HOME`, by default `~/.cache`."""
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (base if base.is_absolute() else Path.home() / ".cache") / "fieldkit" / "tables"
+
+
+def index_path(tables: Sequence[str]) -> Path:
+    """Return the index file of tables with these absolute paths: one per folder that they have in common."""
+    common = os.path.commonpath(tables)
+    return cache_folder() / f"{hashlib.blake2b(os.fsencode(common), digest_size=16).hexdigest()}{_SUFFIX}"
+
+
+def load(path: Path) -> TableIndex:
+    """Return the index in a file; an empty one if there is no file, or if it is damaged or of another version.
+
+    Raises:
+        OSError: The file cannot be read, or it or its folder can be written by another user.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return TableIndex()
+    with os.fdopen(descriptor, "rb") as file:
+        for status in (path.parent.stat(), os.fstat(descriptor)):
+            _require_private(status, path)
+        content = file.read() if stat.S_ISREG(os.fstat(descriptor).st_mode) else b""
+    tail = len(MAGIC) + _DIGEST_BYTES
+    if not content.endswith(MAGIC) or len(content) < tail + _LENGTH_BYTES:
+        return TableIndex()
+    body = memoryview(content)[:-tail]
+    if _digest(body) != content[-tail : -len(MAGIC)]:
+        return TableIndex()
+    split = len(body) - _LENGTH_BYTES - int.from_bytes(body[-_LENGTH_BYTES:], "big")
+    description = json.loads(bytes(body[split:-_LENGTH_BYTES]))
+    if description["version"] != _version():
+        return TableIndex()
+    return TableIndex(dict(_entries(description)), pa.py_buffer(body[:split]), description["types"])
+
+
+def _require_private(status: os.stat_result, path: Path) -> None:
+    if status.st_uid != os.geteuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(1, "another user can write it", str(path))
+
+
+def _digest(content: Any) -> bytes:  # noqa: ANN401 (any buffer)
+    return hashlib.blake2b(content, digest_size=_DIGEST_BYTES).digest()
+
+
+def _version() -> list[str]:
+    return [version("fieldkit"), pa.__version__]
+
+
+def _entries(description: Mapping[str, Any]) -> Iterator[tuple[TableStamp, Entry]]:
+    facts = [TableFacts(tuple(names), text, tuple(expected)) for names, text, expected in description["facts"]]
+    for path, table, plan, number, start, rows in description["tables"]:
+        stamps = FileStamp(*table), plan and FileStamp(*plan)
+        yield stamps, Entry(path, stamps, facts[number], start, rows)
+
+
+def _description(entries: Iterable[Entry], types: Mapping[str, str]) -> bytes:
+    numbers: dict[TableFacts, int] = {}
+    tables = [
+        (entry.path, *entry.stamp, numbers.setdefault(entry.facts, len(numbers)), entry.start, entry.rows)
+        for entry in entries
+    ]
+    facts = [(fact.names, fact.declarations, fact.expected) for fact in numbers]
+    return json.dumps({"version": _version(), "types": types, "facts": facts, "tables": tables}).encode()
+
+
+class IndexWriter:
+    """Writes an index in a temporary file, which replaces the old index at the end.
+
+    Args:
+        file: The temporary file.
+        types: Types of the columns of all tables by name, as in `TableIndex`.
+    """
+
+    def __init__(self, file: Any, types: Mapping[str, str]) -> None:  # noqa: ANN401 (a temporary file)
+        self._file, self._types = file, types
+        self._schema = pa.schema([(name, _TYPES[kind]) for name, kind in types.items()])
+        self._writer = pa.parquet.ParquetWriter(file, self._schema, compression="zstd")
+        self._entries: list[Entry] = []
+        self._rows = 0
+
+    def add(self, columns: Mapping[str, pa.ChunkedArray], tables: Iterable[Entry]) -> None:
+        """Add the rows of some tables; columns that they do not have are missing.
+
+        Args:
+            columns: Columns of Arrow, of the types of `arrow_type`.
+            tables: The tables in the order of their rows; their `start` is replaced.
+        """
+        total = 0
+        for entry in tables:
+            self._entries.append(Entry(entry.path, entry.stamp, entry.facts, self._rows + total, entry.rows))
+            total += max(entry.rows, 0)
+        if total:
+            table = pa.table(
+                [_column(columns.get(item.name), item.type, total) for item in self._schema], self._schema
+            )
+            self._writer.write_table(table)
+        self._rows += total
+
+    def copy(self, index: TableIndex, entries: Collection[Entry]) -> None:
+        """Add tables of another index whose columns have the same types."""
+        ordered = sorted(entries, key=lambda entry: entry.start)
+        rows = pa.array(_ranges(entry for entry in ordered if entry.rows > 0))
+        table = pa.parquet.ParquetFile(pa.BufferReader(index.content)).read().take(rows)
+        columns = {
+            item.name: table.column(item.name).cast(item.type) for item in self._schema if item.name in index.types
+        }
+        self.add(columns, ordered)
+
+    def finish(self) -> None:
+        """Write the description and the digest."""
+        self._writer.close()
+        description = _description(self._entries, self._types)
+        self._file.write(description + len(description).to_bytes(_LENGTH_BYTES, "big"))
+        self._file.flush()
+        self._file.seek(0)
+        digest = hashlib.file_digest(self._file, lambda: hashlib.blake2b(digest_size=_DIGEST_BYTES)).digest()
+        self._file.write(digest + MAGIC)
+
+
+def _column(column: pa.ChunkedArray | None, kind: pa.DataType, rows: int) -> pa.ChunkedArray | pa.Array:
+    """Return a column, or one in which all values are missing; a missing text is empty."""
+    if column is not None:
+        return column
+    if pa.types.is_dictionary(kind):
+        return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array([""]))
+    return pa.nulls(rows, kind)
+
+
+@contextmanager
+def replacing(path: Path, types: Mapping[str, str]) -> Iterator[IndexWriter]:
+    """Replace an index file atomically at the end of the body.
+
+    Raises:
+        OSError: It cannot be written; an existing index is unchanged.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _require_private(path.parent.stat(), path.parent)
+    descriptor, name = tempfile.mkstemp(_TEMPORARY_SUFFIX, path.name, path.parent)
+    try:
+        with os.fdopen(descriptor, "w+b") as file:
+            writer = IndexWriter(file, types)
+            yield writer
+            writer.finish()
+        Path(name).rename(path)
+    except pa.ArrowException as error:
+        raise OSError(5, str(error), str(path)) from error
+    finally:
+        with suppress(FileNotFoundError):
+            Path(name).unlink()
+    _remove_old(path.parent)
+
+
+def _remove_old(folder: Path) -> None:
+    """Remove the oldest indexes beyond `MAX_FILES`, and temporary files of processes that were killed."""
+    with suppress(OSError):  # another process removes them, too
+        by_age = sorted(folder.glob(f"*{_SUFFIX}"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+        left_over = [
+            path for path in folder.glob(f"*{_TEMPORARY_SUFFIX}") if path.stat().st_mtime < time.time() - _LEFT_OVER_S
+        ]
+        for path in (*by_age[MAX_FILES:], *left_over):
+            path.unlink()

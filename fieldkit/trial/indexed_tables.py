@@ -1,0 +1,194 @@
+"""Tables of trials with an index: which of them it covers, and the index of those that it does not cover yet."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+from fieldkit.analysis import table_files, table_index
+from fieldkit.analysis.parsing import Numbers, Texts
+from fieldkit.analysis.table_index import Entry, TableFacts, TableIndex, TableStamp
+from fieldkit.core.columns import Column
+from fieldkit.core.errors import FieldkitError
+from fieldkit.core.executors import Workers
+from fieldkit.core.tasks import completed
+from fieldkit.trial import frozen
+from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.tables import expected, frozen_columns, other_names
+
+MIN_TABLES: Final = 100
+"""Number of tables from which an index is made; fewer are read faster than their index."""
+MIN_NEW: Final = 20
+"""Number of new or changed tables from which an existing index is written again; fewer are read from their files."""
+MAX_TABLE_BYTES: Final = 1 << 25
+"""Largest table that is indexed."""
+_IN_PARALLEL: Final = 200
+"""Number of plans from which they are read in parallel; a plan takes 20 ms, and processes take a second to start."""
+
+Note = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class IndexedTables:
+    """The tables that an index covers, and those that it will cover.
+
+    Attributes:
+        path: The file of the index; None if there is no index.
+        index: Its content.
+        entries: The entries of the tables that it covers.
+        new: Properties of tables that `write` adds to it, with their stamps.
+    """
+
+    path: Path | None = None
+    index: TableIndex = field(default_factory=TableIndex)
+    entries: Mapping[Path, Entry] = field(default_factory=dict)
+    new: Mapping[Path, tuple[TableStamp, TableFacts]] = field(default_factory=dict)
+
+    @cached_property
+    def tables(self) -> frozenset[Path]:
+        """The tables whose rows are in the index."""
+        return frozenset(table for table, entry in self.entries.items() if entry.rows >= 0)
+
+    def facts(self, table: Path) -> TableFacts | None:
+        """Return the properties of a table; None if they are unknown."""
+        if table in self.new:
+            return self.new[table][1]
+        return self.entries[table].facts if table in self.entries else None
+
+    def read(
+        self, tables: Sequence[Path], declared: Mapping[str, Column]
+    ) -> tuple[dict[str, Numbers], dict[str, Texts], list[int]] | None:
+        """Return the rows of tables, as `table_files.IndexedRows`; None if columns have other types now."""
+        if not self.index.has_types(declared.values()):
+            return None
+        entries = [self.entries[table] for table in tables]
+        return *self.index.read(entries, declared), [entry.rows for entry in entries]
+
+
+NO_INDEX: Final = IndexedTables()
+
+
+def find(tables: Iterable[Path], workers: Workers, note: Note) -> IndexedTables:
+    """Return the tables that the index in the user's cache covers, and the properties of those to add.
+
+    Args:
+        tables: The tables.
+        workers: Where plans are read.
+        note: Receives a note if the index cannot be used.
+    """
+    absolute = {table: table.absolute() for table in tables if table.suffix == ".csv"}
+    if len(absolute) < MIN_TABLES:
+        return NO_INDEX
+    path = table_index.index_path(list(map(str, absolute.values())))
+    try:
+        index = table_index.load(path)
+    except OSError as error:
+        note(_unused(path, error))
+        return NO_INDEX
+    now_ns = time.time_ns()
+    entries, new = {}, {}
+    for table, name in absolute.items():
+        stamps = _stamp(name)
+        if stamps is None:
+            continue
+        if stamps in index.entries:
+            entries[table] = index.entries[stamps]
+        elif _can_be_indexed(stamps, now_ns):
+            new[table] = stamps
+    known = IndexedTables(path, index, entries)
+    if len(new) < (MIN_NEW if index.entries else MIN_TABLES):
+        return known
+    facts = _facts(list(new), workers, note)
+    return replace(known, new={table: (new[table], facts[table]) for table in facts})
+
+
+def _unused(path: Path, error: OSError) -> str:
+    return f"{path}: {error.strerror or error}; reading tables without an index takes longer (--no-index: no note)"
+
+
+def _can_be_indexed(stamps: TableStamp, now_ns: int) -> bool:
+    return stamps[0].size <= MAX_TABLE_BYTES and all(item is None or item.is_settled(now_ns) for item in stamps)
+
+
+def _facts(tables: Sequence[Path], workers: Workers, note: Note) -> dict[Path, TableFacts]:
+    """Return the properties of tables, without those of which something is invalid; reading them raises the error."""
+    names: dict[Path, tuple[str, ...]] = {}
+    for table in tables:
+        with suppress(FieldkitError):
+            names[table] = table_files.names(table)
+    with_plan = [table for table in names if other_names(names[table])]
+    if len(with_plan) < _IN_PARALLEL:
+        workers = Workers(jobs=1)
+    declarations = dict.fromkeys(names, "")
+    absolute = [table.absolute() for table in with_plan]  # workers of a cluster have another working directory
+    for end in completed(_declarations, absolute, workers, note):
+        if end.result is None:
+            del declarations[with_plan[end.number]]
+        else:
+            declarations[with_plan[end.number]] = end.result
+    facts = {}
+    for table, text in declarations.items():
+        with suppress(FieldkitError, OSError):
+            facts[table] = TableFacts(names[table], text, expected(table))
+    return facts
+
+
+def _declarations(table: Path) -> str:
+    """Return the columns that the plan next to a table declares, as JSON."""
+    return frozen.to_json(frozen_columns(table))
+
+
+def write(known: IndexedTables, columns: Sequence[Column], note: Note) -> IndexedTables:
+    """Write the index with its new tables, and return the tables that it covers.
+
+    Args:
+        known: The tables, as `find` returned them.
+        columns: Columns of all tables.
+        note: Receives a note if the index cannot be written.
+    """
+    if known.path is None or not known.new:
+        return known
+    declared = {column.name: column for column in columns}
+    index = known.index if known.index.has_types(columns) else TableIndex()
+    types = {**index.types, **{name: table_index.type_name(column) for name, column in declared.items()}}
+    try:
+        with table_index.replacing(known.path, types) as writer:
+            if index.entries:
+                writer.copy(index, _kept(known))
+            for arrays, counts in table_files.typed_tables(_unchanged(known.new), declared):
+                added = [Entry(str(table.absolute()), *known.new[table], 0, rows) for table, rows in counts]
+                writer.add(arrays, added)
+        written = table_index.load(known.path)
+    except OSError as error:
+        note(_unused(known.path, error))
+        return replace(known, new={})
+    stamps = {table: entry.stamp for table, entry in known.entries.items()}
+    stamps |= {table: stamp for table, (stamp, _) in known.new.items()}
+    entries = {table: written.entries[stamp] for table, stamp in stamps.items() if stamp in written.entries}
+    return IndexedTables(known.path, written, entries)
+
+
+def _kept(known: IndexedTables) -> list[Entry]:
+    """Return the entries of an index whose tables have not changed."""
+    requested = {entry.stamp for entry in known.entries.values()}
+    return [
+        entry
+        for entry in known.index.entries.values()
+        if entry.stamp in requested or entry.stamp == _stamp(Path(entry.path))
+    ]
+
+
+def _unchanged(new: Mapping[Path, tuple[TableStamp, TableFacts]]) -> Iterator[tuple[Path, bytes]]:
+    """Yield the tables and their bytes if neither the table nor its plan changed since its stamp was read."""
+    for table, (stamp, _) in new.items():
+        with suppress(OSError):
+            content = table.read_bytes()
+            if _stamp(table.absolute()) == stamp:
+                yield table, content
+
+
+def _stamp(table: Path) -> TableStamp | None:
+    return table_index.stamp(table, table.parent / PLAN_FILE)
