@@ -18,11 +18,19 @@ from sim_backends.linux_wifi.hwsim_messages import (
     RadioAddress,
     RateStage,
     SentFrame,
+    decode_event,
     encode_sent,
 )
-from sim_backends.linux_wifi.netlink import NLMSG_ERROR, NetlinkMessage, decode_generic, encode_generic
+from sim_backends.linux_wifi.netlink import (
+    NLMSG_ERROR,
+    NetlinkMessage,
+    decode_generic,
+    decode_messages,
+    encode_generic,
+)
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import Antenna
+from tests.helpers.paths import ROOT
 
 NAMES = "abc"
 START_NS = 10_000_000
@@ -160,3 +168,21 @@ def test_any_frame_of_a_robot_gets_exactly_one_status(content: bytes, flags: int
     frame = SentFrame(radio(0), content, flags, frequency_mhz, (RateStage(2, 2),), 5)
     medium.receive(START_NS, message(encode_sent(frame)))
     assert [command for command, _ in results(medium)].count(CMD_TX_INFO_FRAME) == 1
+
+
+def test_messages_of_a_real_kernel_get_a_status_each() -> None:
+    """Recorded in an ad-hoc network: see the list of sources beside the recording."""
+    medium, frames = new_medium(), 0
+    recording = (ROOT / "tests/data/hwsim/6.1.176/ad-hoc.txt").read_text(encoding="ascii")
+    for number, line in enumerate(recording.splitlines()):
+        now_ns = START_NS + number * 100_000_000
+        for received in decode_messages(bytes.fromhex(line)):
+            is_frame = isinstance(decode_event(received.payload), SentFrame)
+            medium.receive(now_ns, received)
+            commands = [command for command, _ in results(medium, now_ns)]
+            assert commands.count(CMD_TX_INFO_FRAME) == is_frame
+            # Both other radios are in range and receive each broadcast.
+            assert commands.count(CMD_FRAME) == 2 * is_frame
+            frames += is_frame
+    assert frames == 24
+    assert medium.counts.rejected == 0
