@@ -34,9 +34,9 @@ from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.network.packets import Packet, Received
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.physics.paths import Paths
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.model import WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.motion import State, WayPoints
 
 COUNTS: Final = (3, 10, 30, 100, 200)

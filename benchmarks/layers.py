@@ -21,10 +21,10 @@ from benchmarks.medium import PAYLOAD_BYTES, RADIO, quantile
 from benchmarks.swarm import swarm
 from fieldkit.core.model import DelayParts
 from sim_backends.emulated.medium.medium_client import MediumClient
+from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import antenna_of
 from sim_backends.world.world import World, load_world
 
 PACKET_BYTES: Final = PAYLOAD_BYTES + 28

@@ -1,4 +1,5 @@
-// Results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py. `errors`: frame error by mode and SNR; `link`:
+// Results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py. `errors`: frame error by mode and SNR;
+// `durations`: airtime in ns by frame size in bytes; `link`:
 // goodput in Mbit/s of saturated stations that send UDP to one receiver, all with the same distance from each other; `udp`
 // and `tcp`: goodput and loss of a stream at a rate, or at the full rate of TCP, and the events of the TCP sender.
 
@@ -81,6 +82,11 @@ struct Options
     uint32_t payload = 1000;
     double seconds = 5;
     double loss_db = 60;
+    uint16_t width = 20;
+    uint16_t streams = 1;
+    uint16_t guard_ns = 800;
+    uint32_t ampdu = 0;
+    std::string band = "BAND_2_4GHZ";
     bool relay = false;
     bool adapt = false;
     std::string control = "ns3::TcpCubic";
@@ -98,7 +104,9 @@ WifiStandard StandardOf(const std::string& mode)
     switch (mode[0])
     {
     case 'H':
-        return WIFI_STANDARD_80211n;
+        return mode[1] == 'e' ? WIFI_STANDARD_80211ax : WIFI_STANDARD_80211n;
+    case 'V':
+        return WIFI_STANDARD_80211ac;
     case 'O':
         return WIFI_STANDARD_80211a;
     default:
@@ -121,8 +129,14 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     phy.Set("RxNoiseFigure", DoubleValue(kNoiseFigureDb));
     // 802.11a sends like 802.11g, but in another band; the path loss is an option, independent of the band.
     auto standard = StandardOf(options.mode);
-    bool high = standard == WIFI_STANDARD_80211a;
-    phy.Set("ChannelSettings", StringValue(high ? "{0, 20, BAND_5GHZ, 0}" : "{0, 20, BAND_2_4GHZ, 0}"));
+    auto band = standard == WIFI_STANDARD_80211a ? "BAND_5GHZ" : options.band;
+    bool high = band != "BAND_2_4GHZ";
+    phy.Set("ChannelSettings", StringValue("{0, " + std::to_string(options.width) + ", " + band + ", 0}"));
+    phy.Set("Antennas", UintegerValue(options.streams));
+    phy.Set("MaxSupportedTxSpatialStreams", UintegerValue(options.streams));
+    phy.Set("MaxSupportedRxSpatialStreams", UintegerValue(options.streams));
+    Config::SetDefault("ns3::HtConfiguration::ShortGuardIntervalSupported", BooleanValue(options.guard_ns == 400));
+    Config::SetDefault("ns3::HeConfiguration::GuardInterval", TimeValue(NanoSeconds(std::max<int>(options.guard_ns, 800))));
     WifiHelper wifi;
     wifi.SetStandard(standard);
     if (options.adapt)
@@ -135,10 +149,10 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
                                      "NonUnicastMode", StringValue(high ? "OfdmRate6Mbps" : "ErpOfdmRate6Mbps"));
     }
     WifiMacHelper mac;
-    auto no_aggregates = UintegerValue(0);
+    auto ampdu = UintegerValue(options.ampdu);
     if (!options.relay)
     {
-        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmpduSize", no_aggregates);
+        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmpduSize", ampdu);
         return wifi.Install(phy, mac, nodes);
     }
     auto ssid = SsidValue(Ssid("fieldkit"));
@@ -147,9 +161,9 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     {
         stations.Add(nodes.Get(n));
     }
-    mac.SetType("ns3::StaWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", no_aggregates);
+    mac.SetType("ns3::StaWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", ampdu);
     auto devices = wifi.Install(phy, mac, stations);
-    mac.SetType("ns3::ApWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", no_aggregates);
+    mac.SetType("ns3::ApWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", ampdu);
     devices.Add(wifi.Install(phy, mac, nodes.Get(nodes.GetN() - 1)));
     return devices;
 }
@@ -173,7 +187,7 @@ double Goodput(const Options& options)
     for (uint32_t n = 0; n < options.stations; n++)
     {
         OnOffHelper source("ns3::UdpSocketFactory", to);
-        source.SetConstantRate(DataRate("70Mbps"), options.payload);
+        source.SetConstantRate(DataRate(options.ampdu ? "1300Mbps" : "70Mbps"), options.payload);
         source.Install(nodes.Get(n)).Start(Seconds(kWarmUpS + 0.001 * n));
     }
     uint64_t before = 0;
@@ -328,21 +342,42 @@ void Tcp(const Options& options)
     std::cout << bits / options.seconds / 1e6 << " 0\n";
 }
 
+WifiTxVector Vector(const Options& options)
+{
+    const std::map<WifiStandard, WifiPreamble> preambles{{WIFI_STANDARD_80211n, WIFI_PREAMBLE_HT_MF},
+                                                         {WIFI_STANDARD_80211ac, WIFI_PREAMBLE_VHT_SU},
+                                                         {WIFI_STANDARD_80211ax, WIFI_PREAMBLE_HE_SU}};
+    auto preamble = preambles.find(StandardOf(options.mode));
+    WifiTxVector vector;
+    vector.SetMode(WifiMode(options.mode));
+    vector.SetChannelWidth(options.width);
+    vector.SetNss(options.streams);
+    vector.SetGuardInterval(options.guard_ns);
+    vector.SetPreambleType(preamble == preambles.end() ? WIFI_PREAMBLE_LONG : preamble->second);
+    return vector;
+}
+
+void Durations(const Options& options)
+{
+    auto band = options.band == "BAND_2_4GHZ" ? WIFI_PHY_BAND_2_4GHZ
+                : options.band == "BAND_5GHZ" ? WIFI_PHY_BAND_5GHZ
+                                              : WIFI_PHY_BAND_6GHZ;
+    for (uint32_t bytes : {14, 100, 500, 1036, 1538, 7000, 30000})
+    {
+        std::cout << bytes << " "
+                  << WifiPhy::CalculateTxDuration(bytes, Vector(options), band).GetNanoSeconds() << "\n";
+    }
+}
+
 void Errors(const Options& options)
 {
     ObjectFactory factory("ns3::NistErrorRateModel");
     auto model = factory.Create<ErrorRateModel>();
-    auto mode = WifiMode(options.mode);
-    WifiTxVector vector;
-    vector.SetMode(mode);
-    vector.SetChannelWidth(20);
-    vector.SetNss(1);
-    vector.SetGuardInterval(800);
-    vector.SetPreambleType(options.mode[0] == 'H' ? WIFI_PREAMBLE_HT_MF : WIFI_PREAMBLE_LONG);
-    for (int step = -50; step <= 350; step++)
+    auto vector = Vector(options);
+    for (int step = -50; step <= 450; step++)
     {
         double ratio_db = step / 10.0;
-        double success = model->GetChunkSuccessRate(mode, vector, std::pow(10, ratio_db / 10), 8 * options.payload);
+        double success = model->GetChunkSuccessRate(vector.GetMode(), vector, std::pow(10, ratio_db / 10), 8 * options.payload);
         std::cout << ratio_db << " " << 1 - success << "\n";
     }
 }
@@ -353,12 +388,17 @@ int main(int argc, char** argv)
 {
     Options options;
     CommandLine command;
-    command.AddValue("what", "errors, link, udp or tcp", options.what);
+    command.AddValue("what", "errors, durations, link, udp or tcp", options.what);
     command.AddValue("mode", "ns-3's name of the mode", options.mode);
     command.AddValue("stations", "that send", options.stations);
     command.AddValue("payload", "bytes", options.payload);
     command.AddValue("seconds", "duration of the measurement", options.seconds);
     command.AddValue("loss", "path loss between any two stations, dB", options.loss_db);
+    command.AddValue("width", "of the channel, MHz", options.width);
+    command.AddValue("streams", "spatial streams", options.streams);
+    command.AddValue("guard", "guard interval, ns", options.guard_ns);
+    command.AddValue("ampdu", "maximum size of an A-MPDU, bytes; 0 for none", options.ampdu);
+    command.AddValue("band", "ns-3's name of the band", options.band);
     command.AddValue("relay", "send through an access point", options.relay);
     command.AddValue("adapt", "choose the mode by Minstrel", options.adapt);
     command.AddValue("control", "congestion control of TCP", options.control);
@@ -377,6 +417,10 @@ int main(int argc, char** argv)
     if (options.what == "errors")
     {
         Errors(options);
+    }
+    else if (options.what == "durations")
+    {
+        Durations(options);
     }
     else if (options.what == "udp")
     {

@@ -18,10 +18,12 @@ import numpy as np
 
 from sim_backends.federates.compiling import CompiledProgram
 from sim_backends.ns3.federate import standard_flag, version
-from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode, packet_error
+from sim_backends.radio.antennas import Antenna
+from sim_backends.radio.error_rates import packet_error
+from sim_backends.radio.modes import CHANNEL_6_HZ, G_MODES, N_MODES, WifiMode
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
-from sim_backends.radio.world_channel import CHANNEL_6_HZ, Antenna, WorldChannel
+from sim_backends.radio.world_channel import WorldChannel
 
 SOURCE: Final = Path(__file__).with_name("ns3_link.cc")
 LIBRARIES: Final = (

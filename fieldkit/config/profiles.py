@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar, Final
 from fieldkit.config import catalog, schema
 from fieldkit.config.schema import AfterValidator, Bytes, Field, Hertz, Int, Number, Strict, pattern_field
 from fieldkit.config.sections import Sectioned
+from fieldkit.config.wifi_phy import WifiPhy, check_standard
 from fieldkit.core import plugins
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
@@ -234,11 +235,12 @@ class Radio(Strict):
 
     Attributes:
         interface: Name of the network interface under test, `wlan0`.
-        standard: For example `802.11n 2.4 GHz`, for information only.
+        standard: For example `802.11n 2.4 GHz`.
         access_point: True if the robot runs an access point; `check` reports if its radio is a station.
         tx_power_dbm: Transmit power in dBm; used by the emulated radio.
         sensitivity_dbm: Weakest signal that it can receive, in dBm; used by the emulated radio, and by `check` to
             report a weak signal.
+        phy: Physical layer of 802.11n, ac or ax, for the emulated radio.
     """
 
     interface: Annotated[
@@ -248,6 +250,12 @@ class Radio(Strict):
     access_point: schema.Bool = False
     tx_power_dbm: Number | Int
     sensitivity_dbm: Number | Int
+    phy: WifiPhy | None = Field(default=None, exclude_if=schema.is_empty)
+
+    @schema.model_validator(mode="after")
+    def _check_standard(self) -> "Radio":
+        check_standard(self.standard, self.phy)
+        return self
 
 
 class Limits(Strict):

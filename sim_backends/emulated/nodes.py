@@ -27,7 +27,7 @@ from sim_backends.emulated.robot.ssh_server import SSH_PORT
 from sim_backends.emulated.ros.laser import PlacesWriter
 from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.emulated.ros.steered import Steered, SteeredRecord
-from sim_backends.radio.modes import fixed_mode, standard_of
+from sim_backends.radio.antennas import antenna_of, fixed_mode
 from sim_backends.world.world import World
 
 # Equal to the robots' own radios, so that a link has the same quality in both directions.
@@ -274,7 +274,7 @@ def running_robots(
         ConfigurationError: The site file fixes a radio mode that one of the robots does not have.
         FieldkitError: A robot or the medium did not start.
     """
-    fixed_mode(options.radio.mode, {robot.name: standard_of(robot.profile.radio) for robot in robots.values()})
+    fixed_mode(options.radio.mode, {robot.name: antenna_of(robot.profile.radio) for robot in robots.values()})
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
     with ExitStack() as stack:
         framing = IP if options.mesh is None else ETHERNET

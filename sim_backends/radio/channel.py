@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from fieldkit.core.model import Vector
+from sim_backends.radio.modes import BAND_2_4, Band
 from sim_backends.radio.rate_control import RateControl
 
 
@@ -16,8 +17,10 @@ class RadioChannel(Protocol):
         noise_mw: Noise power at each station, in mW.
         sensitivity_mw: Weakest frame that each station detects, in mW; a station does not send while it detects a
             frame.
+        band: Band in which all stations send.
     """
 
+    band: Band = BAND_2_4
     names: Sequence[str]
     noise_mw: Sequence[float]
     sensitivity_mw: Sequence[float]

@@ -7,7 +7,7 @@ import heapq
 from collections.abc import Callable
 from typing import Any, Final
 
-from sim_backends.radio.modes import CW_MAX, CW_MIN, DIFS_NS, SLOT_NS
+from sim_backends.radio.modes import CW_MAX, CW_MIN, SLOT_NS
 
 CCA_TIME_NS: Final = 4_000
 """Stations that start within this time of each other do not sense each other and collide: aCCATime, table 17-21."""
@@ -16,11 +16,12 @@ CCA_TIME_NS: Final = 4_000
 class Contention:
     """Carrier sense and backoff of one station.
 
-    Backoff slots count down only after the channel has been idle for an inter-frame space (DIFS); the remaining slots
+    Backoff slots count down only after the channel has been idle for an inter-frame space; the remaining slots
     wait for the next idle period. A new backoff is drawn after every frame, so that no station keeps the channel.
 
     Args:
         draw: Returns a uniform random number on [0, 1) per call.
+        ifs_ns: Inter-frame space before the backoff.
 
     Attributes:
         busy_until_ns: End of the last frame or reservation that the station has sensed or sent.
@@ -28,10 +29,11 @@ class Contention:
         slots: Backoff slots that remain.
     """
 
-    __slots__ = ("_draw", "_window", "busy_until_ns", "count_from_ns", "slots")
+    __slots__ = ("_draw", "_ifs_ns", "_window", "busy_until_ns", "count_from_ns", "slots")
 
-    def __init__(self, draw: Callable[[], float]) -> None:
+    def __init__(self, draw: Callable[[], float], ifs_ns: int) -> None:
         self._draw = draw
+        self._ifs_ns = ifs_ns
         self._window = CW_MIN
         self.busy_until_ns = 0
         self.count_from_ns = 0
@@ -61,7 +63,7 @@ class Contention:
         elif now_ns > self.count_from_ns:
             self._count_down(now_ns)
         # An ACK changes nothing for stations that decoded the data frame, which reserved the time of its ACK.
-        if until_ns > self.busy_until_ns or until_ns + DIFS_NS > self.count_from_ns:
+        if until_ns > self.busy_until_ns or until_ns + self._ifs_ns > self.count_from_ns:
             self.set_busy_until(until_ns)
         # A station that drew 0 slots draws again if the channel is busy, as in `earliest_start_ns`.
         if not self.slots:
@@ -78,8 +80,8 @@ class Contention:
         # statements.
         if until_ns > self.busy_until_ns:  # noqa: PLR1730 (see above)
             self.busy_until_ns = until_ns
-        if until_ns + DIFS_NS > self.count_from_ns:  # noqa: PLR1730 (see above)
-            self.count_from_ns = until_ns + DIFS_NS
+        if until_ns + self._ifs_ns > self.count_from_ns:  # noqa: PLR1730 (see above)
+            self.count_from_ns = until_ns + self._ifs_ns
 
     def on_success(self) -> None:
         """Reset the contention window and draw a backoff, after a frame that was delivered or given up."""

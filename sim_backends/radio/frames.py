@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic
 
+from sim_backends.radio.error_rates import log_success
 from sim_backends.radio.links import (
     PACKET,
     PROPAGATION_NS,
@@ -14,7 +15,7 @@ from sim_backends.radio.links import (
     Delay,
     Payload,
 )
-from sim_backends.radio.modes import SHORT_RETRY_LIMIT, WifiMode, log_success
+from sim_backends.radio.modes import SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0
@@ -77,8 +78,14 @@ def success_probability(frame: Transmission, receiver: int, noise_mw: float) -> 
 
     The bits are spread evenly over the frame's duration. Each interval between two changes of interference has its
     own ratio of signal to interference and noise, and all bits must be correct.
+
+    Args:
+        frame: The frame.
+        receiver: Index of the receiver.
+        noise_mw: Its noise power in 20 MHz.
     """
     signal_mw = frame.powers_mw[receiver]
+    noise_mw *= frame.mode.noise_factor
     bits = 8.0 * frame.size_bytes
     if not frame.interferers:
         return math.exp(log_success(frame.mode, decibel(signal_mw / noise_mw), bits))

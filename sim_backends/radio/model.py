@@ -5,13 +5,14 @@ from itertools import product
 from typing import Protocol
 
 from fieldkit.core.model import LinkSample, Vector
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.frames import Emission, TransmissionAttempt
 from sim_backends.radio.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.wifi import Wifi
-from sim_backends.radio.world_channel import Antenna, WorldChannel
+from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.world import World
 
 PathLosses = Callable[[], Mapping[Pair, float]]

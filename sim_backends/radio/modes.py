@@ -1,30 +1,69 @@
-"""Modulation and coding of 802.11g and of 802.11n with one stream in 20 MHz: airtime of frames, and packet errors.
+"""Bands, and modulation and coding of 802.11a/g and of 802.11n with one stream in 20 MHz: airtime of frames.
 
-Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n).
-
-Packet errors by noise follow from the bit error rate of the modulation and from the convolutional code. The model is
-that of Pei and Henderson, "Validation of OFDM error rate model in ns-3" (2010), after Miller, "Validation of
-802.11a/UWB coexistence simulation" (NIST, 2003): hard decisions on a channel with additive white Gaussian noise; the
-error probability of the code by the union bound over its weight spectrum.
+Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n). Modes
+with more streams or wider channels are in `high_throughput`.
 """
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache
+from functools import cache, cached_property
 from typing import Final, Literal
 
-from fieldkit.config.profiles import Radio
-from fieldkit.core.errors import ConfigurationError
-
 Standard = Literal["802.11g", "802.11n"]
-Modulation = Literal["BPSK", "QPSK", "16-QAM", "64-QAM"]
+Modulation = Literal["BPSK", "QPSK", "16-QAM", "64-QAM", "256-QAM", "1024-QAM"]
+PhyFormat = Literal["OFDM", "HT", "VHT", "HE"]
+BandName = Literal["2.4 GHz", "5 GHz", "6 GHz"]
 
-SIFS_NS: Final = 10_000
+BITS_PER_SUBCARRIER: Final[dict[Modulation, int]] = {
+    "BPSK": 1,
+    "QPSK": 2,
+    "16-QAM": 4,
+    "64-QAM": 6,
+    "256-QAM": 8,
+    "1024-QAM": 10,
+}
+
 SLOT_NS: Final = 9_000
-DIFS_NS: Final = SIFS_NS + 2 * SLOT_NS
-"""Table 18-5, short slot: there is no 802.11b station. DIFS by 10.3.7."""
+"""Tables 17-21 and 18-5, short slot: there is no 802.11b station."""
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """A frequency band, and the times that depend on it.
+
+    Attributes:
+        name: Its name.
+        carrier_hz: Centre frequency of the modelled channel.
+        sifs_ns: Short inter-frame space: tables 17-21, 18-5 and 27-54.
+        signal_extension_ns: Time without signal after each OFDM frame, during which the receiver decodes (18.5.3.2).
+    """
+
+    name: BandName
+    carrier_hz: float
+    sifs_ns: int
+    signal_extension_ns: int
+
+    def __deepcopy__(self, memo: dict[int, object]) -> "Band":
+        return self
+
+    @property
+    def difs_ns(self) -> int:
+        """Inter-frame space before the backoff of stations without QoS: 10.3.7."""
+        return self.sifs_ns + 2 * SLOT_NS
+
+
+CHANNEL_6_HZ: Final = 2.437e9
+
+BAND_2_4: Final = Band("2.4 GHz", CHANNEL_6_HZ, 10_000, 6_000)
+BANDS: Final[dict[BandName, Band]] = {
+    "2.4 GHz": BAND_2_4,
+    # The centres of 80 MHz around channels 36 (5 GHz) and 5 (6 GHz).
+    "5 GHz": Band("5 GHz", 5.21e9, 16_000, 0),
+    "6 GHz": Band("6 GHz", 5.985e9, 16_000, 0),
+}
+
+SIFS_NS: Final = BAND_2_4.sifs_ns
+DIFS_NS: Final = BAND_2_4.difs_ns
 
 CW_MIN: Final = 15
 CW_MAX: Final = 1023
@@ -35,9 +74,8 @@ ENERGY_DETECTION_DBM: Final = -62.0
 """Any signal of at least this power keeps a station from sending: 17.3.10.6, 20 dB above -82 dBm."""
 
 ACK_BYTES: Final = 14
-_SYMBOL_NS: Final = 4_000
-_SIGNAL_EXTENSION_NS: Final = 6_000
-_SERVICE_AND_TAIL_BITS: Final = 16 + 6
+SYMBOL_NS: Final = 4_000
+_SERVICE_BITS, _TAIL_BITS = 16, 6
 _OFDM_PREAMBLE_NS: Final = 20_000
 _HT_PREAMBLE_NS: Final = 36_000
 
@@ -47,66 +85,93 @@ class WifiMode:
     """A combination of modulation and coding; one object exists for each, so comparing and hashing use the identity.
 
     Attributes:
-        name: `g54` or `n7`.
+        name: `g54`, `n7` or `vht80-mcs9-2ss-400ns`.
         modulation: Modulation of each subcarrier.
         code_rate: Rate of the convolutional code.
-        bits_per_symbol: Data bits in an OFDM symbol of 4 us, N_DBPS.
-        ht: True for a mode of 802.11n.
+        bits_per_symbol: Data bits of all streams in an OFDM symbol, N_DBPS.
+        phy_format: Format of the frame.
+        band: Band in which it is used.
+        preamble_ns: Duration of the preamble and headers before the data.
+        symbol_ns: Duration of a symbol with its guard interval.
+        granularity_ns: The data end at a multiple of this time after the preamble: 4 us for short guard intervals
+            (19.4.3, 21.4.3).
+        width_mhz: Channel width.
+        streams: Number of spatial streams.
+        encoders: Number of convolutional encoders, N_ES, each of which needs 6 tail bits.
     """
 
     name: str
     modulation: Modulation
     code_rate: Fraction
     bits_per_symbol: int
-    ht: bool = False
+    phy_format: PhyFormat = "OFDM"
+    band: Band = BAND_2_4
+    preamble_ns: int = _OFDM_PREAMBLE_NS
+    symbol_ns: int = SYMBOL_NS
+    granularity_ns: int = 1
+    width_mhz: int = 20
+    streams: int = 1
+    encoders: int = 1
 
     def __deepcopy__(self, memo: dict[int, object]) -> "WifiMode":
         return self
 
     @property
+    def ht(self) -> bool:
+        """True for a mode of 802.11n or later."""
+        return self.phy_format != "OFDM"
+
+    @property
     def rate_bit_s(self) -> int:
         """Data bits per second within symbols."""
-        return self.bits_per_symbol * 1_000_000_000 // _SYMBOL_NS
+        return self.bits_per_symbol * 1_000_000_000 // self.symbol_ns
+
+    @property
+    def guard_interval_ns(self) -> int:
+        """Guard interval within the symbol, which lasts 12.8 us without it in HE and 3.2 us in other formats."""
+        return self.symbol_ns - (12_800 if self.phy_format == "HE" else 3_200)
+
+    @cached_property
+    def noise_factor(self) -> float:
+        """Noise power relative to that in 20 MHz."""
+        return self.width_mhz / 20
 
     def airtime_ns(self, size_bytes: int) -> int:
         """Return the time for which a frame of `size_bytes`, with MAC header and FCS, occupies the channel.
 
-        TXTIME of 17.4.3 with the signal extension of 18.5.3.2 for ERP-OFDM; TXTIME of 19.4.3 for HT in mixed format
-        with one stream (legacy preamble 20 us, HT-SIG 8 us, one HT-STF and one HT-LTF of 4 us each), with the same
-        extension.
+        TXTIME of 17.4.3 (OFDM), 19.4.3 (HT, mixed format), 21.4.3 (VHT), 27.4.3 (HE, single user, no packet
+        extension), with the signal extension of the band.
         """
-        symbols = -(-(_SERVICE_AND_TAIL_BITS + 8 * size_bytes) // self.bits_per_symbol)
-        return self.preamble_ns + symbols * _SYMBOL_NS + _SIGNAL_EXTENSION_NS
-
-    @property
-    def preamble_ns(self) -> int:
-        """Duration of the preamble and headers before the data."""
-        return _HT_PREAMBLE_NS if self.ht else _OFDM_PREAMBLE_NS
+        symbols = -(-(_SERVICE_BITS + _TAIL_BITS * self.encoders + 8 * size_bytes) // self.bits_per_symbol)
+        data_ns = -(-symbols * self.symbol_ns // self.granularity_ns) * self.granularity_ns
+        return self.preamble_ns + data_ns + self.band.signal_extension_ns
 
 
-def _modes(letter: str, table: tuple[tuple[str, Modulation, int, int, int], ...]) -> tuple[WifiMode, ...]:
+def _modes(letter: str, band: Band, table: tuple[tuple[str, Modulation, int, int, int], ...]) -> tuple[WifiMode, ...]:
+    phy_format: PhyFormat = "HT" if letter == "n" else "OFDM"
+    preamble_ns = _HT_PREAMBLE_NS if letter == "n" else _OFDM_PREAMBLE_NS
     return tuple(
-        WifiMode(f"{letter}{name}", modulation, Fraction(data, coded), bits, letter == "n")
+        WifiMode(f"{letter}{name}", modulation, Fraction(data, coded), bits, phy_format, band, preamble_ns)
         for name, modulation, data, coded, bits in table
     )
 
 
-# Tables 17-4 and 19-27.
-G_MODES: Final = _modes(
-    "g",
-    (
-        ("6", "BPSK", 1, 2, 24),
-        ("9", "BPSK", 3, 4, 36),
-        ("12", "QPSK", 1, 2, 48),
-        ("18", "QPSK", 3, 4, 72),
-        ("24", "16-QAM", 1, 2, 96),
-        ("36", "16-QAM", 3, 4, 144),
-        ("48", "64-QAM", 2, 3, 192),
-        ("54", "64-QAM", 3, 4, 216),
-    ),
+# Table 17-4.
+_OFDM_TABLE: Final[tuple[tuple[str, Modulation, int, int, int], ...]] = (
+    ("6", "BPSK", 1, 2, 24),
+    ("9", "BPSK", 3, 4, 36),
+    ("12", "QPSK", 1, 2, 48),
+    ("18", "QPSK", 3, 4, 72),
+    ("24", "16-QAM", 1, 2, 96),
+    ("36", "16-QAM", 3, 4, 144),
+    ("48", "64-QAM", 2, 3, 192),
+    ("54", "64-QAM", 3, 4, 216),
 )
+G_MODES: Final = _modes("g", BAND_2_4, _OFDM_TABLE)
+# Table 19-27.
 N_MODES: Final = _modes(
     "n",
+    BAND_2_4,
     (
         ("0", "BPSK", 1, 2, 26),
         ("1", "QPSK", 1, 2, 52),
@@ -120,139 +185,41 @@ N_MODES: Final = _modes(
 )
 MODES: Final[dict[Standard, tuple[WifiMode, ...]]] = {"802.11g": G_MODES, "802.11n": N_MODES}
 
-BASIC: Final = G_MODES[0]
-"""The mode of broadcasts and multicasts: the lowest basic rate, which every station receives (10.6.5.3)."""
+OFDM_MODES: Final[dict[BandName, tuple[WifiMode, ...]]] = {
+    "2.4 GHz": G_MODES,
+    "5 GHz": _modes("a", BANDS["5 GHz"], _OFDM_TABLE),
+    "6 GHz": _modes("a", BANDS["6 GHz"], _OFDM_TABLE),
+}
+"""The modes without high throughput of each band."""
 
-# The mandatory rates of clause 18.
-_CONTROL_MODES: Final = (G_MODES[4], G_MODES[2], G_MODES[0])
+# Indices of the mandatory rates of clause 17, fastest first.
+_MANDATORY: Final = (4, 2, 0)
 
 
-def standard_of(radio: Radio) -> Standard:
-    """Return the standard of a robot's radio; any standard other than 802.11n is treated as 802.11g."""
-    return "802.11n" if radio.standard.startswith("802.11n") else "802.11g"
-
-
-def fixed_mode(name: str | None, standards: Mapping[str, Standard]) -> WifiMode | None:
-    """Return the mode in which all stations must send; stations of 802.11n also support the modes of 802.11g.
-
-    Args:
-        name: Name of the mode; None if each station chooses its mode.
-        standards: Standards of the stations, by name.
-
-    Raises:
-        ConfigurationError: A station does not support the mode.
-    """
-    if name is None:
-        return None
-    mode = next(mode for mode in (*G_MODES, *N_MODES) if mode.name == name)
-    for station, standard in standards.items():
-        if mode.ht and standard != "802.11n":
-            raise ConfigurationError(
-                f"radio.mode {name} is a mode of 802.11n, but {station} supports only {standard}",
-                remedy=f"use a mode that all stations support: {', '.join(mode.name for mode in G_MODES)}",
-            )
-    return mode
+def basic_mode(band: Band) -> WifiMode:
+    """Return the mode of broadcasts: the lowest basic rate, which every station receives (10.6.5.3)."""
+    return OFDM_MODES[band.name][0]
 
 
 @cache
 def control_mode(mode: WifiMode) -> WifiMode:
     """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate that is no faster (10.6.6.5).
 
-    The reference rate of an HT mode is that of the clause 17 mode with its modulation and code rate (10.6.11).
+    The reference rate of an HT, VHT or HE mode is that of the clause 17 mode with its modulation and code rate
+    (10.6.11).
     """
-    reference = mode
+    reference, modes = mode, OFDM_MODES[mode.band.name]
     if mode.ht:
         matches = [
-            g_mode for g_mode in G_MODES if (g_mode.modulation, g_mode.code_rate) == (mode.modulation, mode.code_rate)
+            ofdm_mode
+            for ofdm_mode in modes
+            if (ofdm_mode.modulation, ofdm_mode.code_rate) == (mode.modulation, mode.code_rate)
         ]
-        reference = matches[0] if matches else G_MODES[-1]
-    return next(control for control in _CONTROL_MODES if control.bits_per_symbol <= reference.bits_per_symbol)
+        reference = matches[0] if matches else modes[-1]
+    return next(modes[index] for index in _MANDATORY if modes[index].bits_per_symbol <= reference.bits_per_symbol)
 
 
 @cache
 def ack_ns(mode: WifiMode) -> int:
     """Return the airtime of the ACK to a frame in `mode`."""
     return control_mode(mode).airtime_ns(ACK_BYTES)
-
-
-# Input bits per step, free distance, and the sum of bit errors over the paths of each weight from the free distance
-# upwards, for the generators 133, 171 and the punctured codes: Haccoun and Begin, IEEE Trans. Commun. 37:1113 (1989);
-# Frenger, Orten and Ottosson, IEEE Commun. Lett. 3:317 (1999).
-_SPECTRA: Final[Mapping[Fraction, tuple[int, int, tuple[int, ...]]]] = {
-    Fraction(1, 2): (
-        1,
-        10,
-        (36, 0, 211, 0, 1404, 0, 11633, 0, 77433, 0, 502690, 0, 3322763, 0, 21292910, 0, 134365911),
-    ),
-    Fraction(2, 3): (2, 6, (3, 70, 285, 1276, 6160, 27128, 117019, 498860, 2103891, 8784123)),
-    Fraction(3, 4): (3, 5, (42, 201, 1492, 10469, 62935, 379644, 2253373, 13073811, 75152755, 428005675)),
-    Fraction(5, 6): (
-        5,
-        4,
-        (92, 528, 8694, 79453, 792114, 7375573, 67884974, 610875423, 5427275376, 47664215639),
-    ),
-}
-
-_STEP_DB: Final = 0.05
-_LOWEST_DB: Final = -10.0
-_HIGHEST_DB: Final = 40.0
-
-
-def bit_error(mode: WifiMode, snr: float) -> float:
-    """Return the share of coded bits in error at the signal-to-noise power ratio `snr` in the signal's bandwidth.
-
-    Proakis, Digital Communications, 4th ed., 5.2: Gray-coded, per subcarrier.
-    """
-    match mode.modulation:
-        case "BPSK":
-            return 0.5 * math.erfc(math.sqrt(snr))
-        case "QPSK":
-            return 0.5 * math.erfc(math.sqrt(snr / 2))
-        case "16-QAM":
-            return 0.75 * 0.5 * math.erfc(math.sqrt(snr / 10))
-        case "64-QAM":
-            return 7 / 12 * 0.5 * math.erfc(math.sqrt(snr / 42))
-
-
-def decoded_bit_error(mode: WifiMode, snr: float) -> float:
-    """Return an upper bound (the union bound) of the share of data bits in error after decoding, at most 1."""
-    raw = bit_error(mode, snr)
-    bhattacharyya = math.sqrt(4 * raw * (1 - raw))
-    inputs, free_distance, weights = _SPECTRA[mode.code_rate]
-    bound = sum(
-        weight * bhattacharyya ** (free_distance + excess_weight) for excess_weight, weight in enumerate(weights)
-    )
-    return min(bound / (2 * inputs), 1.0)
-
-
-@cache
-def _log_success_per_bit(mode: WifiMode) -> tuple[float, ...]:
-    """Return ln(1 - p) of a decoded bit at each step of the table, -inf if p is 1."""
-    steps = round((_HIGHEST_DB - _LOWEST_DB) / _STEP_DB)
-    errors = (decoded_bit_error(mode, 10 ** ((_LOWEST_DB + n * _STEP_DB) / 10)) for n in range(steps + 1))
-    return tuple(math.log1p(-error) if error < 1 else -math.inf for error in errors)
-
-
-def log_success(mode: WifiMode, snr_db: float, bits: float) -> float:
-    """Return ln of the probability that `bits` data bits arrive without error at `snr_db`; -inf if it is 0.
-
-    The value is interpolated linearly in a table with steps of 0.05 dB, which is within 0.002 dB of the formula.
-    Without interpolation the error would be up to 0.05 dB, which corrupts a tenth more of the frames at the edge of a
-    link's range.
-    """
-    steps = (snr_db - _LOWEST_DB) / _STEP_DB
-    if steps <= 0:
-        return -math.inf
-    table = _log_success_per_bit(mode)
-    step = int(steps)
-    if step >= len(table) - 1:
-        return bits * table[-1]
-    below, above = table[step], table[step + 1]
-    if below == -math.inf:
-        return below
-    return bits * (below + (above - below) * (steps - step))
-
-
-def packet_error(mode: WifiMode, snr_db: float, size_bytes: int) -> float:
-    """Return the probability that a frame of `size_bytes` is corrupted at `snr_db`."""
-    return -math.expm1(log_success(mode, snr_db, 8 * size_bytes))

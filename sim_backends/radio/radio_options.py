@@ -16,6 +16,7 @@ from fieldkit.config.schema import (
 )
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, did_you_mean
+from sim_backends.radio.high_throughput import mode_names
 from sim_backends.radio.links import LinkParameters
 from sim_backends.radio.modes import G_MODES, N_MODES
 
@@ -25,12 +26,13 @@ _RATE: Final = "54Mbit/s"
 _HOP_S: Final = 0.0002
 
 
+_MODES: Final = f"{', '.join(mode.name for mode in (*G_MODES, *N_MODES))}, a6 to a54, he80-mcs11-2ss-800ns"
+
+
 def _checked_mode(name: str) -> str:
-    names = [mode.name for mode in (*G_MODES, *N_MODES)]
+    names = mode_names()
     if name not in names:
-        raise schema.validation_error(
-            f"there is no mode {name!r}; {did_you_mean(name, names, 'modes: ' + ', '.join(names))}"
-        )
+        raise schema.validation_error(f"there is no mode {name!r}; {did_you_mean(name, names, f'modes: {_MODES}')}")
     return name
 
 
@@ -72,8 +74,9 @@ class RadioOptions(Strict):
             s.
         noise_floor_dbm: Noise and interference at a receiver, in dBm. -95 dBm is thermal noise in 20 MHz (-101 dBm)
             and a noise figure of 6 dB.
-        mode: Fixed transmission mode: `g6` to `g54` (Mbit/s) or `n0` to `n7` (MCS). Without it, stations adapt the
-            rate to acknowledgements.
+        mode: Fixed transmission mode: `g6` to `g54` (Mbit/s), `a6` to `a54` above 2.4 GHz, `n0` to `n7` (MCS); with
+            `phy` also format, width in MHz, MCS, streams and guard interval, `vht80-mcs9-2ss-400ns`. Without it,
+            stations adapt the rate to acknowledgements.
         queue_packets: Queue length per station, or per fixed link, in packets, without the packet on the air; 1000 is
             Linux's default.
         loss: Fixed links: share of packets lost per link, independently of their length; 0 % if it is omitted

@@ -3,16 +3,8 @@
 from collections.abc import Sequence
 from typing import Final, Protocol
 
-from sim_backends.radio.modes import (
-    CW_MIN,
-    DIFS_NS,
-    SHORT_RETRY_LIMIT,
-    SIFS_NS,
-    SLOT_NS,
-    WifiMode,
-    ack_ns,
-    packet_error,
-)
+from sim_backends.radio.error_rates import packet_error
+from sim_backends.radio.modes import CW_MIN, SHORT_RETRY_LIMIT, SLOT_NS, WifiMode, ack_ns
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
 
@@ -180,4 +172,5 @@ def _count_fitting_attempts(time_ns: int) -> int:
 
 
 def _exchange_ns(mode: WifiMode) -> int:
-    return DIFS_NS + mode.airtime_ns(_REFERENCE_BYTES) + SIFS_NS + ack_ns(mode)
+    band = mode.band
+    return band.difs_ns + mode.airtime_ns(_REFERENCE_BYTES) + band.sifs_ns + ack_ns(mode)

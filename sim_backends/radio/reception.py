@@ -9,11 +9,10 @@ from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import CCA_TIME_NS, EventQueue
 from sim_backends.radio.frames import PREAMBLE_SNR_DB, Emission, Transmission, success_probability
 from sim_backends.radio.links import Payload
-from sim_backends.radio.modes import BASIC, DIFS_NS, ENERGY_DETECTION_DBM, SIFS_NS, ack_ns
+from sim_backends.radio.modes import ENERGY_DETECTION_DBM, ack_ns, basic_mode
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
-_EIFS_EXTRA_NS: Final = SIFS_NS + ack_ns(BASIC)
 _DETECTABLE_RATIO: Final = 10 ** (PREAMBLE_SNR_DB / 10)
 _ENERGY_DETECTION_MW: Final = 10 ** (ENERGY_DETECTION_DBM / 10)
 
@@ -52,6 +51,8 @@ class Reception(Generic[Payload]):
         self._seed = seed
         self._stations = stations
         self._events = events
+        band = channel.band
+        self._eifs_ns = band.sifs_ns + ack_ns(basic_mode(band)) + band.difs_ns
         self._on_air: list[Transmission] = []
         self._emissions: dict[str, Emission] = {}
         self._draws: dict[tuple[int, int, str], PacketDraws] = {}
@@ -96,7 +97,7 @@ class Reception(Generic[Payload]):
         for index in transmission.receivers:
             self._stations[index].receiving = None
         if transmission.interferers:
-            until_ns = now_ns + _EIFS_EXTRA_NS + DIFS_NS
+            until_ns = now_ns + self._eifs_ns
             for index in transmission.detected_by:
                 neighbour = self._stations[index]
                 if index not in transmission.receivers and neighbour.sending_until_ns < now_ns:

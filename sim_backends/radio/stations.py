@@ -19,6 +19,7 @@ class Station(Generic[Payload]):
     Args:
         index: Its index in the channel's list of stations.
         draws: Random draws of its backoff.
+        ifs_ns: Inter-frame space before its backoff.
 
     Attributes:
         contention: Its carrier sense and backoff.
@@ -43,12 +44,12 @@ class Station(Generic[Payload]):
         "sending_until_ns",
     )
 
-    def __init__(self, index: int, draws: PacketDraws) -> None:
+    def __init__(self, index: int, draws: PacketDraws, ifs_ns: int) -> None:
         self.index = index
         self._draws = draws
         self._redraws_of: tuple[PacketIdentity, int] | None = None
         self._redraws = 0
-        self.contention = Contention(self._backoff)
+        self.contention = Contention(self._backoff, ifs_ns)
         self.queue: deque[Frame[Payload]] = deque()
         self.receiving: Transmission | None = None
         self.sending_until_ns = 0

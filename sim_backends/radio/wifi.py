@@ -37,12 +37,11 @@ from sim_backends.radio.links import (
 )
 from sim_backends.radio.modes import (
     ACK_BYTES,
-    BASIC,
     SHORT_RETRY_LIMIT,
-    SIFS_NS,
     SLOT_NS,
     WifiMode,
     ack_ns,
+    basic_mode,
     control_mode,
 )
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
@@ -50,7 +49,7 @@ from sim_backends.radio.reception import Reception
 from sim_backends.radio.stations import Peer, RadioMeter, Station
 
 # 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
-_ACK_TIMEOUT_NS: Final = SIFS_NS + SLOT_NS + 20_000
+_ACK_TIMEOUT_AFTER_SIFS_NS: Final = SLOT_NS + 20_000
 
 # Retry interval of a station that finds the channel jammed; a robot hardly moves in this time.
 _JAMMED_RETRY_NS: Final = 1_000_000
@@ -74,8 +73,12 @@ class Wifi(Generic[Payload]):
         self._off: Set[str] = frozenset()
         self._index = {name: index for index, name in enumerate(channel.names)}
         self._relay: int | None = None
+        band = channel.band
+        self._basic = basic_mode(band)
+        self._sifs_ns = band.sifs_ns
+        self._ack_timeout_ns = band.sifs_ns + _ACK_TIMEOUT_AFTER_SIFS_NS
         self._stations: list[Station[Payload]] = [
-            Station(index, PacketDraws(seed, name, "backoff")) for name, index in self._index.items()
+            Station(index, PacketDraws(seed, name, "backoff"), band.difs_ns) for name, index in self._index.items()
         ]
         self._peers: dict[tuple[int, int], Peer[Payload]] = {}
         self._events = EventQueue(self._start_transmission)
@@ -240,10 +243,14 @@ class Wifi(Generic[Payload]):
             frame.first_attempt_ns = now_ns
         frame.attempts += 1
         receiver, packet, number = frame.receiver, frame.packet, frame.attempts
-        mode = BASIC if receiver is None else self._peer(station.index, receiver).rate.choose(now_ns, packet, number)
+        mode = (
+            self._basic
+            if receiver is None
+            else self._peer(station.index, receiver).rate.choose(now_ns, packet, number)
+        )
         size_bytes = frame.size_bytes + HEADER_BYTES
         end_ns = now_ns + mode.airtime_ns(size_bytes)
-        reserved_ns = end_ns if receiver is None else end_ns + SIFS_NS + ack_ns(mode)
+        reserved_ns = end_ns if receiver is None else end_ns + self._sifs_ns + ack_ns(mode)
         transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, packet, number)
         self._reception.start(transmission, reserved_ns)
         if self._meter is not None:
@@ -279,10 +286,15 @@ class Wifi(Generic[Payload]):
             if received:
                 acknowledging = self._stations[receiver]
                 self._events.at(
-                    now_ns + SIFS_NS, self._acknowledge, acknowledging, station, transmission, station.exchange_id
+                    now_ns + self._sifs_ns,
+                    self._acknowledge,
+                    acknowledging,
+                    station,
+                    transmission,
+                    station.exchange_id,
                 )
             self._events.at(
-                now_ns + _ACK_TIMEOUT_NS, self._ack_timeout, station, station.exchange_id, transmission.mode
+                now_ns + self._ack_timeout_ns, self._ack_timeout, station, station.exchange_id, transmission.mode
             )
 
     def _broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:

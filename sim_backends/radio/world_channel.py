@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from operator import ne
 from typing import Final
 
@@ -10,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from fieldkit.config.profiles import Radio
 from fieldkit.core.model import Vector
 from sim_backends.radio import propagation
+from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
 from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.error_rates import packet_error
 from sim_backends.radio.frames import decibel
-from sim_backends.radio.modes import MODES, Standard, WifiMode, fixed_mode, packet_error, standard_of
+from sim_backends.radio.modes import OFDM_MODES
 from sim_backends.radio.propagation import Echoes, Fades, Fading, Shadowing
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws
@@ -25,8 +25,6 @@ from sim_backends.world.motion import STILL
 from sim_backends.world.shapes import Floats
 from sim_backends.world.world import World
 
-CHANNEL_6_HZ: Final = 2.437e9
-
 # A gain is used for this share of the shortest period of an echo's phase.
 _GAIN_VALID_PERIODS: Final = 0.02
 _SLOWEST_M_S: Final = 1e-6
@@ -34,26 +32,6 @@ _SLOWEST_M_S: Final = 1e-6
 # Computing this number of links costs little more than one, about 0.3 ms among trees, and the next sender may need
 # them.
 _BATCH_LINKS: Final = 100
-
-
-@dataclass(frozen=True)
-class Antenna:
-    """The radio properties of a station.
-
-    Attributes:
-        standard: Standard of its radio.
-        tx_power_dbm: Transmit power.
-        sensitivity_dbm: Weakest frame that it detects.
-    """
-
-    standard: Standard
-    tx_power_dbm: float
-    sensitivity_dbm: float
-
-
-def antenna_of(radio: Radio) -> Antenna:
-    """Return the antenna of a robot's radio; any standard other than 802.11n is treated as 802.11g."""
-    return Antenna(standard_of(radio), float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
 
 
 class _Row:
@@ -119,15 +97,17 @@ class WorldChannel(RadioChannel):
         world: Obstacles between the stations; None for open ground.
 
     Raises:
-        ConfigurationError: `options.mode` is a mode that a station does not support.
+        ConfigurationError: `options.mode` is a mode that a station does not support, or the bands differ.
     """
 
     def __init__(
         self, seed: int, antennas: Mapping[str, Antenna], options: RadioOptions, world: World | None = None
     ) -> None:
+        self.band = band_of(antennas)
         # The error tables are computed now, not when the first frames wait for them.
-        for mode in (*MODES["802.11g"], *MODES["802.11n"]):
-            packet_error(mode, 0.0, 1)
+        for antenna in set(antennas.values()):
+            for mode in (*OFDM_MODES[self.band.name], *modes_between(antenna, antenna)):
+                packet_error(mode, 0.0, 1)
         self.names = tuple(antennas)
         self.noise_mw = [milliwatt(options.noise_floor_dbm)] * len(self.names)
         self.sensitivity_mw = [milliwatt(antenna.sensitivity_dbm) for antenna in antennas.values()]
@@ -135,7 +115,7 @@ class WorldChannel(RadioChannel):
         self._antennas = tuple(antennas.values())
         self._tx_powers_dbm = np.array([antenna.tx_power_dbm for antenna in self._antennas])
         self._options = options
-        self._fixed_mode = fixed_mode(options.mode, {name: antenna.standard for name, antenna in antennas.items()})
+        self._fixed_mode = fixed_mode(options.mode, antennas)
         self._world = world
         self._shadowing = (
             Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
@@ -153,7 +133,7 @@ class WorldChannel(RadioChannel):
             seed,
             self.names,
             self._ends,
-            wavelength_m=SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ,
+            wavelength_m=SPEED_OF_LIGHT_M_S / self.band.carrier_hz,
             stir_m_s=options.stir_m_s,
         )
         self._places: list[Vector | None] = [None] * count
@@ -242,7 +222,7 @@ class WorldChannel(RadioChannel):
     def _compute_gain_valid_ns(self) -> int:
         """Return the time for which a gain is used: 2 % of an echo's period between the two fastest stations."""
         closing_m_s = float(np.sort(np.linalg.norm(self._velocities_m_s, axis=1))[-2:].sum())
-        period_s = SPEED_OF_LIGHT_M_S / CHANNEL_6_HZ / max(closing_m_s + self._options.stir_m_s, _SLOWEST_M_S)
+        period_s = SPEED_OF_LIGHT_M_S / self.band.carrier_hz / max(closing_m_s + self._options.stir_m_s, _SLOWEST_M_S)
         return round(_GAIN_VALID_PERIODS * period_s * 1e9)
 
     def use_losses(self, loss_db: Floats) -> None:
@@ -322,17 +302,17 @@ class WorldChannel(RadioChannel):
     def _open_db(self, start_m: Floats, end_m: Floats) -> Floats:
         match self._options.propagation:
             case "free-space":
-                loss_db = propagation.free_space_db(start_m, end_m, CHANNEL_6_HZ)
+                loss_db = propagation.free_space_db(start_m, end_m, self.band.carrier_hz)
             case "two-ray":
-                loss_db = propagation.two_ray_db(start_m, end_m, CHANNEL_6_HZ)
+                loss_db = propagation.two_ray_db(start_m, end_m, self.band.carrier_hz)
             case _:
-                loss_db = propagation.log_distance_db(start_m, end_m, CHANNEL_6_HZ, self._options.exponent)
+                loss_db = propagation.log_distance_db(start_m, end_m, self.band.carrier_hz, self._options.exponent)
         return loss_db if self._shadowing is None else loss_db + self._shadowing.loss_db(start_m, end_m)
 
     def _obstacles_db(self, start_m: Floats, end_m: Floats) -> Floats:
         if self._world is None:
             return np.zeros(len(start_m))
-        return self._world.penetration_loss_db(start_m, end_m, CHANNEL_6_HZ)
+        return self._world.penetration_loss_db(start_m, end_m, self.band.carrier_hz)
 
     def snr_db(self, transmitter: int, receiver: int) -> float:
         """Return the mean signal-to-noise ratio of a link."""
@@ -370,14 +350,10 @@ class WorldChannel(RadioChannel):
             return FixedRate(self._fixed_mode)
         names = self.names[transmitter], self.names[receiver]
         return Minstrel(
-            self._modes(transmitter, receiver),
+            modes_between(self._antennas[transmitter], self._antennas[receiver]),
             self.snr_db(transmitter, receiver),
             PacketDraws(self._seed, *names, "rate"),
         )
-
-    def _modes(self, transmitter: int, receiver: int) -> tuple[WifiMode, ...]:
-        both = {self._antennas[transmitter].standard, self._antennas[receiver].standard}
-        return MODES["802.11n" if both == {"802.11n"} else "802.11g"]
 
 
 def milliwatt(dbm: float) -> float:

@@ -39,8 +39,8 @@ from sim_backends.physics.body import Body, Twist, Velocity
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DifferentialDrive, DriveLimits
 from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits
 from sim_backends.physics.robot_limits import BODIES, quadrotor
+from sim_backends.radio.antennas import Antenna, antenna_of
 from sim_backends.radio.random_streams import RandomStream
-from sim_backends.radio.world_channel import Antenna, antenna_of
 from sim_backends.world.world import World
 
 
@@ -92,7 +92,7 @@ def antennas(scenario: CosimScenario) -> dict[str, Antenna]:
     agent_antennas = {}
     for name, plan in scenario.agents.items():
         if (radio := plan.radio) is not None:
-            agent_antennas[name] = Antenna(radio.standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
+            agent_antennas[name] = antenna_of(radio)
         elif plan.robot in profile_antennas:
             agent_antennas[name] = profile_antennas[plan.robot]
     return agent_antennas

@@ -1,11 +1,12 @@
 """The schema of a scenario file. Checks that need more than the file are in `checks`."""
 
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
 from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length, Location, Strict
+from fieldkit.config.wifi_phy import WifiPhy, check_standard
 from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import Scenario as Sight
 from fieldkit.core.model import Topology
@@ -18,6 +19,7 @@ from sim_backends.cosim.scenario.federate_choice import (
     NetworkFederateOptions,
     PhysicsFederateOptions,
     agent_references,
+    unsupported,
 )
 from sim_backends.cosim.scenario.reproduced_trial import ReproducedTrial
 from sim_backends.emane_events.options import EmaneOptions
@@ -106,14 +108,26 @@ class AgentRadio(Strict):
     """The radio of an agent.
 
     Attributes:
-        standard: Its IEEE standard.
+        standard: Its IEEE standard; with `phy` also its band, `802.11ac 5 GHz`.
         tx_power_dbm: Its transmit power.
         sensitivity_dbm: Power of the weakest frame that it detects.
+        phy: Physical layer of 802.11n, ac or ax, as `radio.phy` of a [robot profile](reference/robot-profile.md).
     """
 
-    standard: Literal["802.11g", "802.11n"] = "802.11n"
+    standard: str = "802.11n"
     tx_power_dbm: Annotated[Real, Field(ge=-50, le=50)] = 17
     sensitivity_dbm: Annotated[Real, Field(ge=-120, le=0)] = -82
+    phy: WifiPhy | None = None
+
+    @schema.model_validator(mode="after")
+    def _check_standard(self) -> "AgentRadio":
+        if self.phy is None and self.standard not in {"802.11g", "802.11n"}:
+            raise schema.validation_error(
+                f"without phy there is no standard {self.standard!r}; write 802.11g or 802.11n, or add phy",
+                "standard",
+            )
+        check_standard(self.standard, self.phy)
+        return self
 
 
 class AgentPlan(Strict):
@@ -271,6 +285,13 @@ class CosimScenario(Named):
             (("emane",), self.emane),
         ):
             yield from ((name, (*place, *location)) for name, location in agent_references(options))
+
+    @schema.model_validator(mode="after")
+    def _simulators_support_it(self) -> "CosimScenario":
+        for options in (self.physics.options, self.network.options):
+            for what, location in unsupported(options, self):
+                raise schema.validation_error(what, *location)
+        return self
 
     @schema.model_validator(mode="after")
     def _relay_is_named(self) -> "CosimScenario":

@@ -14,8 +14,8 @@ from sim_backends.emulated.medium import air_log
 from sim_backends.emulated.medium.framing import IP, Framing
 from sim_backends.emulated.medium.ports import MediumStats, unpack_links, unpack_stats
 from sim_backends.emulated.process.worker import Worker
+from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import antenna_of
 from sim_backends.world.world import World
 
 

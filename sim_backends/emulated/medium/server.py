@@ -23,10 +23,10 @@ from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, pa
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
+from sim_backends.radio.antennas import Antenna, decode_antenna
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.links import LinkCounters, Pair
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.world import World
 
 BURST: Final = 64
@@ -140,7 +140,7 @@ class MediumServer(ABC):
             case "attach":
                 (fd,) = descriptors
                 self._attach(request["name"], IPv4Interface(request["address"]), fd)
-                self._antennas[request["name"]] = Antenna(**request["antenna"])
+                self._antennas[request["name"]] = decode_antenna(request["antenna"])
                 return {}
             case "use":
                 self._options = RadioOptions.model_validate(request["options"])

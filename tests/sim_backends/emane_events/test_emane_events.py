@@ -45,8 +45,9 @@ from sim_backends.federates.conformance.suite import run_checks
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.protocols import FederateError, UnansweredError
 from sim_backends.physics.body import Twist
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna, WorldChannel
+from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.world import load_world
 from tests.helpers.federate_pairs import Pair
 from tests.helpers.host import separate_namespaces

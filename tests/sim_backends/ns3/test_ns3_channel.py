@@ -9,8 +9,9 @@ import pytest
 
 from fieldkit.config import schema
 from sim_backends.ns3.federate import command
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna, WorldChannel
+from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.world import World
 
 # The names need escapes in JSON, which is the key of the draws, and are not in alphabetical order.

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.links import (
     LOST,
@@ -19,7 +20,6 @@ from sim_backends.radio.model import RadioModel, WifiInWorld
 from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
-from sim_backends.radio.world_channel import Antenna
 from tests.helpers.nightly import examples
 from tests.helpers.stations import FixedPowers
 

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from scipy.stats import binomtest
+import scipy
 
 from benchmarks.namespaces import Namespace
 from fieldkit.config import schema
@@ -22,8 +22,9 @@ from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.core.model import DelayParts, Vector
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.robot.network import open_tun
+from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import WorldChannel, antenna_of
+from sim_backends.radio.world_channel import WorldChannel
 from tests.helpers.host import alive
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
@@ -229,7 +230,9 @@ def test_loss_has_the_set_value(bench: Bench) -> None:
     spaces["a"].run(sys.executable, "-c", SPEAK, ADDRESSES["b"], "3000").check_returncode()
     until(lambda: medium.stats().links["a", "b"].sent == 3000, "all datagrams are on the air")
     counters = medium.stats().links["a", "b"]
-    interval = binomtest(counters.lost, counters.sent).proportion_ci(confidence_level=0.99, method="wilson")
+    interval = scipy.stats.binomtest(counters.lost, counters.sent).proportion_ci(
+        confidence_level=0.99, method="wilson"
+    )
     assert interval.low <= 0.1 <= interval.high
 
 
@@ -387,7 +390,8 @@ OWN_A_MEDIUM = """
 import time
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import WorldChannel, antenna_of
+from sim_backends.radio.antennas import antenna_of
+from sim_backends.radio.world_channel import WorldChannel
 medium = MediumClient(RadioOptions(), seed=1)
 medium.stats()
 print(medium.pid, flush=True)

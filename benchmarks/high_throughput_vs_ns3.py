@@ -1,0 +1,100 @@
+"""802.11n, ac and ax compared with ns-3: `python -m benchmarks.high_throughput_vs_ns3 [--json]`.
+
+Needs what `radio_vs_ns3` needs. All modes: airtimes, and packet errors of 1000 bytes. Known differences of
+airtimes are ns-3's: it does not end the data of short guard intervals at multiples of 4 us (19.4.3, 21.4.3), omits
+VHT-SIG-B (4 us) of frames to one station, and gives each HE-LTF 8 us at all guard intervals.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from typing import Final
+
+from benchmarks.radio_vs_ns3 import PAYLOAD_BYTES, Ns3, build, shift_db
+from sim_backends.radio.error_rates import packet_error
+from sim_backends.radio.high_throughput import HighThroughput, format_modes, guard_intervals_ns
+from sim_backends.radio.modes import WifiMode
+
+WIDTHS_MHZ: Final[dict[HighThroughput, tuple[int, ...]]] = {"HT": (20, 40), "VHT": (20, 40, 80), "HE": (20, 40, 80)}
+STREAMS: Final = (1, 2)
+HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
+
+
+def mcs_of(mode: WifiMode) -> int:
+    """Return the MCS within one number of streams."""
+    return int(mode.name.split("-mcs")[1].split("-")[0]) % (8 if mode.phy_format == "HT" else 100)
+
+
+def ns3_options(mode: WifiMode) -> dict[str, object]:
+    """Return the options of the ns-3 program for a mode."""
+    prefix = {"HT": "Ht", "VHT": "Vht", "HE": "He"}[mode.phy_format]
+    number = mcs_of(mode) + (8 * (mode.streams - 1) if mode.phy_format == "HT" else 0)
+    return {
+        "mode": f"{prefix}Mcs{number}",
+        "width": mode.width_mhz,
+        "streams": mode.streams,
+        "guard": mode.guard_interval_ns,
+        "band": f"BAND_{mode.band.name.replace(' ', '').replace('.', '_').upper()}",
+    }
+
+
+def all_modes() -> Iterator[WifiMode]:
+    """Return the modes of all formats at 5 GHz."""
+    for phy_format, widths_mhz in WIDTHS_MHZ.items():
+        for width_mhz in widths_mhz:
+            for streams in STREAMS:
+                for guard_ns in guard_intervals_ns(phy_format):
+                    yield from format_modes(phy_format, "5 GHz", width_mhz, streams, guard_ns)
+
+
+def unexplained_ns(mode: WifiMode, size_bytes: int, ns3_ns: int) -> int:
+    """Return the difference of an airtime from that of ns-3, without the differences that the standard explains."""
+    airtime_ns = mode.airtime_ns(size_bytes)
+    if mode.phy_format == "VHT":
+        airtime_ns -= 4_000
+    if mode.phy_format == "HE":
+        airtime_ns += (8_000 - HE_LTF_NS[mode.guard_interval_ns]) * mode.streams
+    difference_ns = airtime_ns - ns3_ns
+    return 0 if 0 <= difference_ns < mode.granularity_ns else difference_ns
+
+
+def airtime_differences(ns3: Ns3) -> dict[str, int]:
+    """Return the largest unexplained difference of the airtimes of each mode, in ns."""
+    differences = {}
+    for mode in all_modes():
+        lines = ns3(what="durations", **ns3_options(mode)).splitlines()
+        pairs = [tuple(map(int, line.split())) for line in lines]
+        differences[mode.name] = max((unexplained_ns(mode, *pair) for pair in pairs), key=abs)
+    return differences
+
+
+def error_curves(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
+    """Return per mode of 80 MHz or 40 MHz the SNR in dB and the packet error, of ns-3 and of the radio model."""
+    curves = {}
+    for mode in all_modes():
+        if mode.streams == 1 and mode.width_mhz == WIDTHS_MHZ["HT"][-1] and mode.guard_interval_ns == 800:
+            lines = ns3(what="errors", payload=PAYLOAD_BYTES, **ns3_options(mode)).splitlines()
+            points = [(float(ratio), float(error)) for ratio, error in (line.split() for line in lines)]
+            curves[mode.name] = [(ratio, error, packet_error(mode, ratio, PAYLOAD_BYTES)) for ratio, error in points]
+    return curves
+
+
+def main() -> None:
+    """Run both and print the differences."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", action="store_true", help="print single values")
+    arguments = parser.parse_args()
+    ns3 = build()
+    differences, curves = airtime_differences(ns3), error_curves(ns3)
+    if arguments.json:
+        json.dump({"airtime_difference_ns": differences, "packet_error": curves}, sys.stdout)
+        return
+    largest_ns = max(differences.values(), key=abs)
+    print(f"airtimes of {len(differences)} modes: largest unexplained difference {largest_ns} ns")
+    print("packet error against ratio, largest shift at errors of 50, 10 and 1 % (dB):")
+    print("  " + ", ".join(f"{name} {shift_db(curve):+.2f}" for name, curve in curves.items()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""Physical layer of a robot's Wi-Fi since 802.11n: the keys of `radio.phy`, and which combinations exist."""
+
+import re
+from typing import Final, Literal, cast
+
+from fieldkit.config import schema
+from fieldkit.config.schema import Int, Strict
+
+WifiAmendment = Literal["n", "ac", "ax"]
+WifiBand = Literal["2.4 GHz", "5 GHz", "6 GHz"]
+
+_STANDARD: Final = re.compile(r"802\.11(n|ac|ax) (2\.4 GHz|5 GHz|6 GHz)")
+_STANDARD_EXAMPLES: Final = "802.11n 2.4 GHz, 802.11n 5 GHz, 802.11ac 5 GHz, 802.11ax 2.4, 5 or 6 GHz"
+
+# IEEE 802.11-2020, 19.1.1 and 21.1.1; 802.11ax-2021, 27.1.1: VHT only at 5 GHz; 80 MHz of HE only at 5 and 6 GHz.
+_BANDS: Final[dict[WifiAmendment, tuple[WifiBand, ...]]] = {
+    "n": ("2.4 GHz", "5 GHz"),
+    "ac": ("5 GHz",),
+    "ax": ("2.4 GHz", "5 GHz", "6 GHz"),
+}
+_GUARD_INTERVALS_NS: Final[dict[WifiAmendment, tuple[int, ...]]] = {
+    "n": (400, 800),
+    "ac": (400, 800),
+    "ax": (800, 1600, 3200),
+}
+_MODELLED_WIDTHS_MHZ: Final = (20, 40, 80)
+
+
+class WifiPhy(Strict):
+    """The physical layer of 802.11n, ac or ax, as the emulated radio models it.
+
+    Without this key 802.11n has one stream in 20 MHz without aggregation, and later standards are treated as 802.11g.
+
+    Attributes:
+        width_mhz: Channel width: 20, 40 or 80 MHz.
+        streams: Number of spatial streams, 1 or 2.
+        guard_interval_ns: Shortest guard interval: 400 or 800 ns for 802.11n and ac, 800, 1600 or 3200 ns for
+            802.11ax.
+    """
+
+    width_mhz: Int = 20
+    streams: Int = 1
+    guard_interval_ns: Int = 800
+
+    @schema.model_validator(mode="after")
+    def _check(self) -> "WifiPhy":
+        if self.width_mhz not in _MODELLED_WIDTHS_MHZ:
+            raise schema.validation_error(
+                f"a width of {self.width_mhz} MHz is not modelled; write 20, 40 or 80", "width_mhz"
+            )
+        if self.streams not in {1, 2}:
+            raise schema.validation_error(f"{self.streams} streams are not modelled; write 1 or 2", "streams")
+        valid = sorted({interval for intervals in _GUARD_INTERVALS_NS.values() for interval in intervals})
+        if self.guard_interval_ns not in valid:
+            raise schema.validation_error(
+                f"there is no guard interval of {self.guard_interval_ns} ns; write {_words(valid)}",
+                "guard_interval_ns",
+            )
+        return self
+
+    def standard_error(self, standard: str) -> str | None:
+        """Return why a radio of this standard, `802.11ac 5 GHz`, cannot have this layer; None if it can."""
+        match = _STANDARD.fullmatch(standard)
+        if match is None:
+            return f"phy needs a standard with its band, not {standard!r}; write one of: {_STANDARD_EXAMPLES}"
+        amendment, band = cast("tuple[WifiAmendment, WifiBand]", match.groups())
+        if band not in _BANDS[amendment]:
+            return f"802.11{amendment} does not exist at {band}; it exists at {', '.join(_BANDS[amendment])}"
+        widths_mhz = _widths_mhz(amendment, band)
+        if self.width_mhz not in widths_mhz:
+            return f"{standard} has no width of {self.width_mhz} MHz; write phy.width_mhz: {_words(widths_mhz)}"
+        intervals_ns = _GUARD_INTERVALS_NS[amendment]
+        if self.guard_interval_ns not in intervals_ns:
+            return (
+                f"802.11{amendment} has no guard interval of {self.guard_interval_ns} ns; "
+                f"write phy.guard_interval_ns: {_words(intervals_ns)}"
+            )
+        return None
+
+    def split_standard(self, standard: str) -> tuple[WifiAmendment, WifiBand]:
+        """Return amendment and band of a standard for which `standard_error` returns None."""
+        match = _STANDARD.fullmatch(standard)
+        assert match is not None
+        return cast("tuple[WifiAmendment, WifiBand]", match.groups())
+
+
+def check_standard(standard: str, phy: WifiPhy | None) -> None:
+    """Raise the validation error of a radio whose standard cannot have this physical layer."""
+    if phy is not None and (reason := phy.standard_error(standard)) is not None:
+        raise schema.validation_error(reason, "standard")
+
+
+def _widths_mhz(amendment: WifiAmendment, band: WifiBand) -> tuple[int, ...]:
+    return (20, 40) if amendment == "n" or band == "2.4 GHz" else _MODELLED_WIDTHS_MHZ
+
+
+def _words(values: tuple[int, ...] | list[int]) -> str:
+    *first, last = map(str, values)
+    return f"{', '.join(first)} or {last}"

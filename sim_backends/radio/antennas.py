@@ -1,0 +1,127 @@
+"""Radio properties of the stations, and the modes that they can use with each other."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from fieldkit.config.wifi_phy import WifiPhy
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.radio.high_throughput import PhyCapability, capability_of, common_modes, mode_named
+from sim_backends.radio.modes import BAND_2_4, G_MODES, MODES, OFDM_MODES, Band, Standard, WifiMode
+
+
+class RadioSettings(Protocol):
+    """The radio of a robot profile, or of an agent of a scenario."""
+
+    @property
+    def standard(self) -> str:
+        """Its standard, `802.11n 2.4 GHz`."""
+        ...
+
+    @property
+    def tx_power_dbm(self) -> float:
+        """Its transmit power."""
+        ...
+
+    @property
+    def sensitivity_dbm(self) -> float:
+        """Weakest frame that it detects."""
+        ...
+
+    @property
+    def phy(self) -> WifiPhy | None:
+        """Its physical layer."""
+        ...
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """The radio properties of a station.
+
+    Attributes:
+        standard: Standard of its radio, if it has no `phy`.
+        tx_power_dbm: Transmit power.
+        sensitivity_dbm: Weakest frame that it detects.
+        phy: Its capability since 802.11n; None for 802.11g, or 802.11n with one stream in 20 MHz, at 2.4 GHz.
+    """
+
+    standard: Standard
+    tx_power_dbm: float
+    sensitivity_dbm: float
+    phy: PhyCapability | None = None
+
+    @property
+    def band(self) -> Band:
+        """The band in which it sends."""
+        return BAND_2_4 if self.phy is None else self.phy.band
+
+    def supports(self, mode: WifiMode) -> bool:
+        """Return True if the station can send and receive frames in this mode."""
+        if mode.band is not self.band:
+            return False
+        if self.phy is not None:
+            return mode in OFDM_MODES[self.band.name] or self.phy.supports(mode)
+        return mode in G_MODES or (self.standard == "802.11n" and mode in MODES["802.11n"])
+
+
+def antenna_of(radio: RadioSettings) -> Antenna:
+    """Return the antenna of a robot's radio; without `phy` any standard other than 802.11n is treated as 802.11g."""
+    standard: Standard = "802.11n" if radio.standard.startswith("802.11n") else "802.11g"
+    phy = capability_of(radio.standard, radio.phy)
+    return Antenna(standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm), phy)
+
+
+def decode_antenna(fields: Mapping[str, object]) -> Antenna:
+    """Return the antenna whose `dataclasses.asdict` is `fields`."""
+    phy = fields["phy"]
+    return Antenna(**{**fields, "phy": None if phy is None else PhyCapability(**phy)})  # type: ignore[arg-type]
+
+
+def modes_between(first: Antenna, second: Antenna) -> tuple[WifiMode, ...]:
+    """Return the modes between two stations of one band, slowest first."""
+    if first.phy is not None and second.phy is not None:
+        return common_modes(first.phy, second.phy)
+    # 802.11n of a station without `phy` is not combined with `phy` of another: its 20 MHz at 2.4 GHz are the same.
+    names = {antenna.standard if antenna.phy is None else "802.11n" for antenna in (first, second)}
+    return MODES["802.11n" if names == {"802.11n"} else "802.11g"]
+
+
+def band_of(antennas: Mapping[str, Antenna]) -> Band:
+    """Return the band of all stations; 2.4 GHz if there are none.
+
+    Raises:
+        ConfigurationError: They have different bands.
+    """
+    bands = {antenna.band.name: name for name, antenna in antennas.items()}
+    if len(bands) > 1:
+        words = ", ".join(f"{name} at {band}" for band, name in bands.items())
+        raise ConfigurationError(
+            f"radios of different bands cannot communicate: {words}",
+            remedy="give the radios of all robots a standard of one band; without phy a radio is at 2.4 GHz",
+        )
+    return next((antenna.band for antenna in antennas.values()), BAND_2_4)
+
+
+def fixed_mode(name: str | None, antennas: Mapping[str, Antenna]) -> WifiMode | None:
+    """Return the mode in which all stations must send; stations of 802.11n and later also support those of 802.11g.
+
+    Args:
+        name: Name of the mode; None if each station chooses its mode.
+        antennas: The stations, by name.
+
+    Raises:
+        ConfigurationError: A station does not support the mode.
+    """
+    if name is None:
+        return None
+    band = band_of(antennas)
+    mode = mode_named(name, band)
+    for station, antenna in antennas.items():
+        if mode is None or not antenna.supports(mode):
+            own = MODES[antenna.standard] if antenna.phy is None else common_modes(antenna.phy, antenna.phy)
+            names = ", ".join(mode.name for mode in (*OFDM_MODES[band.name], *own))
+            raise ConfigurationError(
+                f"radio.mode {name} is not a mode of the radio of {station}",
+                remedy=f"use a mode that all stations support; {station} has: {names}",
+            )
+    return mode

@@ -1,0 +1,208 @@
+"""Modes of 802.11n, ac and ax (HT, VHT, HE) with one or two spatial streams in 20, 40 and 80 MHz.
+
+Clauses 19 (HT) and 21 (VHT) are those of IEEE 802.11-2020, clause 27 (HE) that of IEEE 802.11ax-2021. Beamforming,
+STBC, LDPC, dual carrier modulation, 1x HE-LTF, packet extension and multi-user frames are not modelled.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from itertools import product
+from typing import Final, Literal
+
+from fieldkit.config.wifi_phy import WifiAmendment, WifiPhy
+from sim_backends.radio.modes import (
+    BAND_2_4,
+    BANDS,
+    BITS_PER_SUBCARRIER,
+    G_MODES,
+    N_MODES,
+    OFDM_MODES,
+    SYMBOL_NS,
+    Band,
+    BandName,
+    Modulation,
+    WifiMode,
+)
+
+HighThroughput = Literal["HT", "VHT", "HE"]
+
+_ORDER: Final[tuple[WifiAmendment, ...]] = ("n", "ac", "ax")
+_FORMATS: Final[dict[WifiAmendment, HighThroughput]] = {"n": "HT", "ac": "VHT", "ax": "HE"}
+
+# Modulation and code rate by MCS: tables 19-27, 21-29 and 27-111.
+_MCS: Final[tuple[tuple[Modulation, Fraction], ...]] = (
+    ("BPSK", Fraction(1, 2)),
+    ("QPSK", Fraction(1, 2)),
+    ("QPSK", Fraction(3, 4)),
+    ("16-QAM", Fraction(1, 2)),
+    ("16-QAM", Fraction(3, 4)),
+    ("64-QAM", Fraction(2, 3)),
+    ("64-QAM", Fraction(3, 4)),
+    ("64-QAM", Fraction(5, 6)),
+    ("256-QAM", Fraction(3, 4)),
+    ("256-QAM", Fraction(5, 6)),
+    ("1024-QAM", Fraction(3, 4)),
+    ("1024-QAM", Fraction(5, 6)),
+)
+_MCS_COUNT: Final[dict[HighThroughput, int]] = {"HT": 8, "VHT": 10, "HE": 12}
+
+# Data subcarriers by width, N_SD: tables 19-6, 21-5 and 27-16 (one resource unit of 242, 484 or 996 tones).
+_SUBCARRIERS: Final[dict[HighThroughput, dict[int, int]]] = {
+    "HT": {20: 52, 40: 108},
+    "VHT": {20: 52, 40: 108, 80: 234},
+    "HE": {20: 234, 40: 468, 80: 980},
+}
+
+# Data bits per symbol of 4 us that one convolutional encoder handles: tables of 19.5 and 21.5. HE would use LDPC.
+_ENCODER_BITS_PER_SYMBOL: Final[dict[HighThroughput, int]] = {"HT": 1080, "VHT": 2160, "HE": 1 << 30}
+
+_LEGACY_PREAMBLE_NS: Final = 20_000
+_HE_SYMBOL_NS: Final = 12_800
+# HE-LTF by guard interval: the combinations that are mandatory (27.3.11.10), 2x with 0.8 and 1.6 us, 4x with 3.2 us.
+_HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
+
+
+@dataclass(frozen=True)
+class PhyCapability:
+    """What a station of 802.11n or later can send and receive.
+
+    Attributes:
+        amendment: Its amendment of 802.11.
+        band_name: Its band.
+        width_mhz: Widest channel.
+        streams: Most spatial streams.
+        guard_interval_ns: Shortest guard interval.
+    """
+
+    amendment: WifiAmendment
+    band_name: BandName
+    width_mhz: int
+    streams: int
+    guard_interval_ns: int
+
+    @property
+    def band(self) -> Band:
+        """The band."""
+        return BANDS[self.band_name]
+
+    def supports(self, mode: WifiMode) -> bool:
+        """Return True if the station can send and receive frames in this mode of HT, VHT or HE."""
+        formats = [_FORMATS[amendment] for amendment in _ORDER[: _ORDER.index(self.amendment) + 1]]
+        is_he = self.amendment == "ax" and mode.phy_format != "HE"
+        return (
+            mode.phy_format in formats
+            and mode.width_mhz <= self.width_mhz
+            and mode.streams <= self.streams
+            and (is_he or mode.guard_interval_ns >= self.guard_interval_ns)
+        )
+
+
+def capability_of(standard: str, phy: WifiPhy | None) -> PhyCapability | None:
+    """Return the capability of a radio with this standard, `802.11ac 5 GHz`; None for a radio without key `phy`."""
+    if phy is None:
+        return None
+    amendment, band_name = phy.split_standard(standard)
+    return PhyCapability(amendment, band_name, phy.width_mhz, phy.streams, phy.guard_interval_ns)
+
+
+def common_modes(first: PhyCapability, second: PhyCapability) -> tuple[WifiMode, ...]:
+    """Return the modes that two stations of one band support, slowest first.
+
+    They use the latest amendment, the widest channel and the shortest guard interval that both support, and all
+    numbers of streams up to the largest. A station of 802.11ax uses 800 ns with one of an earlier amendment.
+    """
+    amendment = min(first.amendment, second.amendment, key=_ORDER.index)
+    if amendment == "ac" and first.band_name == "2.4 GHz":
+        amendment = "n"
+    phy_format = _FORMATS[amendment]
+    widths = (first.width_mhz, second.width_mhz, max(_SUBCARRIERS[phy_format]))
+    guard_ns = max(first.guard_interval_ns, second.guard_interval_ns)
+    if amendment != "ax":
+        guard_ns = min(guard_ns, 800)
+    streams = range(1, min(first.streams, second.streams) + 1)
+    modes = [
+        mode for count in streams for mode in format_modes(phy_format, first.band_name, min(widths), count, guard_ns)
+    ]
+    return tuple(sorted(modes, key=lambda mode: (mode.rate_bit_s, mode.streams)))
+
+
+@cache
+def format_modes(
+    phy_format: HighThroughput, band_name: BandName, width_mhz: int, streams: int, guard_interval_ns: int
+) -> tuple[WifiMode, ...]:
+    """Return the modes of all MCS of a format, slowest first; always the same objects."""
+    return tuple(
+        _mode(phy_format, BANDS[band_name], mcs, width_mhz=width_mhz, streams=streams, guard_ns=guard_interval_ns)
+        for mcs in range(_MCS_COUNT[phy_format])
+        # Tables 21-29 and 21-30: N_DBPS would not be an integer.
+        if not (phy_format == "VHT" and width_mhz == 20 and mcs == 9)
+    )
+
+
+def _mode(
+    phy_format: HighThroughput, band: Band, mcs: int, *, width_mhz: int, streams: int, guard_ns: int
+) -> WifiMode:
+    modulation, code_rate = _MCS[mcs]
+    coded_bits = _SUBCARRIERS[phy_format][width_mhz] * BITS_PER_SUBCARRIER[modulation] * streams
+    bits = int(coded_bits * code_rate)  # rounded down: 27.5, HE-MCS 9 and 11 of 996 tones
+    is_short = phy_format != "HE" and guard_ns == 400
+    number = mcs + 8 * (streams - 1) if phy_format == "HT" else mcs
+    return WifiMode(
+        f"{phy_format.lower()}{width_mhz}-mcs{number}-{streams}ss-{guard_ns}ns",
+        modulation,
+        code_rate,
+        bits,
+        phy_format,
+        band,
+        _preamble_ns(phy_format, streams, guard_ns),
+        (_HE_SYMBOL_NS if phy_format == "HE" else SYMBOL_NS - 800) + guard_ns,
+        SYMBOL_NS if is_short else 1,
+        width_mhz,
+        streams,
+        -(-bits // _ENCODER_BITS_PER_SYMBOL[phy_format]),
+    )
+
+
+def _preamble_ns(phy_format: HighThroughput, streams: int, guard_interval_ns: int) -> int:
+    """Return the duration of the preamble in mixed format (HT: 19.4.3; VHT: 21.4.3; HE: 27.4.3).
+
+    After the legacy preamble, HT has HT-SIG (8 us), HT-STF (4 us) and an HT-LTF of 4 us per stream; VHT has
+    VHT-SIG-A (8 us), VHT-STF, a VHT-LTF per stream and VHT-SIG-B (4 us each); HE has RL-SIG (4 us), HE-SIG-A (8 us),
+    HE-STF (4 us) and an HE-LTF per stream.
+    """
+    match phy_format:
+        case "HT":
+            return _LEGACY_PREAMBLE_NS + 8_000 + 4_000 + 4_000 * streams
+        case "VHT":
+            return _LEGACY_PREAMBLE_NS + 8_000 + 4_000 + 4_000 * streams + 4_000
+        case "HE":
+            return _LEGACY_PREAMBLE_NS + 4_000 + 8_000 + 4_000 + _HE_LTF_NS[guard_interval_ns] * streams
+
+
+def guard_intervals_ns(phy_format: HighThroughput) -> tuple[int, ...]:
+    """Return the guard intervals of a format."""
+    return tuple(_HE_LTF_NS) if phy_format == "HE" else (400, 800)
+
+
+@cache
+def _names() -> tuple[str, ...]:
+    return tuple(mode.name for mode in _format_modes(BANDS["5 GHz"]))
+
+
+def _format_modes(band: Band) -> Iterator[WifiMode]:
+    for phy_format, widths in _SUBCARRIERS.items():
+        for width_mhz, streams, guard_ns in product(widths, (1, 2), guard_intervals_ns(phy_format)):
+            yield from format_modes(phy_format, band.name, width_mhz, streams, guard_ns)
+
+
+def mode_names() -> tuple[str, ...]:
+    """Return the names of all modes of all bands."""
+    return (*(mode.name for mode in (*G_MODES, *N_MODES, *OFDM_MODES["5 GHz"])), *_names())
+
+
+def mode_named(name: str, band: Band) -> WifiMode | None:
+    """Return the mode of this name in a band, or None if there is none."""
+    legacy = (*G_MODES, *N_MODES) if band is BAND_2_4 else OFDM_MODES[band.name]
+    return next((mode for mode in (*legacy, *_format_modes(band)) if mode.name == name), None)
