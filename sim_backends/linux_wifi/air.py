@@ -14,14 +14,15 @@ from typing_extensions import override
 from fieldkit.core.model import Vector
 from sim_backends.linux_wifi.hwsim_messages import FLAG_NO_ACK, SentFrame
 from sim_backends.linux_wifi.rate_chain import RateChain, rate_chain
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.frames import HEADER_BYTES, TransmissionAttempt, decibel
 from sim_backends.radio.links import QUEUE_FULL, RADIO_OFF
-from sim_backends.radio.modes import BASIC, SHORT_RETRY_LIMIT, WifiMode
+from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.rate_control import RateControl
 from sim_backends.radio.wifi import Wifi
-from sim_backends.radio.world_channel import Antenna, WorldChannel
+from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.world import World
 
 _FCS_BYTES: Final = 4
@@ -53,7 +54,7 @@ class FrameOnAir:
     attempts: int = 0
     acknowledged: bool = False
     signal_dbm: int = _LOWEST_SIGNAL_DBM
-    mode: WifiMode = BASIC
+    mode: WifiMode = G_MODES[0]
     is_final: bool = False
 
 

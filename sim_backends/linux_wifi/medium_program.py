@@ -29,9 +29,9 @@ from sim_backends.linux_wifi.hwsim_medium import HwsimMedium
 from sim_backends.linux_wifi.hwsim_messages import RadioAddress
 from sim_backends.linux_wifi.hwsim_socket import open_registered
 from sim_backends.linux_wifi.netlink import NetlinkFormatError, NetlinkMessage
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.modes import Standard
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna
 from sim_backends.world.world import World
 
 _BURST: Final = 64

@@ -28,8 +28,8 @@ from sim_backends.linux_wifi.netlink import (
     decode_messages,
     encode_generic,
 )
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.world_channel import Antenna
 from tests.helpers.paths import ROOT
 
 NAMES = "abc"
