@@ -40,6 +40,7 @@ mkdir -p /host/dev/pts /host/dev/shm /host/run/netns
 mount -t devpts devpts /host/dev/pts
 mount -t tmpfs shm /host/dev/shm
 chroot /host /bin/sh /mnt/{job} </host/dev/null >/host/mnt/{output} 2>&1
+echo $? >/host/mnt/{output}.code
 poweroff -f
 """
 
@@ -52,7 +53,8 @@ def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
         radios: Number of radios of hwsim.
         job: Name of a shell script in the folder that the machine shares; it runs on the host's files, and the
             machine switches off at its end.
-        output: Name of the file in that folder with its output.
+        output: Name of the file in that folder with its output. A second one, with `.code` added to its name, has the
+            exit code; it is written last.
 
     Raises:
         ConfigurationError: A program, library or module is missing.

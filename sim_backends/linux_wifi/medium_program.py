@@ -7,8 +7,8 @@ one JSON object per line, and answers each with one on standard output. The firs
     {"do": "totals"}
 
 It exits when standard input ends. When the last descriptor of the registered socket is closed, hwsim delivers all
-frames again without loss. A supervisor therefore opens the socket with `open_registered`, keeps it open, and passes
-its descriptor with `--fd`: if the medium is then killed, no frame is delivered, and a new medium continues.
+frames again without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open,
+and passes its descriptor with `--fd`: if the medium is killed, no frame is delivered, and a new medium continues.
 """
 
 import argparse
@@ -26,8 +26,9 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.linux_wifi.air import Air
 from sim_backends.linux_wifi.hwsim_medium import HwsimMedium
-from sim_backends.linux_wifi.hwsim_messages import FAMILY, RadioAddress, encode_register
-from sim_backends.linux_wifi.netlink import FamilySocket, NetlinkFormatError, NetlinkMessage
+from sim_backends.linux_wifi.hwsim_messages import RadioAddress
+from sim_backends.linux_wifi.hwsim_socket import open_registered
+from sim_backends.linux_wifi.netlink import NetlinkFormatError, NetlinkMessage
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.modes import Standard
 from sim_backends.radio.radio_options import RadioOptions
@@ -214,21 +215,6 @@ def _answer(
 def _vector(values: Any) -> tuple[float, float, float]:  # noqa: ANN401 (JSON)
     east_m, north_m, up_m = values
     return float(east_m), float(north_m), float(up_m)
-
-
-def open_registered(fd: int | None = None) -> FamilySocket:
-    """Return a socket that is the medium of all radios in the network namespace.
-
-    Args:
-        fd: Descriptor of a socket that is registered; None to open and register one.
-
-    Raises:
-        ConfigurationError: The kernel has no hwsim, or the process may not administer the network.
-    """
-    kernel = FamilySocket(FAMILY, fd)
-    if fd is None:
-        kernel.send(encode_register())
-    return kernel
 
 
 def main() -> int:

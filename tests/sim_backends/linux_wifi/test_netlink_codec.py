@@ -75,6 +75,12 @@ def test_a_wrong_length_of_a_message_is_rejected(damaged: bytes) -> None:
         list(decode_messages(damaged))
 
 
+@pytest.mark.parametrize("size", [0, 15, 17])
+def test_a_message_shorter_than_its_header_is_rejected_and_does_not_repeat(size: int) -> None:
+    with pytest.raises(NetlinkFormatError):
+        next(decode_messages(size.to_bytes(4, "little") + bytes(12)))
+
+
 @pytest.mark.parametrize("length", [0, 3, 14, 0xFFFF])
 def test_a_wrong_length_of_an_attribute_is_rejected(length: int) -> None:
     payload = FAMILY_REQUEST[16:20] + length.to_bytes(2, "little") + FAMILY_REQUEST[22:33]

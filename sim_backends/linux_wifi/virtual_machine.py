@@ -1,0 +1,183 @@
+"""A virtual machine with Linux's Wi-Fi, made of the distribution's kernel and the files of this host.
+
+It boots the kernel with mac80211_hwsim, mounts the root file system of the host read-only, runs one shell script as
+root, and switches off. It has no network. Its programs are those of the host: Python with fieldkit, iw, hostapd.
+"""
+
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, TestbedLostError
+from sim_backends.emulated.process.worker import PATH
+from sim_backends.linux_wifi.initrd import build_initrd
+
+PACKAGE_OF: Final = {
+    "qemu-system-x86_64": "qemu-system-x86",
+    "busybox": "busybox",
+    "setpriv": "util-linux",
+    "iw": "iw",
+    "hostapd": "hostapd",
+    "wpa_supplicant": "wpasupplicant",
+}
+"""Debian package per program."""
+
+_JOB, _OUTPUT = "job.sh", "output"
+_MAX_OUTPUT_BYTES: Final = 16 << 20
+# An overloaded host misses the timer interrupts by which the kernel checks its IO-APIC, and the kernel would panic.
+_KERNEL_OPTIONS: Final = "console=ttyS0 rdinit=/init panic=-1 quiet no_timer_check"
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """A kernel of the distribution.
+
+    Attributes:
+        image: Its boot image.
+        modules: Folder of its modules.
+    """
+
+    image: Path
+    modules: Path
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """Result of a script in the machine.
+
+    Attributes:
+        code: Exit code.
+        output: Standard output and standard error.
+    """
+
+    code: int
+    output: str
+
+
+def find_kernel(roots: Sequence[Path] = (Path("/"),)) -> Kernel | None:
+    """Return the newest kernel with hwsim in `boot/` and `lib/modules/` of the first folder that has one, or None."""
+    for root in roots:
+        for image in sorted(root.glob("boot/vmlinuz-*"), key=_version, reverse=True):
+            modules = root / "lib/modules" / image.name.removeprefix("vmlinuz-")
+            if any(modules.rglob("mac80211_hwsim.ko")):
+                return Kernel(image, modules)
+    return None
+
+
+def require_machine(roots: Sequence[Path] = (Path("/"),)) -> Kernel:
+    """Return the kernel of the machine.
+
+    Raises:
+        ConfigurationError: The kernel or a program is missing; the message names all that is.
+    """
+    missing = {name: package for name, package in PACKAGE_OF.items() if shutil.which(name, path=PATH) is None}
+    kernel = find_kernel(roots)
+    if kernel is None:
+        missing["a kernel with mac80211_hwsim"] = "linux-image-amd64"
+    if kernel is None or missing:
+        packages = " ".join(sorted(missing.values()))
+        raise ConfigurationError(
+            f"Linux's Wi-Fi needs what is not installed: {', '.join(missing)}",
+            remedy=f"on Debian, as root: apt-get install --no-install-recommends {packages}",
+        )
+    return kernel
+
+
+def run_in_machine(
+    kernel: Kernel, script: str, deadline: Deadline, *, radios: int, memory_mib: int = 1024
+) -> JobResult:
+    """Run a shell script as root in a new machine, and return its result.
+
+    The machine ends with this process, even if this process is killed. The script may write to `/mnt`, `/tmp` and
+    `/run`; other files are those of the host and cannot be changed.
+
+    Args:
+        kernel: Kernel of the machine.
+        script: The script.
+        deadline: Time by which the machine must have switched off; without KVM, boot takes 4 s and more.
+        radios: Number of radios of hwsim.
+        memory_mib: Memory of the machine.
+
+    Raises:
+        ConfigurationError: A file of the machine is missing.
+        TestbedLostError: The machine did not run the script to its end before the deadline.
+    """
+    with tempfile.TemporaryDirectory(prefix="fieldkit-wifi-") as name:
+        folder = Path(name)
+        shared = folder / "shared"
+        shared.mkdir()
+        (shared / _JOB).write_text(script, encoding="utf-8")
+        (folder / "initrd").write_bytes(build_initrd(kernel.modules, radios=radios, job=_JOB, output=_OUTPUT))
+        with (folder / "errors").open("wb") as errors:
+            machine = subprocess.Popen(
+                _command_line(kernel, folder, memory_mib),
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=errors,
+                stderr=errors,
+                start_new_session=True,
+                env={"PATH": PATH},
+            )
+        try:
+            machine.wait(deadline.remaining_s)
+        except subprocess.TimeoutExpired:
+            raise _lost("did not switch off in time", folder) from None
+        finally:
+            machine.kill()
+            machine.wait()
+        code = shared / f"{_OUTPUT}.code"
+        if not code.exists():
+            raise _lost("ended before its script", folder)
+        return JobResult(int(code.read_text(encoding="ascii")), _read_text(shared / _OUTPUT))
+
+
+def _command_line(kernel: Kernel, folder: Path, memory_mib: int) -> list[str]:
+    argv = ["setpriv", "--pdeathsig", "KILL", "--", "qemu-system-x86_64", *_accelerators(), "-cpu", "max"]
+    argv += ["-m", str(memory_mib), "-nodefaults", "-nic", "none", "-display", "none", "-no-reboot"]
+    argv += ["-kernel", str(kernel.image), "-initrd", "initrd", "-append", _KERNEL_OPTIONS]
+    argv += ["-serial", "file:console", "-device", "virtio-rng-pci"]
+    for tag, path, access in (("host", "/", ",readonly=on"), ("lab", str(folder / "shared"), "")):
+        argv += ["-fsdev", f"local,id={tag},path={path},security_model=none,multidevs=remap{access}"]
+        argv += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
+    return argv
+
+
+def _accelerators() -> Sequence[str]:
+    """Return QEMU's options for the accelerator; QEMU uses the first one that works.
+
+    /dev/kvm is not sufficient. Inside of a virtual machine it may be KVM without hardware support (PVM), which
+    interprets unmodified kernels instruction by instruction, far slower than QEMU's emulation.
+    """
+    flags = Path("/proc/cpuinfo").read_text(encoding="ascii").split()
+    kvm = ("-accel", "kvm") if {"vmx", "svm"} & set(flags) else ()
+    return (*kvm, "-accel", "tcg,thread=multi")
+
+
+def _version(image: Path) -> list[tuple[int, str]]:
+    """Return a sort key by which 6.1.0-50 is newer than 6.1.0-9."""
+    words = image.name.removeprefix("vmlinuz-").replace("-", ".").split(".")
+    return [(int(word), "") if word.isdecimal() else (-1, word) for word in words]
+
+
+def _lost(cause: str, folder: Path) -> TestbedLostError:
+    texts = [_read_text(folder / name).strip() for name in ("shared/output", "console", "errors")]
+    last_line = next((text.rsplit("\n", 1)[-1] for text in texts if text), "")
+    return TestbedLostError(
+        f"{cause}; its last output: {last_line}" if last_line else cause,
+        where="the virtual machine with Linux's Wi-Fi",
+        remedy="run it on a machine that is less busy, or that has KVM",
+    )
+
+
+def _read_text(path: Path) -> str:
+    """Return a file as text, at most its last 16 MiB; empty if it does not exist."""
+    if not path.exists():
+        return ""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _MAX_OUTPUT_BYTES))
+        return file.read().decode(errors="replace")

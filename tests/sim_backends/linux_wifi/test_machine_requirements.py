@@ -1,0 +1,32 @@
+"""The parts of the virtual machine: what is missing, and which kernel is used."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.linux_wifi import virtual_machine
+from sim_backends.linux_wifi.virtual_machine import find_kernel, require_machine
+
+
+def test_all_that_is_missing_is_listed_with_its_packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(virtual_machine, "PATH", str(tmp_path))
+    with pytest.raises(ConfigurationError) as caught:
+        require_machine((tmp_path,))
+    assert "qemu-system-x86_64" in caught.value.what
+    for package in ("qemu-system-x86", "linux-image-amd64", "iw", "hostapd", "wpasupplicant", "busybox"):
+        assert f" {package}" in caught.value.remedy
+
+
+def test_the_newest_kernel_with_hwsim_is_used(tmp_path: Path) -> None:
+    for version, has_hwsim in (("6.1.0-9-amd64", True), ("6.1.0-50-amd64", True), ("6.12.0-1-cloud-amd64", False)):
+        modules = tmp_path / "lib/modules" / version / "kernel"
+        modules.mkdir(parents=True)
+        (tmp_path / "boot").mkdir(exist_ok=True)
+        (tmp_path / "boot" / f"vmlinuz-{version}").touch()
+        if has_hwsim:
+            (modules / "mac80211_hwsim.ko").touch()
+    found = find_kernel((tmp_path / "missing", tmp_path))
+    assert found is not None
+    assert found.image.name == "vmlinuz-6.1.0-50-amd64"
+    assert found.modules == tmp_path / "lib/modules/6.1.0-50-amd64"
