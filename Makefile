@@ -1,6 +1,6 @@
 # `make trial` and `make test` install all that they need.
 .DELETE_ON_ERROR:
-.PHONY: trial test nightly compile lint bench soak fuzz
+.PHONY: trial test nightly compile lint rules types pages bench soak fuzz
 
 # Otherwise every worker, and every command that a test runs, would compile its imports again.
 unexport PYTHONDONTWRITEBYTECODE
@@ -38,11 +38,17 @@ compile: ## compile the test files by collecting them once
 	@MAKE_TARGET=$@ .ci/install --dev
 	@.venv/bin/python -m pytest --collect-only -qq >$(COLLECTED) || { cat $(COLLECTED); exit 1; }
 
-lint: ## format, rules, types, docs
+lint: rules types pages ## format, rules, types, docs
+
+rules:
 	@MAKE_TARGET=$@ .ci/install --dev
 	@.venv/bin/ruff format --check .
 	@.venv/bin/ruff check .
+
+types: rules
 	@.venv/bin/mypy
+
+pages: rules
 	@NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --quiet --strict --config-file .ci/mkdocs.yml --site-dir "$(CURDIR)/.venv/site"
 
 soak: ## 1000 power cuts, trials with 200 faults, and 60 faults of moving robots: about 45 minutes

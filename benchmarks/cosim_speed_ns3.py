@@ -2,14 +2,13 @@
 
 Driving robots, 10 m apart, send packets of 1,000 bytes to the next robot by UDP in 802.11g, under `sliding_window`
 with windows of 10 ms. *Alone* is the same program of ns-3 with the same packets and positions, read from a file and
-simulated in one `Run()`. *Minimal* passes the same requests through a pipe, one per window, and ignores the answers:
-no coordinator can cost less. *Coupled* is the co-simulation: processor time of both processes, without that of
-physics and programs. All three write the parts of every delay to a file. *Built-in* is the co-simulation with the
-built-in network. Figures are medians of several rounds; in each round the variants alternate. An error is raised if
-the delays differ.
+simulated in one `Run()`. *Minimal* passes the same requests through a pipe, one per window, and ignores the answers;
+it does not share a processor (`ProcessorSharing`). *Coupled* is the co-simulation: processor time of both processes,
+without that of physics and programs; states that the built-in physics computes on request are computed in its time.
+All three write the parts of every delay to a file. *Built-in* is the co-simulation with the built-in network. Figures
+are medians of several rounds; in each round the variants alternate. An error is raised if the delays differ.
 
-On a machine with idle processors, each message resumes a process on a processor whose caches are cold. `taskset -c 0
-python -m benchmarks.cosim_speed_ns3` shows the costs without it.
+`taskset -c 0 python -m benchmarks.cosim_speed_ns3` shows the costs on one processor.
 """
 
 import argparse
@@ -22,7 +21,7 @@ import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 from unittest.mock import patch
@@ -35,6 +34,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.frames import HEADER_BYTES, NETWORK, MessageKind, ProtocolFrame, encode, read_header
 from sim_backends.federates.remote import RemoteNetwork
 from sim_backends.ns3.federate import command
+from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 
 COUNTS: Final = (3, 10, 30)
@@ -104,8 +104,13 @@ def run_coupled(scenario: CosimScenario, requests: Path | None = None) -> Figure
             simulation.network.session.observer = _recorder(requests)
         # `build` has compiled ns-3's program or read its version, in other processes.
         children_s, started_s = used_s(resource.RUSAGE_CHILDREN), time.process_time()
+        physics, advance = simulation.agents.physics, simulation.agents.physics.advance
+
+        def advance_now(to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
+            return dict(advance(to_ns, commands))
+
         # The parts of a run are usually measured in wall time.
-        with patch.object(time, "perf_counter", time.process_time):
+        with patch.object(time, "perf_counter", time.process_time), patch.object(physics, "advance", advance_now):
             run = simulation.run()
         own_s = time.process_time() - started_s - run.wall_s["agents"]
     child_s = used_s(resource.RUSAGE_CHILDREN) - children_s

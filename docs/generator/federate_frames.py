@@ -1,11 +1,13 @@
 """An example of each message of the protocol of external federates: the test vectors."""
 
+from fieldkit.core.model import LinkSample, StationSample
 from sim_backends.federates import exchanges
 from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import PHYSICS, MessageKind, encode, text_bytes
 from sim_backends.federates.handshake import AgentStart, FederateCapability, Hello, Welcome, encode_join
-from sim_backends.federates.records import COMMAND_TYPES
+from sim_backends.federates.link_records import encode_links
+from sim_backends.federates.records import COMMAND_TYPES, ArrivalDelay
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
@@ -32,8 +34,17 @@ WELCOME = Welcome(
     commands=COMMAND_TYPES,
 )
 
+LINKS = {
+    "ugv": LinkSample(
+        0,
+        (StationSample("uav", -61.5, 54e6, None, 12, 11, 3, 1),),
+        noise_dbm=-95.0,
+        active_ns=11_099_999,
+        busy_ns=2_000_000,
+    )
+}
 
-WITHOUT_VECTOR = {"pong", "busy", "done", "release", "bye"}
+WITHOUT_VECTOR = {"pong", "busy", "done", "release", "bye", "sample links"}
 """Messages with an empty body or that of ping."""
 
 DESCRIPTION = """\
@@ -43,6 +54,7 @@ body or that of ping. Values: a run `demo` of 2 s, seed 7, step 1 ms, configurat
 `carts 1.0`, is deterministic and supports both commands. From 10 to 11.1 ms `ugv` drives at 0.5 m/s and turns at
 -0.125 rad/s, and agent 1 flies at (1, 0, 0.25) m/s. Agent 1, `uav`, appears in the states at (-1.5, 0, 10) with the
 velocity (0, 0.5, -0.25). Packet 9, number 4 of `pose`, has 300 bytes, is sent at 10 ms and enters at 10.5 ms.
+`ugv` hears `uav` with -61.5 dBm, has sent it 12 packets at 54 Mbit/s, last, and received 11 at an unknown rate.
 """
 """Text of their page."""
 
@@ -73,7 +85,11 @@ def example_frames() -> dict[str, bytes]:
             11_099_999, {"ugv": START}, [packet], since_ns=10_000_000, reckoning_ns=1_000_000
         ).encode(agents()),
         MessageKind.OUTCOMES: NetworkOutcomes(
-            11_099_999, 12_000_000, [Arrival(9, "uav", 11_000_250)], [Drop(8, "out of range")]
+            11_099_999,
+            12_000_000,
+            [Arrival(9, "uav", 11_000_250)],
+            [Drop(8, "out of range")],
+            [ArrivalDelay(100_000, 350_000, 33)],
         ).encode(agents()),
         MessageKind.PING: exchanges.encode_number(42),
         MessageKind.PONG: exchanges.encode_number(42),
@@ -83,6 +99,8 @@ def example_frames() -> dict[str, bytes]:
         MessageKind.RELEASE: b"",
         MessageKind.ERROR: text_bytes("ValueError: no wheels"),
         MessageKind.BYE: b"",
+        MessageKind.SAMPLE_LINKS: b"",
+        MessageKind.LINKS: encode_links(LINKS, agents()),
     }
     copies = {MessageKind.RELEASE: 2}
     without_number = {MessageKind.JOIN, MessageKind.RELEASE, MessageKind.BYE}

@@ -12,6 +12,7 @@ from docs.generator.federate_protocol import federate_protocol
 from docs.generator.markdown import page, relative, table
 from docs.generator.models import HEAD, describe, keys_table, kinds, rows
 from docs.generator.simulators import simulator_options
+from docs.generator.step_columns import escaped, step_columns, table_rows
 from fieldkit import cli
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.campaign.plan import CampaignFile
@@ -58,6 +59,7 @@ def pages() -> dict[str, str]:
         "recording-tables.md": recording_tables,
         "pytest-options.md": pytest_options,
         "columns.md": columns,
+        "table-rows.md": table_rows,
         "events.md": json_events,
         "world-file.md": world_file,
         "federate-protocol.md": federate_protocol,
@@ -110,6 +112,7 @@ def index() -> str:
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
         ("[Options of pytest](pytest-options.md)", "of the pytest plugin"),
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
+        ("[Rows of tables](table-rows.md)", "the column of each row that `trial`, `aggregate` and `report` print"),
         ("[Tables of a recording](recording-tables.md)", "packets, states and windows of a co-simulation"),
         ("[JSON events](events.md)", "output of `--json`"),
         ("[Layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
@@ -278,6 +281,7 @@ def columns() -> str:
     ]
     for name, file_columns in files.items():
         blocks += [f"## {name}", table(("column", "unit", "repeats give", "meaning"), _column_rows(file_columns))]
+    blocks += ["## trial.csv with certain steps", "FLOW is the kind of step.", step_columns()]
     packets = ((f"`{column.name}`", column.unit, column.meaning) for column in PACKET_COLUMNS)
     blocks += [
         "## packets",
@@ -290,7 +294,7 @@ def columns() -> str:
 def _column_rows(columns_of_file: tuple[Column, ...]) -> Iterator[tuple[str, str, str, str]]:
     for column in columns_of_file:
         figure = str(column.figure.kind) if column.figure else ""
-        yield f"`{column.name}`", column.unit, figure, column.meaning.replace("<", "&lt;").replace("*", "\\*")
+        yield f"`{column.name}`", column.unit, figure, escaped(column.meaning)
 
 
 def json_events() -> str:

@@ -138,15 +138,20 @@ def add_cells(parser: Parser, default: str = CONDITION) -> None:
     )
 
 
-def add_workers(parser: Parser) -> None:
-    """Add the options that choose where tasks run; `executors.Workers` has both."""
-    workers = parser.add_mutually_exclusive_group()
-    workers.add_argument(
+def add_jobs(parser: argparse._ActionsContainer) -> None:
+    """Add the option for the number of processes on this machine."""
+    parser.add_argument(
         "--jobs",
         type=positive,
         metavar="N",
         help="number of parallel processes (default: the number of processors)",
     )
+
+
+def add_workers(parser: Parser) -> None:
+    """Add the options that choose where tasks run; `executors.Workers` has both."""
+    workers = parser.add_mutually_exclusive_group()
+    add_jobs(workers)
     workers.add_argument(
         "--cluster",
         default="",

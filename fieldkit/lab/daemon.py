@@ -169,7 +169,7 @@ def _serve(client: socket.socket, robots: Lab, start_s: float) -> None:
                 case "connect":
                     _pass_socket(client, robots, arguments)
                 case "state":
-                    client.sendall(requests.pack_state(_state(robots, time.monotonic() - start_s)))
+                    client.sendall(_state(robots, time.monotonic() - start_s))
                 case "overview":
                     client.sendall(requests.pack_overview(robots.overview()))
                 case "move":
@@ -202,8 +202,16 @@ def _move(robots: Lab, name: str, to: str) -> bytes:
         return requests.pack_error(error)
 
 
-def _state(robots: Lab, up_s: float) -> LabState:
-    rows = (
+def _state(robots: Lab, up_s: float) -> bytes:
+    """Return the state of the lab, or the error of a lab that has lost a process."""
+    try:
+        return requests.pack_state(LabState(os.getpid(), up_s, tuple(_robot_states(robots))))
+    except FieldkitError as error:
+        return requests.pack_error(error)
+
+
+def _robot_states(robots: Lab) -> Iterator[RobotState]:
+    return (
         RobotState(
             name=name,
             profile=member.profile.name,
@@ -214,7 +222,6 @@ def _state(robots: Lab, up_s: float) -> LabState:
         )
         for name, member in robots.members.items()
     )
-    return LabState(os.getpid(), up_s, tuple(rows))
 
 
 _CONNECT: Final = Path(__file__).with_name("connect.py")

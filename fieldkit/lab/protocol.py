@@ -106,7 +106,11 @@ class Lab(Protocol):
         ...
 
     def place_m(self, name: str) -> Vector:
-        """Return the position of a robot's antenna in metres."""
+        """Return the position of a robot's antenna in metres.
+
+        Raises:
+            FieldkitError: The positions are unknown, because a process of the lab has failed.
+        """
         ...
 
     def move(self, name: str, to: Destination) -> Vector:

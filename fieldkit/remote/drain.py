@@ -7,11 +7,10 @@ from typing import IO, Final
 from fieldkit.core.deadline import Deadline, ExpiredError
 from fieldkit.core.errors import RobotError
 from fieldkit.remote.command import printable
-from fieldkit.remote.link import Channel
+from fieldkit.remote.link import Channel, connection_error
 from fieldkit.remote.persistent_shells import Execution
 
 _CHUNK: Final = 1 << 16
-_LINK_ERROR_S: Final = 0.5
 _MAX_WAIT_S: Final = 1.0
 """Maximum time of one wait. If Ctrl-C arrives just before a wait, Python handles it only after the wait."""
 
@@ -99,11 +98,8 @@ def _exit_code(channel: Execution, stderr: bytes, robot: str) -> int:
     code = channel.recv_exit_status()
     if code >= 0:
         return code
-    # A broken link closes its channels first, and reports its error shortly after.
-    transport = channel.get_transport()
-    transport.join(_LINK_ERROR_S)
-    if not transport.is_active():
-        raise transport.get_exception() or EOFError("the connection ended before the command")
+    if (error := connection_error(channel.get_transport())) is not None:
+        raise error
     raise RobotError(
         f"a signal ended the command: {printable(stderr) or 'no message'}",
         where=robot,

@@ -74,11 +74,13 @@ class _Packetizer(paramiko.packet.Packetizer):
             algorithm (RFC 896): it delays a small packet until the previous one is acknowledged, which this computer
             delays by 40 ms (RFC 1122, section 4.2.3.2). Linux leaves the quick acknowledgement mode whenever data is
             sent (tcp(7), TCP_QUICKACK).
+        has_ended: Whether reading from the connection has failed, which paramiko reports to one thread only.
     """
 
     def __init__(self, stream: socket.socket) -> None:
         super().__init__(stream)
         self.acknowledges = True
+        self.has_ended = False
         self._stream = stream
         self._received_banner_bytes = 0
 
@@ -87,6 +89,14 @@ class _Packetizer(paramiko.packet.Packetizer):
         super().send_message(data)
         if self.acknowledges:
             self._stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+
+    @override
+    def read_message(self) -> tuple[int, paramiko.Message]:
+        try:
+            return super().read_message()
+        except BROKEN:
+            self.has_ended = True
+            raise
 
     @override
     def read_all(self, n: int, check_rekey: bool = False) -> bytes:
@@ -356,6 +366,21 @@ class Link:
         if self._stream is None or self._transport is None:
             raise EOFError("not connected")
         return self._stream, self._transport
+
+
+def connection_error(transport: paramiko.Transport) -> BaseException | None:
+    """Return the error of the connection of a closed channel, or None if the server has closed only the channel.
+
+    paramiko stores its exception, closes the channels of the connection, and only then marks the connection as
+    inactive. On a busy computer this takes any time.
+    """
+    assert isinstance(transport.packetizer, _Packetizer)
+    error = transport.saved_exception
+    if isinstance(error, paramiko.ChannelException):  # the server has refused another channel
+        error = None
+    if error is None and (transport.packetizer.has_ended or not transport.is_active()):
+        error = EOFError("the connection ended before the command")
+    return error
 
 
 def _closes_spares(transport: paramiko.Transport) -> bool:

@@ -4,6 +4,7 @@ The simulation writes captures of both ends and the output of ping as files of a
 does not write are missing.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -173,9 +174,12 @@ class SimulatedTrial:
             folder = Path(name)
             self._write(simulated, folder)
             measured = gates.judge(self._plan, simulated.repeat, AttemptEvidence(folder)).measured
-        attempt = Attempt(simulated.repeat, 1, 0, simulated.status, simulated.reason)
-        row = rows.build(self._plan, attempt, measured)
-        return {key: value for key, value in {**row, **simulated.values, **identity}.items() if key not in _NO_CLOCK}
+        status, reason = simulated.status, simulated.reason
+        if status is Status.VALID and (contradictions := differences(measured.values, simulated.values)):
+            status, reason = Status.FAILED, f"captures and simulation disagree: {contradictions}"
+        row = rows.build(self._plan, Attempt(simulated.repeat, 1, 0, status, reason), measured)
+        row = {**row, **simulated.values}
+        return {key: value for key, value in {**row, **_goodput(row), **identity}.items() if key not in _NO_CLOCK}
 
     def _write(self, simulated: SimulatedRepeat, folder: Path) -> None:
         """Write the evidence of a repeat."""
@@ -185,6 +189,32 @@ class SimulatedTrial:
                     (folder / str(capture_around(placed.within, role))).write_bytes(content)
             if isinstance(placed.step, PingStep):
                 (folder / placed.step.pinging().file).write_text(simulated.ping, encoding="ascii")
+
+
+def differences(measured: Mapping[str, Value], known: Mapping[str, Value]) -> str:
+    """Return the columns that the evidence and the simulation know differently, as text; empty if there are none."""
+    same_names = {"received_bytes": "tcp_received_bytes", "sent_bytes": "tcp_unique_bytes"}
+    pairs = list(known.items())
+    pairs += [(same_names[name], value) for name, value in known.items() if name in same_names]
+    found_differences = []
+    for name, value in pairs:
+        found = measured.get(name)
+        if not isinstance(found, int | float) or not isinstance(value, int | float):
+            continue
+        if not math.isclose(found, value, rel_tol=1e-9, abs_tol=1e-12):
+            found_differences.append(f"{name} is {found:g} in the captures and {value:g} in the simulation")
+    return "; ".join(found_differences)
+
+
+def _goodput(row: Mapping[str, Value]) -> dict[str, Value]:
+    """Return the goodput as `rates` defines it; a first packet that is a whole datagram is not counted."""
+    received_bytes, completion_s = row.get("received_bytes"), row.get("completion_s")
+    if not isinstance(received_bytes, int) or not isinstance(completion_s, float) or completion_s <= 0:
+        return {}
+    head_bytes, datagrams = 0, row.get("datagrams_received")
+    if isinstance(datagrams, int) and datagrams and row.get("datagrams_sent") == row.get("ip_packets_sent"):
+        head_bytes = -(-received_bytes // datagrams)
+    return {"goodput_bit_s": 8 * max(received_bytes - head_bytes, 0) / completion_s}
 
 
 _NO_CLOCK: Final = frozenset({"started_utc_ns"})

@@ -29,7 +29,7 @@ from sim_backends.world.motion import STILL, State
 
 
 class EmaneLocations:
-    """A physics whose agents are where the last location event of their NEM says.
+    """A physics in which each agent has the position of the last location event of its NEM.
 
     Simulated time passes as fast as wall time, from the first request on. The motion of the scenario's agents is not
     simulated.

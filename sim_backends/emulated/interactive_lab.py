@@ -52,6 +52,7 @@ class EmulatedLab:
         self._places_m = placement.square_m(members, world)
         self._path_starts_ns: dict[str, int] = {}
         self._states: dict[str, State] = {}
+        self._watch: MotionThread | None = None
         # A separate thread follows robots that steer themselves.
         self._lock = threading.RLock()
         for name in members:
@@ -71,6 +72,9 @@ class EmulatedLab:
 
     def place_m(self, name: str) -> Vector:
         """Implement `Lab.place_m`."""
+        self._running.medium.check_alive()
+        if self._watch is not None:
+            self._watch.check()
         with self._lock:
             return self._places_m[name]
 
@@ -99,7 +103,8 @@ class EmulatedLab:
         """Return a context that keeps the medium up to date with robots that steer themselves."""
         if not any(robot.spec.steers for robot in self._running.robots.values()):
             return nullcontext()
-        return MotionThread(self._follow, "watch")
+        self._watch = MotionThread(self._follow, "watch")
+        return self._watch
 
     def _follow(self) -> float:
         """Update the places of robots that steer themselves; return the seconds until the next update."""

@@ -64,6 +64,11 @@ class MotionThread:
         if self._error is not None and error is None:
             raise self._error
 
+    def check(self) -> None:
+        """Raise the error of `step` if there was one, since no step follows it."""
+        if self._error is not None:
+            raise self._error
+
     def _run(self) -> None:
         try:
             while (wait_s := self._step()) is not None and not self._stop.wait(wait_s):

@@ -31,6 +31,7 @@ class Child:
 
     Attributes:
         channel: The channel to it.
+        pid: Its process.
 
     Raises:
         ConfigurationError: It cannot be started.
@@ -58,6 +59,7 @@ class Child:
         assert process.stdin is not None
         assert process.stdout is not None
         self._process = process
+        self.pid = process.pid
         # The channel owns duplicates, so that the process object does not close descriptors that are in use again.
         self.channel = StreamChannel(os.dup(process.stdout.fileno()), os.dup(process.stdin.fileno()))
         process.stdin.close()

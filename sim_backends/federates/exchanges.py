@@ -16,10 +16,13 @@ from sim_backends.federates.agent_states import (
 )
 from sim_backends.federates.frames import HEADER_BYTES, FrameReader, MalformedFrameError
 from sim_backends.federates.records import (
+    ArrivalDelay,
+    arrival_delays_bytes,
     arrivals_bytes,
     commands_bytes,
     drops_bytes,
     packets_bytes,
+    read_arrival_delays,
     read_arrivals,
     read_commands,
     read_drops,
@@ -151,12 +154,14 @@ class NetworkOutcomes(NamedTuple):
         next_event_ns: Time of its next event; `NO_EVENT` for none.
         arrivals: Packets that arrived.
         drops: Packets that will never arrive.
+        delays: Parts of the delay of each arrival; empty if the network does not report them.
     """
 
     at_ns: int
     next_event_ns: int
     arrivals: Sequence[Arrival]
     drops: Sequence[Drop]
+    delays: Sequence[ArrivalDelay] = ()
 
     def encode(self, agents: AgentTable) -> bytes:
         """Return the body of the message."""
@@ -164,6 +169,7 @@ class NetworkOutcomes(NamedTuple):
             _TWO_TIMES.pack(self.at_ns, self.next_event_ns)
             + arrivals_bytes(self.arrivals, agents)
             + drops_bytes(self.drops)
+            + arrival_delays_bytes(self.delays)
         )
 
     @staticmethod
@@ -180,8 +186,9 @@ class NetworkOutcomes(NamedTuple):
         reader = FrameReader(body)
         at_ns, next_event_ns = reader.unpack(_TWO_TIMES)
         arrivals, drops = read_arrivals(reader, agents), read_drops(reader)
+        delays = read_arrival_delays(reader, len(arrivals)) if reader.remaining_bytes else ()
         reader.end()
-        return NetworkOutcomes(at_ns, next_event_ns, arrivals, drops)
+        return NetworkOutcomes(at_ns, next_event_ns, arrivals, drops, delays)
 
 
 def encode_number(number: int) -> bytes:

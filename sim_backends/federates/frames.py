@@ -42,7 +42,7 @@ class MessageKind(IntEnum):
         ADVANCE_NETWORK: coordinator: `to_ns` i64, `since_ns` i64, `reckoning_ns` i64, `new` u32 as in states,
             `states` u32, each a state, `packets` u32, each a packet
         OUTCOMES: federate: `at_ns` i64, `next_event_ns` i64, `arrivals` u32, each an arrival, `drops` u32, each a
-            drop
+            drop, and optionally the delay parts of each arrival
         PING: coordinator: `value` i64
         PONG: federate: `value` i64 of the ping
         BUSY: federate: `at_ns` i64, the time that it has reached
@@ -51,6 +51,8 @@ class MessageKind(IntEnum):
         RELEASE: coordinator: empty; the header's copy is not used again; without an answer
         ERROR: federate: `text`; answers any request; the session ends
         BYE: coordinator: empty; the federate ends, without an answer
+        SAMPLE_LINKS: coordinator: empty; only to a network with the capability 64
+        LINKS: federate: `radios` u32, each a radio sample, `links` u32, each a link sample
     """
 
     JOIN = 1
@@ -68,6 +70,8 @@ class MessageKind(IntEnum):
     RELEASE = 13
     ERROR = 14
     BYE = 15
+    SAMPLE_LINKS = 16
+    LINKS = 17
 
 
 _KINDS: Final = {int(kind): kind for kind in MessageKind}
@@ -165,6 +169,11 @@ class FrameReader:
     def position(self) -> int:
         """Number of the next byte, from the beginning of the frame."""
         return HEADER_BYTES + self._at
+
+    @property
+    def remaining_bytes(self) -> int:
+        """Number of bytes that have not been read."""
+        return len(self._body) - self._at
 
     def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
         """Return the next values.

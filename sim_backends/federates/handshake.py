@@ -50,6 +50,7 @@ class FederateCapability(IntFlag):
         EXTRAPOLATES: It moves agents by dead reckoning.
         AGENTS_APPEAR: Agents that are not in hello may appear.
         AGENTS_DISAPPEAR: Agents may disappear, and return.
+        SAMPLES_LINKS: It answers requests for samples of the links of its radios.
     """
 
     DETERMINISTIC = 1
@@ -58,6 +59,7 @@ class FederateCapability(IntFlag):
     EXTRAPOLATES = 8
     AGENTS_APPEAR = 16
     AGENTS_DISAPPEAR = 32
+    SAMPLES_LINKS = 64
 
 
 NO_CAPABILITY: Final = FederateCapability(0)

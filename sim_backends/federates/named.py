@@ -28,12 +28,17 @@ class ProgramFederate:
             something is not installed; the remedy is the command that installs it.
         summary: What it is, in one line.
         options: Model of its options in a scenario; None if it has any options, which are not validated.
+        writes_captures: True for a network that writes the captures that `captures` of its configuration describes.
+        is_single_threaded: True if it has one thread, which computes only during requests. It then shares the
+            processor of the coordinator (`ProcessorSharing`).
     """
 
     role: int
     command: Callable[[], str]
     summary: str = ""
     options: type[SimulatorOptions] | None = None
+    writes_captures: bool = False
+    is_single_threaded: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,6 +111,16 @@ def _load(point: EntryPoint) -> NamedFederate:
     raise ConfigurationError(
         "it is not a ProgramFederate or PythonFederate", where=plugins.location(point), remedy=plugins.REMEDY
     )
+
+
+def is_single_threaded(where: str, role: int) -> bool:
+    """Return True if the federate of a name is a program that declares one thread; False for commands and addresses.
+
+    Raises:
+        ConfigurationError: As for `named`.
+    """
+    federate = named(where, role)
+    return isinstance(federate, ProgramFederate) and federate.is_single_threaded
 
 
 def command_line(where: str, role: int) -> str:

@@ -4,7 +4,7 @@ import math
 import struct
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.frames import FrameReader, MalformedFrameError, count_bytes, text_bytes
@@ -14,6 +14,7 @@ from sim_backends.physics.body import Twist, Velocity
 _PACKET: Final = struct.Struct("<QqQqqII")
 _ARRIVAL: Final = struct.Struct("<QqII")
 _DROP: Final = struct.Struct("<Q")
+_DELAY_PARTS: Final = struct.Struct("<3q")
 _COMMAND: Final = struct.Struct("<IHH")
 _TWIST: Final = struct.Struct("<2d")
 _VELOCITY: Final = struct.Struct("<4d")
@@ -34,6 +35,12 @@ LAYOUTS: Final = {
     "u32, `flow` text, `protocol` text",
     "arrival": "`id` u64, `at_ns` i64, `agent` u32, `reserved` u32",
     "drop": "`id` u64, `reason` text",
+    "delay parts": "`queueing_ns` i64, `transmission_ns` i64, `propagation_ns` i64, none negative; the rest of the "
+    "delay, from `enters_ns` to `at_ns`, is processing in hosts",
+    "radio sample": "`agent` u32, `reserved` u32, `noise_dbm` f64, `active_ns` i64, `busy_ns` i64 (as in `iw survey "
+    "dump`)",
+    "link sample": "`agent` u32, `peer` u32, `signal_dbm` f64, `tx_rate_bit_s` f64, `rx_rate_bit_s` f64 (NaN if "
+    "unknown), `tx_packets` u64, `rx_packets` u64, `tx_retries` u64, `tx_failures` u64 (as in `iw station dump`)",
 }
 """Layout of each part of a message, for the reference."""
 
@@ -161,3 +168,36 @@ def read_drops(reader: FrameReader) -> list[Drop]:
         MalformedFrameError: A drop is invalid.
     """
     return [Drop(reader.unpack(_DROP)[0], reader.text()) for _ in range(reader.count(_DROP.size + 2))]
+
+
+class ArrivalDelay(NamedTuple):
+    """Parts of the delay of an arrival; the rest of its delay is processing in hosts.
+
+    Attributes:
+        queueing_ns: Time in queues.
+        transmission_ns: Time from the first attempt of a frame to the end of the received one.
+        propagation_ns: Time in the air.
+    """
+
+    queueing_ns: int
+    transmission_ns: int
+    propagation_ns: int
+
+
+def arrival_delays_bytes(delays: Iterable[ArrivalDelay]) -> bytes:
+    """Return the parts of the delay of each arrival."""
+    return b"".join(_DELAY_PARTS.pack(*parts) for parts in delays)
+
+
+def read_arrival_delays(reader: FrameReader, count: int) -> list[ArrivalDelay]:
+    """Return the parts of the delays of `count` arrivals.
+
+    Raises:
+        MalformedFrameError: There are not as many, or a part is negative.
+    """
+    begin = reader.position
+    delays = [ArrivalDelay(*parts) for parts in _DELAY_PARTS.iter_unpack(reader.take(count * _DELAY_PARTS.size))]
+    for number, parts in enumerate(delays):
+        if min(parts) < 0:
+            raise MalformedFrameError(begin + number * _DELAY_PARTS.size, f"a part of a delay is {min(parts)} ns")
+    return delays

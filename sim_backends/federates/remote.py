@@ -1,11 +1,13 @@
 """Physics and network in other processes, as the coordinator uses them."""
 
 import copy
+import time
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from fieldkit.core.model import LinkSample
 from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import (
     AdvanceNetwork,
@@ -16,11 +18,15 @@ from sim_backends.federates.exchanges import (
 )
 from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
 from sim_backends.federates.handshake import NO_EVENT, FederateCapability, Hello, Welcome
+from sim_backends.federates.link_records import decode_links
 from sim_backends.federates.protocols import FederateError, seconds_text
-from sim_backends.federates.records import command_type
+from sim_backends.federates.records import ArrivalDelay, command_type
 from sim_backends.federates.session import FederateSession, open_session
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.motion import DeadReckoned, State
+
+ArrivalDelayLog = Callable[[Arrival, ArrivalDelay], None]
+"""Called with each arrival, and the parts of its delay."""
 
 
 class _RemoteFederate:
@@ -153,6 +159,28 @@ class RemoteNetwork(_RemoteFederate):
         self._last_states: Mapping[str, State] | None = None
         if not welcome.capabilities & FederateCapability.AGENTS_DISAPPEAR:
             self._last_states = {agent.name: agent.start for agent in hello.agents}
+        self._log_delay: ArrivalDelayLog | None = None
+
+    def log_arrival_delays(self, log: ArrivalDelayLog | None) -> None:
+        """Pass the parts of the delays of all arrivals from now on to `log`, if it reports them; None stops it."""
+        self._log_delay = log
+
+    def sample_links(self) -> dict[str, LinkSample]:
+        """Return a sample of the links of each radio, at the time that it has reached; empty if it has none.
+
+        Raises:
+            FederateError: It failed, or sent a malformed answer.
+        """
+        if not self.welcome.capabilities & FederateCapability.SAMPLES_LINKS:
+            return {}
+        return self.session.request(
+            MessageKind.SAMPLE_LINKS,
+            self._copy,
+            b"",
+            MessageKind.LINKS,
+            decode=partial(decode_links, agents=self._agents, utc_ns=time.time_ns()),
+            what=lambda: "sample the links",
+        )
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
@@ -190,6 +218,9 @@ class RemoteNetwork(_RemoteFederate):
             )
         self._next_event_ns = outcomes.next_event_ns
         self.session.reached_ns = to_ns
+        if self._log_delay is not None and outcomes.delays:
+            for arrival, parts in zip(outcomes.arrivals, outcomes.delays, strict=True):
+                self._log_delay(arrival, parts)
         return list(outcomes.arrivals), list(outcomes.drops)
 
     def next_event_ns(self) -> int | None:

@@ -3,7 +3,7 @@
 import re
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
 from typing import Final, NoReturn, TypeVar
 
@@ -21,7 +21,8 @@ from sim_backends.federates.frames import (
     encode,
 )
 from sim_backends.federates.handshake import Hello, Welcome
-from sim_backends.federates.named import command_line
+from sim_backends.federates.named import command_line, is_single_threaded
+from sim_backends.federates.processor_sharing import ProcessorSharing
 from sim_backends.federates.protocols import FederateError, UnansweredError, seconds_text
 from sim_backends.federates.transports.contract import read_token
 from sim_backends.federates.transports.joining import accept_federate
@@ -58,6 +59,7 @@ class FederateSession:
         name: Its role, its name if it is known, and its command or address.
         reached_ns: Last simulated time that it has answered, or None.
         observer: Called with each request and answer, in bytes, or None.
+        exchange_context: Context of each request and its answer.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class FederateSession:
         self.name = f"{ROLES[role]} ({where})"
         self.reached_ns: int | None = None
         self.observer: Callable[[bytes, ProtocolFrame | None], None] | None = None
+        self.exchange_context: AbstractContextManager[None] = nullcontext()
 
     def __deepcopy__(self, memo: dict[int, object]) -> "FederateSession":
         return self  # copies of a federate share the connection
@@ -138,7 +141,9 @@ class FederateSession:
                 self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
             self._released.clear()
             self._requests = (self._requests + 1) % _REQUESTS
-            frame = self._exchange(encode(kind, self._requests, copy, body), Header(0, answer, self._requests, copy))
+            expected = Header(0, answer, self._requests, copy)
+            with self.exchange_context:
+                frame = self._exchange(encode(kind, self._requests, copy, body), expected)
             if frame.header.kind is MessageKind.ERROR:
                 text = printable(decode_text(frame.body))
                 self.fail(f"{self.name} failed at the request to {what()}: {text}")
@@ -292,6 +297,8 @@ def open_session(
     if address is None:
         child = _child(where, role)
         session = FederateSession(role, printable(where), child.channel, deadline_s=deadline_s, child=child)
+        if is_single_threaded(where, role):
+            session.exchange_context = ProcessorSharing(child.pid)
     else:
         token = read_token(address)
         hello = replace(hello, token=token)

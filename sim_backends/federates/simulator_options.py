@@ -1,7 +1,7 @@
 """Options of simulators: `physics.options` and `network.options` of a scenario."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
 from fieldkit.config.schema import JsonValue, Location, Strict
@@ -26,6 +26,15 @@ class SimulatorOptions(Strict):
 
     def agent_names(self) -> Iterator[tuple[str, Location]]:
         """Yield every reference to an agent of the scenario, with its keys."""
+        yield from ()
+
+    def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
+        """Yield everything in a scenario that the simulator does not support, with its keys.
+
+        Args:
+            scenario: The scenario as in the configuration of hello, in JSON values.
+        """
+        del scenario
         yield from ()
 
     def to_json(self) -> dict[str, Any]:

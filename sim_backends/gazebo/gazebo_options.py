@@ -1,7 +1,7 @@
 """Options of Gazebo: `physics.options` of a scenario. The adapter reads them in `options.h`."""
 
-from collections.abc import Iterator
-from typing import Annotated, Literal
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
 
 from typing_extensions import override
 
@@ -81,3 +81,10 @@ class GazeboOptions(SimulatorOptions):
     def agent_names(self) -> Iterator[tuple[str, Location]]:
         for key in ("models", "origins_m", "command_topics"):
             yield from ((name, (key, name)) for name in getattr(self, key))
+
+    @override
+    def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
+        for name, plan in scenario["agents"].items():
+            for key in ("appears", "disappears"):
+                if plan.get(key, "0s") not in {"0s", "0.0s"}:
+                    yield f"robots cannot appear or disappear in Gazebo; remove {key}", ("agents", name, key)

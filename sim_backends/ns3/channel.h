@@ -70,6 +70,14 @@ class Channel
         return link.mean_db - link.gain_db;
     }
 
+    // The loss without fading, of the positions of the last call of LossDb for this link.
+    double MeanLossDb(size_t a, size_t b) const
+    {
+        bool swapped = m_names[b] < m_names[a];
+        const Link& link = m_links[swapped ? b * m_names.size() + a : a * m_names.size() + b];
+        return link.cuts > 0 ? std::numeric_limits<double>::infinity() : link.mean_db;
+    }
+
     // Count one more or one fewer reason why two stations cannot receive each other.
     void Cut(size_t a, size_t b, int change)
     {

@@ -5,15 +5,22 @@
 
 #include "simulator.h"
 
+#include "fieldkit/packets.h"
+
 #include "ns3/mobility-model.h"
 #include "ns3/propagation-delay-model.h"
 #include "ns3/tag.h"
 #include "ns3/wifi-mac-queue.h"
 #include "ns3/wifi-mac.h"
 #include "ns3/wifi-net-device.h"
+#include "ns3/wifi-mpdu.h"
+#include "ns3/wifi-phy-state-helper.h"
 #include "ns3/wifi-phy.h"
+#include "ns3/wifi-psdu.h"
 
+#include <cmath>
 #include <functional>
+#include <map>
 #include <unordered_map>
 
 namespace fieldkit
@@ -95,12 +102,16 @@ class FrameTag : public NumberTag
     }
 };
 
-// Parts of a delay; the processing in hosts is what remains of it.
-struct DelayParts
+using protocol::DelayParts;
+
+// Counters of the frames from a station to another one, as those of a radio's driver.
+struct LinkCounters
 {
-    int64_t queueing_ns = 0;
-    int64_t transmission_ns = 0;
-    int64_t propagation_ns = 0;
+    uint64_t frames = 0; // whose first attempt has started
+    uint64_t retries = 0;
+    uint64_t failures = 0; // given up after the last retry
+    uint64_t delivered = 0;
+    double rate_bit_s = NAN; // of the last attempt
 };
 
 // Follows the frames of all stations by ns-3's traces.
@@ -121,6 +132,7 @@ class FrameTracker
         size_t station = m_mobilities.size();
         m_mobilities.push_back(mobility);
         m_last.emplace_back();
+        m_busy.emplace_back();
         m_stations[Mac48Address::ConvertFrom(device->GetAddress())] = station;
         using OnMpdu = Callback<void, Ptr<const WifiMpdu>>;
         auto mac = device->GetMac();
@@ -144,8 +156,17 @@ class FrameTracker
                                             Lost(packet, "not associated");
                                         }));
         device->GetPhy()->TraceConnectWithoutContext(
-            "PhyTxBegin", Callback<void, Ptr<const Packet>, double>(
-                              [this, station](Ptr<const Packet> packet, double) { Transmitted(station, packet); }));
+            "PhyTxPsduBegin", Callback<void, WifiConstPsduMap, WifiTxVector, double>(
+                                  [this, station](WifiConstPsduMap frames, WifiTxVector settings, double) {
+                                      Transmitted(station, frames, settings);
+                                  }));
+        device->GetPhy()->GetState()->TraceConnectWithoutContext(
+            "State", Callback<void, Time, Time, WifiPhyState>([this, station](Time start, Time duration, WifiPhyState state) {
+                if (state == WifiPhyState::TX || state == WifiPhyState::RX || state == WifiPhyState::CCA_BUSY)
+                {
+                    m_busy[station].Add(start.GetNanoSeconds(), (start + duration).GetNanoSeconds());
+                }
+            }));
         // It is passed to the host in the order of sequence numbers, possibly after its acknowledgement.
         mac->TraceConnectWithoutContext("MacRx", Callback<void, Ptr<const Packet>>([this, station](Ptr<const Packet> packet) {
                                             Received(station, packet);
@@ -157,6 +178,19 @@ class FrameTracker
     {
         const auto& [at_ns, parts] = m_last[station];
         return at_ns == NowNs() ? parts : DelayParts();
+    }
+
+    // Counters of the frames between two stations.
+    const LinkCounters& Counters(size_t from, size_t to)
+    {
+        return m_links[{from, to}];
+    }
+
+    // The time for which the channel of a station has been busy.
+    int64_t BusyNs(size_t station) const
+    {
+        const Busy& busy = m_busy[station];
+        return busy.total_ns - std::max<int64_t>(busy.until_ns - Simulator::Now().GetNanoSeconds(), 0);
     }
 
     // Report the packet of a frame or IP packet as lost.
@@ -172,6 +206,7 @@ class FrameTracker
   private:
     struct HopFrame
     {
+        size_t from = kNoStation;
         size_t to = kNoStation;
         int64_t enqueued_ns = 0;
         int64_t first_ns = -1; // start of its first attempt
@@ -179,6 +214,19 @@ class FrameTracker
         bool is_received = false;
         bool is_acknowledged = false;
         DelayParts parts; // of the hops before; once it is received, of this hop too
+    };
+
+    // Time for which a channel was busy. ns-3 reports a transmission at its start, and other states at their ends.
+    struct Busy
+    {
+        void Add(int64_t start_ns, int64_t end_ns)
+        {
+            total_ns += std::max<int64_t>(end_ns - std::max(start_ns, until_ns), 0);
+            until_ns = std::max(until_ns, end_ns);
+        }
+
+        int64_t total_ns = 0;
+        int64_t until_ns = 0;
     };
 
     void Enqueued(size_t station, Ptr<const WifiMpdu> mpdu)
@@ -206,13 +254,28 @@ class FrameTracker
         }
         auto to = m_stations.find(mpdu->GetHeader().GetAddr1());
         frame.to = to == m_stations.end() ? kNoStation : to->second;
+        frame.from = station;
         frame.enqueued_ns = NowNs();
         tag.number = ++m_count;
         m_frames[tag.number] = frame;
         packet->AddPacketTag(tag);
     }
 
-    void Transmitted(size_t station, Ptr<const Packet> packet)
+    void Transmitted(size_t station, const WifiConstPsduMap& frames, const WifiTxVector& settings)
+    {
+        for (const auto& [receiver, frame] : frames)
+        {
+            for (const auto& mpdu : *PeekPointer(frame))
+            {
+                if (mpdu->GetHeader().IsData())
+                {
+                    Transmitted(station, mpdu->GetPacket(), settings);
+                }
+            }
+        }
+    }
+
+    void Transmitted(size_t station, Ptr<const Packet> packet, const WifiTxVector& settings)
     {
         FrameTag tag;
         auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
@@ -221,7 +284,8 @@ class FrameTracker
             return;
         }
         HopFrame& frame = found->second;
-        if (frame.first_ns < 0)
+        bool is_first = frame.first_ns < 0;
+        if (is_first)
         {
             frame.first_ns = NowNs();
         }
@@ -229,6 +293,9 @@ class FrameTracker
         {
             frame.propagation_ns =
                 m_delay->GetDelay(m_mobilities[station], m_mobilities[frame.to]).GetNanoSeconds();
+            LinkCounters& counters = m_links[{station, frame.to}];
+            (is_first ? counters.frames : counters.retries)++;
+            counters.rate_bit_s = static_cast<double>(settings.GetMode().GetDataRate(settings));
         }
     }
 
@@ -249,10 +316,11 @@ class FrameTracker
     }
 
     // Add the parts of a hop that ends now.
-    static void Complete(HopFrame& frame)
+    void Complete(HopFrame& frame)
     {
         if (!frame.is_received)
         {
+            m_links[{frame.from, frame.to}].delivered++;
             frame.is_received = true;
             frame.parts.queueing_ns += frame.first_ns - frame.enqueued_ns;
             frame.parts.propagation_ns += frame.propagation_ns;
@@ -285,18 +353,22 @@ class FrameTracker
         {
             return Lost(mpdu->GetPacket(), "queue full");
         }
+        bool is_unanswered = reason == WIFI_MAC_DROP_REACHED_RETRY_LIMIT;
         FrameTag tag;
         if (mpdu->GetPacket()->PeekPacketTag(tag))
         {
             auto found = m_frames.find(tag.number);
             bool is_received = found != m_frames.end() && found->second.is_received;
+            if (found != m_frames.end() && found->second.to != kNoStation && is_unanswered)
+            {
+                m_links[{found->second.from, found->second.to}].failures++;
+            }
             m_frames.erase(tag.number);
             if (is_received) // only its acknowledgements were lost
             {
                 return;
             }
         }
-        bool is_unanswered = reason == WIFI_MAC_DROP_REACHED_RETRY_LIMIT;
         Lost(mpdu->GetPacket(), is_unanswered ? "retries exhausted" : "dropped by the MAC");
     }
 
@@ -304,6 +376,8 @@ class FrameTracker
     std::unordered_map<uint64_t, HopFrame> m_frames;
     std::map<Mac48Address, size_t> m_stations;
     std::vector<Ptr<MobilityModel>> m_mobilities;
+    std::map<std::pair<size_t, size_t>, LinkCounters> m_links; // by transmitter and receiver
+    std::vector<Busy> m_busy;
     std::vector<std::pair<int64_t, DelayParts>> m_last; // of each station: when it received a frame, and its parts
     Ptr<ConstantSpeedPropagationDelayModel> m_delay = CreateObject<ConstantSpeedPropagationDelayModel>();
 };

@@ -5,7 +5,9 @@
 //     network VERSION losses          print the losses of links, for tests
 
 #include "fieldkit/handshake.h"
+#include "fieldkit/links.h"
 #include "fieldkit/packets.h"
+#include "captures.h"
 #include "transports.h"
 
 #include "ns3/rng-seed-manager.h"
@@ -55,7 +57,7 @@ class Network
         protocol::Welcome welcome;
         welcome.role = protocol::kNetwork;
         welcome.capabilities = protocol::kDeterministic | protocol::kNextEvent | protocol::kExtrapolates |
-                               protocol::kAgentsDisappear;
+                               protocol::kAgentsDisappear | protocol::kSamplesLinks;
         welcome.step_ns = hello.step_ns;
         welcome.next_event_ns = NextEventNs();
         welcome.configuration_hash = hello.configuration_hash;
@@ -79,6 +81,10 @@ class Network
         if (to_ns >= NowNs())
         {
             RunUntil(to_ns);
+        }
+        if (m_captures != nullptr)
+        {
+            m_captures->Flush();
         }
         return m_outcomes.TakeBody(to_ns, NextEventNs());
     }
@@ -152,6 +158,26 @@ class Network
         return request.to_ns;
     }
 
+    // Samples of all radios now, and of their links to the stations to which they send frames.
+    std::string SampleLinks()
+    {
+        std::vector<protocol::RadioSample> radios;
+        std::vector<protocol::LinkSample> links;
+        for (size_t number = 0; number < m_stations.size(); number++)
+        {
+            radios.push_back({m_stations[number].agent, m_setup.noise_dbm, NowNs(), m_tracker.BusyNs(number)});
+            bool is_client = m_setup.relay >= 0 && static_cast<size_t>(m_setup.relay) != number;
+            for (size_t peer = 0; peer < m_stations.size(); peer++)
+            {
+                if (peer != number && (!is_client || static_cast<size_t>(m_setup.relay) == peer))
+                {
+                    links.push_back(SampleLink(number, peer));
+                }
+            }
+        }
+        return protocol::LinksBody(radios, links);
+    }
+
     size_t arrivals() const
     {
         return m_outcomes.Arrivals();
@@ -219,6 +245,13 @@ class Network
                     [this](uint64_t id, const std::string& reason) { Drop(id, reason); }};
         m_udp = std::make_unique<UdpTransport>(m_stations, fates);
         m_tcp = std::make_unique<TcpTransport>(m_stations, fates);
+        if (configuration.contains("captures"))
+        {
+            m_captures = std::make_unique<IpCaptures>(configuration["captures"], m_stations);
+            m_tcp->on_connect = [this](Ipv4Address source, uint16_t port, const std::string& flow) {
+                m_captures->Connect(source, port, flow);
+            };
+        }
         for (const Json& fault : scenario.at("faults"))
         {
             AddFault(fault);
@@ -228,6 +261,30 @@ class Network
             AddLifetime(number, scenario.at("agents").at(m_stations[number].name));
         }
         RunUntil(-1);
+    }
+
+    protocol::LinkSample SampleLink(size_t number, size_t peer)
+    {
+        const Station& station = m_stations[number];
+        const Station& other = m_stations[peer];
+        const LinkCounters& sent = m_tracker.Counters(number, peer);
+        const LinkCounters& reverse = m_tracker.Counters(peer, number);
+        Vector here = station.mobility->GetPosition();
+        Vector there = other.mobility->GetPosition();
+        double loss_db =
+            m_channel->LossDb(NowNs(), peer, {there.x, there.y, there.z}, number, {here.x, here.y, here.z});
+        double mean_db = m_channel->MeanLossDb(peer, number);
+        bool is_in_range = other.tx_power_dbm - mean_db >= station.sensitivity_dbm &&
+                           station.tx_power_dbm - mean_db >= other.sensitivity_dbm;
+        protocol::LinkSample sample{station.agent, other.agent};
+        sample.signal_dbm = is_in_range ? other.tx_power_dbm - loss_db : NAN;
+        sample.tx_rate_bit_s = sent.rate_bit_s;
+        sample.rx_rate_bit_s = reverse.rate_bit_s;
+        sample.tx_packets = sent.frames;
+        sample.rx_packets = reverse.delivered;
+        sample.tx_retries = sent.retries;
+        sample.tx_failures = sent.failures;
+        return sample;
     }
 
     // Switch the radio of a station off (1), or on again (-1).
@@ -420,6 +477,10 @@ class Network
         {
             throw Refusal("packet " + std::to_string(packet.id) + " has entered before");
         }
+        if (m_captures != nullptr)
+        {
+            m_captures->Enter(packet.id, packet.flow, packet.number);
+        }
         Time after = NanoSeconds(std::max<int64_t>(packet.enters_ns - NowNs(), 0));
         uint32_t context = m_stations[packet.source].node->GetId();
         Simulator::ScheduleWithContext(context, after, [this, id = packet.id] { Send(m_pending.at(id)); });
@@ -458,30 +519,36 @@ class Network
         }
         const CoordinatorPacket& packet = found->second;
         int64_t now_ns = NowNs();
-        m_outcomes.Arrive(id, now_ns, m_stations[packet.destination].agent);
+        DelayParts parts = WithinDelay(m_tracker.PartsNow(packet.destination), now_ns - packet.enters_ns);
+        m_outcomes.Arrive(id, now_ns, m_stations[packet.destination].agent, parts);
         m_checksum = m_checksum * 31 + static_cast<uint64_t>(now_ns);
         if (m_parts.is_open())
         {
-            WriteParts(packet, now_ns - packet.enters_ns, m_tracker.PartsNow(packet.destination));
+            WriteParts(packet, now_ns - packet.enters_ns, parts);
         }
         m_pending.erase(found);
     }
 
-    // Write the parts of a delay. A frame may have been queued before a message of TCP that it completes: no part exceeds
+    // The parts of a delay. A frame may have been queued before a message of TCP that it completes: no part exceeds
     // what the others leave of the delay.
+    static DelayParts WithinDelay(DelayParts parts, int64_t delay_ns)
+    {
+        parts.propagation_ns = std::min(parts.propagation_ns, delay_ns);
+        parts.transmission_ns = std::min(parts.transmission_ns, delay_ns - parts.propagation_ns);
+        parts.queueing_ns = std::min(parts.queueing_ns, delay_ns - parts.propagation_ns - parts.transmission_ns);
+        return parts;
+    }
+
     void WriteParts(const CoordinatorPacket& packet, int64_t delay_ns, const DelayParts& parts)
     {
-        int64_t propagation_ns = std::min(parts.propagation_ns, delay_ns);
-        int64_t transmission_ns = std::min(parts.transmission_ns, delay_ns - propagation_ns);
-        int64_t queueing_ns = std::min(parts.queueing_ns, delay_ns - propagation_ns - transmission_ns);
-        int64_t processing_ns = delay_ns - propagation_ns - transmission_ns - queueing_ns;
+        int64_t processing_ns = delay_ns - parts.propagation_ns - parts.transmission_ns - parts.queueing_ns;
         std::string flow = packet.flow;
         for (size_t place = 0; (place = flow.find('"', place)) != std::string::npos; place += 2)
         {
             flow.insert(place, 1, '"');
         }
         m_parts << '"' << flow << "\"," << packet.number << ',' << delay_ns << ',' << processing_ns << ','
-                << queueing_ns << ',' << transmission_ns << ',' << propagation_ns << '\n';
+                << parts.queueing_ns << ',' << parts.transmission_ns << ',' << parts.propagation_ns << '\n';
     }
 
     void Drop(uint64_t id, const std::string& reason)
@@ -514,6 +581,7 @@ class Network
     FrameTracker m_tracker;
     std::unique_ptr<UdpTransport> m_udp;
     std::unique_ptr<TcpTransport> m_tcp;
+    std::unique_ptr<IpCaptures> m_captures; // null if there are none
     int64_t m_toNs = -1;
     std::unordered_map<uint64_t, CoordinatorPacket> m_pending;
     protocol::Outcomes m_outcomes;
@@ -534,6 +602,12 @@ AnswerTo(Network& network, const protocol::Frame& request)
             throw Refusal("hello is missing, or there is no such copy");
         }
         return {protocol::kOutcomes, network.Advance(request.body)};
+    case protocol::kSampleLinks:
+        if (!network.IsReady() || request.copy != 0 || !request.body.empty())
+        {
+            throw Refusal("hello is missing, there is no such copy, or bytes follow the message");
+        }
+        return {protocol::kLinks, network.SampleLinks()};
     default:
         throw Refusal("the request is not supported");
     }

@@ -1,8 +1,11 @@
 """Options of ns-3: `network.options` of a scenario. `network.cc` reads them."""
 
-from typing import Annotated, Literal
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
 
-from fieldkit.config.schema import Field, Int
+from typing_extensions import override
+
+from fieldkit.config.schema import Field, Int, Location
 from sim_backends.federates.simulator_options import SimulatorOptions
 
 
@@ -25,3 +28,28 @@ class Ns3Options(SimulatorOptions):
     topics: Literal["udp"] | None = None
     delay_parts: Annotated[str, Field(min_length=1)] | None = None
     pcap: Annotated[str, Field(min_length=1)] | None = None
+
+    @override
+    def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
+        for key in ("loss", "delay", "rate", "jitter"):
+            if key in scenario["radio"]:
+                yield f"ns-3 simulates Wi-Fi, not fixed links; remove {key}", ("radio", key)
+        for number, fault in enumerate(scenario["faults"]):
+            if fault["kind"] == "jammer":
+                yield "ns-3 has no jammers; remove the fault", ("faults", number, "kind")
+        for number, traffic in enumerate(scenario["traffic"]):
+            yield from ((text, ("traffic", number, key)) for text, key in self._unsupported_traffic(traffic))
+
+    def _unsupported_traffic(self, traffic: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """Yield why traffic is not supported, with its key."""
+        if traffic["protocol"] == "ros1":
+            yield "ns-3 does not carry topics of ROS 1; use udp or tcp", "protocol"
+        elif traffic["protocol"] == "topic":
+            if self.topics is None:
+                yield (
+                    "ns-3 carries topics only with network.options.topics: udp; set it, or use udp or tcp",
+                    "protocol",
+                )
+            elif traffic.get("qos", {}).get("reliability", "reliable") == "reliable":
+                key = "qos" if "qos" in traffic else "protocol"
+                yield "with topics: udp, ns-3 carries no reliable topics; set reliability: best_effort", key

@@ -186,6 +186,9 @@ class TcpTransport
         }
     }
 
+    // Called with the address and port of a connection's source, and the flow.
+    std::function<void(Ipv4Address, uint16_t, const std::string&)> on_connect;
+
     void Send(const CoordinatorPacket& packet)
     {
         auto key = std::make_tuple(packet.source, packet.destination, packet.flow);
@@ -230,7 +233,12 @@ class TcpTransport
         socket->Bind();
         Address own;
         socket->GetSockName(own);
-        m_byEnd[{source.address, InetSocketAddress::ConvertFrom(own).GetPort()}] = connection;
+        uint16_t port = InetSocketAddress::ConvertFrom(own).GetPort();
+        m_byEnd[{source.address, port}] = connection;
+        if (on_connect)
+        {
+            on_connect(source.address, port, packet.flow);
+        }
         std::weak_ptr<Connection> weak = connection;
         socket->SetConnectCallback(OnSocket([this, weak](Ptr<Socket>) {
                                        if (auto opened = weak.lock())

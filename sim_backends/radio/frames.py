@@ -15,7 +15,7 @@ from sim_backends.radio.links import (
     Delay,
     Payload,
 )
-from sim_backends.radio.modes import ACK_BYTES, WifiMode
+from sim_backends.radio.modes import ACK_BYTES, SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0
@@ -138,6 +138,7 @@ class Frame(Generic[Payload]):
         attempts: Number of attempts so far.
         sequence: Its number in a Block Ack session; -1 before its first attempt, or without a session.
         is_received: True if the receiver of a Block Ack session has decoded it.
+        max_attempts: Number of attempts after which it is given up.
     """
 
     payload: Payload
@@ -153,6 +154,7 @@ class Frame(Generic[Payload]):
     attempts: int = 0
     sequence: int = -1
     is_received: bool = False
+    max_attempts: int = SHORT_RETRY_LIMIT
 
     def total_delay(self, now_ns: int, propagation_ns: int) -> Delay:
         """Return the delay over all hops so far, for a frame decoded at `now_ns`."""

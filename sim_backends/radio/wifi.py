@@ -158,8 +158,9 @@ class Wifi(Generic[Payload]):
         *,
         packet: PacketIdentity | None = None,
         before: Delay = 0,
+        max_attempts: int = SHORT_RETRY_LIMIT,
     ) -> None:
-        """Implement `RadioModel.send`."""
+        """Implement `RadioModel.send`; after `max_attempts` on its first hop the packet is given up."""
         self.advance(now_ns)
         station = self._stations[self._index[source]]
         receiver = None if destination is None else self._index[destination]
@@ -171,6 +172,7 @@ class Wifi(Generic[Payload]):
         else:
             kept = receiver is None
             frame = Frame(payload, size_bytes, source, relay, (receiver,), kept, identity, now_ns, before)
+        frame.max_attempts = max_attempts
         self._enqueue(now_ns, station, frame)
 
     def next_event_ns(self) -> int | None:
@@ -366,7 +368,7 @@ class Wifi(Generic[Payload]):
         peer.rate.report(mode, acknowledged=acknowledged)
         if not acknowledged:
             station.contention.set_busy_until(now_ns)
-        done = acknowledged or frame.attempts >= SHORT_RETRY_LIMIT
+        done = acknowledged or frame.attempts >= frame.max_attempts
         if done:
             peer.count(delivered=peer.last_frame is frame)
             if self._meter is not None and not acknowledged:
@@ -391,7 +393,7 @@ class Wifi(Generic[Payload]):
             station.contention.set_busy_until(now_ns)
             station.contention.on_failure()
             peer.failed_exchanges += 1
-        given_up = {frame for frame in frames if frame not in confirmed and frame.attempts >= SHORT_RETRY_LIMIT}
+        given_up = {frame for frame in frames if frame not in confirmed and frame.attempts >= frame.max_attempts}
         lost = [frame for frame in frames if frame in given_up and not frame.is_received]
         for frame in lost:
             self._lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)

@@ -191,7 +191,9 @@ def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(tmp_path: 
     with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame], ARDUCOPTER) as (port, autopilot):
         pilot_plan = replace(plan(tmp_path, port), liveness=str(life))
         with patient_agent(replace(pilot_plan, guards=True)) as guard:
-            wait_until(lambda: life.exists() and guard_iterations() > 0, Deadline.after(60))
+            # The file is created first, and then allocated.
+            wait_until(lambda: life.exists() and life.stat().st_size == liveness.SIZE, Deadline.after(60))
+            wait_until(lambda: guard_iterations() > 0, Deadline.after(60))
             with patient_agent(pilot_plan) as pilot:
                 wait_until_up(autopilot)
                 silent.set()

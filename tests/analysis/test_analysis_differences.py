@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from fieldkit.analysis.significance import between, cliffs_delta, holm, p_value
 from fieldkit.core.model import Interval
@@ -43,8 +43,8 @@ def test_an_interval_that_ends_at_zero_has_a_p_value_of_5_percent() -> None:
 
 @given(st.floats(-5, 5).filter(lambda z: abs(z) > 1e-6))
 def test_the_p_value_of_a_normal_interval_is_the_normal_one(z: float) -> None:
-    half = stats.norm.ppf(0.975)
-    assert p_value(Interval(z, z - half, z + half)) == pytest.approx(2 * stats.norm.sf(abs(z)), rel=1e-9)
+    half = scipy.stats.norm.ppf(0.975)
+    assert p_value(Interval(z, z - half, z + half)) == pytest.approx(2 * scipy.stats.norm.sf(abs(z)), rel=1e-9)
 
 
 @pytest.mark.parametrize(("difference", "p"), [(Interval(0, 0, 0), 1.0), (Interval(1, 1, 1), 0.0)])
@@ -72,7 +72,7 @@ samples = st.lists(st.integers(0, 8).map(float), min_size=1, max_size=30).map(np
 
 @given(samples, samples)
 def test_cliffs_delta_is_scipys_u_statistic_scaled(a: np.ndarray, b: np.ndarray) -> None:
-    u = stats.mannwhitneyu(b, a).statistic
+    u = scipy.stats.mannwhitneyu(b, a).statistic
     assert cliffs_delta(a, b) == pytest.approx(2 * u / (len(a) * len(b)) - 1)
     assert cliffs_delta(b, a) == -cliffs_delta(a, b)
 

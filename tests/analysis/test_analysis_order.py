@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from fieldkit.analysis import independence
 from fieldkit.cli import main
@@ -35,10 +35,10 @@ def test_the_variances_are_those_over_all_permutations(ranks: list[int]) -> None
 
 def test_ranks_and_trend_equal_scipy() -> None:
     values = np.random.default_rng(1).integers(0, 6, (9, 25)).astype(float)
-    assert independence._ranks(values) + 1 == pytest.approx(stats.rankdata(values, axis=1))
+    assert independence._ranks(values) + 1 == pytest.approx(scipy.stats.rankdata(values, axis=1))
     centred = independence._ranks(values)
     centred -= centred.mean(axis=1, keepdims=True)
-    theirs = [stats.spearmanr(row, np.arange(25)) for row in values]
+    theirs = [scipy.stats.spearmanr(row, np.arange(25)) for row in values]
     correlation, variance = independence._spearman(centred)
     assert correlation == pytest.approx([abs(item.statistic) for item in theirs])
     assert 2 * independence._upper_tail(correlation, variance) == pytest.approx(
@@ -48,7 +48,7 @@ def test_ranks_and_trend_equal_scipy() -> None:
 
 def test_the_correction_equals_scipy() -> None:
     some = np.random.default_rng(2).random(40) ** 3
-    assert independence.corrected(some) == pytest.approx(stats.false_discovery_control(some))
+    assert independence.corrected(some) == pytest.approx(scipy.stats.false_discovery_control(some))
     assert not len(independence.corrected(np.empty(0)))
 
 

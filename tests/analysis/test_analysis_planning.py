@@ -5,9 +5,9 @@ from itertools import count
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from fieldkit.analysis import sample_size
 from fieldkit.analysis.statistics import Intervals, shares
@@ -24,7 +24,7 @@ def half(interval: Interval | None) -> float:
 @given(st.integers(0, 30), st.integers(1, 30), st.floats(0.01, 0.6))
 def test_a_flag_needs_the_number_of_wilsons_formula(true: int, untrue: int, wanted: float) -> None:
     n = true + untrue
-    p, z = true / n, stats.norm.ppf(0.975)
+    p, z = true / n, scipy.stats.norm.ppf(0.975)
     total = next(
         many
         for many in count(n)
@@ -40,7 +40,7 @@ def test_students_quantile_decreases_with_more_repeats(n: int, part: float) -> N
     now = half(interval)
 
     def expected(many: int) -> float:
-        quantile = stats.t.ppf(0.975, [many - 1, n - 1]) if n < 6 else (1, 1)
+        quantile = scipy.stats.t.ppf(0.975, [many - 1, n - 1]) if n < 6 else (1, 1)
         return float(now * quantile[0] / quantile[1] * math.sqrt(n / many))
 
     total = next(many for many in count(n) if expected(many) <= part * now * (1 + 2e-4))

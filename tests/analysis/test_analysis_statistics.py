@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import example, given
 from hypothesis import strategies as st
-from scipy import optimize, stats
 
 from fieldkit.analysis.statistics import means, medians, shares, student, wilsons
 from fieldkit.core.model import Interval
@@ -28,7 +28,7 @@ def there(interval: Interval | None) -> Interval:
 def test_wilson_equals_scipy(count: tuple[int, int]) -> None:
     events, trials = count
     ours = wilson(events, trials)
-    theirs = stats.binomtest(events, trials).proportion_ci(0.95, method="wilson")
+    theirs = scipy.stats.binomtest(events, trials).proportion_ci(0.95, method="wilson")
     assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), rel=1e-9, abs=1e-12)
     assert 0 <= ours.low <= ours.value <= ours.high <= 1
 
@@ -36,7 +36,7 @@ def test_wilson_equals_scipy(count: tuple[int, int]) -> None:
 def test_nothing_lost_of_36_still_allows_ten_per_cent() -> None:
     """Field notes; at no event the upper bound is z²/(n + z²)."""
     interval = wilson(0, 36)
-    z = stats.norm.ppf(0.975)
+    z = scipy.stats.norm.ppf(0.975)
     assert (interval.value, interval.low) == (0, 0)
     assert interval.high == pytest.approx(z * z / (36 + z * z))
     assert interval.high == pytest.approx(0.0964, abs=1e-4)
@@ -49,8 +49,8 @@ def test_impossible_counts_have_no_interval() -> None:
 
 def test_student_equals_scipy() -> None:
     free = np.concatenate([[1], np.linspace(2, 30, 281), [100, 1e5]])
-    assert student(free) == pytest.approx(stats.t.ppf(0.975, free), rel=2e-4)
-    assert student(np.array([1, 2])) == pytest.approx(stats.t.ppf(0.975, [1, 2]), rel=1e-12)
+    assert student(free) == pytest.approx(scipy.stats.t.ppf(0.975, free), rel=2e-4)
+    assert student(np.array([1, 2])) == pytest.approx(scipy.stats.t.ppf(0.975, [1, 2]), rel=1e-12)
 
 
 @pytest.mark.parametrize("sent", [np.full(20, 36), np.arange(33, 53)], ids=["equal", "unequal"])
@@ -61,14 +61,14 @@ def test_a_share_s_interval_contains_the_values_that_a_score_test_accepts(sent: 
     off = BURSTY - rate * sent
     variance = np.var(off, ddof=1) * len(sent) / sent.sum() ** 2
     trials = rate * (1 - rate) / variance
-    t = stats.t.ppf(0.975, 2 * (off**2).sum() ** 2 / (off**4).sum())
+    t = scipy.stats.t.ppf(0.975, 2 * (off**2).sum() ** 2 / (off**4).sum())
 
     def beyond(p: float) -> float:
         return float((rate - p) ** 2 - t * t * p * (1 - p) / trials)
 
     assert interval.value == rate
-    assert interval.low == pytest.approx(optimize.brentq(beyond, 1e-9, rate), rel=1e-3)
-    assert interval.high == pytest.approx(optimize.brentq(beyond, rate, 1 - 1e-9), rel=1e-3)
+    assert interval.low == pytest.approx(scipy.optimize.brentq(beyond, 1e-9, rate), rel=1e-3)
+    assert interval.high == pytest.approx(scipy.optimize.brentq(beyond, rate, 1 - 1e-9), rel=1e-3)
 
 
 def test_bursts_make_the_interval_wider_than_wilsons() -> None:
@@ -140,15 +140,15 @@ def test_shares_are_means_if_one_is_outside_of_0_to_1() -> None:
 
 def test_without_skewness_a_mean_has_students_interval() -> None:
     interval = there(mean([1.0, -1.0] * 10))
-    theirs = stats.t.interval(0.95, 19, 0, stats.sem([1.0, -1.0] * 10))
+    theirs = scipy.stats.t.interval(0.95, 19, 0, scipy.stats.sem([1.0, -1.0] * 10))
     assert (interval.low, interval.high) == pytest.approx(theirs, rel=1e-4)
 
 
 def test_a_mean_has_the_bootstrap_t_interval() -> None:
     """Computed here by resampling: the mean of each sample divided by its standard error."""
     drawn = SKEWED[np.random.default_rng(4).integers(60, size=(40_000, 60))]
-    t = (drawn.mean(axis=1) - SKEWED.mean()) / stats.sem(drawn, axis=1)
-    high, low = SKEWED.mean() - np.quantile(t, (0.025, 0.975)) * stats.sem(SKEWED)
+    t = (drawn.mean(axis=1) - SKEWED.mean()) / scipy.stats.sem(drawn, axis=1)
+    high, low = SKEWED.mean() - np.quantile(t, (0.025, 0.975)) * scipy.stats.sem(SKEWED)
     interval = there(mean(SKEWED))
     assert interval.value == SKEWED.mean()
     assert (interval.low, interval.high) == pytest.approx((low, high), abs=0.05 * (high - low))
@@ -172,7 +172,7 @@ def test_the_mean_of_tiny_values_has_a_tiny_interval() -> None:
 def test_a_median_lies_between_the_two_nearest_order_intervals(n: int) -> None:
     ordered = np.arange(1.0, n + 1)
     interval = there(median(ordered[::-1]))
-    outer = stats.quantile_test(ordered, p=0.5).confidence_interval(0.95)
+    outer = scipy.stats.quantile_test(ordered, p=0.5).confidence_interval(0.95)
     assert interval.value == np.median(ordered)
     assert outer.low <= interval.low < outer.low + 1
     assert outer.high - 1 < interval.high <= outer.high
@@ -182,7 +182,7 @@ def test_a_median_lies_between_the_two_nearest_order_intervals(n: int) -> None:
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_few_repeats_have_students_interval_for_a_median_and_all_repeats_in_it(n: int) -> None:
     times = SKEWED[:n]
-    low, high = stats.t.interval(0.95, n - 1, times.mean(), stats.sem(times))
+    low, high = scipy.stats.t.interval(0.95, n - 1, times.mean(), scipy.stats.sem(times))
     interval = there(median(times))
     assert (interval.low, interval.high) == pytest.approx(
         (min(low, times.min()), max(high, times.max())), rel=1e-3, abs=1e-3

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scipy import stats
 
 from fieldkit.analysis import one_sided_bounds
 from tests.analysis.test_coverage import lost_in_bursts
@@ -13,8 +13,8 @@ from tests.analysis.test_coverage import lost_in_bursts
 @given(st.integers(0, 200), st.integers(1, 200))
 def test_shares_of_repeats_equal_clopper_and_pearson(met: int, n: int) -> None:
     assume(met <= n)
-    low = 0.0 if met == 0 else stats.beta.ppf(0.05, met, n - met + 1)
-    high = 1.0 if met == n else stats.beta.ppf(0.95, met + 1, n - met)
+    low = 0.0 if met == 0 else scipy.stats.beta.ppf(0.05, met, n - met + 1)
+    high = 1.0 if met == n else scipy.stats.beta.ppf(0.95, met + 1, n - met)
     assert one_sided_bounds.share_low(met, n) == pytest.approx(low, abs=1e-9)
     assert one_sided_bounds.share_high(met, n) == pytest.approx(high, abs=1e-9)
 
@@ -34,7 +34,7 @@ def test_29_repeats_are_needed_for_90_percent() -> None:
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=20))
 def test_the_loss_is_garwoods_bound_with_the_worst_repeat_as_burst_length(lost: list[int]) -> None:
     burst, total = max([*lost, one_sided_bounds.SHORTEST_BURST]), 1000 * len(lost)
-    expected = burst * stats.gamma.ppf(0.95, sum(lost) / burst + 1) / total
+    expected = burst * scipy.stats.gamma.ppf(0.95, sum(lost) / burst + 1) / total
     assert one_sided_bounds.loss_high(lost, [1000] * len(lost)) == pytest.approx(min(expected, 1), rel=1e-9)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from statistics import median
 
 import pytest
-from scipy.stats import binomtest
+import scipy
 
 from tests.helpers.known_radio import EACH_LOSS, REPEATS, LossyTables, Table, make_lab, run_all
 from tests.helpers.runs import total
@@ -38,7 +38,9 @@ def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str,
     table = lossy_udp[str(percent)]
     sent, received = total(table, "ip_packets_sent"), total(table, "ip_packets_received")
     assert sent > len(table) * 20
-    interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
+    interval = scipy.stats.binomtest(sent - received, sent).proportion_ci(
+        confidence_level=FOUR_SIGMA, method="wilson"
+    )
     assert interval.low <= percent / 100 <= interval.high, (sent, received)
 
 
@@ -78,7 +80,9 @@ def test_datagram_loss_is_larger_as_six_fragments_predict(
     # The last datagram of every repeat is the rest of the file, with a different number of fragments.
     fragments_of_last = total(table, "ip_packets_sent") - FRAGMENTS * (sent - repeats)
     delivered = (sent - repeats) * (1 - loss) ** FRAGMENTS + repeats * (1 - loss) ** (fragments_of_last / repeats)
-    interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
+    interval = scipy.stats.binomtest(sent - received, sent).proportion_ci(
+        confidence_level=FOUR_SIGMA, method="wilson"
+    )
     assert interval.low <= 1 - delivered / sent <= interval.high, (sent, received)
     if percent >= 10:
         packet_loss = 1 - total(table, "ip_packets_received") / total(table, "ip_packets_sent")
@@ -120,5 +124,7 @@ def test_the_papers_loss_counts_first_fragments_only(
         assert int(row["paper_received"]) >= int(row["datagrams_received"])
         assert float(row["paper_loss"]) == pytest.approx(1 - int(row["paper_received"]) / int(row["paper_packets"]))
     sent, received = total(table, "paper_packets"), total(table, "paper_received")
-    interval = binomtest(sent - received, sent).proportion_ci(confidence_level=FOUR_SIGMA, method="wilson")
+    interval = scipy.stats.binomtest(sent - received, sent).proportion_ci(
+        confidence_level=FOUR_SIGMA, method="wilson"
+    )
     assert interval.low <= percent / 100 <= interval.high

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from scipy import stats
+import scipy
 
 from benchmarks.studies import middleware, middleware_table
 from benchmarks.studies.middleware_cells import MiddlewareFindings
@@ -51,7 +51,7 @@ def test_the_table_is_written_again_from_its_cells() -> None:
 def test_the_interval_counts_samples_within_half_a_second_as_one(size_bytes: int, samples: int, lost: int) -> None:
     trials = samples / (5 if size_bytes < 1_000_000 else 1)
     low, high = middleware_table.interval(lost / samples, size_bytes, samples)
-    z = stats.norm.ppf(0.975)
+    z = scipy.stats.norm.ppf(0.975)
     p = lost / samples
     centre = (p + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z / (1 + z**2 / trials) * (p * (1 - p) / trials + z**2 / (4 * trials**2)) ** 0.5

@@ -2,6 +2,7 @@
 
 #include "fieldkit/commands.h"
 #include "fieldkit/handshake.h"
+#include "fieldkit/links.h"
 #include "fieldkit/packets.h"
 #include "fieldkit/serving.h"
 
@@ -54,9 +55,13 @@ AnswerTo(const Frame& request, Heartbeat& heartbeat)
         const Packet& packet = advance.packets.at(0);
         Require(advance.states.at(0).position_m[1] == 2 && packet.flow == "pose" && packet.size_bytes == 300, "packet");
         Outcomes outcomes;
-        outcomes.Arrive(packet.id, 11'000'250, packet.destination);
+        outcomes.Arrive(packet.id, 11'000'250, packet.destination, {100'000, 350'000, 33});
         outcomes.Drop(8, "out of range");
         return {kOutcomes, outcomes.TakeBody(advance.to_ns, 12'000'000)};
+    }
+    if (request.kind == kSampleLinks)
+    {
+        return {kLinks, LinksBody({{0, -95, 11'099'999, 2'000'000}}, {{0, 1, -61.5, 54e6, NAN, 12, 11, 3, 1}})};
     }
     heartbeat.Send(10'000'000);
     throw Refusal("ValueError: no wheels");

@@ -452,8 +452,15 @@ class WaitingCommand:
         script = 'echo $$ >>"$0"; echo part; while [ -e "$0" -a ! -e "$1" ]; do sleep 0.02; done; echo whole'
         self.argv = ("sh", "-c", script, str(self.starts), str(self.go))
 
-    def wait_for_starts(self, count: int) -> None:
-        wait_until(lambda: self.starts.exists() and len(self.starts.read_text().split()) == count, soon())
+    def wait_for_starts(self, count: int, running: Future[Any] | None = None) -> None:
+        """Wait until the command was started `count` times; raise the error of `running` if it ends before."""
+
+        def is_reached() -> bool:
+            if running is not None and running.done():
+                raise AssertionError(f"the command ended early: {running.exception() or running.result()}")
+            return self.starts.exists() and len(self.starts.read_text().split()) == count
+
+        wait_until(is_reached, soon())
 
 
 @pytest.fixture
@@ -572,10 +579,46 @@ def test_fetch_starts_its_file_again(
     done = pool.submit(shell.fetch, waiting.argv, into, deadline=soon(), limit_bytes=100)
     waiting.wait_for_starts(1)
     line.cut()
-    waiting.wait_for_starts(2)
+    waiting.wait_for_starts(2, done)
     waiting.go.touch()
     assert done.result(SOON).exit_code == 0
     assert into.read_bytes() == b"part\nwhole\n"
+
+
+@pytest.mark.parametrize("other_takes_error", [False, True])
+def test_slow_end_of_a_connection_is_not_a_signal(
+    shell: SshShell,
+    line: CuttableLine,
+    waiting: WaitingCommand,
+    pool: ThreadPoolExecutor,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    other_takes_error: bool,
+) -> None:
+    """On a busy computer, a long time passes between the end of the channels and that of their connection."""
+    done = pool.submit(shell.run, waiting.argv, deadline=soon())
+    waiting.wait_for_starts(1)
+    link = shell._connection._link
+    assert link is not None
+    transport = link._transport
+    assert transport is not None
+    unlink = paramiko.Channel._unlink  # type: ignore[attr-defined]
+
+    def unlink_and_wait(channel: paramiko.Channel) -> None:
+        if channel.get_transport() is not transport:
+            unlink(channel)
+            return
+        if other_takes_error:
+            transport.get_exception()
+        for each in transport._channels.values():  # type: ignore[attr-defined]
+            unlink(each)
+        wait_until(lambda: done.done() or len(waiting.starts.read_text().split()) == 2, soon())
+
+    monkeypatch.setattr(paramiko.Channel, "_unlink", unlink_and_wait)
+    line.cut()
+    waiting.wait_for_starts(2, done)
+    waiting.go.touch()
+    assert done.result(SOON).stdout == b"part\nwhole\n"
 
 
 @pytest.mark.parametrize("ends_by", ["the body", "its time"])

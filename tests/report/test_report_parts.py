@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
 from scapy.layers.inet import IP
 from scapy.utils import rdpcap, wrpcap
-from scipy import stats
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.analysis.repeats import Repeats
@@ -125,7 +125,7 @@ def test_runs_cover_the_marked_packets(marked: list[bool]) -> None:
 @given(st.lists(st.floats(0, 10), min_size=1, max_size=distribution.MAX_STEPS))
 def test_distribution_equals_that_of_scipy(times: list[float]) -> None:
     x, shares = distribution._steps(np.sort(times))
-    expected = stats.ecdf(times).cdf
+    expected = scipy.stats.ecdf(times).cdf
     for at in times:
         assert shares[np.searchsorted(x, at, side="right") - 1] == pytest.approx(expected.evaluate(at))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.cli.parser import Commands, Parser
-from fieldkit.cli.shared_arguments import add_json, add_workers, natural, repeats
+from fieldkit.cli.shared_arguments import add_jobs, add_json, add_workers, natural, repeats
 
 _PACKAGE: Final = "sim_backends.cosim.commands"
 _FORMATS: Final = ("table", "csv", "json", "markdown")
@@ -44,6 +44,7 @@ def _add_run(commands: Commands) -> None:
     _add_policy(parser, "sync policy (default: the scenario's)")
     _add_window(parser, "window of the sync policy")
     _add_seeds(parser)
+    add_jobs(parser)
     _add_federates(parser)
     parser.add_argument(
         "--emane-events",

@@ -3,6 +3,7 @@
 import argparse
 import shlex
 from functools import partial
+from typing import Any
 
 from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, FieldkitError
@@ -30,7 +31,10 @@ def run(arguments: argparse.Namespace) -> int:
     """
     where = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
     deadline_s = settings.deadline_s(arguments.deadline)
-    scenario = load_scenario(arguments.scenario, settings.changes(arguments) | _named_federate(where))
+    changes = settings.changes(arguments)
+    if _has_role(where, NETWORK):
+        changes |= {"traffic": _udp_traffic(load_scenario(arguments.scenario, changes))}
+    scenario = load_scenario(arguments.scenario, changes | _named_federate(where))
     role, name = _role(where, scenario, arguments.role, deadline_s)
     opener = partial(open_session, role, where, deadline_s=deadline_s)
     target = Target(opener, _hello(scenario, role), arguments.windows)
@@ -76,6 +80,16 @@ def _role(where: str, scenario: CosimScenario, requested: str | None, deadline_s
 def _named_federate(where: str) -> dict[str, str]:
     """Return the change of a scenario that uses a federate with a name, whose options are then validated."""
     return {f"{ROLES[role]}.federate": where for role in (PHYSICS, NETWORK) if _has_role(where, role)}
+
+
+def _udp_traffic(scenario: CosimScenario) -> list[dict[str, Any]]:
+    """Return the traffic without topics, which a network may not support; its checks send packets of their own."""
+    entries = [traffic.model_dump(mode="json", by_alias=True, exclude_none=True) for traffic in scenario.traffic]
+    for entry in entries:
+        if entry["protocol"] in {"topic", "ros1"}:
+            entry["protocol"] = "udp"
+            entry.pop("qos", None)
+    return entries
 
 
 def _has_role(where: str, role: int) -> bool:

@@ -17,14 +17,14 @@ from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.real_time import Pace, WindowLateness
 from sim_backends.cosim.recording.manifest import RunSettings
-from sim_backends.cosim.recording.recorder import RunRecorder, StateSamples
+from sim_backends.cosim.recording.recorder import CAPTURES, RunRecorder, StateSamples
 from sim_backends.cosim.run_record import WindowObserver
 from sim_backends.cosim.scenario.build import build, captured_flows
 from sim_backends.cosim.scenario.emane import EmaneObserver, emane_observer
 from sim_backends.cosim.scenario.external import has_addresses
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
-from sim_backends.cosim.studies.seeds import Task, as_completed_tasks, workers_for
+from sim_backends.cosim.studies.seeds import ALL_PROCESSORS, Task, as_completed_tasks, workers_for
 from sim_backends.cosim.wall_time import DEADLINE_S
 
 
@@ -88,7 +88,10 @@ def simulate(
     publisher: EmaneObserver | nullcontext[None] = nullcontext()
     if scenario.emane is not None:
         observer = publisher = emane_observer(scenario, seed, observer)
-    simulation = build(scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s)
+    captures = None if folder is None else folder.recording(seed) / CAPTURES
+    simulation = build(
+        scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s, captures=captures
+    )
     agents = simulation.agents
     starts = {name: absence.state for name, absence in agents.absent.items()} | dict(agents.states(0).items())
     ended_by: FieldkitError | KeyboardInterrupt | None = None
@@ -129,6 +132,7 @@ def simulate_all(
     sink: Sink,
     deadline_s: float | None = DEADLINE_S,
     pace: Pace | None = None,
+    workers: Workers = ALL_PROCESSORS,
 ) -> tuple[list[SeedResult], bool]:
     """Return the result of a scenario for each seed, and True if Ctrl-C interrupted them.
 
@@ -143,6 +147,7 @@ def simulate_all(
         sink: Receives progress reports.
         deadline_s: As for `build`.
         pace: As for `simulate`; the runs are then not parallel.
+        workers: Where the runs of several seeds are executed.
     """
     if len(seeds) == 1:
         report = partial(progress_reporter(sink, "s"), "simulate", scenario.duration)
@@ -165,7 +170,9 @@ def simulate_all(
     try:
         # A federate with an address serves one run at a time, and parallel runs would delay each other.
         workers = (
-            Workers(1) if has_addresses(scenario) or pace is not None else workers_for(scenario.packets * len(seeds))
+            Workers(1)
+            if has_addresses(scenario) or pace is not None
+            else workers_for(scenario.packets * len(seeds), workers)
         )
         work = partial(_simulate, scenario, folder, deadline_s, pace)
         for number, result in as_completed_tasks(work, tasks, workers=workers):

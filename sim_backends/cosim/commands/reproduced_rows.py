@@ -12,9 +12,10 @@ from fieldkit.trial.simulated import PlannedExchange, SimulatedRepeat, Simulated
 from sim_backends.cosim.commands.flow_rows import BACKEND, motion_columns
 from sim_backends.cosim.commands.results import FlowResult, FlowRoundTrips, SeedResult
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.recording.captures import addresses, between
+from sim_backends.cosim.recording.captures import addresses, between, first_tcp_ns
 from sim_backends.cosim.recording.recorder import CAPTURES
 from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.external import writes_captures
 from sim_backends.cosim.scenario.reproduced_trial import ReproducedRepeat, ReproducedTrial
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.world.world import load_world
@@ -109,19 +110,23 @@ class ReproducedRows:
                 continue
             ping = flows.get(ping_name)
             reason = result.stopped or ("the run ended before the transfer" if transfer.under_way else "")
+            captures = self._captures(repeat, recording)
+            values = self._values(repeat, transfer, ping)
+            if repeat.protocol is Protocol.TCP and not reason and Role.RECEIVER in captures:
+                values |= _tcp_completion(captures[Role.RECEIVER], repeat, transfer)
             simulated = SimulatedRepeat(
                 repeat=RepeatId(repeat.protocol, number),
                 status=Status.FAILED if reason else Status.VALID,
                 reason=reason,
-                captures=self._captures(repeat, recording),
+                captures=captures,
                 ping="" if ping is None or ping.round_trips is None else self._ping_text(repeat, ping.round_trips),
-                values=self._values(repeat, transfer, ping),
+                values=values,
             )
             yield self._trial.row(simulated, identity)
 
     def _captures(self, repeat: ReproducedRepeat, recording: Path) -> dict[Role, bytes]:
-        """Return the captures of both ends; an external network has none of IP packets as they were sent."""
-        if self._scenario.network.federate is not None:
+        """Return the captures of both ends, if the network wrote those of its IP packets."""
+        if self._scenario.network.federate is not None and not writes_captures(self._scenario):
             return {}
         paths = {role: recording / CAPTURES / f"{self._agents[role]}.pcap" for role in (Role.SENDER, Role.RECEIVER)}
         return {
@@ -166,6 +171,14 @@ class ReproducedRows:
                 "datagram_loss": transfer.loss,
             }
         return values
+
+
+def _tcp_completion(capture: bytes, repeat: ReproducedRepeat, transfer: FlowResult) -> dict[str, Value]:
+    """Return the time from the first segment at the receiver until its program had the whole file."""
+    first_ns = None if repeat.transfer.port is None else first_tcp_ns(capture, repeat.transfer.port)
+    if first_ns is None or transfer.last_arrived_ns is None or transfer.arrived_bytes < repeat.transfer.size_bytes:
+        return {}
+    return {"completion_s": (transfer.last_arrived_ns - first_ns) / 1e9}
 
 
 def _flow_names(repeat: ReproducedRepeat) -> tuple[str, str, str]:

@@ -146,6 +146,7 @@ class FlowResult:
         sender_m_s: Mean speed of the sender at the times of sending.
         relative_m_s: Mean magnitude of its velocity relative to the receiver.
         round_trips: The round trips of a ping; None for other flows.
+        last_arrived_ns: Simulated time of the last arrival; None without arrivals.
     """
 
     name: str
@@ -165,6 +166,7 @@ class FlowResult:
     sender_m_s: float
     relative_m_s: float
     round_trips: FlowRoundTrips | None
+    last_arrived_ns: int | None = None
 
     @property
     def loss(self) -> float:
@@ -216,6 +218,7 @@ def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) ->
         sender_m_s=_mean(np.linalg.norm(velocities[0], axis=1)),
         relative_m_s=_mean(_distances(*velocities)),
         round_trips=None if replies is None else _round_trips(fates, replies),
+        last_arrived_ns=int(arrived_ns.max()) if len(arrived_ns) else None,
     )
 
 

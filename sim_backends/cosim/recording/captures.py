@@ -294,6 +294,20 @@ def _records(capture: bytes) -> Iterator[tuple[int, int, int]]:
         begin = end
 
 
+def first_tcp_ns(capture: bytes, port: int) -> int | None:
+    """Return the time of the first TCP packet to a port in a capture of `Captures`, or None if there is none.
+
+    Args:
+        capture: The content of the file.
+        port: Destination port.
+    """
+    for at_ns, begin, end in _records(capture):
+        packet = capture[begin + _RECORD_HEADER.size : end]
+        if packet[9] == _TCP and packet[HEADER_BYTES + 2 : HEADER_BYTES + 4] == port.to_bytes(2, "big"):
+            return at_ns
+    return None
+
+
 class PacketObserver:
     """An observer that passes the packets of programs to the log of IP packets, and all calls to a recorder.
 

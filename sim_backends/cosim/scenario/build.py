@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 from fieldkit.core.model import Topology
 from sim_backends.cosim.agents import Agents
@@ -16,12 +17,12 @@ from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.recording.captures import CapturedFlow, PacketObserver
+from sim_backends.cosim.recording.captures import CapturedFlow, PacketObserver, addresses
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import FileTraffic, PingTraffic, QosOptions, Traffic
 from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
 from sim_backends.cosim.scenario.checks import check
-from sim_backends.cosim.scenario.external import open_network, open_physics
+from sim_backends.cosim.scenario.external import open_network, open_physics, writes_captures
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.wall_time import DEADLINE_S, Stall, stalled
@@ -93,6 +94,26 @@ def captured_flows(traffic: Iterable[Traffic]) -> dict[str, CapturedFlow]:
             elif isinstance(entry, FileTraffic) and entry.port is not None:
                 flows[flow] = CapturedFlow(port=entry.port)
     return flows
+
+
+def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
+    """Return the description of captures with the headers of `Captures`; None if the network writes none."""
+    if not writes_captures(scenario):
+        return None
+    flows = captured_flows(scenario.traffic)
+    pings = list(dict.fromkeys(flow.ping for flow in flows.values() if flow.ping))
+    return {
+        "folder": str(folder.absolute()),
+        "addresses": {name: str(address) for name, address in addresses(sorted(scenario.agents)).items()},
+        "flows": {
+            name: {
+                "port": flow.port or 0,
+                "ping": pings.index(flow.ping) + 1 if flow.ping else 0,
+                "reply": flow.is_reply,
+            }
+            for name, flow in flows.items()
+        },
+    }
 
 
 def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFactory]:
@@ -210,6 +231,7 @@ def build(
     physics: PhysicsFederate | None = None,
     network: NetworkFederate | None = None,
     measures_all: bool = False,
+    captures: Path | None = None,
 ) -> Simulation:
     """Return a scenario as a simulation.
 
@@ -223,6 +245,7 @@ def build(
         physics: Replaces the scenario's physics, and receives the commands to bodies.
         network: Replaces the scenario's network; faults of the radio are then its responsibility.
         measures_all: As for `Coordinator`.
+        captures: Folder of captures for a network that writes them itself; the recorder then receives no IP packets.
 
     Raises:
         ConfigurationError: The scenario cannot be run; the message states the reason.
@@ -238,14 +261,15 @@ def build(
         details = scenario, world, scenario_bodies, seed, deadline_s
         if physics is None and (physics := open_physics(*details)) is not None:
             federates.callback(getattr(physics, "close", _nothing_to_close))
-        if network is None and (network := open_network(*details)) is not None:
+        described = None if network is not None or captures is None else _captures(scenario, captures)
+        if network is None and (network := open_network(*details, captures=described)) is not None:
             federates.callback(getattr(network, "close", _nothing_to_close))
         if physics is None:
             physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns, lifetimes=scenario.lifetimes)
         if network is None:
             losses_db = partial(getattr, physics, "path_losses_db") if hasattr(physics, "path_losses_db") else None
             network = radio_network(scenario, world, seed, recorder, losses_db)
-        elif isinstance(recorder, IpObserver):
+        elif isinstance(recorder, IpObserver) and described is None:
             recorder = PacketObserver(recorder, recorder.log_ip)
         for fault in scenario.faults:
             if isinstance(fault, StalledFederateFault):

@@ -12,7 +12,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, Hello
-from sim_backends.federates.named import PythonFederate, federates, named
+from sim_backends.federates.named import ProgramFederate, PythonFederate, federates, named
 from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
 from sim_backends.federates.simulator_options import options_json
 from sim_backends.federates.transports.transport_table import parse_address
@@ -40,6 +40,13 @@ def has_addresses(scenario: CosimScenario) -> bool:
     """Return True if a federate of the scenario has the address of a transport instead of a command."""
     federates = (scenario.physics.federate, scenario.network.federate)
     return any(where is not None and parse_address(where) is not None for where in federates)
+
+
+def writes_captures(scenario: CosimScenario) -> bool:
+    """Return True if the network is a program that writes captures of its IP packets itself."""
+    where = scenario.network.federate
+    federate = None if where is None else named(where, NETWORK)
+    return isinstance(federate, ProgramFederate) and federate.writes_captures
 
 
 def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, role: int) -> Hello:
@@ -140,13 +147,31 @@ def open_physics(
 
 
 def open_network(
-    scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
+    scenario: CosimScenario,
+    world: World,
+    bodies: Mapping[str, Body[Any]],
+    seed: int,
+    deadline_s: float | None,
+    *,
+    captures: Mapping[str, Any] | None = None,
 ) -> NetworkFederate | None:
-    """Start, connect or make the scenario's external network, if it has one; otherwise as `open_physics`."""
+    """Start, connect or make the scenario's external network, if it has one; otherwise as `open_physics`.
+
+    Args:
+        scenario: As for `open_physics`, like the next ones.
+        world: The world.
+        bodies: The bodies.
+        seed: The seed.
+        deadline_s: The deadline.
+        captures: Description of the captures that a network with `writes_captures` writes; None for none.
+    """
     where = scenario.network.federate
     if where is None:
         return None
     hello = make_hello(scenario, world, bodies, seed, NETWORK)
+    if captures is not None:
+        configuration = json.loads(hello.configuration) | {"captures": captures}
+        hello = dataclasses.replace(hello, configuration=json.dumps(configuration).encode())
     federate = named(where, NETWORK)
     if isinstance(federate, PythonFederate):
         made: NetworkFederate = _made(federate, where, hello)

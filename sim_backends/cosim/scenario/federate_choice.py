@@ -65,6 +65,12 @@ def agent_references(options: Options) -> Iterator[tuple[str, Location]]:
         yield from options.agent_names()
 
 
+def unsupported(options: Options, scenario: schema.Strict) -> Iterator[tuple[str, Location]]:
+    """Yield everything in a scenario that the simulator with these options does not support, with its keys."""
+    if isinstance(options, SimulatorOptions):
+        yield from options.unsupported(scenario.model_dump(mode="json", by_alias=True, exclude_none=True))
+
+
 def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) -> None:  # noqa: ANN401 (any YAML value)
     """Remove the options of each federate that a change replaces, because they are only valid for it.
 

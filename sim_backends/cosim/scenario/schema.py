@@ -19,6 +19,7 @@ from sim_backends.cosim.scenario.federate_choice import (
     NetworkFederateOptions,
     PhysicsFederateOptions,
     agent_references,
+    unsupported,
 )
 from sim_backends.cosim.scenario.reproduced_trial import ReproducedTrial
 from sim_backends.emane_events.options import EmaneOptions
@@ -284,6 +285,13 @@ class CosimScenario(Named):
             (("emane",), self.emane),
         ):
             yield from ((name, (*place, *location)) for name, location in agent_references(options))
+
+    @schema.model_validator(mode="after")
+    def _simulators_support_it(self) -> "CosimScenario":
+        for options in (self.physics.options, self.network.options):
+            for what, location in unsupported(options, self):
+                raise schema.validation_error(what, *location)
+        return self
 
     @schema.model_validator(mode="after")
     def _relay_is_named(self) -> "CosimScenario":

@@ -1,4 +1,4 @@
-"""The medium of a co-simulation: real programs on emulated robots, moved by a physics and heard over a network.
+"""The medium of a co-simulation: a physics moves emulated robots, and a network carries the packets of their programs.
 
 | module | purpose | imports |
 | --- | --- | --- |

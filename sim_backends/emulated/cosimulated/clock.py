@@ -14,7 +14,7 @@ class RealTime:
         self.epoch_ns = time.monotonic_ns()
 
     def now_ns(self) -> int:
-        """Return the simulated time that it is now."""
+        """Return the present simulated time."""
         return time.monotonic_ns() - self.epoch_ns
 
     def monotonic_ns(self, simulated_ns: int) -> int:
@@ -26,5 +26,5 @@ class RealTime:
         return monotonic_ns - self.epoch_ns
 
     def give_up(self, lag_ns: int) -> None:
-        """Delay all later simulated time: a simulation that lags behind by this does not catch up."""
+        """Shift all later simulated time by a delay, so that a late simulation does not catch up."""
         self.epoch_ns += lag_ns

@@ -57,7 +57,7 @@ _START_NS: Final = 5_000_000
 
 
 class _NewSession(BaseException):
-    """Raised through the coordinator of an old session."""
+    """Ends the coordinator of an old session."""
 
 
 class CosimulatedMedium(MediumServer):
@@ -319,10 +319,7 @@ class CosimulatedMedium(MediumServer):
 
     @override
     def _sample_links(self, now_ns: int) -> Mapping[str, LinkSample]:
-        session = self._session
-        if session is None or session.builtin is None:
-            return {}
-        return session.sample_links()
+        return {} if self._session is None else self._session.sample_links()
 
     @override
     def _link_counters(self) -> dict[Pair, LinkCounters]:

@@ -24,12 +24,14 @@ from sim_backends.emulated.cosimulated.simulators import (
 )
 from sim_backends.emulated.cosimulated.steering import Steering
 from sim_backends.emulated.medium.server import AttemptLog
-from sim_backends.federates.protocols import NetworkFederate
+from sim_backends.federates.protocols import FederateError, NetworkFederate
+from sim_backends.federates.records import ArrivalDelay
+from sim_backends.federates.remote import RemoteNetwork
 from sim_backends.network.bare_ip import BROADCAST, broadcast_flow
 from sim_backends.network.ip import Fragment
-from sim_backends.network.packets import Packet
+from sim_backends.network.packets import Arrival, Packet
 from sim_backends.radio.frames import TransmissionAttempt
-from sim_backends.radio.links import PACKET, Delay
+from sim_backends.radio.links import PACKET, PROCESSING_NS, PROPAGATION_NS, QUEUING_NS, TRANSMISSION_NS, Delay
 from sim_backends.radio.random_streams import PacketIdentity
 
 
@@ -73,12 +75,15 @@ class CosimSession:
         )
         self.builtin: BuiltinNetwork | None = None
         self._delays: dict[tuple[str, PacketIdentity], Delay] = {}
+        self._arrival_delays: dict[int, ArrivalDelay] = {}
         if settings.simulators.network == BUILTIN:
             self.builtin = builtin_network(settings)
             self.builtin.federate.log_delays(self._log_delay)
             self.network: NetworkFederate = self.builtin.federate
         else:
-            self.network = start_network(settings, self.physics.states)
+            remote = start_network(settings, self.physics.states)
+            remote.log_arrival_delays(self._log_arrival_delay)
+            self.network = remote
         self.agents = RealAgents(self.physics, medium)
         self.coordinator = Coordinator(
             self.agents, self.network, make_policy(**policy), [*permutations(self.stations, 2)], observer=medium
@@ -93,18 +98,26 @@ class CosimSession:
     def forget(self, packet: Packet) -> None:
         """Remove a packet whose fate is decided from the record of the coordinator."""
         del self.coordinator.run.fates[packet.identity]
+        self._arrival_delays.pop(packet.packet_id, None)
 
     def network_delay(self, fate: Fate) -> tuple[Delay, int]:
-        """Return the parts of a packet's delay in the network, and the delay that the network does not divide."""
+        """Return the parts of a packet's delay in the network, and the delay that the network does not divide.
+
+        Raises:
+            FederateError: The parts exceed the delay.
+        """
         packet = fate.packet
+        assert fate.arrived_ns is not None
+        delay_ns = fate.arrived_ns - packet.enters_ns
+        if (parts := self._arrival_delays.get(packet.packet_id)) is not None:
+            return _packed(packet, delay_ns, parts), 0
         identity = packet.identity
         if packet.protocol == BROADCAST:
             identity = broadcast_flow(packet.source), identity[1]
         delay = self._delays.pop((packet.destination, identity), None)
         if delay is not None:
             return delay, 0
-        assert fate.arrived_ns is not None
-        return PACKET, fate.arrived_ns - packet.enters_ns
+        return PACKET, delay_ns
 
     def log_attempts(self, log: AttemptLog | None) -> None:
         """Pass every transmission attempt to `log`, in real time, with the content of its packet; None stops it."""
@@ -117,7 +130,9 @@ class CosimSession:
         log(replace(attempt, start_ns=start_ns, end_ns=end_ns, payload=content))
 
     def sample_links(self) -> Mapping[str, LinkSample]:
-        """Return a sample of the links of all radios at their present positions."""
+        """Return a sample of the links of all radios at their present positions; empty if the network has none."""
+        if isinstance(self.network, RemoteNetwork):
+            return self.network.sample_links()
         assert self.builtin is not None
         federate, radio = self.builtin
         positions_m = {name: state.position_m for name, state in self.physics.states.items()}
@@ -126,3 +141,23 @@ class CosimSession:
 
     def _log_delay(self, host: str, fragment: Fragment, delay: Delay) -> None:
         self._delays[host, fragment.identity] = delay
+
+    def _log_arrival_delay(self, arrival: Arrival, parts: ArrivalDelay) -> None:
+        self._arrival_delays[arrival.packet_id] = parts
+
+
+def _packed(packet: Packet, delay_ns: int, parts: ArrivalDelay) -> Delay:
+    """Return a delay with its parts; the rest of it is processing."""
+    processing_ns = delay_ns - sum(parts)
+    if processing_ns < 0:
+        raise FederateError(
+            f"the network reported parts of {sum(parts)} ns for a packet of {packet.source}, whose delay is "
+            f"{delay_ns} ns"
+        )
+    return (
+        PACKET
+        + processing_ns * PROCESSING_NS
+        + parts.transmission_ns * TRANSMISSION_NS
+        + parts.propagation_ns * PROPAGATION_NS
+        + parts.queueing_ns * QUEUING_NS
+    )

@@ -1,4 +1,4 @@
-"""The physics of a lab: it moves robots that their programs drive; others are where the lab has put them."""
+"""The physics of a lab: moves the robots that programs drive; other robots stay where the lab has put them."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -26,7 +26,7 @@ _MOVED_M: Final = 1e-6
 
 @runtime_checkable
 class Placing(PhysicsFederate, Protocol):
-    """A physics that can put a robot at a place during a run. Another one is started again for this."""
+    """A physics that can put a robot at a place during a run. Without this method the physics is restarted for it."""
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
         """Put a robot at a place, at rest.
@@ -46,9 +46,9 @@ StartPhysics = Callable[[Mapping[str, State]], PhysicsFederate]
 class LabPhysics:
     """The physics of a session of the co-simulation; implements `PhysicsFederate`.
 
-    It is started when the lab has put all robots that can be driven at a place, and it moves a robot from its first
-    command on. Until then, and after the lab has put it elsewhere, a robot is where the lab says. A station without a
-    body, such as the laptop, always is.
+    It starts when the lab has placed all robots that can be driven, and moves a robot from the robot's first command
+    on. Before that, and after the lab has placed it again, a robot stays where the lab has put it. A station without
+    a body, such as the laptop, always does.
 
     Args:
         start: Starts the physics.
@@ -124,8 +124,8 @@ class LabPhysics:
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (read here)
         """Implement `PhysicsFederate.advance`; the commands are those of the robots' programs."""
-        if to_ns - self._polled_ns >= _POLL_NS:
-            self._poll_placements(to_ns)
+        if (now_ns := self._clock.now_ns()) - self._polled_ns >= _POLL_NS:
+            self._poll_placements(now_ns)
         if self._physics is not None:
             for at_ns, name, twist in sorted(self._commands(to_ns), key=lambda command: command[0]):
                 self._drive(name, max(at_ns, self._now_ns), twist)

@@ -40,15 +40,15 @@ class Devices(Protocol):
     """The devices of all robots, in simulated time."""
 
     def wait(self, until_ns: int) -> None:
-        """Return when it is this time; packets are read, and requests answered, meanwhile."""
+        """Wait until this time; meanwhile packets are read and requests answered."""
         ...
 
     def wait_for_packet(self, until_ns: int) -> None:
-        """Return when a packet has been read, at the latest at this time; requests are not answered meanwhile."""
+        """Wait until a packet has been read, at most until this time; meanwhile no request is answered."""
         ...
 
     def first_ns(self) -> int | None:
-        """Return the time of the first packet that was read and not taken, or None if there is none."""
+        """Return the time of the first packet that `packets` has not returned yet, or None."""
         ...
 
     def take(self, last_ns: int) -> list[RealPacket]:

@@ -14,7 +14,7 @@ from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello
 from sim_backends.federates.named import PythonFederate, named
-from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
+from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, BareBroadcast, BareIp
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
@@ -149,7 +149,7 @@ def builtin_network(settings: LabSettings) -> BuiltinNetwork:
     return BuiltinNetwork(RadioNetwork(radio, tuple(antennas), transports=transports, relay=settings.relay), radio)
 
 
-def start_network(settings: LabSettings, states: Mapping[str, State]) -> NetworkFederate:
+def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.RemoteNetwork:
     """Start a network that is a program; arguments and errors as `start_physics`, with all stations."""
     network = remote.open_network(settings.simulators.network, _hello(settings, NETWORK, states), DEADLINE_S)
     supported = network.welcome.transports
@@ -181,8 +181,12 @@ def _hello(settings: LabSettings, role: int, states: Mapping[str, State]) -> Hel
 
 
 def _configuration(settings: LabSettings, states: Mapping[str, State]) -> dict[str, Any]:
-    """Return the configuration that a scenario with the same radio, world and robots would have."""
-    topology = Topology.MASTERLESS if settings.relay is None else Topology.MASTER
+    """Return the configuration that a scenario with the same radio, world and robots would have.
+
+    The relay is omitted if it has no state: a drone has none in the physics.
+    """
+    relay = settings.relay if settings.relay in states else None
+    topology = Topology.MASTERLESS if relay is None else Topology.MASTER
     scenario = CosimScenario.model_validate(
         {
             "name": "lab",
@@ -190,7 +194,7 @@ def _configuration(settings: LabSettings, states: Mapping[str, State]) -> dict[s
             "world": "open" if settings.world is None else settings.world.name,
             "duration": "1s",
             "topology": topology.value,
-            "relay": settings.relay,
+            "relay": relay,
             "agents": {
                 name: {"robot": "turtlebot3_burger", "at_m": [*state.position_m[:2]]}
                 for name, state in states.items()

@@ -1,18 +1,22 @@
-"""Steering of one robot by the programs in it: commanded velocities in, the record of its motion out."""
+"""Steering of one robot: reads the velocities that its programs command, and writes the record of its motion."""
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS, odometry
-from sim_backends.emulated.robot.commanded import CommandedRecord
+from sim_backends.emulated.robot.commanded import Commanded, CommandedRecord
 from sim_backends.emulated.ros.own_motion import AT_REST, MotionReporter, OwnMotion
 from sim_backends.physics.body import Twist
 from sim_backends.world.motion import STILL, State
 
 _REPORT_NS: Final = 10_000_000
 """Interval of the records while a robot moves: those of the robot's own base controller have 20 ms."""
+
+_PENDING_COMMANDS: Final = 1000
+"""Velocities that are kept while the simulation lags, by at most 1 s; older ones are dropped."""
 
 
 class Steering:
@@ -33,6 +37,7 @@ class Steering:
         steered, paths, commanded = descriptors
         self._commands = CommandedRecord(commanded)
         self._seen_ns = now_ns
+        self._pending: deque[Commanded] = deque(maxlen=_PENDING_COMMANDS)
         self._reporter = MotionReporter(_path(paths), _path(steered), now_ns)
         self.is_driven = False
         self._start: OwnMotion = AT_REST
@@ -50,6 +55,7 @@ class Steering:
         if placed is not None:
             self._start, self.is_placed = placed, True
             self._seen_ns = now_ns
+            self._pending.clear()
             self.is_driven, self._stops_ns, self._reported, self.rests = False, None, None, True
         return placed
 
@@ -59,17 +65,27 @@ class Steering:
         return self._start.heading_rad
 
     def commands(self, until_ns: int) -> Iterator[tuple[int, Twist]]:
-        """Yield the times and velocities that were commanded until a time, and the stop after a missing command."""
+        """Yield the times and velocities that were commanded until a time, and the stop after a missing command.
+
+        A simulation that lags behind reads velocities that it has not reached; they are kept until then.
+        """
         commanded = self._commands.read()
-        if commanded is None or not self._seen_ns < commanded.time_ns <= until_ns or not self.is_placed:
-            commanded = None
-        if self._stops_ns is not None and self._stops_ns <= (until_ns if commanded is None else commanded.time_ns):
-            yield self._stops_ns, Twist()
-            self._stops_ns = None
-        if commanded is not None:
-            self._seen_ns, self._stops_ns = commanded.time_ns, commanded.time_ns + TIMEOUT_NS
+        if commanded is not None and self._seen_ns < commanded.time_ns and self.is_placed:
+            self._seen_ns = commanded.time_ns
+            self._pending.append(commanded)
+        while self._pending and self._pending[0].time_ns <= until_ns:
+            commanded = self._pending.popleft()
+            yield from self._stop_until(commanded.time_ns)
+            self._stops_ns = commanded.time_ns + TIMEOUT_NS
             self.is_driven, self.rests = True, False
             yield commanded.time_ns, Twist(commanded.forward_m_s, commanded.turn_rad_s)
+        yield from self._stop_until(until_ns)
+
+    def _stop_until(self, until_ns: int) -> Iterator[tuple[int, Twist]]:
+        """Yield the stop after a missing command if it is due at a time."""
+        if self._stops_ns is not None and self._stops_ns <= until_ns:
+            yield self._stops_ns, Twist()
+            self._stops_ns = None
 
     def report(self, at_ns: int, state: State) -> None:
         """Record the motion of a robot that is driven; a robot that has stopped is recorded once.
@@ -102,7 +118,7 @@ class Steering:
 
 _STILL_M_S: Final = 1e-3
 _NO_TURN_RAD_S: Final = 1e-3
-"""Slower motions are those of a simulated contact: a robot that stands in MuJoCo is never exactly at rest."""
+"""Slower motions are those of a simulated contact: in MuJoCo a stationary robot is never exactly at rest."""
 
 
 def _path(fd: int) -> Path:

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import linprog
 
 from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.transfers.clock_offset import MAX_SKEW, QUARTZ_SKEW, STAMP_S, Clocks, StampPairs, estimate
@@ -97,7 +97,7 @@ def test_the_error_is_that_of_linear_programs_that_each_leave_out_one_packet(
     ]
     x = (int(at_ns[0]) - middle_ns) / 1e9
     reach_s = [
-        linprog(
+        scipy.optimize.linprog(
             [sign, sign * x],
             A_ub=np.array([row for row, _ in rows[:left_out] + rows[left_out + 1 :]]),
             b_ub=np.array([bound for _, bound in rows[:left_out] + rows[left_out + 1 :]]),
@@ -204,7 +204,10 @@ def _farthest_lines_s(forward: StampPairs, reverse: StampPairs, at_ns: int) -> t
     rows = np.concatenate([sign * np.stack((np.ones_like(x), x), axis=1) for sign, x, _ in sides])
     limits = np.concatenate([sign * y + STAMP_S for sign, _, y in sides])
     lowest, highest = (
-        sign * linprog([sign, 0.0], A_ub=rows, b_ub=limits, bounds=[(None, None), (-MAX_SKEW, MAX_SKEW)]).fun
+        sign
+        * scipy.optimize.linprog(
+            [sign, 0.0], A_ub=rows, b_ub=limits, bounds=[(None, None), (-MAX_SKEW, MAX_SKEW)]
+        ).fun
         for sign in (1, -1)
     )
     return float(lowest), float(highest)

@@ -65,6 +65,7 @@ def test_the_command_refuses_results_and_shows_the_histogram(tmp_path: Path) -> 
     paced = run_here(tmp_path, *words, "--realtime", "2", "--late-bound", "60s")
     assert paced.code == 0, paced.err
     assert "late up to (ms)" in paced.out
+    assert "0.4 s simulated, in real time; without waiting for it, " in paced.out
 
     for options, message in (
         (("--realtime", "-1"), "--realtime: '-1' is not a number above 0"),

@@ -30,8 +30,8 @@ def answers(program: Path, *requests: bytes) -> bytes:
 
 
 def test_frames_are_those_of_the_documentation(program: Path) -> None:
-    requests = [FRAMES[name] for name in (*REQUESTS, "ping", "release", "bye", "ping")]
-    expected = [FRAMES[name] for name in ("welcome", "states", "outcomes", "pong")]
+    requests = [FRAMES[name] for name in (*REQUESTS, "sample links", "ping", "release", "bye", "ping")]
+    expected = [FRAMES[name] for name in ("welcome", "states", "outcomes", "links", "pong")]
     assert answers(program, *requests) == b"".join(expected)
     assert answers(program, FRAMES["fork"], FRAMES["ping"]) == FRAMES["busy"] + FRAMES["error"]
 
@@ -64,5 +64,5 @@ def test_the_headers_of_a_program_are_part_of_its_name() -> None:
     names = [file.name for file in included_files(SOURCE)]
     assert names[0] == SOURCE.name
     assert sorted(names[1:]) == [
-        "bytes.h", "commands.h", "frames.h", "handshake.h", "packets.h", "serving.h", "states.h",
+        "bytes.h", "commands.h", "frames.h", "handshake.h", "links.h", "packets.h", "serving.h", "states.h",
     ]  # fmt: skip

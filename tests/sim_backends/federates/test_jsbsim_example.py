@@ -84,3 +84,8 @@ def test_a_drone_follows_its_commands(capfd: pytest.CaptureFixture[str]) -> None
 def test_a_robot_that_drives_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="leader is a husky, which drives; JSBSim moves only drones"):
         build(load_scenario("convoy", {"physics.federate": "jsbsim"}))
+
+
+def test_it_has_no_options() -> None:
+    with pytest.raises(ConfigurationError, match=r"in physics.options: unknown key wind; no keys are valid here"):
+        load_scenario(SCENARIO, {"physics.federate": "jsbsim", "physics.options": {"wind": 1}})

@@ -84,7 +84,7 @@ def test_a_simulator_receives_all_options(tmp_path: Path) -> None:
     assert (sent["limit_m_s2"], sent["settle_s"], sent["acknowledge"]) == (3, 0.5, "auto")
     assert "world" not in sent
     assert options_sent(scenario, NETWORK) == {"ampdu_bytes": 100}
-    assert options_sent(load_scenario("convoy", {"network.federate": "ns3"}), NETWORK) == {"ampdu_bytes": 0}
+    assert options_sent(loaded(tmp_path, network__options=None), NETWORK) == {"ampdu_bytes": 0}
     emane = load_scenario("convoy", {"physics.federate": "emane", "physics.options": {"nems": {"leader": 7}}})
     assert EmaneOptions.model_validate(options_sent(emane, PHYSICS)) == emane.physics.options
 
@@ -99,3 +99,49 @@ def test_another_simulator_does_not_get_the_options_of_the_one_that_it_replaces(
     scenario = loaded(tmp_path, physics__federate="mujoco", network__federate="builtin")
     assert options_sent(scenario, PHYSICS) == {}
     assert scenario.network.options is None
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("radio: {loss: 1%}", "ns-3 simulates Wi-Fi, not fixed links; remove loss"),
+        ("faults: [{kind: jammer, power_dbm: 10, at_m: [3, 3]}]", "ns-3 has no jammers; remove the fault"),
+        (
+            "traffic: [{kind: stream, from: ann, to: bob, rate: 10Hz, protocol: topic}]",
+            "only with network.options.topics: udp",
+        ),
+        (
+            "traffic: [{kind: stream, from: ann, to: bob, rate: 10Hz, protocol: ros1}]\nrelay: ann",
+            "ns-3 does not carry topics of ROS 1",
+        ),
+    ],
+)
+def test_what_a_simulator_does_not_support_has_its_line(line: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "pair.yaml"
+    path.write_text(SCENARIO.replace("PHYSICS", "gazebo").replace("VALUE", "{}") + line + "\n", encoding="utf-8")
+    changes = {"physics.options": None, "network.federate": "ns3"}
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        load_scenario(path, changes)
+    assert caught.value.where.startswith(f"{path}:13")
+    load_scenario(path, changes | {"network.federate": "builtin", "network.options": None})
+
+
+@pytest.mark.parametrize("key", ["appears", "disappears"])
+def test_gazebo_refuses_agents_that_appear_or_disappear_with_their_line(key: str, tmp_path: Path) -> None:
+    path = tmp_path / "pair.yaml"
+    text = (
+        SCENARIO.replace("PHYSICS", "gazebo").replace("    VALUE\n", "    reset: false\n").replace("NETWORK", "ns3")
+    )
+    path.write_text(text.replace("bob: {", f"bob: {{{key}: 500ms, "), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=f"cannot appear or disappear in Gazebo; remove {key}") as caught:
+        load_scenario(path)
+    assert caught.value.where == f"{path}:12"
+
+
+def test_reliable_topics_over_ns3_are_refused_with_their_line(tmp_path: Path) -> None:
+    topics = {"kind": "stream", "from": "ann", "to": "bob", "rate": "10Hz", "protocol": "topic"}
+    best_effort = topics | {"qos": {"reliability": "best_effort"}}
+    loaded(tmp_path, traffic=[best_effort], network__options__topics="udp")
+    for traffic in (topics, topics | {"qos": {"reliability": "reliable"}}):
+        with pytest.raises(ConfigurationError, match="no reliable topics; set reliability: best_effort"):
+            loaded(tmp_path, traffic=[best_effort, traffic], network__options__topics="udp")

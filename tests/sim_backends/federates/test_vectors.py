@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 
-from docs.generator.federate_frames import DRONE, HELLO, START, WELCOME, WITHOUT_VECTOR, agents, example_frames
+from docs.generator.federate_frames import DRONE, HELLO, LINKS, START, WELCOME, WITHOUT_VECTOR, agents, example_frames
 from sim_backends.federates import exchanges
 from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import AdvanceNetwork, NetworkOutcomes
 from sim_backends.federates.frames import HEADER_BYTES, MessageKind, read_header
 from sim_backends.federates.handshake import Hello, Welcome, decode_join
+from sim_backends.federates.link_records import decode_links
 from tests.helpers.paths import ROOT
 
 PAGE = (ROOT / "docs" / "reference" / "federate-vectors.md").read_text(encoding="utf-8")
@@ -87,7 +88,12 @@ def test_requests_and_answers_by_hand() -> None:
     outcomes = ByHand(VECTORS["outcomes"])
     assert (outcomes.kind, outcomes.take("qqI")) == (7, (11_099_999, 12_000_000, 1))
     assert (outcomes.take("QqII"), outcomes.take("IQ")) == ((9, 11_000_250, 1, 0), (1, 8))
-    assert (outcomes.text(), outcomes.rest) == ("out of range", b"")
+    assert (outcomes.text(), outcomes.take("3q"), outcomes.rest) == ("out of range", (100_000, 350_000, 33), b"")
+    links = ByHand(VECTORS["links"])
+    assert (links.kind, links.take("IIIdqq")) == (17, (1, 0, 0, -95.0, 11_099_999, 2_000_000))
+    *link, rx_rate_bit_s = links.take("IIIdd d")
+    assert (link, math.isnan(rx_rate_bit_s)) == ([1, 0, 1, -61.5, 54e6], True)
+    assert (links.take("4Q"), links.rest) == ((12, 11, 3, 1), b"")
 
 
 def test_short_messages_by_hand() -> None:
@@ -129,6 +135,8 @@ def test_our_decoder_reads_the_vectors() -> None:
     assert network.encode(agents()) == body("advance network")
     outcomes = NetworkOutcomes.decode(body("outcomes"), agents())
     assert outcomes.encode(agents()) == body("outcomes")
+    assert outcomes.delays == [(100_000, 350_000, 33)]
+    assert decode_links(body("links"), agents(), 0) == LINKS
     assert exchanges.decode_text(body("error")) == "ValueError: no wheels"
 
 

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from scipy.stats import binomtest
+import scipy
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss, active, changes_ns
@@ -118,18 +118,20 @@ def test_the_noise_of_a_jammer_follows_from_the_path_loss() -> None:
     result = run_jammed(sent, weaker)
     attempt_error = packet_error(G6, ratio_db + 0.1, size_bytes + 28 + HEADER_BYTES)
     assert 0.05 < attempt_error < 0.7
-    interval = binomtest(len(result.dropped), n).proportion_ci(confidence_level=0.99, method="wilson")
+    interval = scipy.stats.binomtest(len(result.dropped), n).proportion_ci(confidence_level=0.99, method="wilson")
     assert interval.low <= attempt_error**7 <= interval.high
-    interval = binomtest(count_first_attempts(result), n).proportion_ci(confidence_level=0.99, method="wilson")
+    interval = scipy.stats.binomtest(count_first_attempts(result), n).proportion_ci(
+        confidence_level=0.99, method="wilson"
+    )
     assert interval.low <= 1 - attempt_error <= interval.high
     # If the noise ends in the middle of each frame, half of the bits have the SNR without noise.
     half_ns = G6.airtime_ns(size_bytes + 28 + HEADER_BYTES) // 2
     half_frame_jammers = [
         replace(weaker, begin_ns=packet.sent_ns - MS, end_ns=packet.sent_ns + half_ns) for packet in sent[1:]
     ]
-    interval = binomtest(count_first_attempts(run_jammed(sent[1:], *half_frame_jammers)), n - 1).proportion_ci(
-        0.99, method="wilson"
-    )
+    interval = scipy.stats.binomtest(
+        count_first_attempts(run_jammed(sent[1:], *half_frame_jammers)), n - 1
+    ).proportion_ci(0.99, method="wilson")
     assert interval.low <= (1 - attempt_error) ** 0.5 <= interval.high
 
 

@@ -1,7 +1,7 @@
 """UDP over analytically solvable links: loss of fragments, delay, queues, range."""
 
 import pytest
-from scipy.stats import binomtest
+import scipy
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.radio.links import LOST, OUT_OF_RANGE, QUEUE_FULL
@@ -18,7 +18,7 @@ def test_a_datagram_is_lost_if_any_fragment_is_lost(size_bytes: int, fragments: 
     net = network(fixed(loss=f"{loss:.0%}"), "ab")
     sent = packets([(number * MS, "a", "b", size_bytes) for number in range(n)])
     result = carry(net, STATES, sent)
-    interval = binomtest(len(result.dropped), n).proportion_ci(confidence_level=0.99, method="wilson")
+    interval = scipy.stats.binomtest(len(result.dropped), n).proportion_ci(confidence_level=0.99, method="wilson")
     assert interval.low <= 1 - (1 - loss) ** fragments <= interval.high
     assert set(result.dropped.values()) == {LOST}
     assert len(result.arrived) + len(result.dropped) == n

@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from itertools import permutations
 
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binomtest
 
 from sim_backends.radio.fixed_links import FixedLinks, _LinkPacket
 from sim_backends.radio.links import Delay, LinkCounters, LinkParameters
@@ -110,7 +110,7 @@ def test_the_configured_loss_is_in_the_wilson_interval(loss: float) -> None:
     for number in range(n):
         links.send(number, "a", number, 100, "b")
     lost = n - len(drain(links))
-    interval = binomtest(lost, n).proportion_ci(confidence_level=0.99, method="wilson")
+    interval = scipy.stats.binomtest(lost, n).proportion_ci(confidence_level=0.99, method="wilson")
     assert interval.low <= loss <= interval.high
     assert links.counters()["a", "b"].lost == lost
 
@@ -136,7 +136,7 @@ def test_losses_of_a_broadcast_are_independent_per_receiver() -> None:
     for _, name, number in drain(links):
         reached[name].add(number)
     received_by_all = len(reached["b"] & reached["c"] & reached["d"])
-    interval = binomtest(received_by_all, n).proportion_ci(confidence_level=0.99, method="wilson")
+    interval = scipy.stats.binomtest(received_by_all, n).proportion_ci(confidence_level=0.99, method="wilson")
     assert interval.low <= 0.5**3 <= interval.high
 
 
@@ -165,7 +165,7 @@ def test_loss_applies_to_each_hop_of_a_relayed_packet() -> None:
     links, n = engine(LinkParameters(loss=0.1), "abr", relay="r"), 20_000
     for number in range(n):
         links.send(number, "a", number, 100, "b")
-    interval = binomtest(len(drain(links)), n).proportion_ci(confidence_level=0.99, method="wilson")
+    interval = scipy.stats.binomtest(len(drain(links)), n).proportion_ci(confidence_level=0.99, method="wilson")
     assert interval.low <= 0.81 <= interval.high
 
 

@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import special, stats
 
 from sim_backends.radio import propagation
 from sim_backends.radio.error_rates import bit_error, decoded_bit_error, packet_error
@@ -49,7 +49,7 @@ def test_uncoded_bit_error_equals_proakis(mode: WifiMode) -> None:
     """Gray-coded M-QAM by Q functions, nearest neighbours only."""
     for snr_db in (5.0, 10.0, 15.0):
         snr = 10 ** (snr_db / 10)
-        q = stats.norm.sf
+        q = scipy.stats.norm.sf
         expected = {
             "BPSK": q(math.sqrt(2 * snr)),
             "QPSK": q(math.sqrt(snr)),
@@ -180,7 +180,7 @@ def assert_clarke_correlation(power_gains: Floats, *paths: tuple[float, float]) 
     centred = power_gains - power_gains.mean()
     for steps in (2, 4, 8, 20):
         turns = 2 * math.pi * PATHS_M[steps] / WAVELENGTH_M
-        among_many = math.prod(special.j0(share * turns) ** 2 for share, _ in paths)
+        among_many = math.prod(scipy.special.j0(share * turns) ** 2 for share, _ in paths)
         echoes = np.ones(12, dtype=complex)
         for (share, angle), pairing in zip(paths, (5, 1, 7), strict=False):
             angles = (np.arange(12)[:, None] * pairing % 12 + np.linspace(0, 1, 101)) * math.pi / 6
@@ -195,7 +195,7 @@ def test_without_line_of_sight_the_gain_is_exponential() -> None:
     """Rayleigh: the power gain has the exponential distribution with mean 1."""
     power_gains = gains_along(0.0)
     assert power_gains.mean() == pytest.approx(1, abs=0.03)
-    assert stats.kstest(power_gains[:, 0], "expon").pvalue > 0.01
+    assert scipy.stats.kstest(power_gains[:, 0], "expon").pvalue > 0.01
 
 
 @pytest.mark.parametrize("k", [1.0, 4.0])
@@ -203,7 +203,7 @@ def test_with_line_of_sight_the_gain_is_rician(k: float) -> None:
     """Twice (K + 1) times the gain is noncentral chi-square with 2 degrees of freedom and noncentrality 2 K."""
     power_gains = np.array([gains(fading(seed), *ends, k=k)[0] for seed, ends in enumerate(RANDOM_ENDS)])
     assert power_gains.mean() == pytest.approx(1, abs=0.06)
-    assert stats.kstest(2 * (k + 1) * power_gains, "ncx2", args=(2, 2 * k)).pvalue > 0.01
+    assert scipy.stats.kstest(2 * (k + 1) * power_gains, "ncx2", args=(2, 2 * k)).pvalue > 0.01
 
 
 @pytest.mark.parametrize("angle", [0.0, -0.9])

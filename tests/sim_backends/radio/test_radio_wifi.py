@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import brentq
 
 from sim_backends.radio.contention import CCA_TIME_NS
 from sim_backends.radio.error_rates import packet_error
@@ -56,7 +56,7 @@ def bianchi_bit_s(stations: int, mode: WifiMode) -> float:
     def tau(p: float) -> float:
         return 2 * (1 - 2 * p) / ((1 - 2 * p) * (window + 1) + p * window * (1 - (2 * p) ** doublings))
 
-    p = brentq(lambda p: p - (1 - (1 - tau(p)) ** (stations - 1)), 0, 0.49)
+    p = scipy.optimize.brentq(lambda p: p - (1 - (1 - tau(p)) ** (stations - 1)), 0, 0.49)
     sending_probability = tau(p)
     any_sends = 1 - (1 - sending_probability) ** stations
     only_one_sends = stations * sending_probability * (1 - sending_probability) ** (stations - 1) / any_sends

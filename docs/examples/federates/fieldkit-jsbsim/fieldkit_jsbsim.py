@@ -9,6 +9,7 @@ from sim_backends.federates.answering import FederateService
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.named import PythonFederate
 from sim_backends.federates.records import VELOCITY
+from sim_backends.federates.simulator_options import SimulatorOptions
 from sim_backends.physics.body import GRAVITY_M_S2, Velocity
 from sim_backends.world.motion import State
 
@@ -49,9 +50,8 @@ class Drone:
     def step(self):
         """Control it, and advance by a step."""
         fdm, (_, (v_e, v_n, v_u), heading_rad) = self.fdm, self.state()
-        to_e, to_n, to_u = self.target.velocity_m_s
+        (to_e, to_n, to_u), cos, sin = self.target.velocity_m_s, math.cos(heading_rad), math.sin(heading_rad)
         east, north, up = limited(to_e - v_e, 2.0), limited(to_n - v_n, 2.0), limited(to_u - v_u, 1.0)
-        cos, sin = math.cos(heading_rad), math.sin(heading_rad)
         pitch_rad = -math.atan2(east * cos + north * sin, GRAVITY_M_S2)  # positive with its nose up
         roll_rad = math.atan2(east * sin - north * cos, GRAVITY_M_S2)
         turn_rad = math.remainder(self.heading_rad - heading_rad, math.tau)
@@ -96,4 +96,4 @@ class Drones:
 
 
 SERVICE = {"name": "jsbsim", "software": f"JSBSim {jsbsim.__version__}", "forks": False, "commands": (VELOCITY,)}
-JSBSIM = PythonFederate(PHYSICS, lambda: FederateService(Drones, **SERVICE))
+JSBSIM = PythonFederate(PHYSICS, lambda: FederateService(Drones, **SERVICE), "JSBSim: F450 drones", SimulatorOptions)

@@ -27,6 +27,8 @@ enum Kind : uint16_t
     kRelease = 13,
     kError = 14,
     kBye = 15,
+    kSampleLinks = 16,
+    kLinks = 17,
 };
 
 constexpr uint16_t kVersion = 1;
@@ -56,7 +58,7 @@ ReadFrame(std::FILE* stream, Frame& frame)
     auto reserved = fields.Get<uint16_t>();
     frame.request = fields.Get<uint32_t>();
     frame.copy = fields.Get<uint32_t>();
-    if (frame.kind < kJoin || frame.kind > kBye)
+    if (frame.kind < kJoin || frame.kind > kLinks)
     {
         throw MalformedFrame(4, "there is no kind of message " + std::to_string(frame.kind));
     }

@@ -23,6 +23,7 @@ enum Capability : uint32_t
     kExtrapolates = 8,
     kAgentsAppear = 16,
     kAgentsDisappear = 32,
+    kSamplesLinks = 64,
 };
 
 constexpr uint32_t kMaxAgents = 10'000;

@@ -60,6 +60,14 @@ ReadNetworkRequest(const std::string& body)
     return request;
 }
 
+// Parts of the delay of a packet in the network; the processing in hosts is what remains of it.
+struct DelayParts
+{
+    int64_t queueing_ns = 0;
+    int64_t transmission_ns = 0;
+    int64_t propagation_ns = 0;
+};
+
 // Collects arrivals and drops, each in order of time, for the next answer.
 class Outcomes
 {
@@ -68,6 +76,13 @@ class Outcomes
     {
         m_arrivals.Put(id).Put(at_ns).Put(agent).Put(uint32_t{0});
         m_arrivalCount++;
+    }
+
+    // As above, with the parts of the delay. A network that reports those of an arrival reports those of each.
+    void Arrive(uint64_t id, int64_t at_ns, uint32_t agent, const DelayParts& parts)
+    {
+        Arrive(id, at_ns, agent);
+        m_parts.Put(parts.queueing_ns).Put(parts.transmission_ns).Put(parts.propagation_ns);
     }
 
     void Drop(uint64_t id, const std::string& reason)
@@ -94,12 +109,13 @@ class Outcomes
         body.data += m_arrivals.data;
         body.Put(m_dropCount);
         body.data += m_drops.data;
+        body.data += m_parts.data;
         *this = Outcomes();
         return body.data;
     }
 
   private:
-    Writer m_arrivals, m_drops;
+    Writer m_arrivals, m_drops, m_parts;
     uint32_t m_arrivalCount = 0, m_dropCount = 0;
 };
 

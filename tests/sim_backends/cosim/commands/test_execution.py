@@ -2,16 +2,20 @@
 
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import pytest
 
 from fieldkit.core.events import Event
+from fieldkit.core.executors import Workers
 from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.commands import execution
 from sim_backends.cosim.commands.execution import between_windows
+from sim_backends.cosim.real_time import Pace
 from sim_backends.cosim.run_record import EventDigest, Window
 from sim_backends.world.motion import State
+from tests.helpers.runs import run_here
 
 INTERRUPTED_WINDOW = 7
 
@@ -81,3 +85,41 @@ def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyP
     assert (started, ended) == ([1, 2], True)
     assert [(result.seed, result.is_interrupted) for result in results] == [(1, False), (2, True)]
     assert results[1].simulated_s == 0.02
+
+
+def test_the_output_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:
+    outputs = []
+    for jobs in ("1", "2"):
+        words = (
+            "--seeds",
+            "3",
+            "--jobs",
+            jobs,
+            "--duration",
+            "600ms",
+            "--format",
+            "csv",
+            "--out",
+            f"jobs-{jobs}/runs",
+        )
+        run = run_here(tmp_path, "cosim", "run", "field_30ft", *words)
+        assert run.code == 0, run.err
+        folder = tmp_path / f"jobs-{jobs}"
+        tables = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("trial.csv")}
+        assert len(tables) == 3
+        outputs.append((run.out, tables))
+    assert outputs[0] == outputs[1]
+
+
+def test_the_number_of_workers_is_that_of_the_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = []
+
+    def completed(*_: object, workers: Workers) -> Iterator[object]:
+        chosen.append(workers)
+        yield from ()
+
+    monkeypatch.setattr(execution, "as_completed_tasks", completed)
+    scenario = load_scenario("field_30ft")
+    execution.simulate_all(scenario, "scheduled", [1, 2], None, sink=ignore, workers=Workers(2))
+    execution.simulate_all(scenario, "scheduled", [1, 2], None, sink=ignore, pace=Pace(1), workers=Workers(2))
+    assert chosen == [Workers(2), Workers(1)]

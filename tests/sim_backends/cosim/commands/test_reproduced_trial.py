@@ -6,17 +6,21 @@ import pytest
 from scapy.layers.inet import ICMP, IP, TCP, UDP
 from scapy.utils import PcapReader
 
+from fieldkit.core.columns import Value
 from fieldkit.core.model import Topology
+from fieldkit.trial.simulated import differences
 from sim_backends.cosim import load_scenario
 from sim_backends.cosim.commands.reproduced_rows import ReproducedRows
 from tests.helpers.runs import Run, rows, run_here
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
+@pytest.fixture(scope="module", params=["builtin", "ns3"])
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
     """Return the folder of a run of the shipped scenario, and its output."""
     folder = tmp_path_factory.mktemp("field")
-    ran = run_here(folder, "cosim", "run", "field_30ft", "--out", "simulated")
+    on_ns3 = ("--network", "ns3", "--policy", "sliding_window", "--window", "5ms")
+    options = on_ns3 if request.param == "ns3" else ()
+    ran = run_here(folder, "cosim", "run", "field_30ft", *options, "--out", "simulated")
     assert ran.code == 0, ran.err
     return folder / "simulated", ran
 
@@ -37,6 +41,13 @@ def test_rows_have_the_identity_and_the_columns_of_the_trial(run: tuple[Path, Ru
     fragments = [frame for frame in frames if frame[IP].proto == 17]
     assert int(udp["ip_packets_sent"]) == len(fragments)
     assert int(udp["datagrams_sent"]) == sum(UDP in frame for frame in fragments) == 29
+
+    arrived = list(PcapReader(str(folder / "captures" / "receiver.pcap")))
+    first_s = next(float(frame.time) for frame in arrived if TCP in frame and frame[TCP].dport == 1234)
+    last_s = max(float(frame.time) for frame in arrived if TCP in frame and len(frame[TCP].payload))
+    assert float(tcp["completion_s"]) == pytest.approx(last_s - first_s, abs=1e-5)
+    for row in (udp, tcp):
+        assert float(row["goodput_bit_s"]) == pytest.approx(8 * 230989 / float(row["completion_s"]), rel=1e-6)
 
     for row, payload_bytes in ((udp, 8192), (tcp, 502)):
         requests = {
@@ -80,3 +91,12 @@ def test_the_distance_is_that_of_the_trial_in_each_topology() -> None:
         scenario = load_scenario("field_30ft", {"topology": topology})
         assert scenario.trial is not None
         assert ReproducedRows(scenario, scenario.trial, "event_driven")._distance().metres == distance_m
+
+
+def test_a_contradiction_of_simulation_and_captures_makes_the_row_invalid() -> None:
+    measured: dict[str, Value] = {"datagrams_sent": 29, "tcp_received_bytes": 100, "reason": "text"}
+    agreeing: dict[str, Value] = {"datagrams_sent": 29, "received_bytes": 100, "sent_bytes": 7, "reason": "other"}
+    assert not differences(measured, agreeing)
+    assert differences(measured, {"received_bytes": 101}) == (
+        "tcp_received_bytes is 100 in the captures and 101 in the simulation"
+    )

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+import scipy
 
 from sim_backends.cosim.studies.intervals import Floats, IntervalEstimate, jackknife, mean, repeats_needed, t_quantile
 
@@ -15,12 +15,12 @@ def normal(*shape: int) -> Floats:
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 4, 7, 19, 20, 99, 1000])
 def test_students_quantile_equals_scipys(degrees: int) -> None:
-    assert t_quantile(degrees) == pytest.approx(stats.t.ppf(0.975, degrees), rel=1e-9)
+    assert t_quantile(degrees) == pytest.approx(scipy.stats.t.ppf(0.975, degrees), rel=1e-9)
 
 
 def test_a_mean_has_students_interval_and_a_single_value_has_none() -> None:
     values = normal(5)
-    expected = stats.t.interval(0.95, 4, values.mean(), stats.sem(values))
+    expected = scipy.stats.t.interval(0.95, 4, values.mean(), scipy.stats.sem(values))
     estimate = mean(values)
     assert (estimate.low, estimate.high) == pytest.approx(expected)
     assert mean(np.array([3.0])).value == 3.0
@@ -44,8 +44,8 @@ def test_the_needed_repeats_detect_a_difference_in_four_of_five_studies(differen
     """The exact power is computed with the noncentral t distribution."""
 
     def power(count: int) -> float:
-        wide, centre = stats.t.ppf(0.975, count - 1), difference / deviation * math.sqrt(count)
-        below, above = stats.nct.cdf([-wide, wide], count - 1, centre)
+        wide, centre = scipy.stats.t.ppf(0.975, count - 1), difference / deviation * math.sqrt(count)
+        below, above = scipy.stats.nct.cdf([-wide, wide], count - 1, centre)
         return float(below + 1 - above)
 
     count = repeats_needed(difference, deviation)

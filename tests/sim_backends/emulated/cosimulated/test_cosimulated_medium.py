@@ -1,25 +1,30 @@
 """The co-simulated medium between real namespaces: every policy, delays, motion by the physics, lateness."""
 
 import math
+import os
 import re
 import shlex
+import signal
 import socket
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import RobotError
+from fieldkit.core.errors import RobotError, TestbedLostError
 from fieldkit.core.model import Lateness, Vector
 from fieldkit.measure.evidence import oracle_delays
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.spec import ANTENNA_M
+from sim_backends.emulated.ros.steered import SILENT_NS
 from sim_backends.federates.frames import NETWORK
 from sim_backends.federates.named import command_line, default_options
 from sim_backends.world.world import load_world
 from tests.helpers.cosim_benches import BODY, PLACES, cosim_bench, distance_m
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
@@ -44,10 +49,28 @@ def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
     options = default_options("ns3", NETWORK)
     with cosim_bench(tmp_path, network=network, network_options=options) as bench:
         assert len(bench.ping()) == 20
+        parts = bench.medium.stats().delays["a", "b"]
+        (sample,) = bench.medium.links(continue_sampling=False)["a"]
         bench.ping("-b", count=3, address="10.9.0.255")
         stats = bench.medium.stats()
         assert stats.ports["b"].written == 23
         assert stats.ports["a"].written == 20
+    assert parts.packets == 20
+    assert 20 * 30_000 < parts.transmission_ns < 20 * 20_000_000, "84 bytes, from 65 Mbit/s to 1 Mbit/s with retries"
+    assert 20 * 20 < parts.propagation_ns < 20 * 40, "9 m at the speed of light"
+    (peer,) = sample.stations
+    assert (peer.station, peer.tx_packets, peer.rx_packets, peer.tx_failures) == ("b", 20, 20, 0)
+    assert peer.tx_rate_bit_s is not None
+    assert peer.rx_rate_bit_s is not None
+    assert 1e6 <= min(peer.tx_rate_bit_s, peer.rx_rate_bit_s) <= 65e6
+    assert sample.busy_ns is not None
+    assert sample.active_ns is not None
+    assert parts.transmission_ns < sample.busy_ns < sample.active_ns
+    (tmp_path / "builtin").mkdir()
+    with cosim_bench(tmp_path / "builtin") as bench:
+        (expected,) = bench.medium.links(continue_sampling=False)["a"]
+    assert peer.signal_dbm == pytest.approx(expected.stations[0].signal_dbm, abs=1e-6)
+    assert sample.noise_dbm == pytest.approx(expected.noise_dbm)
 
 
 DISC = """
@@ -137,6 +160,28 @@ def test_a_robot_hits_the_wall_and_is_put_elsewhere(physics: str, tmp_path: Path
         assert moved.place_m[0] == pytest.approx(PLACES["a"][0], abs=0.02)
         assert moved.place_m[1] == pytest.approx(PLACES["a"][1] + 0.2, abs=0.1)
         assert bench.ping(count=3)
+
+
+@pytest.mark.parametrize("physics", mark_nightly(["mujoco", "kinematic"]))
+def test_a_robot_stops_if_its_physics_is_suspended_or_killed(physics: str, tmp_path: Path) -> None:
+    """Its sensors and the lab extrapolate the last record for `SILENT_NS`; afterwards it is at rest."""
+    with cosim_bench(tmp_path, physics=physics) as bench:
+        pid = bench.medium.pid
+        bench.driven.drive(0.2, 1.0)
+        os.kill(pid, signal.SIGSTOP)
+        last = bench.driven.drive(0.2, SILENT_NS / 1e9)
+        assert last.moves
+        at_rest = last.at(time.monotonic_ns() + SILENT_NS)
+        assert not at_rest.moves
+        assert distance_m(at_rest, last.place_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
+        os.kill(pid, signal.SIGCONT)
+        wait_until(lambda: (motion := bench.driven.motion()) is not None and not motion.moves, Deadline.after(60))
+        wait_until(lambda: bench.driven.drive(0.2, 0.5).moves, Deadline.after(60))
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(TestbedLostError, match="killed by SIGKILL"):
+            bench.medium.place(PLACES)
+        motion = bench.driven.drive(0.2, SILENT_NS / 1e9)
+        assert not motion.at(time.monotonic_ns() + SILENT_NS).moves
 
 
 def test_a_robot_cannot_be_put_into_the_wall(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from scipy.stats import binomtest
+import scipy
 
 from benchmarks.namespaces import Namespace
 from fieldkit.config import schema
@@ -230,7 +230,9 @@ def test_loss_has_the_set_value(bench: Bench) -> None:
     spaces["a"].run(sys.executable, "-c", SPEAK, ADDRESSES["b"], "3000").check_returncode()
     until(lambda: medium.stats().links["a", "b"].sent == 3000, "all datagrams are on the air")
     counters = medium.stats().links["a", "b"]
-    interval = binomtest(counters.lost, counters.sent).proportion_ci(confidence_level=0.99, method="wilson")
+    interval = scipy.stats.binomtest(counters.lost, counters.sent).proportion_ci(
+        confidence_level=0.99, method="wilson"
+    )
     assert interval.low <= 0.1 <= interval.high
 
 

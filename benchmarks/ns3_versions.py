@@ -1,0 +1,156 @@
+"""Tests of the network ns-3 with other versions of ns-3: `python -m benchmarks.ns3_versions [trixie] [sid] [wheel]`.
+
+A name of a Debian release takes libns3-dev of that release with all libraries that it needs, from the mirror in the
+sources of apt; `wheel` takes the headers and libraries in the PyPI package `ns3`. They are extracted into a folder
+(about 1 GB per release), and nothing is installed. The g++ of this machine compiles the network against them, and the
+program runs with their libraries. Then the conformance suite and the tests in `tests/sim_backends/ns3` run. Each line
+of the output states the version that the program reports, and the results. The exit code is 1 if something failed.
+"""
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from sim_backends.federates.compiling import cache_folder
+
+NAMES: Final = ("trixie", "sid", "wheel")
+PACKAGES: Final = ("libns3-dev", "nlohmann-json3-dev", "libc6-dev")
+TESTS: Final = "tests/sim_backends/ns3"
+LIBRARIES: Final = "usr/lib/x86_64-linux-gnu"
+_MIRROR: Final = re.compile(r"^(?:URIs:|deb(?: \[[^\]]*\])?) *(https?://\S+/debian)/?(?:\s|$)", re.MULTILINE)
+
+
+def run(*words: str | Path) -> None:
+    """Run a command; raise if it fails."""
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+
+
+def mirror() -> str:
+    """Return the address of Debian in the sources of apt.
+
+    Raises:
+        RuntimeError: There is none.
+    """
+    folder = Path("/etc/apt")
+    for file in (folder / "sources.list", *sorted(folder.glob("sources.list.d/*"))):
+        if file.is_file() and (match := _MIRROR.search(file.read_text(encoding="utf-8"))):
+            return match[1]
+    raise RuntimeError("the sources of apt have no mirror of Debian")
+
+
+def extract_release(release: str, folder: Path) -> None:
+    """Extract libns3-dev of a Debian release and all packages that it needs into `root`, without installing them."""
+    apt, root = folder / "apt", folder / "root"
+    for name in ("etc/apt/sources.list.d", "etc/apt/preferences.d", "state/lists/partial", "cache/archives/partial"):
+        (apt / name).mkdir(parents=True, exist_ok=True)
+    (apt / "status").touch()
+    source = f"deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg] {mirror()} {release} main\n"
+    (apt / "etc/apt/sources.list").write_text(source, encoding="utf-8")
+    places = {
+        "Dir::Etc": "etc/apt",
+        "Dir::State": "state",
+        "Dir::State::status": "status",
+        "Dir::Cache": "cache",
+    }
+    options = [word for name, place in places.items() for word in ("-o", f"{name}={apt / place}")]
+    # Without root, apt would refuse to lock; the user `_apt` may not read the folder.
+    options += ["-o", "Debug::NoLocking=1", "-o", "APT::Sandbox::User=root", "-q"]
+    run("apt-get", *options, "update")
+    run("apt-get", *options, "install", "--download-only", "--no-install-recommends", "-y", *PACKAGES)
+    for link in ("bin", "lib", "lib64", "sbin"):  # a merged /usr, as base-files makes it
+        (root / "usr" / link).mkdir(parents=True, exist_ok=True)
+        if not (root / link).is_symlink():
+            (root / link).symlink_to(f"usr/{link}")
+    for package in sorted((apt / "cache/archives").glob("*.deb")):
+        archive = subprocess.run(("dpkg-deb", "--fsys-tarfile", package), check=True, stdout=subprocess.PIPE).stdout
+        words = ("tar", "-x", "--keep-directory-symlink", "--no-same-owner", "--exclude=./dev/*", "-C", str(root))
+        subprocess.run(words, check=True, input=archive)
+
+
+def extract_wheel(folder: Path) -> None:
+    """Extract the headers and libraries of the PyPI package `ns3`."""
+    run(sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--only-binary=:all:", "-d", folder, "ns3")
+    (wheel,) = folder.glob("ns3-*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "root")
+    for library in (folder / "root/ns3/lib64").glob("libns3.*-*.so"):
+        link = library.with_name(re.sub(r"^libns3\.\d+(-default)?-", "libns3-", library.name))
+        link.unlink(missing_ok=True)
+        link.symlink_to(library.name)
+
+
+def environment(folder: Path, *, is_wheel: bool) -> dict[str, str]:
+    """Write a `g++` that uses the extracted headers and libraries, and return the environment that finds it."""
+    root = folder / "root"
+    if is_wheel:
+        libraries = root / "ns3/lib64"
+        flags = f'-I{root}/ns3/include "$@" -L{libraries} -Wl,-rpath,{libraries} -Wl,--allow-shlib-undefined'
+        descriptions = f"{libraries}/pkgconfig:/usr/share/pkgconfig"
+    else:
+        libraries = root / LIBRARIES
+        loader = root / "lib64/ld-linux-x86-64.so.2"
+        paths = [libraries, *sorted({path.parent for path in libraries.glob("*/*.so*")})]
+        flags = (
+            f'--sysroot={root} "$@" -Wl,--dynamic-linker={loader} -Wl,--allow-shlib-undefined'
+            f" -Wl,--disable-new-dtags -Wl,-rpath,{':'.join(map(str, paths))}"
+        )
+        descriptions = f"{libraries}/pkgconfig:{root}/usr/share/pkgconfig"
+    wrapper = folder / "bin/g++"
+    wrapper.parent.mkdir(exist_ok=True)
+    wrapper.write_text(
+        f'#!/bin/sh\ncase "$*" in --version) exec /usr/bin/g++ "$@";; esac\nexec /usr/bin/g++ {flags}\n'
+    )
+    wrapper.chmod(0o755)
+    return {
+        **os.environ,
+        "PATH": f"{wrapper.parent}:{os.environ['PATH']}",
+        "PKG_CONFIG_LIBDIR": descriptions,
+        "XDG_CACHE_HOME": str(folder / "cache"),
+    }
+
+
+def check(name: str, folder: Path) -> bool:
+    """Extract a version, test it, and print the results; return True if all passed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / "root/usr/include").is_dir() and not (folder / "root/ns3").is_dir():
+        if name == "wheel":
+            extract_wheel(folder)
+        else:
+            extract_release(name, folder)
+    variables = environment(folder, is_wheel=name == "wheel")
+    conform = _last_line(folder, variables, "-m", "fieldkit", "cosim", "conform", "ns3")
+    tests = _last_line(folder, variables, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", TESTS)
+    version = _output(variables, "pkg-config", "--modversion", "ns3-core")
+    print(f"{name}: ns-3 {version}: conformance {conform[1]}; tests: {tests[1]}", flush=True)
+    return conform[0] and tests[0]
+
+
+def _output(variables: Mapping[str, str], *words: str) -> str:
+    return subprocess.run(words, env=dict(variables), capture_output=True, text=True, check=True).stdout.strip()
+
+
+def _last_line(folder: Path, variables: Mapping[str, str], *words: str) -> tuple[bool, str]:
+    """Run a program in Python; return True if it succeeded, and the last line of its output, which a file keeps."""
+    done = subprocess.run((sys.executable, *words), env=dict(variables), capture_output=True, text=True, check=False)
+    (folder / f"{words[1]}.txt").write_text(done.stdout + done.stderr, encoding="utf-8")
+    return not done.returncode, (done.stdout.strip() or done.stderr.strip()).rpartition("\n")[2]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Test the versions."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", default=NAMES, metavar="NAME", help="trixie, sid, wheel; by default all")
+    parser.add_argument("--folder", type=Path, default=cache_folder().parent / "ns3-versions")
+    options = parser.parse_args(arguments)
+    passed = [check(name, options.folder.resolve() / name) for name in options.names]
+    return 0 if all(passed) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

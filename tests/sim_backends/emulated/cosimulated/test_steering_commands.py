@@ -1,0 +1,68 @@
+"""Commanded velocities of a robot, also while the simulation lags behind real time."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sim_backends.emulated.cosimulated.steering import Steering
+from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
+from sim_backends.emulated.robot.commanded import Commanded, CommandedRecord
+from sim_backends.emulated.robot.spec import ANTENNA_M
+from sim_backends.physics.body import Twist
+from tests.helpers.cosim_benches import Driven
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def driven(tmp_path: Path) -> Driven:
+    driven = Driven.make(tmp_path / "robot")
+    driven.assign((1.0, 2.0, ANTENNA_M))
+    return driven
+
+
+@pytest.fixture
+def record(driven: Driven) -> Iterator[CommandedRecord]:
+    record = CommandedRecord.open(driven.folder / "commanded")
+    yield record
+    record.close()
+
+
+def placed(driven: Driven) -> tuple[Steering, int]:
+    """Return the steering of a robot at its place, and the time of its placement."""
+    start_ns = time.monotonic_ns()
+    steering = Steering(driven.descriptors, start_ns)
+    assert steering.poll_placement(start_ns) is not None
+    return steering, start_ns
+
+
+def test_a_simulation_that_lags_applies_every_velocity_at_its_time(driven: Driven, record: CommandedRecord) -> None:
+    """It lags by 200 ms, more than the interval of the velocities, 50 ms: each is read before it applies."""
+    steering, start_ns = placed(driven)
+    applied: list[tuple[int, Twist]] = []
+    for command in range(1, 21):
+        at_ns = start_ns + 50 * MS * command
+        record.write(Commanded(at_ns, 0.01 * command, 0.0))
+        applied += steering.commands(at_ns - 200 * MS)
+    assert applied == [(start_ns + 50 * MS * command, Twist(0.01 * command)) for command in range(1, 17)]
+
+
+def test_the_stop_after_a_missing_velocity_precedes_a_later_one(driven: Driven, record: CommandedRecord) -> None:
+    steering, start_ns = placed(driven)
+    first_ns, later_ns = start_ns + MS, start_ns + MS + 2 * TIMEOUT_NS
+    record.write(Commanded(first_ns, 0.2, 0.1))
+    assert list(steering.commands(first_ns)) == [(first_ns, Twist(0.2, 0.1))]
+    record.write(Commanded(later_ns, 0.1, 0.0))
+    assert list(steering.commands(later_ns)) == [(first_ns + TIMEOUT_NS, Twist()), (later_ns, Twist(0.1))]
+    assert list(steering.commands(later_ns + TIMEOUT_NS)) == [(later_ns + TIMEOUT_NS, Twist())]
+
+
+def test_a_velocity_from_before_a_placement_is_dropped(driven: Driven, record: CommandedRecord) -> None:
+    steering, start_ns = placed(driven)
+    record.write(Commanded(start_ns + 10 * MS, 0.2, 0.0))
+    assert list(steering.commands(start_ns)) == []
+    driven.assign((3.0, 2.0, ANTENNA_M))
+    assert steering.poll_placement(start_ns + 20 * MS) is not None
+    assert list(steering.commands(start_ns + 30 * MS)) == []
