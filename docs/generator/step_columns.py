@@ -58,8 +58,8 @@ def table_rows() -> str:
     )
     return page(
         "Rows of tables",
-        "Rows of the tables of `trial`, `aggregate`, `compare` and `report`, with their columns in `trial.csv`. FLOW is "
-        "`transfer`, `iperf3`, `soak` or `topic`. After a reboot; other faults have the same rows. "
+        "Rows of the tables of `trial`, `aggregate`, `compare` and `report`, with their columns in `trial.csv`. "
+        "FLOW is `transfer`, `iperf3`, `soak` or `topic`. After a reboot; other faults have the same rows. "
         "[Losses and marks](../glossary.md).",
         table(("row", "column", "meaning"), lines),
     )

@@ -17,7 +17,7 @@ from sim_backends.linux_wifi.rate_chain import RateChain, rate_chain
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.frames import HEADER_BYTES, TransmissionAttempt, decibel
 from sim_backends.radio.links import QUEUE_FULL, RADIO_OFF
-from sim_backends.radio.modes import BAND_2_4, SHORT_RETRY_LIMIT, WifiMode, basic_mode
+from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.rate_control import RateControl
@@ -29,9 +29,6 @@ _FCS_BYTES: Final = 4
 _LOWEST_SIGNAL_DBM: Final = -120
 _ABSENT: Final = ""
 """Station without a position: the receiver of frames to an address that no radio has."""
-
-
-_BASIC: Final = basic_mode(BAND_2_4)
 
 
 @dataclass(eq=False)
@@ -57,7 +54,7 @@ class FrameOnAir:
     attempts: int = 0
     acknowledged: bool = False
     signal_dbm: int = _LOWEST_SIGNAL_DBM
-    mode: WifiMode = _BASIC
+    mode: WifiMode = G_MODES[0]
     is_final: bool = False
 
 

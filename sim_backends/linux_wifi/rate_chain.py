@@ -21,7 +21,7 @@ from sim_backends.linux_wifi.hwsim_messages import (
     RATE_VHT,
     RateStage,
 )
-from sim_backends.radio.modes import BAND_2_4, G_MODES, N_MODES, SHORT_RETRY_LIMIT, WifiMode, basic_mode
+from sim_backends.radio.modes import G_MODES, N_MODES, SHORT_RETRY_LIMIT, WifiMode
 
 _DSSS_RATES: Final = 4
 """1, 2, 5.5 and 11 Mbit/s, with which the list of the band at 2.4 GHz begins."""
@@ -81,7 +81,7 @@ def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
         return N_MODES[stage.index] if 0 <= stage.index < len(N_MODES) else None
     index = stage.index if frequency_mhz >= _FIRST_5_GHZ_MHZ else stage.index - _DSSS_RATES
     if index < 0:
-        return basic_mode(BAND_2_4)
+        return G_MODES[0]
     return G_MODES[index] if index < len(G_MODES) else None
 
 

@@ -1,4 +1,4 @@
-"""The medium of a co-simulation: a physics moves emulated robots, and a network carries the packets of their programs.
+"""The medium of a co-simulation: a physics moves emulated robots, and a network delivers their packets.
 
 | module | purpose | imports |
 | --- | --- | --- |
