@@ -2,7 +2,8 @@
 
 Needs what `radio_vs_ns3` needs. All modes: airtimes, and packet errors of 1000 bytes. Known differences of
 airtimes are ns-3's: it does not end the data of short guard intervals at multiples of 4 us (19.4.3, 21.4.3), omits
-VHT-SIG-B (4 us) of frames to one station, and gives each HE-LTF 8 us at all guard intervals.
+VHT-SIG-B (4 us) of frames to one station, and gives each HE-LTF 8 us at all guard intervals. Then goodput with A-MPDU
+in one mode, without RTS: one station at signal-to-noise ratios down to the end of its range, and several stations.
 """
 
 import argparse
@@ -11,13 +12,24 @@ import sys
 from collections.abc import Iterator
 from typing import Final
 
-from benchmarks.radio_vs_ns3 import PAYLOAD_BYTES, Ns3, build, shift_db
+import numpy as np
+
+from benchmarks.radio_vs_ns3 import NOISE_DBM, PAYLOAD_BYTES, SENSITIVITY_DBM, TX_POWER_DBM, Ns3, Row, build, shift_db
+from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.high_throughput import HighThroughput, format_modes, guard_intervals_ns
+from sim_backends.radio.high_throughput import HighThroughput, PhyCapability, format_modes, guard_intervals_ns
 from sim_backends.radio.modes import WifiMode
+from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.radio.wifi import Wifi
+from sim_backends.radio.world_channel import WorldChannel
 
 WIDTHS_MHZ: Final[dict[HighThroughput, tuple[int, ...]]] = {"HT": (20, 40), "VHT": (20, 40, 80), "HE": (20, 40, 80)}
 STREAMS: Final = (1, 2)
+HT20_7: Final = format_modes("HT", "2.4 GHz", 20, 1, 800)[7]
+RATIOS_DB: Final = (40.0, 26.0, 24.5, 24.0, 23.5, 23.0)
+STATIONS: Final = (2, 5, 10, 20)
+QUEUED: Final = 300
+SECONDS: Final = 2.0
 HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
 
 
@@ -80,20 +92,68 @@ def error_curves(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
     return curves
 
 
+def goodput_mbit_s(mode: WifiMode, ratio_db: float, stations: int) -> float:
+    """Return the goodput of saturated stations with A-MPDU in the radio model, all at one signal-to-noise ratio."""
+    phy = PhyCapability(
+        "n" if mode.phy_format == "HT" else "ac" if mode.phy_format == "VHT" else "ax",
+        mode.band.name,
+        mode.width_mhz,
+        mode.streams,
+        mode.guard_interval_ns,
+    )
+    names = [*(f"s{number}" for number in range(stations)), "receiver"]
+    antennas = {name: Antenna("802.11n", TX_POWER_DBM, SENSITIVITY_DBM, phy) for name in names}
+    channel = WorldChannel(1, antennas, RadioOptions(fading=False, noise_floor_dbm=NOISE_DBM, mode=mode.name))
+    channel.use_losses(np.where(np.eye(len(names), dtype=bool), np.inf, _loss_db(ratio_db)))
+    wifi: Wifi[str] = Wifi(channel, 1)
+    for name in names[:-1]:
+        for _ in range(QUEUED):
+            wifi.send(0, name, name, PAYLOAD_BYTES + 28, "receiver")
+    arrived = lost = 0
+    while (now_ns := wifi.next_event_ns()) is not None and now_ns < SECONDS * 1e9:
+        sources = [source for _, _, _, source, _ in wifi.deliveries(now_ns)]
+        arrived += len(sources)
+        lost_now = sum(counters.lost for counters in wifi.counters().values()) if stations == 1 else 0
+        sources += names[:1] * (lost_now - lost)
+        lost = lost_now
+        for source in sources:
+            wifi.send(now_ns, source, source, PAYLOAD_BYTES + 28, "receiver")
+    return arrived * PAYLOAD_BYTES * 8 / SECONDS / 1e6
+
+
+def _loss_db(ratio_db: float) -> float:
+    """Return the path loss that gives a signal-to-noise ratio in 20 MHz."""
+    return TX_POWER_DBM - NOISE_DBM - ratio_db
+
+
+def goodputs(ns3: Ns3) -> list[Row]:
+    """Return goodputs in Mbit/s over the signal-to-noise ratio, and for contending stations."""
+    rows: list[Row] = []
+    for ratio_db, stations in (*((ratio_db, 1) for ratio_db in RATIOS_DB), *((50.0, count) for count in STATIONS)):
+        options = ns3_options(HT20_7) | {"loss": _loss_db(ratio_db), "stations": stations, "ampdu": 65_535}
+        ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
+        name = f"{HT20_7.name}, {ratio_db} dB, {stations} stations"
+        rows.append((name, ns3_value, goodput_mbit_s(HT20_7, ratio_db, stations)))
+    return rows
+
+
 def main() -> None:
     """Run both and print the differences."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print single values")
     arguments = parser.parse_args()
     ns3 = build()
-    differences, curves = airtime_differences(ns3), error_curves(ns3)
+    differences, curves, rows = airtime_differences(ns3), error_curves(ns3), goodputs(ns3)
     if arguments.json:
-        json.dump({"airtime_difference_ns": differences, "packet_error": curves}, sys.stdout)
+        json.dump({"airtime_difference_ns": differences, "packet_error": curves, "goodput_mbit_s": rows}, sys.stdout)
         return
     largest_ns = max(differences.values(), key=abs)
     print(f"airtimes of {len(differences)} modes: largest unexplained difference {largest_ns} ns")
     print("packet error against ratio, largest shift at errors of 50, 10 and 1 % (dB):")
     print("  " + ", ".join(f"{name} {shift_db(curve):+.2f}" for name, curve in curves.items()))
+    print(f"{'UDP goodput (Mbit/s)':44}{'ns-3':>9}{'ours':>9}")
+    for what, ns3_value, own_value in rows:
+        print(f"{what:44}{ns3_value:9.2f}{own_value:9.2f}")
 
 
 if __name__ == "__main__":

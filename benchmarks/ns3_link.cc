@@ -135,6 +135,9 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     phy.Set("Antennas", UintegerValue(options.streams));
     phy.Set("MaxSupportedTxSpatialStreams", UintegerValue(options.streams));
     phy.Set("MaxSupportedRxSpatialStreams", UintegerValue(options.streams));
+    // Without RTS, also before aggregates of more than 65,535 bytes; the window of Block Acks of 802.11ax.
+    Config::SetDefault("ns3::WifiRemoteStationManager::RtsCtsThreshold", UintegerValue(4692480));
+    Config::SetDefault("ns3::HeConfiguration::MpduBufferSize", UintegerValue(256));
     Config::SetDefault("ns3::HtConfiguration::ShortGuardIntervalSupported", BooleanValue(options.guard_ns == 400));
     Config::SetDefault("ns3::HeConfiguration::GuardInterval", TimeValue(NanoSeconds(std::max<int>(options.guard_ns, 800))));
     WifiHelper wifi;
@@ -170,6 +173,11 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
 
 double Goodput(const Options& options)
 {
+    if (options.ampdu)
+    {
+        // Frames that exceed a time limit would leave gaps in the windows of the Block Acks.
+        Config::SetDefault("ns3::WifiMacQueue::MaxDelay", TimeValue(Seconds(1000)));
+    }
     NodeContainer nodes;
     nodes.Create(options.stations + 1 + (options.relay ? 1 : 0));
     auto devices = Install(options, nodes);

@@ -104,10 +104,10 @@ class _ChainRates(RateControl):
         return self._frame.chain.modes[attempt - 1]
 
     @override
-    def report(self, mode: WifiMode, *, acknowledged: bool) -> None:
+    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
         frame = self._frame
         assert frame is not None
-        frame.acknowledged = acknowledged
+        frame.acknowledged = bool(acknowledged)
         if acknowledged:
             transmitter, receiver = self._ends
             frame.signal_dbm = self._channel.signal_dbm(receiver, transmitter, self._now_ns)

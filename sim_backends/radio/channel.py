@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from fieldkit.core.model import Vector
+from sim_backends.radio.aggregation import AmpduLimits
 from sim_backends.radio.modes import BAND_2_4, Band
 from sim_backends.radio.rate_control import RateControl
 
@@ -39,6 +40,14 @@ class RadioChannel(Protocol):
     def delay_ns(self, transmitter: int, receiver: int) -> int:
         """Return the propagation delay, in ns."""
         ...
+
+    def ifs_ns(self, station: int) -> int:  # noqa: ARG002 (a default)
+        """Return the inter-frame space of a station before its backoff: DIFS, or the AIFS of a station with QoS."""
+        return self.band.difs_ns
+
+    def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:  # noqa: ARG002 (a default)
+        """Return the limits of aggregates on a link; None if its frames are not aggregated."""
+        return None
 
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
         """Return the rate control of a link; called once per link."""

@@ -29,11 +29,11 @@ class Contention:
         slots: Backoff slots that remain.
     """
 
-    __slots__ = ("_draw", "_ifs_ns", "_window", "busy_until_ns", "count_from_ns", "slots")
+    __slots__ = ("_draw", "_window", "busy_until_ns", "count_from_ns", "ifs_ns", "slots")
 
     def __init__(self, draw: Callable[[], float], ifs_ns: int) -> None:
         self._draw = draw
-        self._ifs_ns = ifs_ns
+        self.ifs_ns = ifs_ns
         self._window = CW_MIN
         self.busy_until_ns = 0
         self.count_from_ns = 0
@@ -63,7 +63,7 @@ class Contention:
         elif now_ns > self.count_from_ns:
             self._count_down(now_ns)
         # An ACK changes nothing for stations that decoded the data frame, which reserved the time of its ACK.
-        if until_ns > self.busy_until_ns or until_ns + self._ifs_ns > self.count_from_ns:
+        if until_ns > self.busy_until_ns or until_ns + self.ifs_ns > self.count_from_ns:
             self.set_busy_until(until_ns)
         # A station that drew 0 slots draws again if the channel is busy, as in `earliest_start_ns`.
         if not self.slots:
@@ -80,8 +80,8 @@ class Contention:
         # statements.
         if until_ns > self.busy_until_ns:  # noqa: PLR1730 (see above)
             self.busy_until_ns = until_ns
-        if until_ns + self._ifs_ns > self.count_from_ns:  # noqa: PLR1730 (see above)
-            self.count_from_ns = until_ns + self._ifs_ns
+        if until_ns + self.ifs_ns > self.count_from_ns:  # noqa: PLR1730 (see above)
+            self.count_from_ns = until_ns + self.ifs_ns
 
     def on_success(self) -> None:
         """Reset the contention window and draw a backoff, after a frame that was delivered or given up."""

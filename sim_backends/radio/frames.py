@@ -15,7 +15,7 @@ from sim_backends.radio.links import (
     Delay,
     Payload,
 )
-from sim_backends.radio.modes import SHORT_RETRY_LIMIT, WifiMode
+from sim_backends.radio.modes import ACK_BYTES, SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.random_streams import PacketIdentity
 
 PREAMBLE_SNR_DB: Final = 4.0
@@ -58,6 +58,7 @@ class Transmission:
         detected_by: Indices of the stations that detect it, whether or not they can receive it.
         interferers: Frames and jammer noise that overlap it in time.
         receivers: Indices of the stations that are synchronized to it, and so receive it.
+        response_bytes: Size of the ACK or Block Ack to it.
     """
 
     transmitter: int
@@ -71,6 +72,7 @@ class Transmission:
     detected_by: Sequence[int] = ()
     interferers: list["Transmission | Emission"] = field(default_factory=list)
     receivers: set[int] = field(default_factory=set)
+    response_bytes: int = ACK_BYTES
 
 
 def success_probability(frame: Transmission, receiver: int, noise_mw: float) -> float:
@@ -84,16 +86,23 @@ def success_probability(frame: Transmission, receiver: int, noise_mw: float) -> 
         receiver: Index of the receiver.
         noise_mw: Its noise power in 20 MHz.
     """
+    return part_success_probability(frame, receiver, noise_mw, (frame.start_ns, frame.end_ns), 8.0 * frame.size_bytes)
+
+
+def part_success_probability(
+    frame: Transmission, receiver: int, noise_mw: float, part_ns: tuple[int, int], bits: float
+) -> float:
+    """Return the probability that the bits that a frame carries between two times are decoded."""
+    start_ns, end_ns = part_ns
     signal_mw = frame.powers_mw[receiver]
     noise_mw *= frame.mode.noise_factor
-    bits = 8.0 * frame.size_bytes
     if not frame.interferers:
         return math.exp(log_success(frame.mode, decibel(signal_mw / noise_mw), bits))
-    edges = {frame.start_ns, frame.end_ns}
+    edges = {start_ns, end_ns}
     for other in frame.interferers:
-        edges.update(min(max(edge, frame.start_ns), frame.end_ns) for edge in (other.start_ns, other.end_ns))
+        edges.update(min(max(edge, start_ns), end_ns) for edge in (other.start_ns, other.end_ns))
     times = sorted(edges)
-    length_ns = frame.end_ns - frame.start_ns
+    length_ns = end_ns - start_ns
     logarithm = 0.0
     for begin, end in itertools.pairwise(times):
         interference_mw = sum(
@@ -127,6 +136,8 @@ class Frame(Generic[Payload]):
         before: Sum of the delays before this hop, in the packed form of `links.Delay`; 0 for none.
         first_attempt_ns: Start of its first attempt.
         attempts: Number of attempts so far.
+        sequence: Its number in a Block Ack session; -1 before its first attempt, or without a session.
+        is_received: True if the receiver of a Block Ack session has decoded it.
         max_attempts: Number of attempts after which it is given up.
     """
 
@@ -141,6 +152,8 @@ class Frame(Generic[Payload]):
     before: Delay = 0
     first_attempt_ns: int = 0
     attempts: int = 0
+    sequence: int = -1
+    is_received: bool = False
     max_attempts: int = SHORT_RETRY_LIMIT
 
     def total_delay(self, now_ns: int, propagation_ns: int) -> Delay:
@@ -182,16 +195,19 @@ class TransmissionAttempt:
 
 
 def attempt_record(
-    names: Sequence[str], transmission: Transmission, frame: Frame[Any], received: Iterable[int]
+    names: Sequence[str], transmission: Transmission, frame: Frame[Any], received: Iterable[int], size_bytes: int
 ) -> TransmissionAttempt:
-    """Return the log entry of an attempt at `frame`, decoded by the stations with the indices `received`."""
+    """Return the log entry of an attempt at `frame`, decoded by the stations with the indices `received`.
+
+    `size_bytes` is its size with MAC header and FCS. Frames of one aggregate have the times of the whole.
+    """
     return TransmissionAttempt(
         transmission.start_ns,
         transmission.end_ns,
         names[transmission.transmitter],
         None if frame.receiver is None else names[frame.receiver],
         transmission.mode,
-        transmission.size_bytes,
+        size_bytes,
         frame.attempts,
         tuple(names[index] for index in received),
         frame.payload,

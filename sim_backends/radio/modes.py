@@ -51,6 +51,11 @@ class Band:
         """Inter-frame space before the backoff of stations without QoS: 10.3.7."""
         return self.sifs_ns + 2 * SLOT_NS
 
+    @property
+    def best_effort_aifs_ns(self) -> int:
+        """Inter-frame space of the access category best effort, AIFSN 3: 10.3.2.3.6 and table 9-155."""
+        return self.sifs_ns + 3 * SLOT_NS
+
 
 CHANNEL_6_HZ: Final = 2.437e9
 
@@ -222,4 +227,10 @@ def control_mode(mode: WifiMode) -> WifiMode:
 @cache
 def ack_ns(mode: WifiMode) -> int:
     """Return the airtime of the ACK to a frame in `mode`."""
-    return control_mode(mode).airtime_ns(ACK_BYTES)
+    return response_ns(mode, ACK_BYTES)
+
+
+@cache
+def response_ns(mode: WifiMode, size_bytes: int) -> int:
+    """Return the airtime of the ACK or Block Ack of this size to a frame in `mode`."""
+    return control_mode(mode).airtime_ns(size_bytes)

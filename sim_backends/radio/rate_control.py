@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Final, Protocol
 
 from sim_backends.radio.error_rates import packet_error
+from sim_backends.radio.frames import decibel
 from sim_backends.radio.modes import CW_MIN, SHORT_RETRY_LIMIT, SLOT_NS, WifiMode, ack_ns
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
@@ -21,8 +22,8 @@ class RateControl(Protocol):
         """
         ...
 
-    def report(self, mode: WifiMode, *, acknowledged: bool) -> None:
-        """Record the result of an attempt."""
+    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+        """Record how many of the frames of an attempt were acknowledged."""
         ...
 
 
@@ -40,7 +41,7 @@ class FixedRate:
         """Implement `RateControl.choose`."""
         return self._mode
 
-    def report(self, mode: WifiMode, *, acknowledged: bool) -> None:
+    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
         """Implement `RateControl.report`."""
 
 
@@ -52,6 +53,8 @@ _SEGMENT_NS: Final = 6_000_000
 _LOW_SHARE, _HIGH_SHARE = 0.1, 0.95
 _SAMPLES: Final = 4
 _STALE_UPDATES: Final = 20
+# A mode of aggregates that fails is evaluated before the end of its interval, as in Linux's minstrel_ht.
+_FAILING_ATTEMPTS, _FAILING_SHARE = 30, 0.2
 
 
 class Minstrel:
@@ -68,21 +71,29 @@ class Minstrel:
 
     Three things differ. The initial shares are computed from the signal-to-noise ratio, like in drivers that start
     from RSSI. The frames that sample, and the sampled modes, are drawn per frame and not counted, so that an
-    additional frame does not change the results of others. 802.11n's modes are selected by the same algorithm, for
-    which Linux has minstrel_ht.
+    additional frame does not change the results of others. Modes of 802.11n and later are selected by the same
+    algorithm, for which Linux has minstrel_ht; it measures the mean length of aggregates, which is an argument here.
 
     Args:
         modes: The available modes, two or more, slowest first.
-        snr_db: Mean signal-to-noise ratio at the receiver.
+        snr_db: Mean signal-to-noise ratio at the receiver, with the noise of 20 MHz.
         draws: Random draws for sampling.
+        frames_per_exchange: Number of frames that share the times between frames, the preamble and the response.
     """
 
-    def __init__(self, modes: Sequence[WifiMode], snr_db: float, draws: PacketDraws) -> None:
+    def __init__(
+        self, modes: Sequence[WifiMode], snr_db: float, draws: PacketDraws, *, frames_per_exchange: int = 1
+    ) -> None:
         self._modes = tuple(modes)
         self._draws = draws
-        self._time_ns = {mode: _exchange_ns(mode) for mode in modes}
-        self._max_attempts = {mode: _count_fitting_attempts(time_ns) for mode, time_ns in self._time_ns.items()}
-        self._share = {mode: 1 - packet_error(mode, snr_db, _REFERENCE_BYTES) for mode in modes}
+        self._time_ns = {mode: _time_per_frame_ns(mode, frames_per_exchange) for mode in modes}
+        self._frames_per_exchange = frames_per_exchange
+        self._max_attempts = {
+            mode: _count_fitting_attempts(frames_per_exchange * time_ns) for mode, time_ns in self._time_ns.items()
+        }
+        self._share = {
+            mode: 1 - packet_error(mode, snr_db - decibel(mode.noise_factor), _REFERENCE_BYTES) for mode in modes
+        }
         self._attempts = dict.fromkeys(modes, 0)
         self._acknowledged = dict.fromkeys(modes, 0)
         self._unused_updates = dict.fromkeys(modes, 0)
@@ -102,10 +113,16 @@ class Minstrel:
             )
         return self._rate_chain[attempt - 1]
 
-    def report(self, mode: WifiMode, *, acknowledged: bool) -> None:
+    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
         """Implement `RateControl.report`."""
-        self._attempts[mode] += 1
+        self._attempts[mode] += attempts
         self._acknowledged[mode] += acknowledged
+        if self._frames_per_exchange > 1 and self._is_failing(mode):
+            self._updated_ns = -_UPDATE_NS
+
+    def _is_failing(self, mode: WifiMode) -> bool:
+        attempts = self._attempts[mode]
+        return attempts > _FAILING_ATTEMPTS and self._acknowledged[mode] < _FAILING_SHARE * attempts
 
     def _update(self, now_ns: int) -> None:
         for mode, attempts in self._attempts.items():
@@ -169,6 +186,11 @@ def _count_fitting_attempts(time_ns: int) -> int:
         attempts, window = attempts + 1, 2 * window + 1
         elapsed_ns += time_ns + window * SLOT_NS // 2
     return attempts
+
+
+def _time_per_frame_ns(mode: WifiMode, frames: int) -> int:
+    exchange_ns, bits = _exchange_ns(mode), 8 * _REFERENCE_BYTES * 1_000_000_000
+    return (exchange_ns + (frames - 1) * bits // mode.rate_bit_s) // frames
 
 
 def _exchange_ns(mode: WifiMode) -> int:

@@ -5,9 +5,17 @@ from dataclasses import dataclass
 from operator import ge
 from typing import Final, Generic
 
+from sim_backends.radio.aggregation import QOS_HEADER_BYTES, Aggregate
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import CCA_TIME_NS, EventQueue
-from sim_backends.radio.frames import PREAMBLE_SNR_DB, Emission, Transmission, success_probability
+from sim_backends.radio.frames import (
+    PREAMBLE_SNR_DB,
+    Emission,
+    Frame,
+    Transmission,
+    part_success_probability,
+    success_probability,
+)
 from sim_backends.radio.links import Payload
 from sim_backends.radio.modes import ENERGY_DETECTION_DBM, ack_ns, basic_mode
 from sim_backends.radio.random_streams import PacketDraws
@@ -52,7 +60,7 @@ class Reception(Generic[Payload]):
         self._stations = stations
         self._events = events
         band = channel.band
-        self._eifs_ns = band.sifs_ns + ack_ns(basic_mode(band)) + band.difs_ns
+        self._eifs_extra_ns = band.sifs_ns + ack_ns(basic_mode(band))
         self._on_air: list[Transmission] = []
         self._emissions: dict[str, Emission] = {}
         self._draws: dict[tuple[int, int, str], PacketDraws] = {}
@@ -97,11 +105,11 @@ class Reception(Generic[Payload]):
         for index in transmission.receivers:
             self._stations[index].receiving = None
         if transmission.interferers:
-            until_ns = now_ns + self._eifs_ns
+            until_ns = now_ns + self._eifs_extra_ns
             for index in transmission.detected_by:
                 neighbour = self._stations[index]
                 if index not in transmission.receivers and neighbour.sending_until_ns < now_ns:
-                    neighbour.contention.defer_until(until_ns)
+                    neighbour.contention.defer_until(until_ns + neighbour.contention.ifs_ns)
                     if index in self._events.starts:
                         self._events.schedule_start(neighbour.contention.earliest_start_ns(now_ns), index)
             transmission.interferers.clear()
@@ -151,6 +159,31 @@ class Reception(Generic[Payload]):
             transmission, index, self._channel.noise_mw[index]
         )
 
+    def decoded_frames(
+        self, index: int, transmission: Transmission, aggregate: Aggregate[Payload]
+    ) -> list[Frame[Payload]]:
+        """Return the frames of an aggregate that ends now and that a station decodes; call it once, before `end`."""
+        if index not in transmission.receivers:
+            return []
+        noise_mw, draws = self._channel.noise_mw[index], self._link_draws(transmission.transmitter, index, "data")
+        start_ns = transmission.start_ns + transmission.mode.preamble_ns
+        ns_per_byte = (transmission.end_ns - start_ns) / aggregate.size_bytes
+        decoded, before_bytes = [], 0
+        probabilities: dict[int, float] = {}
+        for frame in aggregate.frames:
+            size_bytes = frame.size_bytes + QOS_HEADER_BYTES
+            probability = None if transmission.interferers else probabilities.get(size_bytes)
+            if probability is None:
+                begin_ns = start_ns + round(before_bytes * ns_per_byte)
+                end_ns = begin_ns + max(round(size_bytes * ns_per_byte), 1)
+                probability = probabilities[size_bytes] = part_success_probability(
+                    transmission, index, noise_mw, (begin_ns, end_ns), 8.0 * size_bytes
+                )
+            before_bytes += size_bytes
+            if draws.draw(frame.packet, frame.attempts) < probability:
+                decoded.append(frame)
+        return decoded
+
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
         reach = self._reaches.get(transmitter)
@@ -162,10 +195,13 @@ class Reception(Generic[Payload]):
         return reach
 
     def _draw(self, transmission: Transmission, receiver: int, purpose: str) -> float:
-        key = transmission.transmitter, receiver, purpose
+        draws = self._link_draws(transmission.transmitter, receiver, purpose)
+        return draws.draw(transmission.packet, transmission.attempt)
+
+    def _link_draws(self, transmitter: int, receiver: int, purpose: str) -> PacketDraws:
+        key = transmitter, receiver, purpose
         draws = self._draws.get(key)
         if draws is None:
             names = self._channel.names
-            draws = PacketDraws(self._seed, names[transmission.transmitter], names[receiver], purpose)
-            self._draws[key] = draws
-        return draws.draw(transmission.packet, transmission.attempt)
+            draws = self._draws[key] = PacketDraws(self._seed, names[transmitter], names[receiver], purpose)
+        return draws

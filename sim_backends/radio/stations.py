@@ -1,10 +1,9 @@
-"""State of the stations, of their links to the peers to which they send, and the counters of their drivers."""
+"""State of the stations, and of their links to the peers to which they send."""
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Generic
 
+from sim_backends.radio.aggregation import Aggregate, BlockAckSession
 from sim_backends.radio.contention import Contention
 from sim_backends.radio.frames import Frame, Transmission
 from sim_backends.radio.links import LinkCounters, Payload
@@ -29,12 +28,14 @@ class Station(Generic[Payload]):
         exchange_id: Number that increases at the start and the end of each exchange of a frame and its ACK; odd
             during an exchange.
         offered: Number of packets that were passed to it for sending.
+        aggregate: The aggregate of its current exchange; None if it sends a single frame without a session.
     """
 
     __slots__ = (
         "_draws",
         "_redraws",
         "_redraws_of",
+        "aggregate",
         "contention",
         "exchange_id",
         "index",
@@ -52,6 +53,7 @@ class Station(Generic[Payload]):
         self.contention = Contention(self._backoff, ifs_ns)
         self.queue: deque[Frame[Payload]] = deque()
         self.receiving: Transmission | None = None
+        self.aggregate: Aggregate[Payload] | None = None
         self.sending_until_ns = 0
         self.exchange_id = self.offered = 0
 
@@ -71,18 +73,42 @@ class Peer(Generic[Payload]):
     Args:
         receiver: Index of the peer.
         rate: Rate control of the link.
+        session: Block Ack session of the link; None if its frames are not aggregated.
 
     Attributes:
+        failed_exchanges: Number of aggregates without a Block Ack since the last one.
         last_frame: The last frame that the peer received; a retry after a lost ACK is a duplicate of it.
     """
 
-    __slots__ = ("delivered", "last_frame", "lost", "queue_dropped", "rate", "receiver", "sent")
+    __slots__ = (
+        "delivered",
+        "failed_exchanges",
+        "last_frame",
+        "lost",
+        "queue_dropped",
+        "rate",
+        "receiver",
+        "sent",
+        "session",
+    )
 
-    def __init__(self, receiver: int, rate: RateControl) -> None:
+    def __init__(self, receiver: int, rate: RateControl, session: BlockAckSession[Payload] | None) -> None:
         self.receiver = receiver
         self.rate = rate
+        self.session = session
         self.sent = self.queue_dropped = self.lost = self.delivered = 0
+        self.failed_exchanges = 0
         self.last_frame: Frame[Payload] | None = None
+
+    def has_received(self, frame: Frame[Payload]) -> bool:
+        """Return True if the peer has decoded a frame that may not have been acknowledged."""
+        return frame.is_received or self.last_frame is frame
+
+    def count_frames(self, *, delivered: int, lost: int) -> None:
+        """Count the final results of the frames of an aggregate."""
+        self.sent += delivered + lost
+        self.delivered += delivered
+        self.lost += lost
 
     def count(self, *, delivered: bool) -> None:
         """Count the final result of a frame."""
@@ -94,62 +120,3 @@ class Peer(Generic[Payload]):
     def counters(self) -> LinkCounters:
         """The counters so far."""
         return LinkCounters(self.sent, self.queue_dropped, self.lost, self.delivered)
-
-
-@dataclass(slots=True)
-class LinkMeter:
-    """Counters of one directed link.
-
-    Attributes:
-        frames: Packets whose first attempt has started.
-        retries: Attempts after the first.
-        failures: Packets given up after the last attempt.
-        rate_bit_s: Rate of the last attempt; None before the first.
-    """
-
-    frames: int = 0
-    retries: int = 0
-    failures: int = 0
-    rate_bit_s: int | None = None
-
-
-class RadioMeter:
-    """Counters for stations that share one channel.
-
-    Args:
-        stations: Number of stations.
-    """
-
-    def __init__(self, stations: int) -> None:
-        self._links: dict[tuple[int, int], LinkMeter] = {}
-        self._busy_ns = [0] * stations
-        self._busy_until_ns = [0] * stations
-
-    def on_start(self, transmission: Transmission, receiver: int | None) -> None:
-        """Record a frame that starts now; `receiver` is None for broadcasts and ACKs."""
-        start_ns, end_ns = transmission.start_ns, transmission.end_ns
-        busy_ns, busy_until_ns = self._busy_ns, self._busy_until_ns
-        for index in (transmission.transmitter, *transmission.detected_by):
-            until_ns = busy_until_ns[index]
-            if end_ns > until_ns:
-                busy_ns[index] += end_ns - max(start_ns, until_ns)
-                busy_until_ns[index] = end_ns
-        if receiver is not None:
-            link = self.link(transmission.transmitter, receiver)
-            if transmission.attempt == 1:
-                link.frames += 1
-            else:
-                link.retries += 1
-            link.rate_bit_s = transmission.mode.rate_bit_s
-
-    def on_failure(self, transmitter: int, receiver: int) -> None:
-        """Record that a packet was given up."""
-        self.link(transmitter, receiver).failures += 1
-
-    def link(self, transmitter: int, receiver: int) -> LinkMeter:
-        """Return the counters of a link, which continue to change."""
-        return self._links.setdefault((transmitter, receiver), LinkMeter())
-
-    def busy_ns(self, now_ns: int) -> Sequence[int]:
-        """Return the time for which each station found its channel busy until now, by index."""
-        return [busy - max(0, until - now_ns) for busy, until in zip(self._busy_ns, self._busy_until_ns, strict=True)]

@@ -1,17 +1,19 @@
 """802.11 stations on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
 
 An event-driven engine on integer nanoseconds that uses no clock and no socket; its interface is `model.RadioModel`.
-It does not model RTS/CTS (drivers switch it off below 2347 bytes), A-MPDU aggregation, beacons of the access point,
-power save and fragmentation.
+Frames between stations with `phy` are aggregated. It does not model RTS/CTS (drivers switch it off below 2347 bytes),
+other access categories than best effort, beacons of the access point, power save and fragmentation.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Set
 from itertools import permutations
 from typing import Final, Generic
 
-from fieldkit.core.model import LinkSample, StationSample
+from fieldkit.core.model import LinkSample
+from sim_backends.radio.aggregation import QOS_HEADER_BYTES, Aggregate, BlockAckSession, remove_frames
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import EventQueue
+from sim_backends.radio.driver_statistics import RadioMeter, link_samples
 from sim_backends.radio.frames import (
     HEADER_BYTES,
     Emission,
@@ -20,7 +22,6 @@ from sim_backends.radio.frames import (
     TransmissionAttempt,
     ack_record,
     attempt_record,
-    decibel,
 )
 from sim_backends.radio.links import (
     NOT_DECODED,
@@ -36,17 +37,17 @@ from sim_backends.radio.links import (
     Payload,
 )
 from sim_backends.radio.modes import (
-    ACK_BYTES,
     SHORT_RETRY_LIMIT,
     SLOT_NS,
     WifiMode,
     ack_ns,
     basic_mode,
     control_mode,
+    response_ns,
 )
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.reception import Reception
-from sim_backends.radio.stations import Peer, RadioMeter, Station
+from sim_backends.radio.stations import Peer, Station
 
 # 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
 _ACK_TIMEOUT_AFTER_SIFS_NS: Final = SLOT_NS + 20_000
@@ -78,7 +79,8 @@ class Wifi(Generic[Payload]):
         self._sifs_ns = band.sifs_ns
         self._ack_timeout_ns = band.sifs_ns + _ACK_TIMEOUT_AFTER_SIFS_NS
         self._stations: list[Station[Payload]] = [
-            Station(index, PacketDraws(seed, name, "backoff"), band.difs_ns) for name, index in self._index.items()
+            Station(index, PacketDraws(seed, name, "backoff"), channel.ifs_ns(index))
+            for name, index in self._index.items()
         ]
         self._peers: dict[tuple[int, int], Peer[Payload]] = {}
         self._events = EventQueue(self._start_transmission)
@@ -102,36 +104,7 @@ class Wifi(Generic[Payload]):
         self.advance(now_ns)
         if self._meter is None:
             return {}
-        busy_ns = self._meter.busy_ns(now_ns)
-        return {
-            name: LinkSample(
-                utc_ns,
-                tuple(self._station_sample(now_ns, self._meter, index, other) for other in self._associated(index)),
-                noise_dbm=decibel(self._channel.noise_mw[index]),
-                active_ns=now_ns,
-                busy_ns=busy_ns[index],
-            )
-            for name, index in self._index.items()
-        }
-
-    def _associated(self, index: int) -> list[int]:
-        """Return the indices of the stations to which a station sends frames: all others, or its access point."""
-        others = range(len(self._stations)) if self._relay in {None, index} else (self._relay,)
-        return [other for other in others if other is not None and other != index]
-
-    def _station_sample(self, now_ns: int, meter: RadioMeter, index: int, other: int) -> StationSample:
-        name, linked = self._channel.names[other], self._channel.linked(other, index)
-        sent, reverse, peer = meter.link(index, other), meter.link(other, index), self._peers.get((other, index))
-        return StationSample(
-            station=name,
-            signal_dbm=decibel(self._channel.powers_mw(other, now_ns)[index]) if linked else None,
-            tx_rate_bit_s=sent.rate_bit_s,
-            rx_rate_bit_s=reverse.rate_bit_s,
-            tx_packets=sent.frames,
-            rx_packets=0 if peer is None else peer.delivered,
-            tx_retries=sent.retries,
-            tx_failures=sent.failures,
-        )
+        return link_samples(now_ns, utc_ns, self._channel, self._meter, self._peers, relay=self._relay)
 
     def switch_off(self, now_ns: int, names: Set[str]) -> None:
         """Set the stations whose radios are off; the caller must also put them out of range of all others.
@@ -144,10 +117,14 @@ class Wifi(Generic[Payload]):
             self._reception.abort(station.index, now_ns)
             self._events.cancel_start(station.index)
             station.exchange_id += station.exchange_id & 1
+            station.aggregate = None
             while station.queue:
                 frame = station.queue.popleft()
-                if frame.receiver is None or self._peer(station.index, frame.receiver).last_frame is not frame:
+                peer = None if frame.receiver is None else self._peer(station.index, frame.receiver)
+                if peer is None or not peer.has_received(frame):
                     self._lose(now_ns, station.index, frame, RADIO_OFF)
+                    if peer is not None and peer.session is not None:
+                        self._pass_up(now_ns, station.index, peer, peer.session.skip([frame]))
         self._off = frozenset(names)
 
     def set_emissions(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
@@ -239,15 +216,16 @@ class Wifi(Generic[Payload]):
             return
         station.exchange_id += 1
         frame = station.queue[0]
+        receiver = frame.receiver
+        peer = None if receiver is None else self._peer(station.index, receiver)
+        if peer is not None and peer.session is not None:
+            self._start_aggregate(now_ns, station, peer, peer.session)
+            return
         if not frame.attempts:
             frame.first_attempt_ns = now_ns
         frame.attempts += 1
-        receiver, packet, number = frame.receiver, frame.packet, frame.attempts
-        mode = (
-            self._basic
-            if receiver is None
-            else self._peer(station.index, receiver).rate.choose(now_ns, packet, number)
-        )
+        packet, number = frame.packet, frame.attempts
+        mode = self._basic if peer is None else peer.rate.choose(now_ns, packet, number)
         size_bytes = frame.size_bytes + HEADER_BYTES
         end_ns = now_ns + mode.airtime_ns(size_bytes)
         reserved_ns = end_ns if receiver is None else end_ns + self._sifs_ns + ack_ns(mode)
@@ -256,6 +234,48 @@ class Wifi(Generic[Payload]):
         if self._meter is not None:
             self._meter.on_start(transmission, receiver)
         self._events.at(end_ns, self._end_transmission, station, frame, transmission)
+
+    def _start_aggregate(
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload], session: BlockAckSession[Payload]
+    ) -> None:
+        first = station.queue[0]
+        # Hardware repeats an aggregate in the next mode of the chain only if the Block Ack is missing.
+        mode = peer.rate.choose(now_ns, first.packet, min(peer.failed_exchanges + 1, SHORT_RETRY_LIMIT))
+        aggregate = station.aggregate = session.build_aggregate(station.queue, mode)
+        for frame in aggregate.frames:
+            if not frame.attempts:
+                frame.first_attempt_ns = now_ns
+            frame.attempts += 1
+        size_bytes, response_bytes = aggregate.size_bytes, aggregate.response_bytes
+        end_ns = now_ns + mode.airtime_ns(size_bytes)
+        transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, first.packet, first.attempts)
+        transmission.response_bytes = response_bytes
+        self._reception.start(transmission, end_ns + self._sifs_ns + response_ns(mode, response_bytes))
+        if self._meter is not None:
+            self._meter.on_start(transmission, None)
+            self._meter.on_aggregate(transmission, peer.receiver, aggregate.frames)
+        self._events.at(end_ns, self._end_aggregate, station, peer, aggregate, transmission)
+
+    def _end_aggregate(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload],
+        aggregate: Aggregate[Payload],
+        transmission: Transmission,
+    ) -> None:
+        decoded = aggregate.decoded = self._reception.decoded_frames(peer.receiver, transmission, aggregate)
+        self._reception.end(now_ns, transmission)
+        if self._log is not None:
+            for frame in aggregate.frames:
+                received = [peer.receiver] if frame in decoded else []
+                size_bytes = frame.size_bytes + QOS_HEADER_BYTES
+                self._log(attempt_record(self._channel.names, transmission, frame, received, size_bytes))
+        if station.aggregate is not aggregate:
+            return  # aborted: its radio was switched off
+        assert peer.session is not None
+        self._pass_up(now_ns, station.index, peer, peer.session.receive(decoded))
+        self._await_ack(now_ns, station, peer.receiver, transmission, is_decoded=bool(decoded))
 
     def _retry_when_idle(self, now_ns: int, station: Station[Payload]) -> None:
         if not station.queue or station.exchange_id & 1 or station.index in self._events.starts:
@@ -274,7 +294,7 @@ class Wifi(Generic[Payload]):
         received = [index for index in addressed if self._reception.decodes(index, transmission, "data")]
         self._reception.end(now_ns, transmission)
         if self._log is not None:
-            self._log(attempt_record(self._channel.names, transmission, frame, received))
+            self._log(attempt_record(self._channel.names, transmission, frame, received, transmission.size_bytes))
         if not station.queue or station.queue[0] is not frame:
             return  # aborted: its radio was switched off
         for index in received:
@@ -283,19 +303,16 @@ class Wifi(Generic[Payload]):
             self._broadcast(now_ns, station.index, frame, received)
             self._end_exchange(now_ns, station, done=True)
         else:
-            if received:
-                acknowledging = self._stations[receiver]
-                self._events.at(
-                    now_ns + self._sifs_ns,
-                    self._acknowledge,
-                    acknowledging,
-                    station,
-                    transmission,
-                    station.exchange_id,
-                )
-            self._events.at(
-                now_ns + self._ack_timeout_ns, self._ack_timeout, station, station.exchange_id, transmission.mode
-            )
+            self._await_ack(now_ns, station, receiver, transmission, is_decoded=bool(received))
+
+    def _await_ack(
+        self, now_ns: int, station: Station[Payload], receiver: int, transmission: Transmission, *, is_decoded: bool
+    ) -> None:
+        exchange_id, call_at = station.exchange_id, self._events.at
+        if is_decoded:
+            ack_ns = now_ns + self._sifs_ns
+            call_at(ack_ns, self._acknowledge, self._stations[receiver], station, transmission, exchange_id)
+        call_at(now_ns + self._ack_timeout_ns, self._ack_timeout, station, exchange_id, transmission.mode)
 
     def _broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
         for index, name in enumerate(self._channel.names):
@@ -315,10 +332,10 @@ class Wifi(Generic[Payload]):
     ) -> None:
         if receiver.sending_until_ns > now_ns:
             return
-        mode = transmission.mode
-        end_ns = now_ns + ack_ns(mode)
+        mode, size_bytes = transmission.mode, transmission.response_bytes
+        end_ns = now_ns + response_ns(mode, size_bytes)
         packet, number = transmission.packet, transmission.attempt
-        ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), ACK_BYTES, packet, number)
+        ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), size_bytes, packet, number)
         self._reception.start(ack, end_ns)
         if self._meter is not None:
             self._meter.on_start(ack, None)
@@ -345,6 +362,9 @@ class Wifi(Generic[Payload]):
         frame = station.queue[0]
         assert frame.receiver is not None
         peer = self._peer(station.index, frame.receiver)
+        if station.aggregate is not None:
+            self._finish_aggregate(now_ns, station, peer, mode, acknowledged=acknowledged)
+            return
         peer.rate.report(mode, acknowledged=acknowledged)
         if not acknowledged:
             station.contention.set_busy_until(now_ns)
@@ -356,6 +376,36 @@ class Wifi(Generic[Payload]):
             if peer.last_frame is not frame:
                 self._lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
         self._end_exchange(now_ns, station, done=done)
+
+    def _finish_aggregate(
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload], mode: WifiMode, *, acknowledged: bool
+    ) -> None:
+        aggregate, session = station.aggregate, peer.session
+        assert aggregate is not None
+        assert session is not None
+        station.aggregate = None
+        frames, confirmed = aggregate.frames, set(aggregate.decoded if acknowledged else ())
+        peer.rate.report(mode, acknowledged=len(confirmed), attempts=len(frames))
+        if acknowledged:
+            station.contention.on_success()
+            peer.failed_exchanges = 0
+        else:
+            station.contention.set_busy_until(now_ns)
+            station.contention.on_failure()
+            peer.failed_exchanges += 1
+        given_up = {frame for frame in frames if frame not in confirmed and frame.attempts >= frame.max_attempts}
+        lost = [frame for frame in frames if frame in given_up and not frame.is_received]
+        for frame in lost:
+            self._lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
+        peer.count_frames(delivered=len(confirmed) + len(given_up) - len(lost), lost=len(lost))
+        if self._meter is not None:
+            self._meter.link(station.index, peer.receiver).failures += len(given_up)
+        if lost:
+            self._pass_up(now_ns, station.index, peer, session.skip(lost))
+        remove_frames(station.queue, confirmed | given_up)
+        station.exchange_id += 1
+        if station.queue:
+            self._contend(now_ns, station)
 
     def _end_exchange(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
         station.exchange_id += 1
@@ -372,14 +422,20 @@ class Wifi(Generic[Payload]):
         if peer.last_frame is frame:
             return
         peer.last_frame = frame
+        self._pass_up(now_ns, transmitter, peer, (frame,))
+
+    def _pass_up(self, now_ns: int, transmitter: int, peer: Peer[Payload], frames: Iterable[Frame[Payload]]) -> None:
+        """Deliver frames at a receiver, or queue them for their second hop."""
+        receiver = peer.receiver
         propagation_ns = self._channel.delay_ns(transmitter, receiver)
-        delay_so_far = frame.total_delay(now_ns, propagation_ns)
-        if frame.keep:
-            self._events.at(
-                now_ns + propagation_ns, self._deliver, receiver, frame.payload, frame.source, delay_so_far
-            )
-        for onward in frame.onward:
-            self._enqueue(now_ns, self._stations[receiver], frame.for_second_hop(now_ns, onward, delay_so_far))
+        for frame in frames:
+            delay_so_far = frame.total_delay(now_ns, propagation_ns)
+            if frame.keep:
+                self._events.at(
+                    now_ns + propagation_ns, self._deliver, receiver, frame.payload, frame.source, delay_so_far
+                )
+            for onward in frame.onward:
+                self._enqueue(now_ns, self._stations[receiver], frame.for_second_hop(now_ns, onward, delay_so_far))
 
     def _deliver(self, now_ns: int, receiver: int, payload: Payload, source: str, delay_so_far: Delay) -> None:
         name = self._channel.names[receiver]
@@ -403,5 +459,7 @@ class Wifi(Generic[Payload]):
     def _peer(self, transmitter: int, receiver: int) -> Peer[Payload]:
         pair = transmitter, receiver
         if pair not in self._peers:
-            self._peers[pair] = Peer(receiver, self._channel.rate_control(*pair))
+            limits = self._channel.ampdu_limits(*pair)
+            session: BlockAckSession[Payload] | None = None if limits is None else BlockAckSession(limits)
+            self._peers[pair] = Peer(receiver, self._channel.rate_control(*pair), session)
         return self._peers[pair]

@@ -11,10 +11,12 @@ from typing_extensions import override
 
 from fieldkit.core.model import Vector
 from sim_backends.radio import propagation
+from sim_backends.radio.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
 from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.error_rates import packet_error
 from sim_backends.radio.frames import decibel
+from sim_backends.radio.high_throughput import common_modes
 from sim_backends.radio.modes import OFDM_MODES
 from sim_backends.radio.propagation import Echoes, Fades, Fading, Shadowing
 from sim_backends.radio.radio_options import RadioOptions
@@ -345,6 +347,18 @@ class WorldChannel(RadioChannel):
         return round(math.dist(first or STILL, second or STILL) / SPEED_OF_LIGHT_M_S * 1e9)
 
     @override
+    def ifs_ns(self, station: int) -> int:
+        return self.band.difs_ns if self._antennas[station].phy is None else self.band.best_effort_aifs_ns
+
+    @override
+    def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:
+        first, second = self._antennas[transmitter], self._antennas[receiver]
+        if first.phy is None or second.phy is None or (self._fixed_mode is not None and not self._fixed_mode.ht):
+            return None
+        mode = self._fixed_mode or common_modes(first.phy, second.phy)[0]
+        return AMPDU_LIMITS[mode.phy_format]
+
+    @override
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
         if self._fixed_mode is not None:
             return FixedRate(self._fixed_mode)
@@ -353,6 +367,7 @@ class WorldChannel(RadioChannel):
             modes_between(self._antennas[transmitter], self._antennas[receiver]),
             self.snr_db(transmitter, receiver),
             PacketDraws(self._seed, *names, "rate"),
+            frames_per_exchange=1 if self.ampdu_limits(transmitter, receiver) is None else TYPICAL_FRAMES,
         )
 
 

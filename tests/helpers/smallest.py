@@ -273,7 +273,17 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     "cosim_vs_ns3": MinimalRun("", shrink=_one_link),
     "emane": MinimalRun("--rounds 1", {"ROBOTS": 2, "PINGS": 3}, shrink=_one_radio, emulated=True),
     "studies.field_shape": MinimalRun("--out FOLDER/lab --repeats 1", shrink=_one_trial, emulated=True),
-    "high_throughput_vs_ns3": MinimalRun("", {"WIDTHS_MHZ": {"HT": (40,), "VHT": (), "HE": ()}, "STREAMS": (1,)}),
+    "high_throughput_vs_ns3": MinimalRun(
+        "",
+        {
+            "WIDTHS_MHZ": {"HT": (40,)},
+            "STREAMS": (1,),
+            "RATIOS_DB": (40.0,),
+            "STATIONS": (2,),
+            "QUEUED": 150,
+            "SECONDS": 0.1,
+        },
+    ),
     "layers": MinimalRun("--rounds 1 --packets 20", {"PINGS": 5, "STATIONS": (2,)}, shrink=_one_layer, emulated=True),
     "ledger": MinimalRun("--repeats 3"),
     "medium": MinimalRun("--rounds 1 --seconds 1 --probes 20", shrink=_slow_iperf, emulated=True),

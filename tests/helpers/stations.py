@@ -48,6 +48,7 @@ def saturate(
     *,
     seconds: float,
     payload_bytes: int = 1000,
+    queued: int = 50,
     relay: str | None = None,
     seed: int = 1,
     log: list[TransmissionAttempt] | None = None,
@@ -58,7 +59,7 @@ def saturate(
     wifi.set_relay(relay)
     arrived = dict.fromkeys(senders, 0)
     for name in senders:
-        for _ in range(50):
+        for _ in range(queued):
             wifi.send(0, name, name, payload_bytes + HEADERS_BYTES, receiver)
     end_ns = round(seconds * 1e9)
     while (now_ns := wifi.next_event_ns()) is not None and now_ns < end_ns:

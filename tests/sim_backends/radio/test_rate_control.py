@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
+from sim_backends.radio.high_throughput import format_modes
 from sim_backends.radio.modes import G_MODES, WifiMode
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control import Minstrel
@@ -101,3 +102,26 @@ def test_an_additional_frame_does_not_change_others() -> None:
     chosen = [with_frame.choose(0, ("a", number), 1) for number in numbers]
     assert [without_frame.choose(0, ("a", number), 1) for number in numbers if number != 7] == chosen[:7] + chosen[8:]
     assert len(set(chosen)) > 1
+
+
+def test_aggregates_that_fail_lower_the_rate_within_the_interval() -> None:
+    """All frames of the fastest modes fail at once, as in a fade; the interval of updates is 100 ms."""
+    modes = format_modes("HE", "5 GHz", 80, 1, 800)
+    control = Minstrel(modes, 60.0, PacketDraws(1, "a", "b"), frames_per_exchange=16)
+    chosen = []
+    for number in range(60):
+        mode = control.choose(number * 500_000, ("flow", number), 1)
+        control.report(mode, acknowledged=64 * (mode.rate_bit_s < 200e6), attempts=64)
+        chosen.append(mode.rate_bit_s)
+    assert chosen[0] > 500e6
+    assert sorted(chosen[-20:])[10] < 200e6, "the median of the last frames, some of which are samples"
+
+
+def test_the_first_modes_consider_the_noise_of_the_width() -> None:
+    """At 20 dB in 20 MHz the ratio in 80 MHz is 14 dB."""
+    narrow, wide = (
+        Minstrel(format_modes("HE", "5 GHz", width_mhz, 1, 800), 20.0, PacketDraws(1, "a", "b"))
+        for width_mhz in (20, 80)
+    )
+    first = [control.choose(0, ("flow", 5), 2).name for control in (narrow, wide)]
+    assert first == ["he20-mcs4-1ss-800ns", "he80-mcs3-1ss-800ns"]

@@ -1,0 +1,155 @@
+"""A-MPDU: aggregates of frames to one receiver, acknowledged by a Block Ack (IEEE 802.11-2020, 9.7, 10.12 and 10.25).
+
+The originator sends frames again, alone or with new ones, until they are acknowledged or given up. The recipient
+passes them up in the order of their sequence numbers, so a frame waits for the ones before it. Two steps of the
+standard are instantaneous here: the agreement exists from the first frame, and the recipient immediately skips a
+frame that the originator has given up (a BlockAckReq reports this in the standard).
+"""
+
+from collections import deque
+from collections.abc import Iterable, Sequence, Set
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, Generic
+
+from sim_backends.radio.frames import HEADER_BYTES, Frame
+from sim_backends.radio.links import Payload
+from sim_backends.radio.modes import ACK_BYTES, PhyFormat, WifiMode
+
+QOS_HEADER_BYTES: Final = HEADER_BYTES + 2
+"""Headers of a QoS data frame: 9.2.4.5."""
+
+TYPICAL_FRAMES: Final = 16
+"""Length of aggregates for which rate control compares modes: our choice, between one frame and the window."""
+
+_DELIMITER_BYTES: Final = 4
+_MAX_PPDU_NS: Final = 5_484_000
+"""aPPDUMaxTime: tables 19-25, 21-28 and 27-54."""
+
+
+@dataclass(frozen=True)
+class AmpduLimits:
+    """Limits of aggregates.
+
+    Attributes:
+        window: Most frames between the oldest unacknowledged one and the newest: size of the bitmap.
+        max_bytes: Most bytes of an A-MPDU.
+    """
+
+    window: int
+    max_bytes: int
+
+    @property
+    def block_ack_bytes(self) -> int:
+        """Size of a compressed Block Ack with its bitmap: 9.3.1.8."""
+        return 24 + self.window // 8
+
+
+AMPDU_LIMITS: Final[dict[PhyFormat, AmpduLimits]] = {
+    "HT": AmpduLimits(64, 65_535),
+    "VHT": AmpduLimits(64, 1_048_575),
+    "HE": AmpduLimits(256, 4_194_303),
+}
+"""Largest exponents of the maximum A-MPDU length: 9.4.2.55.3, 9.4.2.157.2 and 9.4.2.248 (without its extension)."""
+
+
+@dataclass(eq=False, slots=True)
+class Aggregate(Generic[Payload]):
+    """Frames that are sent together.
+
+    Attributes:
+        frames: The frames, in the order of their sequence numbers.
+        size_bytes: Size of the PSDU.
+        response_bytes: Size of the Block Ack, or of the ACK to a single frame.
+        decoded: The frames that the receiver decoded; empty until the aggregate ends.
+    """
+
+    frames: Sequence[Frame[Payload]]
+    size_bytes: int
+    response_bytes: int
+    decoded: Sequence[Frame[Payload]] = ()
+
+
+class BlockAckSession(Generic[Payload]):
+    """The agreement between an originator and a recipient: sequence numbers and reordering.
+
+    Args:
+        limits: Limits of aggregates.
+    """
+
+    def __init__(self, limits: AmpduLimits) -> None:
+        self._limits = limits
+        self._next_sequence = 0
+        # The recipient's next sequence number to pass up; frames after it; numbers that were given up.
+        self._expected = 0
+        self._held: dict[int, Frame[Payload]] = {}
+        self._skipped: set[int] = set()
+
+    def build_aggregate(self, queue: deque[Frame[Payload]], mode: WifiMode) -> Aggregate[Payload]:
+        """Return the aggregate of the first frame of a queue and of later ones to its receiver, as many as fit."""
+        limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, _MAX_PPDU_NS))
+        frames: list[Frame[Payload]] = []
+        first, size_bytes, last_sequence = queue[0], 0, 0
+        for frame in queue:
+            if frame.receiver != first.receiver:
+                continue
+            sequence = self._next_sequence if frame.sequence < 0 else frame.sequence
+            # Each subframe but the last is padded to a multiple of 4 bytes.
+            new_bytes = -(-size_bytes // 4) * 4 + _DELIMITER_BYTES + frame.size_bytes + QOS_HEADER_BYTES
+            if not frames:
+                last_sequence = sequence + self._limits.window
+            elif new_bytes > limit_bytes or sequence >= last_sequence:
+                break
+            if frame.sequence < 0:
+                frame.sequence = sequence
+                self._next_sequence += 1
+            frames.append(frame)
+            size_bytes = new_bytes
+        if len(frames) > 1:
+            return Aggregate(frames, size_bytes, self._limits.block_ack_bytes)
+        # Frames of VHT and HE always have a delimiter: 9.7.1.
+        return Aggregate(frames, size_bytes - (_DELIMITER_BYTES if mode.phy_format == "HT" else 0), ACK_BYTES)
+
+    def receive(self, frames: Iterable[Frame[Payload]]) -> list[Frame[Payload]]:
+        """Store decoded frames at the recipient; return those that it passes up now, in order, without duplicates."""
+        for frame in frames:
+            if not frame.is_received:
+                frame.is_received = True
+                self._held[frame.sequence] = frame
+        return self._pop_in_order()
+
+    def skip(self, frames: Iterable[Frame[Payload]]) -> list[Frame[Payload]]:
+        """Give up frames that were not received; return those that the recipient passes up now."""
+        self._skipped.update(frame.sequence for frame in frames if frame.sequence >= 0)
+        return self._pop_in_order()
+
+    def _pop_in_order(self) -> list[Frame[Payload]]:
+        frames = []
+        while self._expected in self._held or self._expected in self._skipped:
+            if (frame := self._held.pop(self._expected, None)) is not None:
+                frames.append(frame)
+            self._skipped.discard(self._expected)
+            self._expected += 1
+        return frames
+
+
+def remove_frames(queue: deque[Frame[Payload]], done: Set[Frame[Payload]]) -> None:
+    """Remove frames from a queue that contains all of them; the order of the others does not change."""
+    kept, remaining = [], len(done)
+    while remaining:
+        frame = queue.popleft()
+        if frame in done:
+            remaining -= 1
+        else:
+            kept.append(frame)
+    queue.extendleft(reversed(kept))
+
+
+@cache
+def _bytes_in(mode: WifiMode, time_ns: int) -> int:
+    """Return the size of the largest PSDU with at most this airtime."""
+    symbols = (time_ns - mode.preamble_ns - mode.band.signal_extension_ns) // mode.symbol_ns
+    size_bytes = symbols * mode.bits_per_symbol // 8
+    while mode.airtime_ns(size_bytes) > time_ns:
+        size_bytes -= 1
+    return size_bytes

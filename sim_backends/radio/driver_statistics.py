@@ -1,0 +1,128 @@
+"""Counters of the radio drivers, as real drivers report them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fieldkit.core.model import LinkSample, StationSample
+from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.frames import Frame, Transmission, decibel
+from sim_backends.radio.stations import Peer
+
+_Peers = Mapping[tuple[int, int], Peer[Any]]
+
+
+@dataclass(slots=True)
+class LinkMeter:
+    """Counters of one directed link.
+
+    Attributes:
+        frames: Packets whose first attempt has started.
+        retries: Attempts after the first.
+        failures: Packets given up after the last attempt.
+        rate_bit_s: Rate of the last attempt; None before the first.
+    """
+
+    frames: int = 0
+    retries: int = 0
+    failures: int = 0
+    rate_bit_s: int | None = None
+
+
+class RadioMeter:
+    """Counters for stations that share one channel.
+
+    Args:
+        stations: Number of stations.
+    """
+
+    def __init__(self, stations: int) -> None:
+        self._links: dict[tuple[int, int], LinkMeter] = {}
+        self._busy_ns = [0] * stations
+        self._busy_until_ns = [0] * stations
+
+    def on_start(self, transmission: Transmission, receiver: int | None) -> None:
+        """Record a frame that starts now; `receiver` is None for broadcasts, ACKs and aggregates."""
+        start_ns, end_ns = transmission.start_ns, transmission.end_ns
+        busy_ns, busy_until_ns = self._busy_ns, self._busy_until_ns
+        for index in (transmission.transmitter, *transmission.detected_by):
+            until_ns = busy_until_ns[index]
+            if end_ns > until_ns:
+                busy_ns[index] += end_ns - max(start_ns, until_ns)
+                busy_until_ns[index] = end_ns
+        if receiver is not None:
+            link = self.link(transmission.transmitter, receiver)
+            if transmission.attempt == 1:
+                link.frames += 1
+            else:
+                link.retries += 1
+            link.rate_bit_s = transmission.mode.rate_bit_s
+
+    def on_aggregate(self, transmission: Transmission, receiver: int, frames: Sequence[Frame[Any]]) -> None:
+        """Record the frames of an aggregate that starts now, after `on_start`."""
+        link = self.link(transmission.transmitter, receiver)
+        new = sum(frame.attempts == 1 for frame in frames)
+        link.frames += new
+        link.retries += len(frames) - new
+        link.rate_bit_s = transmission.mode.rate_bit_s
+
+    def on_failure(self, transmitter: int, receiver: int) -> None:
+        """Record that a packet was given up."""
+        self.link(transmitter, receiver).failures += 1
+
+    def link(self, transmitter: int, receiver: int) -> LinkMeter:
+        """Return the counters of a link, which continue to change."""
+        return self._links.setdefault((transmitter, receiver), LinkMeter())
+
+    def busy_ns(self, now_ns: int) -> Sequence[int]:
+        """Return the time for which each station found its channel busy until now, by index."""
+        return [busy - max(0, until - now_ns) for busy, until in zip(self._busy_ns, self._busy_until_ns, strict=True)]
+
+
+def link_samples(
+    now_ns: int, utc_ns: int, channel: RadioChannel, meter: RadioMeter, peers: _Peers, *, relay: int | None
+) -> dict[str, LinkSample]:
+    """Return the driver statistics of each station, with the timestamp `utc_ns`.
+
+    Args:
+        now_ns: Current time.
+        utc_ns: Timestamp.
+        channel: The channel.
+        meter: The counters.
+        peers: The links, by indices of transmitter and receiver.
+        relay: Index of the access point; None for direct links.
+    """
+    busy_ns = meter.busy_ns(now_ns)
+    indices = range(len(channel.names))
+
+    def associated(index: int) -> Sequence[int]:
+        """Return the stations to which a station sends frames: all others, or its access point."""
+        return [other for other in (indices if relay in {None, index} else (relay,)) if other not in {None, index}]
+
+    return {
+        name: LinkSample(
+            utc_ns,
+            tuple(_station_sample(now_ns, channel, meter, peers, (index, other)) for other in associated(index)),
+            noise_dbm=decibel(channel.noise_mw[index]),
+            active_ns=now_ns,
+            busy_ns=busy_ns[index],
+        )
+        for index, name in enumerate(channel.names)
+    }
+
+
+def _station_sample(
+    now_ns: int, channel: RadioChannel, meter: RadioMeter, peers: _Peers, link: tuple[int, int]
+) -> StationSample:
+    index, other = link
+    sent, reverse, peer = meter.link(index, other), meter.link(other, index), peers.get((other, index))
+    return StationSample(
+        station=channel.names[other],
+        signal_dbm=decibel(channel.powers_mw(other, now_ns)[index]) if channel.linked(other, index) else None,
+        tx_rate_bit_s=sent.rate_bit_s,
+        rx_rate_bit_s=reverse.rate_bit_s,
+        tx_packets=sent.frames,
+        rx_packets=0 if peer is None else peer.delivered,
+        tx_retries=sent.retries,
+        tx_failures=sent.failures,
+    )

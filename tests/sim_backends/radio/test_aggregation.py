@@ -1,0 +1,218 @@
+"""A-MPDU: building of aggregates, Block Ack sessions, and goodput compared with a closed form and with ns-3."""
+
+from collections import deque
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typing_extensions import override
+
+from sim_backends.radio.aggregation import (
+    AMPDU_LIMITS,
+    QOS_HEADER_BYTES,
+    AmpduLimits,
+    BlockAckSession,
+    remove_frames,
+)
+from sim_backends.radio.contention import CCA_TIME_NS
+from sim_backends.radio.frames import Frame, TransmissionAttempt
+from sim_backends.radio.high_throughput import format_modes
+from sim_backends.radio.links import RETRIES_EXHAUSTED
+from sim_backends.radio.modes import CW_MIN, SHORT_RETRY_LIMIT, SLOT_NS, WifiMode, response_ns
+from sim_backends.radio.wifi import Wifi
+from tests.helpers.stations import HEADERS_BYTES, FixedPowers, saturate
+
+HT20 = format_modes("HT", "2.4 GHz", 20, 1, 800)
+HT20_7 = HT20[7]
+HT40_7 = format_modes("HT", "2.4 GHz", 40, 1, 800)[7]
+VHT80_9 = format_modes("VHT", "5 GHz", 80, 2, 400)[9]
+HE80_11 = format_modes("HE", "5 GHz", 80, 2, 800)[11]
+SUBFRAME_BYTES = 4 + 1028 + QOS_HEADER_BYTES
+
+
+def frames(count: int, *, size_bytes: int = 1028, receiver: int = 1) -> deque[Frame[int]]:
+    return deque(
+        Frame(number, size_bytes, "a", receiver, (), True, ("a", number), queued_ns=0) for number in range(count)
+    )
+
+
+def session(mode: WifiMode) -> BlockAckSession[int]:
+    return BlockAckSession(AMPDU_LIMITS[mode.phy_format])
+
+
+class AggregatingPowers(FixedPowers):
+    """Stations that aggregate frames and have the inter-frame space of best effort."""
+
+    def __init__(self, names: Sequence[str], mode: WifiMode, deaf: Sequence[tuple[str, str]] = ()) -> None:
+        super().__init__(names, mode, deaf=deaf)
+        self.band = mode.band
+        self.mode = mode
+
+    @override
+    def ifs_ns(self, station: int) -> int:
+        return self.band.best_effort_aifs_ns
+
+    @override
+    def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits:
+        return AMPDU_LIMITS[self.mode.phy_format]
+
+
+def test_an_aggregate_is_limited_by_its_bytes_its_duration_and_the_window() -> None:
+    # 65,535 bytes hold 61 subframes of 1070 bytes, padded to 1072: 61 * 1072 = 65,392.
+    assert len(session(HT40_7).build_aggregate(frames(100), HT40_7).frames) == 61
+    assert len(session(VHT80_9).build_aggregate(frames(100), VHT80_9).frames) == 64
+    assert len(session(HE80_11).build_aggregate(frames(400), HE80_11).frames) == 256
+    slow = session(HT20[0]).build_aggregate(frames(100), HT20[0])
+    assert HT20[0].airtime_ns(slow.size_bytes) <= 5_484_000 < HT20[0].airtime_ns(slow.size_bytes + SUBFRAME_BYTES + 2)
+
+
+def test_a_single_frame_is_answered_by_an_ack_and_has_a_delimiter_only_in_vht_and_he() -> None:
+    for mode, size_bytes in ((HT20_7, 1028 + QOS_HEADER_BYTES), (VHT80_9, SUBFRAME_BYTES)):
+        single = session(mode).build_aggregate(frames(1), mode)
+        assert (single.size_bytes, single.response_bytes) == (size_bytes, 14)
+    assert session(VHT80_9).build_aggregate(frames(2), VHT80_9).response_bytes == 32
+    assert session(HE80_11).build_aggregate(frames(2), HE80_11).response_bytes == 56
+
+
+def test_only_frames_to_the_receiver_of_the_first_are_aggregated() -> None:
+    queue = deque(frame for pair in zip(frames(5), frames(5, receiver=2), strict=True) for frame in pair)
+    assert {frame.receiver for frame in session(HT20_7).build_aggregate(queue, HT20_7).frames} == {1}
+
+
+def test_the_window_starts_at_the_oldest_unacknowledged_frame() -> None:
+    queue, agreement = frames(100), session(VHT80_9)
+    first = agreement.build_aggregate(queue, VHT80_9)
+    remove_frames(queue, set(first.frames[1:]))
+    second = agreement.build_aggregate(queue, VHT80_9)
+    assert [frame.sequence for frame in second.frames] == [0], "sequence numbers 1 to 63 fill the rest of the window"
+    remove_frames(queue, set(first.frames[:1]))
+    assert [frame.sequence for frame in agreement.build_aggregate(queue, VHT80_9).frames] == list(range(64, 100))
+
+
+@given(st.lists(st.sets(st.integers(0, 19)), max_size=12), st.sets(st.integers(0, 19)))
+def test_a_recipient_passes_up_each_frame_once_in_order(decoded: list[set[int]], given_up: set[int]) -> None:
+    agreement = session(VHT80_9)
+    sent = list(agreement.build_aggregate(frames(20), VHT80_9).frames)
+    passed_up = [frame for numbers in decoded for frame in agreement.receive([sent[number] for number in numbers])]
+    assert [frame.sequence for frame in passed_up] == list(range(len(passed_up))), "no gap before any is given up"
+    passed_up += agreement.skip([frame for frame in sent if frame.sequence in given_up and not frame.is_received])
+    rest = [frame for frame in sent if not frame.is_received and frame.sequence not in given_up]
+    passed_up += agreement.receive(rest)
+    received = set().union(*decoded) | {frame.sequence for frame in rest}
+    assert [frame.sequence for frame in passed_up] == sorted(received)
+
+
+@pytest.mark.parametrize("mode", [HT20_7, VHT80_9, HE80_11], ids=lambda mode: mode.name)
+def test_goodput_of_one_station_equals_the_closed_form(mode: WifiMode) -> None:
+    """Full aggregates, mean backoff of 7.5 slots: n payloads per AIFS, backoff, aggregate, SIFS and Block Ack."""
+    log: list[TransmissionAttempt] = []
+    goodput = saturate(AggregatingPowers("ab", mode), "a", "b", seconds=0.5, queued=600, log=log)["a"]
+    queue = frames(600)
+    aggregate = session(mode).build_aggregate(queue, mode)
+    exchange_ns = (
+        mode.band.best_effort_aifs_ns
+        + CW_MIN / 2 * SLOT_NS
+        + mode.airtime_ns(aggregate.size_bytes)
+        + mode.band.sifs_ns
+        + response_ns(mode, aggregate.response_bytes)
+    )
+    assert goodput == pytest.approx(len(aggregate.frames) * 8000 / exchange_ns * 1e9, rel=0.02)
+    assert {attempt.size_bytes for attempt in log if attempt.number} == {1028 + QOS_HEADER_BYTES}
+
+
+@pytest.mark.parametrize("stations", [2, 5, 10, 20])
+def test_contending_stations_follow_bianchi_with_aggregates(stations: int) -> None:
+    """Bianchi, IEEE JSAC 18:535 (2000), eq. 7 to 13, with A-MPDU and Block Ack as the payload and its answer.
+
+    A collision lasts for the aggregate and the time until the sender senses a missing Block Ack.
+    """
+    mode = HT20_7
+    names = [f"s{number}" for number in range(stations)]
+    goodput = sum(saturate(AggregatingPowers([*names, "r"], mode), names, "r", seconds=4.0, queued=150).values())
+    assert goodput == pytest.approx(bianchi_bit_s(mode, stations), rel=0.05)
+
+
+def bianchi_bit_s(mode: WifiMode, stations: int) -> float:
+    window, stages = CW_MIN + 1, 6
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        tau = (low + high) / 2
+        collision = 1 - (1 - tau) ** (stations - 1)
+        doubling = sum((2 * collision) ** stage for stage in range(stages))
+        high, low = (high, tau) if tau < 2 / (1 + window + collision * window * doubling) else (tau, low)
+    aggregate = session(mode).build_aggregate(frames(100), mode)
+    airtime_ns, aifs_ns = mode.airtime_ns(aggregate.size_bytes), mode.band.best_effort_aifs_ns
+    success_ns = airtime_ns + mode.band.sifs_ns + response_ns(mode, aggregate.response_bytes) + aifs_ns
+    collision_ns = airtime_ns + mode.band.sifs_ns + SLOT_NS + 20_000 + aifs_ns
+    idle, one = (1 - tau) ** stations, stations * tau * (1 - tau) ** (stations - 1)
+    slot_ns = idle * SLOT_NS + one * success_ns + (1 - idle - one) * collision_ns
+    assert CCA_TIME_NS < SLOT_NS
+    return one * len(aggregate.frames) * 8000 / slot_ns * 1e9
+
+
+# ns-3 3.37, `benchmarks.high_throughput_vs_ns3`: payloads of 1000 bytes, Mbit/s.
+@pytest.mark.parametrize(("stations", "ns3_mbit_s"), [(1, 58.50), (5, 49.07)])
+def test_goodput_is_within_five_percent_of_ns3(stations: int, ns3_mbit_s: float) -> None:
+    names = [f"s{number}" for number in range(stations)]
+    goodput = sum(saturate(AggregatingPowers([*names, "r"], HT20_7), names, "r", seconds=2.0, queued=150).values())
+    assert goodput / 1e6 == pytest.approx(ns3_mbit_s, rel=0.05)
+
+
+def test_lost_frames_are_sent_again_within_later_aggregates_and_arrive_in_order() -> None:
+    """At a ratio where a tenth of the frames is corrupted, all arrive, once and in order."""
+    channel = AggregatingPowers("ab", HT20_7)
+    channel.rows = [[power * 1e-9 * 10**2.36 / 1e-4 for power in row] for row in channel.rows]
+    channel.sensitivity_mw = [1e-9] * 2
+    wifi: Wifi[int] = Wifi(channel, 1)
+    log: list[TransmissionAttempt] = []
+    wifi.log_attempts(log.append)
+    for number in range(500):
+        wifi.send(0, "a", number, 1000 + HEADERS_BYTES, "b")
+    arrived = [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
+    attempts = [attempt for attempt in log if attempt.number]
+    assert arrived == list(range(500))
+    again = [attempt for attempt in attempts if attempt.number > 1]
+    assert 0.02 < len(again) / len(attempts) < 0.5
+    together = {attempt.start_ns for attempt in attempts if attempt.number == 1}
+    assert any(attempt.start_ns in together for attempt in again), "sent again together with new frames"
+
+
+def test_frames_to_a_silent_receiver_are_given_up_after_the_retry_limit() -> None:
+    channel = AggregatingPowers("ab", HT20_7, deaf=[("a", "b")])
+    wifi: Wifi[int] = Wifi(channel, 1)
+    losses: list[tuple[int, str, str]] = []
+    wifi.log_losses(lambda _, payload, station, reason: losses.append((payload, station, reason)))
+    log: list[TransmissionAttempt] = []
+    wifi.log_attempts(log.append)
+    for number in range(3):
+        wifi.send(0, "a", number, 1028, "b")
+    assert wifi.deliveries(10**10) == []
+    assert losses == [(number, "b", RETRIES_EXHAUSTED) for number in range(3)]
+    assert {attempt.number for attempt in log} == set(range(1, SHORT_RETRY_LIMIT + 1))
+    counters = wifi.counters()["a", "b"]
+    assert (counters.sent, counters.lost, counters.delivered) == (3, 3, 0)
+
+
+def test_frames_of_a_station_that_is_switched_off_are_lost_once() -> None:
+    wifi: Wifi[int] = Wifi(AggregatingPowers("ab", HT20_7), 1)
+    losses: list[int] = []
+    wifi.log_losses(lambda _, payload, *rest: losses.append(payload))
+    for number in range(200):
+        wifi.send(0, "a", number, 1028, "b")
+    arrived = [payload for _, _, payload, _, _ in wifi.deliveries(3_000_000)]
+    wifi.switch_off(3_000_000, {"a"})
+    arrived += [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
+    assert sorted(arrived + losses) == list(range(200))
+    assert arrived == sorted(arrived)
+
+
+def test_drivers_count_the_frames_of_aggregates() -> None:
+    wifi: Wifi[int] = Wifi(AggregatingPowers("ab", VHT80_9), 1)
+    wifi.use_meter()
+    for number in range(100):
+        wifi.send(0, "a", number, 1028, "b")
+    wifi.deliveries(10**9)
+    (station,) = wifi.sample(10**9, 0)["a"].stations
+    assert (station.tx_packets, station.tx_retries, station.tx_failures) == (100, 0, 0)
+    assert station.tx_rate_bit_s == pytest.approx(866.7e6, rel=1e-4)
