@@ -1,0 +1,34 @@
+"""The index of tables on a real file system that is full or read-only: a tmpfs in a mount namespace."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.archive_trials import write_archive
+from fieldkit.trial import indexed_tables
+from tests.helpers.paths import ROOT
+
+pytestmark = pytest.mark.emulated
+
+
+@pytest.mark.parametrize("options", ["size=16k", "size=16m,ro"])
+def test_the_result_is_right_if_the_cache_is_full_or_read_only(tmp_path: Path, options: str) -> None:
+    write_archive(tmp_path / "trials", indexed_tables.MIN_TABLES, 2)
+    (tmp_path / "cache").mkdir()
+    command = f"{sys.executable} -m fieldkit aggregate trials --format csv"
+    script = f"""sleep 2.1
+    mount -t tmpfs -o {options} tmpfs cache
+    {command} --no-index > direct.csv
+    {command} > full.csv 2> notes.txt
+    [ -z "$(find cache -type f)" ]"""  # tables that are younger than 2 s get no index
+    namespace = ("unshare", "--mount", "--propagation", "private", "--", "sh", "-euc", script)
+    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    done = subprocess.run(namespace, cwd=tmp_path, env=environment, capture_output=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    direct, full = ((tmp_path / name).read_bytes() for name in ("direct.csv", "full.csv"))
+    assert direct == full
+    assert direct.count(b"\n") > 1
+    notes = [line for line in (tmp_path / "notes.txt").read_text().splitlines() if "index" in line]
+    assert len(notes) == 1
