@@ -97,7 +97,8 @@ def environment(folder: Path, *, is_wheel: bool) -> dict[str, str]:
         loader = root / "lib64/ld-linux-x86-64.so.2"
         paths = [libraries, *sorted({path.parent for path in libraries.glob("*/*.so*")})]
         flags = (
-            f'--sysroot={root} "$@" -Wl,--dynamic-linker={loader} -Wl,--allow-shlib-undefined'
+            # With --sysroot alone, g++ would search its own folders first, and link the ns-3 of this machine.
+            f'--sysroot={root} -L{libraries} "$@" -Wl,--dynamic-linker={loader} -Wl,--allow-shlib-undefined'
             f" -Wl,--disable-new-dtags -Wl,-rpath,{':'.join(map(str, paths))}"
         )
         descriptions = f"{libraries}/pkgconfig:{root}/usr/share/pkgconfig"
