@@ -41,6 +41,15 @@ class FrameReader(Protocol):
         """Yield the frames of a file in chunks of about `chunk_bytes`; at least one chunk."""
 
 
+def frame_reader(data: Buffer) -> FrameReader | None:
+    """Return the reader of a capture file's format, or None if the bytes have none of the formats."""
+    module = FORMATS.get(bytes(data[:4]))
+    if module is None:
+        return None
+    reader: FrameReader = import_module(f"{__package__}.{module}").chunks
+    return reader
+
+
 @dataclass(frozen=True)
 class Capture:
     """Packets of a capture file or of a chunk of it.
@@ -96,16 +105,15 @@ def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
 
 
 def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
-    magic = bytes(data[:4])
-    if magic not in FORMATS:
+    reader = frame_reader(data)
+    if reader is None:
         raise EvidenceError(
             "is not a pcap or pcapng file" if data else "is empty",
             where=where,
             remedy="read the capture's log: tcpdump must have started, and must be stopped with SIGINT or SIGTERM",
         )
-    read_chunks: FrameReader = import_module(f"{__package__}.{FORMATS[magic]}").chunks
     integers = Integers(data)
-    for chunk in read_chunks(data, where=where, chunk_bytes=chunk_bytes):
+    for chunk in reader(data, where=where, chunk_bytes=chunk_bytes):
         yield Capture(decode(integers, chunk.frames), len(chunk.frames), chunk.damage)
 
 
