@@ -34,19 +34,19 @@ FORMATS: Final = MappingProxyType(
 """Module that reads a format, in this package, by the first four bytes of the file."""
 
 
-class FrameReader(Protocol):
+class ChunkReader(Protocol):
     """The function `chunks` of a format's module."""
 
     def __call__(self, data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
         """Yield the frames of a file in chunks of about `chunk_bytes`; at least one chunk."""
 
 
-def frame_reader(data: Buffer) -> FrameReader | None:
+def frame_reader(data: Buffer) -> ChunkReader | None:
     """Return the reader of a capture file's format, or None if the bytes have none of the formats."""
     module = FORMATS.get(bytes(data[:4]))
     if module is None:
         return None
-    reader: FrameReader = import_module(f"{__package__}.{module}").chunks
+    reader: ChunkReader = import_module(f"{__package__}.{module}").chunks
     return reader
 
 
