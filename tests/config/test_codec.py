@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.config.schema import Codec, Field
+from fieldkit.config.json_records import Codec
+from fieldkit.config.schema import Field
 
 
 class Colour(StrEnum):

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from fieldkit.config import program_files, schema
-from fieldkit.config.program_files import LabProgram, NamedProgram
+from fieldkit.config.named_programs import NamedProgram
+from fieldkit.config.program_files import LabProgram
 from fieldkit.config.schema import Strict
 from fieldkit.core.errors import ConfigurationError
 

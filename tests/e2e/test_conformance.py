@@ -14,7 +14,7 @@ from fieldkit.config.site import load_site
 from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Unattended
 from fieldkit.core.units import parse_distance
-from fieldkit.remote.link import Timing
+from fieldkit.remote.sockets import Timing
 from fieldkit.remote.ssh import CONNECT_S
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed

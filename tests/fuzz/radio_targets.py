@@ -11,7 +11,7 @@ from typing import Final
 from fieldkit.core.columns import cell
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
-from fieldkit.measure.evidence import link, link_samples, program_output
+from fieldkit.measure.evidence import link, link_samples, program_output, robot_link_samples
 from tests.fuzz.harness import Target
 from tests.helpers.paths import DATA
 
@@ -51,16 +51,16 @@ def _read_robot_samples(name: str, data: bytes, place: Path) -> None:
     if "link" not in name:
         (place / "sender-link.txt").write_text(_OWN, encoding="utf-8")
     (place / name).write_bytes(data)
-    _measure(list(link_samples.read_robot(place, Role.SENDER)))
+    _measure(list(robot_link_samples.read(place, Role.SENDER)))
 
 
 def _parse_iw(data: bytes, _: Path) -> None:
     text = data.decode(errors="replace")
-    link_samples.parse_stations(text)
-    link_samples.parse_cell(text)
-    link_samples.parse_channel(text)
+    robot_link_samples.parse_stations(text)
+    robot_link_samples.parse_cell(text)
+    robot_link_samples.parse_channel(text)
     for line in text.split("\n"):
-        link_samples.parse_wireless(line)
+        robot_link_samples.parse_wireless(line)
 
 
 def _evaluate_path(data: bytes, place: Path) -> None:
@@ -81,7 +81,7 @@ def _match_expression(data: bytes, place: Path) -> None:
 
 def radio_targets() -> Iterator[Target]:
     """Yield the targets."""
-    samples = link_samples.parse(_OWN)
+    samples = robot_link_samples.parse(_OWN)
     testbeds = link_samples.text({Role.SENDER: samples, Role.RECEIVER: samples[:3]}).encode()
     yield Target("link-csv", (testbeds,), _read_testbed_samples)
     states = (_CLOCK + (_IW / "station-iwlwifi-6.txt").read_text(encoding="utf-8")).encode()

@@ -22,8 +22,8 @@ from paramiko.common import AUTH_FAILED, AUTH_SUCCESSFUL, OPEN_SUCCEEDED
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, LinkLostError, RobotError
 from fieldkit.remote.keys import read_private_key
-from fieldkit.remote.link import Timing
 from fieldkit.remote.shell import Completed
+from fieldkit.remote.sockets import Timing
 from fieldkit.remote.ssh import SshShell
 from tests.helpers.sshd import Server, wait_until
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FIXED_ROLES, LinkSample, Role, StationSample
-from fieldkit.measure.evidence import link_samples
+from fieldkit.measure.evidence import link_samples, robot_link_samples
 from tests.helpers.paths import DATA
 
 S = 10**9
@@ -97,7 +97,7 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
         (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode()))
     else:
         (tmp_path / "sender-link.txt").write_text(OWN, encoding="utf-8")
-    samples_read = link_samples.read_robot(tmp_path, Role.SENDER)
+    samples_read = robot_link_samples.read(tmp_path, Role.SENDER)
     at_s = [item.utc_ns / S - BOOTED_S for item in samples_read]
     assert at_s == pytest.approx([100.0, 101.0, 101.2, 101.4, 102.0], abs=0.02)
     packets = [[station.tx_packets for station in item.stations if station.station] for item in samples_read]
@@ -113,7 +113,7 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
 
 @given(st.integers(0, len(OWN)))
 def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
-    whole, cut = link_samples.parse(OWN), link_samples.parse(OWN[:at])
+    whole, cut = robot_link_samples.parse(OWN), robot_link_samples.parse(OWN[:at])
     assert [item.utc_ns for item in cut] == [item.utc_ns for item in whole][: len(cut)]
     for item, other in zip(cut, whole, strict=False):
         for station in item.stations:
@@ -125,9 +125,9 @@ def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
 
 def test_without_a_clock_or_a_file_there_are_no_samples(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="does not contain the clock"):
-        link_samples.read_robot(tmp_path, Role.SENDER)
+        robot_link_samples.read(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
-    assert link_samples.read_robot(tmp_path, Role.SENDER) == ()
+    assert robot_link_samples.read(tmp_path, Role.SENDER) == ()
     (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode())[:-20])
     with pytest.raises(EvidenceError, match="cannot be read"):
-        link_samples.read_robot(tmp_path, Role.SENDER)
+        robot_link_samples.read(tmp_path, Role.SENDER)

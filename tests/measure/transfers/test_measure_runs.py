@@ -5,7 +5,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures import classic_pcap, pcap
 from tests.helpers.captures import Frame, file_bytes, segment
 
 runs = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 200)), min_size=1, max_size=12)
@@ -24,7 +24,7 @@ def records(data: bytes) -> list[int]:
 def test_runs_of_any_lengths(some: list[tuple[int, int]], chunk_bytes: int) -> None:
     frames = [Frame(0, bytes(1 + size)) for size, count in some for _ in range(count)]
     data = file_bytes(frames)
-    chunks = list(pcap.classic_chunks(data, where="test", chunk_bytes=chunk_bytes))
+    chunks = list(classic_pcap.chunks(data, where="test", chunk_bytes=chunk_bytes))
     assert [at for chunk in chunks for at in chunk.frames.start.tolist()] == records(data)
     assert [chunk.damage for chunk in chunks] == [None] * len(chunks)
 
