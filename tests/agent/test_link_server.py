@@ -38,12 +38,12 @@ def drone_at(kind: str) -> Iterator[str]:
         with socket.socket(type=socket.SOCK_DGRAM) as drone, socket.socket(type=socket.SOCK_DGRAM) as free:
             drone.bind(("127.0.0.1", 0))
             free.bind(("127.0.0.1", 0))
-            there = free.getsockname()
+            address = free.getsockname()
             free.close()
-            with drones.flying(drone.fileno(), lambda frame: drone.sendto(frame, there), drone.recv) as autopilot:
+            with drones.flying(drone.fileno(), lambda frame: drone.sendto(frame, address), drone.recv) as autopilot:
                 greeting = drones.Sender(255, 190).frame(drones.beat())
                 list(autopilot.receive(greeting, drones.PEER, time.monotonic_ns()))
-                yield f"udpin:127.0.0.1:{there[1]}"
+                yield f"udpin:127.0.0.1:{address[1]}"
     else:
         with drones.at_udp() as port, MavlinkRouter(port, 1 if kind.endswith("client") else 100) as router:
             yield f"udpout:127.0.0.1:{router.udp}" if kind == "udpout" else f"tcp:127.0.0.1:{router.tcp}"

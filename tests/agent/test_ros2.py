@@ -93,9 +93,9 @@ def test_fast_dds_and_cyclonedds_exchange_samples_through_the_agent(program: Pat
     # On a busy machine CycloneDDS sometimes does not discover an endpoint of Fast DDS that has discovered it.
     assert any(exchange(program, tmp_path) for _ in range(TRIES))
     for topic in SIZES:
-        sent, came = (read(tmp_path / f"{topic}.{verb}", records.SAMPLE) for verb in ("publish", "subscribe"))
+        sent, received = (read(tmp_path / f"{topic}.{verb}", records.SAMPLE) for verb in ("publish", "subscribe"))
         assert sent
-        assert [row[1:] for row in came] == [row[1:] for row in sent]
+        assert [row[1:] for row in received] == [row[1:] for row in sent]
 
 
 @pytest.mark.emulated
@@ -121,7 +121,7 @@ def test_ros_2_node_leaves_no_file_in_the_home_of_its_robot(program: Path, tmp_p
     assert not list(home.iterdir())
 
 
-SHOWN: Final = """
+PRINT_POLICIES: Final = """
 import json, sys
 sys.path.insert(0, sys.argv[1])
 from fieldkit.agent.messaging import ros2
@@ -141,7 +141,9 @@ print(json.dumps([policies, made.deadline.nanoseconds, made.lifespan.nanoseconds
 
 @pytest.mark.emulated
 def test_network_settings_and_quality_in_rclpy(program: Path) -> None:
-    done = subprocess.run((ROS2, "-c", SHOWN, str(program)), capture_output=True, check=False, timeout=LONG_S)
+    done = subprocess.run(
+        (ROS2, "-c", PRINT_POLICIES, str(program)), capture_output=True, check=False, timeout=LONG_S
+    )
     assert done.returncode == 0, done.stderr
     policies, deadline_ns, lifespan_ns, output, ways = json.loads(done.stdout)
     assert policies == ["BEST_EFFORT", "KEEP_LAST", 7, "TRANSIENT_LOCAL"]

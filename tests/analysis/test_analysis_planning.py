@@ -22,15 +22,15 @@ def half(interval: Interval | None) -> float:
 
 
 @given(st.integers(0, 30), st.integers(1, 30), st.floats(0.01, 0.6))
-def test_a_flag_needs_the_number_of_wilsons_formula(true: int, untrue: int, wanted: float) -> None:
+def test_a_flag_needs_the_number_of_wilsons_formula(true: int, untrue: int, expected: float) -> None:
     n = true + untrue
     p, z = true / n, scipy.stats.norm.ppf(0.975)
     total = next(
         many
         for many in count(n)
-        if z / (1 + z * z / many) * math.sqrt(p * (1 - p) / many + (z / many) ** 2 / 4) <= wanted * (1 + 1e-9)
+        if z / (1 + z * z / many) * math.sqrt(p * (1 - p) / many + (z / many) ** 2 / 4) <= expected * (1 + 1e-9)
     )
-    assert additional_repeats(wilson(true, n), n, wanted, Kind.FLAG) == total - n
+    assert additional_repeats(wilson(true, n), n, expected, Kind.FLAG) == total - n
 
 
 @given(st.integers(2, 25), st.floats(0.2, 1.5))

@@ -68,10 +68,10 @@ def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
 
 @given(rows_of_anything())
 def test_rows_equal_those_read_from_their_table(rows: list[dict[str, Any]]) -> None:
-    made, read_back = parsed(rows), parse(to_csv(rows, trial_columns()).encode(), trial_columns())
-    assert len(made) == len(rows)
-    assert same(made, read_back)
-    for first, second in ((made.numbers, read_back.numbers), (made.texts, read_back.texts)):
+    expected, read_back = parsed(rows), parse(to_csv(rows, trial_columns()).encode(), trial_columns())
+    assert len(expected) == len(rows)
+    assert same(expected, read_back)
+    for first, second in ((expected.numbers, read_back.numbers), (expected.texts, read_back.texts)):
         assert [(name, column.dtype) for name, column in first.items()] == [
             (name, column.dtype) for name, column in second.items()
         ]

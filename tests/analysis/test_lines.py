@@ -52,15 +52,15 @@ def test_the_label_has_the_range_of_payload_sizes() -> None:
 
 @pytest.mark.parametrize("form", ["markdown", "latex"])
 def test_tables_for_papers_have_payload_size_and_number_of_repeats(form: str) -> None:
-    made = {"markdown": paper_tables.to_markdown, "latex": paper_tables.to_latex}[form]
+    to_text = {"markdown": paper_tables.to_markdown, "latex": paper_tables.to_latex}[form]
     table = [
         PINGED,
         *(replace(PINGED, repeat=2 + n, rtt_loss=1.0, rtt_received=0, rtt_median_s=None) for n in (0, 1)),
     ]
-    text = made(DEFAULT_BY, cells_of(table), quantities(trial_columns()))
+    text = to_text(DEFAULT_BY, cells_of(table), quantities(trial_columns()))
     assert "RTT, 8192-byte ping, median (ms)" in text
     assert "10.00 (1 of 3)" in text
-    text = made(DEFAULT_BY, cells_of(table[1:]), quantities(trial_columns()))
+    text = to_text(DEFAULT_BY, cells_of(table[1:]), quantities(trial_columns()))
     assert "none, 0 of 2" in text
 
 

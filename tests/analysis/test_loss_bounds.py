@@ -11,12 +11,12 @@ from tests.analysis.test_coverage import lost_in_bursts
 
 
 @given(st.integers(0, 200), st.integers(1, 200))
-def test_shares_of_repeats_equal_clopper_and_pearson(met: int, n: int) -> None:
-    assume(met <= n)
-    low = 0.0 if met == 0 else scipy.stats.beta.ppf(0.05, met, n - met + 1)
-    high = 1.0 if met == n else scipy.stats.beta.ppf(0.95, met + 1, n - met)
-    assert one_sided_bounds.share_low(met, n) == pytest.approx(low, abs=1e-9)
-    assert one_sided_bounds.share_high(met, n) == pytest.approx(high, abs=1e-9)
+def test_shares_of_repeats_equal_clopper_and_pearson(successes: int, n: int) -> None:
+    assume(successes <= n)
+    low = 0.0 if successes == 0 else scipy.stats.beta.ppf(0.05, successes, n - successes + 1)
+    high = 1.0 if successes == n else scipy.stats.beta.ppf(0.95, successes + 1, n - successes)
+    assert one_sided_bounds.share_low(successes, n) == pytest.approx(low, abs=1e-9)
+    assert one_sided_bounds.share_high(successes, n) == pytest.approx(high, abs=1e-9)
 
 
 @given(st.floats(0.001, 0.9999))
@@ -62,8 +62,8 @@ def test_the_number_of_packets_without_a_loss_is_minimal(bound: float) -> None:
 def test_the_bound_is_above_the_true_loss_in_95_percent_of_runs(burst: int, rate: float) -> None:
     """6 repeats of 1,250 datagrams on a Gilbert-Elliott link, as an iperf3 test of 3 s."""
     lost = lost_in_bursts(np.random.default_rng(21), rate, burst, (400, 6), 1250)
-    held = np.mean([one_sided_bounds.loss_high(run, [1250] * 6) >= rate for run in lost])
-    assert held >= 0.94  # 95 % minus a standard error
+    coverage = np.mean([one_sided_bounds.loss_high(run, [1250] * 6) >= rate for run in lost])
+    assert coverage >= 0.94  # 95 % minus a standard error
 
 
 @pytest.mark.parametrize("bursts_per_run", [0.5, 3, 20])

@@ -269,9 +269,9 @@ def test_notes_of_commands_are_warnings(tmp_path: Path) -> None:
 
 
 def test_rebuild_measures_the_evidence_again(recorded_trial: Path) -> None:
-    kept = fieldkit.load(recorded_trial).repeats
+    stored = fieldkit.load(recorded_trial).repeats
     (recorded_trial / store.TRIAL_CSV).unlink()
-    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(kept)
+    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(stored)
 
 
 def test_the_package_imports_its_readers_lazily() -> None:

@@ -26,7 +26,7 @@ class RecordingOperator:
 
 
 @pytest.mark.parametrize(
-    ("fault", "asked", "lasted_s"),
+    ("fault", "requests", "lasted_s"),
     [
         (Fault(FaultKind.REBOOT, Role.RECEIVER), ["reboot turtlebot-2"], 0.0),
         (Fault(FaultKind.KILL, Role.SENDER, process="nc"), ["kill nc on turtlebot-1"], 0.0),
@@ -37,10 +37,10 @@ class RecordingOperator:
         ),
     ],
 )
-def test_request_and_duration_of_each_fault(fault: Fault, asked: list[str], lasted_s: float | None) -> None:
+def test_request_and_duration_of_each_fault(fault: Fault, requests: list[str], lasted_s: float | None) -> None:
     operator = RecordingOperator()
     assert FieldTestbed(CAST, {}, operator).inject(fault) == lasted_s
-    assert operator.asked == asked
+    assert operator.asked == requests
 
 
 class SlowOperator(RecordingOperator):
@@ -68,7 +68,7 @@ def test_link_down_lasts_from_first_to_second_answer(monkeypatch: pytest.MonkeyP
     assert operator.asked == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
 
 
-AWAY = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
+MOVE = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
 START_REQUEST = (
     "move turtlebot-1, as seen from {}: 10 m away, then 2 m left, at 0.2 m/s; answer when it starts to move"
 )
@@ -76,7 +76,7 @@ START_REQUEST = (
 
 def test_operator_moves_robot_and_brings_it_back() -> None:
     operator = RecordingOperator()
-    with FieldTestbed(CAST, {}, operator).moving(AWAY):
+    with FieldTestbed(CAST, {}, operator).moving(MOVE):
         assert operator.asked == [START_REQUEST.format("duckiedrone-1")]
     assert operator.asked[1:] == ["bring turtlebot-1 back to its place"]
 
@@ -85,7 +85,7 @@ def test_operator_moves_robot_and_brings_it_back() -> None:
 def test_robot_is_brought_back_after_error_but_not_after_ctrl_c(error: BaseException) -> None:
     operator = RecordingOperator()
     direct: dict[Role, Robot] = {role: CAST[role] for role in (Role.SENDER, Role.RECEIVER)}
-    with pytest.raises(type(error)), FieldTestbed(direct, {}, operator).moving(AWAY):
+    with pytest.raises(type(error)), FieldTestbed(direct, {}, operator).moving(MOVE):
         raise error
     back = ["bring turtlebot-1 back to its place"] if isinstance(error, Exception) else []
     assert operator.asked == [START_REQUEST.format("turtlebot-2"), *back]

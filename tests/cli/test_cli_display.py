@@ -87,9 +87,9 @@ def test_remedy_for_a_failed_step_is_below_its_repeat() -> None:
 
 
 def test_finished_campaign_shows_no_time_and_no_disk_space() -> None:
-    went = CampaignWent("los 10ft master", done=2, total=2, left_s=0.0)
+    progress = CampaignWent("los 10ft master", done=2, total=2, left_s=0.0)
     planned = CampaignPlanned("small", (), 2, 2, walk_m=0.0, left_s=0.0, needed_bytes=0, free_bytes=1 << 30)
-    for event in (went, planned):
+    for event in (progress, planned):
         assert "".join(text for text, _ in event_words(event)) == "campaign: 2 of 2 trials are done"
 
 

@@ -16,7 +16,7 @@ from fieldkit.core.model import Verdict
 from tests.helpers.paths import ROOT
 
 COMMAND = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;,\n`]*)")
-GIVEN = ("--site", "my lab.yaml", "--backend", "field")
+OPTIONS = ("--site", "my lab.yaml", "--backend", "field")
 
 
 def messages() -> Iterator[tuple[str, str, bool]]:
@@ -80,9 +80,9 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
 def test_hints_include_the_options_given(typed_before: str, hint: str, whole: str) -> None:
     top = parser()
     with hints.completing(top) as options:
-        options.read(top.parse_args((*typed_before.split(), *GIVEN)))
+        options.read(top.parse_args((*typed_before.split(), *OPTIONS)))
         completed = hints.completed(hint)
-    assert completed == whole.format(given=shlex.join(GIVEN))
+    assert completed == whole.format(given=shlex.join(OPTIONS))
     if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
         again = top.parse_args(shlex.split(completed)[1:])
         assert getattr(again, "site", None) is None or str(again.site) == "my lab.yaml"
@@ -99,11 +99,11 @@ def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture
             with showing_events(as_json=as_json) as sink:
                 sink(TrialStopped("my trials/a", 1, 2))
                 sink(finding)
-    shown = capsys.readouterr()
-    assert shown.err.endswith("remedy: fieldkit abort --site x.yaml\n")
-    assert "end it: fieldkit abort --site x.yaml\n" in shown.out
-    assert "to continue: fieldkit resume --site x.yaml 'my trials/a'\n" in shown.out
-    assert json.loads(shown.out.splitlines()[-1])["remedy"] == "wait, or end it: fieldkit abort --site x.yaml"
+    output = capsys.readouterr()
+    assert output.err.endswith("remedy: fieldkit abort --site x.yaml\n")
+    assert "end it: fieldkit abort --site x.yaml\n" in output.out
+    assert "to continue: fieldkit resume --site x.yaml 'my trials/a'\n" in output.out
+    assert json.loads(output.out.splitlines()[-1])["remedy"] == "wait, or end it: fieldkit abort --site x.yaml"
 
 
 def test_without_options_hints_are_unchanged() -> None:

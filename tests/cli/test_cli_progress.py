@@ -41,7 +41,7 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("width", "shown"),
+    ("width", "expected"),
     [
         (120, f"trial 3 of 6  {'━' * 4}{'─' * 20}  7/40  3 min 20 s left  udp-08 transfer  12 s left"),
         (80, f"trial 3 of 6  {'━' * 2}{'─' * 10}  7/40  3 min 20 s left  udp-08 transfer  12 s left"),
@@ -52,8 +52,8 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
         (5, "ud..."),
     ],
 )
-def test_line_fits_and_keeps_the_current_phase(width: int, shown: str) -> None:
-    assert line(width, *STARTED) == shown
+def test_line_fits_and_keeps_the_current_phase(width: int, expected: str) -> None:
+    assert line(width, *STARTED) == expected
 
 
 def test_the_line_is_never_wider_than_the_terminal() -> None:

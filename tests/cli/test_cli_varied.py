@@ -143,8 +143,8 @@ def test_exports_have_types_units_and_meanings_of_all_columns(
     output_of(capsys, "export", ".", "--format", "parquet", "-o", "all.parquet")
     table = pyarrow.parquet.read_table(trials / "all.parquet")
     for column in (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS):
-        kept = table.schema.field(column.name).metadata
-        assert (kept[b"unit"].decode(), kept[b"meaning"].decode()) == (column.unit, column.meaning)
+        metadata = table.schema.field(column.name).metadata
+        assert (metadata[b"unit"].decode(), metadata[b"meaning"].decode()) == (column.unit, column.meaning)
     assert table.column("probe.level").null_count == 0
     assert table.column("up.transfer_s").null_count == table.num_rows // 2
     output_of(capsys, "export", ".", "--format", "csv", "-o", "all.csv")

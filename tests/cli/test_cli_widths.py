@@ -42,8 +42,8 @@ def test_a_table_keeps_every_word_and_is_no_wider_than_the_terminal(data: st.Dat
     right = data.draw(st.lists(st.integers(0, size - 1), max_size=2))
     text = printed(width, head, rows, right)
     words = [word for row in rows for cell in row for word in cell.split()]
-    shown = text.split()
-    assert all(shown.count(word) >= words.count(word) for word in words)
+    printed_words = text.split()
+    assert all(printed_words.count(word) >= words.count(word) for word in words)
     longest = max([cell_len(word) for word in words], default=0) + max(map(len, head)) + 4
     assert all(cell_len(line) <= max(width, longest) for line in text.splitlines())
 

@@ -101,8 +101,8 @@ def campaign(*changes: str, started: bool = False) -> Setup:
         path = lab / "lawn.yaml"
         path.write_text(text, encoding="utf-8")
         if started:
-            asked, _ = plan.make_plan(path, "emulated")
-            with CampaignJournal(lab / "trials" / "campaign_lawn").locked(asked):
+            campaign_plan, _ = plan.make_plan(path, "emulated")
+            with CampaignJournal(lab / "trials" / "campaign_lawn").locked(campaign_plan):
                 pass
         for old, new in zip(changes[::2], changes[1::2], strict=True):
             assert old in text

@@ -47,12 +47,12 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
     )
     environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}"}
 
-    def run(*words: str, **asked: str) -> subprocess.CompletedProcess[str]:
+    def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
         command = (sys.executable, "-m", "fieldkit", *words)
         return subprocess.run(
             command,
             cwd=tmp_path,
-            env=environment | asked,
+            env=environment | variables,
             capture_output=True,
             text=True,
             check=False,
@@ -83,8 +83,8 @@ def test_the_help_lists_it_and_the_tab_key_completes_it(fieldkit: Fieldkit, tmp_
     )
     answer = tmp_path / "answer"
     for line, words in (("fieldkit wor", ["worst "]), ("fieldkit worst x --b", ["--by "])):
-        asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
-        fieldkit(**asked, _ARGCOMPLETE_STDOUT_FILENAME=str(answer))
+        variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+        fieldkit(**variables, _ARGCOMPLETE_STDOUT_FILENAME=str(answer))
         assert answer.read_text(encoding="utf-8").split("\n") == words, line
 
 

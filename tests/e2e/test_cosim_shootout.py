@@ -128,15 +128,17 @@ def test_followers_are_reported_with_their_distance_from_the_reference_path(lab:
 
 
 def test_a_run_reports_the_same_followers_as_its_recording(lab: Path) -> None:
-    ran = cosim(lab, "run", "convoy", "--duration", "1s", "--window", "7ms", "--policy", "scheduled", "--out", "sim")
-    assert "spacing (cm)" in ran.out
+    result = cosim(
+        lab, "run", "convoy", "--duration", "1s", "--window", "7ms", "--policy", "scheduled", "--out", "sim"
+    )
+    assert "spacing (cm)" in result.out
     assert len(list((lab / "sim" / "captures").iterdir())) == 3
     replayed = cosim(lab, "replay", "sim")
-    assert replayed.out.partition("followers\n")[2] == ran.out.partition("followers\n")[2], replayed.err
+    assert replayed.out.partition("followers\n")[2] == result.out.partition("followers\n")[2], replayed.err
     report = json.loads(cosim(lab, "replay", "sim", "--format", "json").out)
     assert report.keys() == {"flows", "followers"}
     (row,) = report["followers"]
-    assert f"{100 * row['spacing_mean_m']:.3g}" in ran.out.partition("followers\n")[2]
+    assert f"{100 * row['spacing_mean_m']:.3g}" in result.out.partition("followers\n")[2]
 
 
 def test_the_table_of_a_shootout_can_be_plotted_again(lab: Path) -> None:

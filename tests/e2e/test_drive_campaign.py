@@ -40,9 +40,9 @@ OPTION = "--allow-motion-after-fault"
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RoverLab]:
-    with rover_lab(tmp_path_factory.mktemp("lawn"), fence_m=FENCE_M, lease_s=LEASE_S) as made:
-        (made.folder / "lawn.yaml").write_text(CAMPAIGN, encoding="utf-8")
-        yield made
+    with rover_lab(tmp_path_factory.mktemp("lawn"), fence_m=FENCE_M, lease_s=LEASE_S) as created_lab:
+        (created_lab.folder / "lawn.yaml").write_text(CAMPAIGN, encoding="utf-8")
+        yield created_lab
 
 
 def campaign(lab: RoverLab, out: str, *words: str) -> Run:

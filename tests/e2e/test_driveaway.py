@@ -85,7 +85,7 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     assert {point.position_m for point in where if point.role is Role.SENDER} == {(3.0, 6.0, 0.2)}
     east_m = [point.position_m[0] for point in receiver_track if point.position_m is not None]
     assert (east_m[0], max(east_m), east_m[-1]) == (43.0, 43.0 + PATH_M, 43.0), "there, and back at its place"
-    assert all(here < there for here, there in pairwise(east_m[:-1]))
+    assert all(earlier < later for earlier, later in pairwise(east_m[:-1]))
     assert len(east_m) > PATH_M / 2, "positions along the whole path"
     assert {point.velocity_m_s for point in receiver_track[1:-2]} == {(SPEED_M_S, 0.0, 0.0)}
     assert receiver_track[-2].velocity_m_s == receiver_track[-1].velocity_m_s == (0.0, 0.0, 0.0)
@@ -93,8 +93,8 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     end_m = range_m()
     assert 60 < end_m < 40 + PATH_M, "the route leads out of range"
     sent = frames(folder, where)
-    heard = [metres for metres, _, received in sent if received]
-    assert end_m - 10 < max(heard) <= end_m
+    received_m = [metres for metres, _, received in sent if received]
+    assert end_m - 10 < max(received_m) <= end_m
     nearest_m = min(metres for metres, _, _ in sent)  # the robot already drives while the programs start
     near, far = ([RATES[m] for metres, m, _ in sent if 0 <= metres - low <= 10] for low in (nearest_m, end_m - 10))
     assert sum(near) / len(near) > 1.2 * sum(far) / len(far)

@@ -31,9 +31,9 @@ BARE_PRINT = {"fieldkit/cli/display.py", "fieldkit/cli/terminal.py", "fieldkit/c
 def formats() -> Iterator[tuple[str, str]]:
     """Yield every command that has a choice of formats, with each format, including commands added later."""
     for command in ("aggregate", "compare", "export"):
-        known = parser().command(command)
-        assert known is not None
-        (choices,) = (action.choices for action in known._actions if "--format" in action.option_strings)
+        arguments = parser().command(command)
+        assert arguments is not None
+        (choices,) = (action.choices for action in arguments._actions if "--format" in action.option_strings)
         assert choices is not None
         yield from ((command, form) for form in choices)
 

@@ -107,13 +107,13 @@ def test_plain_ssh_scp_and_sftp_reach_the_robots(lab: Path) -> None:
     assert (lab / "back").read_bytes() == (lab / "there").read_bytes()
 
 
-STANDS: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
+DRIVE_SCRIPT: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
 
 
 def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
     """The program has the driver's command line, by which `fieldkit stop` recognizes it in every case."""
     attempt = jobs.work_folder("trial-a", "tcp-01-1")
-    argv = ("sh", "-c", STANDS, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
+    argv = ("sh", "-c", DRIVE_SCRIPT, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
     driver = Job(attempt, "drive", argv, WITHIN_S, "drive.log", ready="log:up")
     with lab_shells.opened(folder.of_directory(lab)) as shells:
         jobs.install(shells["ground-1"], Deadline.after(WITHIN_S))
@@ -308,8 +308,8 @@ def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Pat
     os.kill(process, 9)
     wait_for_end(lived | {process}, within_s=WITHIN_S)
     untouched()
-    gone = run_here(tmp_path, "lab", "ps")
-    assert (gone.code, "remedy: fieldkit lab up" in gone.err) == (2, True)
+    listing = run_here(tmp_path, "lab", "ps")
+    assert (listing.code, "remedy: fieldkit lab up" in listing.err) == (2, True)
     assert fieldkit(tmp_path, "lab", "up").code == 0
     assert fieldkit(tmp_path, "lab", "down").code == 0
 

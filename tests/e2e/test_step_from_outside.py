@@ -74,8 +74,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fieldkit]:
 
 
 def test_its_columns_and_commands_are_available(fieldkit: Fieldkit) -> None:
-    shown = fieldkit("columns", "show", "route_device")
-    assert "Interface to the other robot" in shown.stdout, shown.stderr
+    output = fieldkit("columns", "show", "route_device")
+    assert "Interface to the other robot" in output.stdout, output.stderr
     planned = fieldkit("trial", "busy", "5m", "--dry-run")
     assert "route: ip -json route get 10.42.0.1 > route.txt 2> receiver-route.log" in planned.stdout, planned.stderr
 

@@ -32,11 +32,11 @@ def test_the_exported_csv_equals_the_trial_csv(trial: Path) -> None:
 
 
 def test_raw_evidence_measured_again_gives_the_same_bytes(trial: Path, tmp_path: Path) -> None:
-    kept = (trial / store.TRIAL_CSV).read_bytes()
+    table_bytes = (trial / store.TRIAL_CSV).read_bytes()
     (trial / store.TRIAL_CSV).unlink()
     out = tmp_path / "again.csv"
     assert main(["export", str(trial), "--rebuild", "--format", "csv", "-o", str(out)]) == 0
-    assert out.read_bytes() == kept
+    assert out.read_bytes() == table_bytes
 
 
 def test_tables_with_different_columns_are_combined(trial: Path, tmp_path: Path) -> None:

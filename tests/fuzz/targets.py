@@ -232,7 +232,7 @@ def _measure_attempt(name: str, data: bytes, place: Path) -> None:
         result = AttemptEvidence(attempt)
         protocol, _, number = folder.name.partition("-")
         scene = the_plan.scene(
-            RepeatId(next(known for known in the_plan.protocols if known == protocol), int(number)), ""
+            RepeatId(next(candidate for candidate in the_plan.protocols if candidate == protocol), int(number)), ""
         )
         for placed in the_plan.procedure.walk():
             view = View(scene, result, placed.within)

@@ -45,7 +45,7 @@ def real_frames() -> list[bytes]:
     text = d.MAVLink_statustext_message(4, b"\xfe\xfd" * 20)
     return [
         bytes(v1.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0).pack(old)),
-        *(one.frame(message) for one in (new, signed) for message in (attitude, text, drones.beat())),
+        *(encoder.frame(message) for encoder in (new, signed) for message in (attitude, text, drones.beat())),
     ]
 
 
@@ -56,11 +56,11 @@ FRAMES = real_frames()
 def test_frames_are_complete_for_any_cut_of_the_stream(sent: list[bytes], cuts: list[int]) -> None:
     stream = b"".join(sent)
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    buffer, came = bytearray(), list[bytes]()
+    buffer, received = bytearray(), list[bytes]()
     for begin, end in pairwise(edges):
         buffer += stream[begin:end]
-        came += mavlink_frames.frames(buffer)
-    assert came == sent
+        received += mavlink_frames.frames(buffer)
+    assert received == sent
     assert not buffer
 
 
@@ -91,7 +91,7 @@ def test_created_frames_are_read_by_pymavlink() -> None:
     )
     assert (command.command, command.param1, command.param2) == (d.MAV_CMD_SET_MESSAGE_INTERVAL, 32, 100_000)
     assert (command.target_system, command.target_component) == (7, 1)
-    assert [one.get_seq() for one in (beat, command, other)] == [0, 1, 2]
+    assert [frame.get_seq() for frame in (beat, command, other)] == [0, 1, 2]
 
 
 @pytest.mark.parametrize("old", [False, True])
@@ -182,7 +182,7 @@ def _late(stream: Callable[[], socket.socket]) -> Iterator[None]:
     over, ready = threading.Event(), threading.Event()
 
     def fly() -> None:
-        with stream() as one, drones.flying(one.fileno(), one.sendall, one.recv):
+        with stream() as connection, drones.flying(connection.fileno(), connection.sendall, connection.recv):
             ready.set()
             over.wait()
 
@@ -203,14 +203,14 @@ def over_udp() -> Iterator[str]:
 
 @contextmanager
 def over_udp_that_speaks_first() -> Iterator[str]:
-    there = ("127.9.9.9", 14_550)
+    address = ("127.9.9.9", 14_550)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind(("127.0.0.1", 0))
         with drones.flying(
-            endpoint.fileno(), lambda frame: endpoint.sendto(frame, there), endpoint.recv
+            endpoint.fileno(), lambda frame: endpoint.sendto(frame, address), endpoint.recv
         ) as autopilot:
             list(autopilot.receive(Sender(255, 190).frame(drones.beat()), ("gcs", 1), time.monotonic_ns()))
-            yield f"udpin:{there[0]}:{there[1]}"
+            yield f"udpin:{address[0]}:{address[1]}"
 
 
 @contextmanager

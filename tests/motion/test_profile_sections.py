@@ -23,8 +23,8 @@ def drive_section(profile: RobotProfile) -> Drive:
     return drive
 
 
-def conflict(one: Robot, others: Iterable[Robot]) -> str | None:
-    return drive_section(one.profile).topic_conflict(one, others)
+def conflict(robot: Robot, others: Iterable[Robot]) -> str | None:
+    return drive_section(robot.profile).topic_conflict(robot, others)
 
 
 def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str | None = None) -> RobotProfile:

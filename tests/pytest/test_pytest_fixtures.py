@@ -235,22 +235,22 @@ def test_an_error_of_the_lab_is_reported_with_its_remedy(ran: SuiteRun) -> None:
 
 
 def test_only_evidence_of_failures_is_kept(ran: SuiteRun, folder: Path) -> None:
-    (kept,) = (folder / "fieldkit-results").iterdir()
-    own = {path.name for path in (kept / "test_robots.py").iterdir()}
+    (kept_folder,) = (folder / "fieldkit-results").iterdir()
+    own = {path.name for path in (kept_folder / "test_robots.py").iterdir()}
     assert own - {"set-up"} >= FAIL - {"test_fails_because_of_a_figure"}, (
         "what that one is about was set up for several"
     )
     assert not any(name.startswith(("test_a", "test_r", "test_t")) for name in own if "asks" not in name)
-    log = (kept / "test_robots.py" / "test_fails_because_of_a_program" / "lab.log").read_text(encoding="utf-8")
+    log = (kept_folder / "test_robots.py" / "test_fails_because_of_a_program" / "lab.log").read_text(encoding="utf-8")
     assert log.endswith("rover $ sh -c 'echo broken >&2; exit 3'\nbroken\nexit code 3\n")
     for name, trials in (("set-up", 1), ("test_fails_because_of_an_expectation", 1)):
-        tables = list((kept / "test_robots.py" / name / "trials").glob("*/trial.csv"))
+        tables = list((kept_folder / "test_robots.py" / name / "trials").glob("*/trial.csv"))
         assert len(tables) == trials
 
 
 def test_a_failed_test_names_its_evidence(ran: SuiteRun, folder: Path) -> None:
-    (kept,) = (folder / "fieldkit-results").iterdir()
-    own = kept / "test_robots.py" / "test_fails_because_of_a_program"
+    (kept_folder,) = (folder / "fieldkit-results").iterdir()
+    own = kept_folder / "test_robots.py" / "test_fails_because_of_a_program"
     assert f"fieldkit evidence -------------------------------\n{own}\n" in part(
         ran.output, "test_fails_because_of_a_program"
     )
@@ -263,9 +263,11 @@ def test_each_worker_has_a_lab_and_all_share_one_folder(tmp_path: Path) -> None:
     suites.write(tmp_path, **files)
     done = suites.run(tmp_path, "-n", "2", "--dist", "loadfile", "--fieldkit-keep", "all")
     assert (done.code, set(done.results.values())) == (0, {"passed"}), done.output
-    (kept,) = (tmp_path / "fieldkit-results").iterdir()
-    logs = sorted(str(path.relative_to(kept)) for path in kept.rglob("lab.log"))
-    assert logs == [f"test_{one}.py/{test}/lab.log" for one in "ab" for test in ("set-up", f"test_{one}", "test_one")]
+    (kept_folder,) = (tmp_path / "fieldkit-results").iterdir()
+    logs = sorted(str(path.relative_to(kept_folder)) for path in kept_folder.rglob("lab.log"))
+    assert logs == [
+        f"test_{letter}.py/{test}/lab.log" for letter in "ab" for test in ("set-up", f"test_{letter}", "test_one")
+    ]
 
 
 def test_nothing_remains_after_ctrl_c(tmp_path: Path) -> None:

@@ -276,9 +276,9 @@ def test_errors_and_tables_show_markup_and_escapes_literally(
     show: Callable[[str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     show("[bold]a[/bold] \x1b]52;c;QQ==\x07 \u202e b")
-    shown = "".join(capsys.readouterr())
-    assert "[bold]a[/bold] ?]52;c;QQ==" in shown
-    assert not set(shown) & set("\x1b\x07\u202e")
+    output = "".join(capsys.readouterr())
+    assert "[bold]a[/bold] ?]52;c;QQ==" in output
+    assert not set(output) & set("\x1b\x07\u202e")
 
 
 class Endless:

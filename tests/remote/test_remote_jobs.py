@@ -239,8 +239,8 @@ def test_repeated_start_reports_that_the_job_ended_before_it_was_ready(shell: Lo
 
 
 def test_job_that_is_not_ready_in_time_is_killed_and_its_log_reported(shell: LocalShell) -> None:
-    stays = job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done")
-    job_spec = replace(stays, ready="log:up", ready_s=3)
+    stubborn = job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done")
+    job_spec = replace(stubborn, ready="log:up", ready_s=3)
     with pytest.raises(RobotError, match="job job was not up in 3 s: still looking") as caught:
         jobs.start(shell, job_spec)
     assert FOLDER in caught.value.remedy

@@ -132,14 +132,14 @@ def pinned(key: paramiko.PKey) -> str:
 
 @pytest.fixture
 def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], FakeServer]]:
-    made: list[FakeServer] = []
+    servers: list[FakeServer] = []
 
     def make(serve: Callable[[socket.socket], object]) -> FakeServer:
-        made.append(FakeServer(serve))
-        return made[-1]
+        servers.append(FakeServer(serve))
+        return servers[-1]
 
     yield make
-    for fake in made:
+    for fake in servers:
         fake.listener.close()
 
 
@@ -465,9 +465,9 @@ class WaitingCommand:
 
 @pytest.fixture
 def waiting(tmp_path: Path) -> Iterator[WaitingCommand]:
-    made = WaitingCommand(tmp_path)
-    yield made
-    made.go.touch()
+    command = WaitingCommand(tmp_path)
+    yield command
+    command.go.touch()
 
 
 def test_command_whose_link_breaks_is_sent_again(

@@ -399,10 +399,10 @@ def test_output_and_exit_code_are_separated_for_any_pieces(
     end = NONCE + f" {code}\n".encode()
     begin = stray + NONCE + b"\n"
     channel = ReceivedChannel(split(begin + out[0] + end + stray, out[1]), split(begin + err[0] + end, err[1]))
-    taken = threading.Lock()
-    taken.acquire()
+    lock = threading.Lock()
+    lock.acquire()
     try:
-        running_command = wait_for_start(cast("Channel", channel), NONCE, taken)
+        running_command = wait_for_start(cast("Channel", channel), NONCE, lock)
         into = BytesIO()
         assert running_command is not None
         assert wait_for_output(running_command, out[0][:3], deadline=soon(), robot="robot")
@@ -411,7 +411,7 @@ def test_output_and_exit_code_are_separated_for_any_pieces(
     finally:
         os.close(channel.event)
     assert (into.getvalue(), done) == (out[0][3:], (code, err[0]))
-    assert not taken.locked()
+    assert not lock.locked()
     assert not channel.closed
 
 

@@ -137,9 +137,9 @@ def usual(seed: int) -> list[Any]:
     transfer |= draw.choice([{}, {}, {}, {"port": 2222}, {"file": f"{name}.bag"}, {"file": "none.bin"}])
     inside: list[Any] = [{"transfer": transfer}]
     if draw.random() < 0.7:
-        asked = draw.choice([{}, {"payload_bytes": {"tcp": 8, "udp": 100}}])
+        options = draw.choice([{}, {"payload_bytes": {"tcp": 8, "udp": 100}}])
         ends = draw.choice([(source, target)] * 3 + [(target, source)])
-        inside.append({"ping": {"from": ends[0], "to": ends[1], "count": 4, **asked}})
+        inside.append({"ping": {"from": ends[0], "to": ends[1], "count": 4, **options}})
     inside = _more(draw, inside, source, target)
     if draw.random() < 0.3:
         move = {"robot": draw.choice([source, "relay"]), "path": [{"away": "5m"}], "speed": "0.1m/s"}
@@ -249,16 +249,16 @@ def _compare(
     assert len(set(declared)) == len(declared)
     assert set(declared) <= values.keys() | missing.keys()
     assert all(missing.get(name, "for a reason") for name in declared)
-    for name, (asked, answered) in truth.pings.items():
+    for name, (requests, answered) in truth.pings.items():
         assert (values[step_prefixed(name, "rtt_sent")], values[step_prefixed(name, "rtt_received")]) == (
-            asked,
+            requests,
             answered,
         )
-    for name, (sent, came) in truth.loads.items():
-        for end, packets in (("sent", sent), ("received", came)):
+    for name, (sent, received) in truth.loads.items():
+        for end, packets in (("sent", sent), ("received", received)):
             assert values[step_prefixed(name, f"iperf3_{end}_bytes")] == 1400 * packets
         loss, cookie_bytes = step_prefixed(name, "iperf3_captured_loss"), truth.cookies_bytes[name]
-        sent_bytes, came_bytes = (1400 * packets + cookie_bytes for packets in (sent, came))
+        sent_bytes, came_bytes = (1400 * packets + cookie_bytes for packets in (sent, received))
         assert loss in missing or values[loss] == 1 - came_bytes / sent_bytes
         SEEN["valid, iperf3 captured"] += loss in values
     SEEN["valid, two pings or more"] += len(truth.pings) > 1

@@ -52,13 +52,13 @@ def pipe(path: Path) -> None:
 
 
 def unix_socket(path: Path) -> None:
-    here = Path.cwd()
+    working_directory = Path.cwd()
     os.chdir(path.parent)  # a socket path is limited to 108 characters
     try:
-        with socket.socket(socket.AF_UNIX) as one:
-            one.bind(path.name)
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(path.name)
     finally:
-        os.chdir(here)
+        os.chdir(working_directory)
 
 
 PLACES = [

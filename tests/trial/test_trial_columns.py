@@ -48,8 +48,8 @@ def declared_columns(draw: st.DrawFn) -> Column:
 def tables_of_columns(draw: st.DrawFn) -> tuple[list[Column], dict[str, Value]]:
     """Columns of one trial, and a value for each."""
     drawn = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
-    kept = [column for column in drawn if column.name not in EVERYWHERE]
-    return kept, {column.name: draw(values(column)) for column in kept}
+    columns = [column for column in drawn if column.name not in EVERYWHERE]
+    return columns, {column.name: draw(values(column)) for column in columns}
 
 
 def values(column: Column) -> st.SearchStrategy[Value]:
@@ -67,9 +67,9 @@ def values(column: Column) -> st.SearchStrategy[Value]:
 @settings(max_examples=15)
 @given(tables_of_columns())
 def test_any_valid_column_is_read_back_from_plan_and_table(
-    tmp_path_factory: pytest.TempPathFactory, found: tuple[list[Column], dict[str, Value]]
+    tmp_path_factory: pytest.TempPathFactory, drawn_table: tuple[list[Column], dict[str, Value]]
 ) -> None:
-    columns, row = found
+    columns, row = drawn_table
     assert [column.declaration_error() for column in columns] == [None] * len(columns)
     plan = los_plan().model_copy(update={"columns": freeze(columns) or None})
     folder = tmp_path_factory.mktemp("trial")
@@ -78,8 +78,8 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     assert store.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
     read = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
     # A cell has nine digits of a number; a bound may have more.
-    kept = [float(f"{value:.9g}") if isinstance(value, float) else value for value in row.values()]
-    assert [read.column(name)[0] for name in row] == kept
+    values = [float(f"{value:.9g}") if isinstance(value, float) else value for value in row.values()]
+    assert [read.column(name)[0] for name in row] == values
 
 
 def test_common_columns_are_first_independently_of_their_rank() -> None:
@@ -171,14 +171,16 @@ def names(columns: Sequence[Column]) -> list[str]:
 
 @pytest.mark.usefixtures("meters")
 def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
-    made = procedure("meter: {called: b, measures: [x]}", "ping: {from: sender, to: receiver}", "meter: {}")
-    own = of_steps(placed.step for placed in made.walk())
+    parsed_procedure = procedure(
+        "meter: {called: b, measures: [x]}", "ping: {from: sender, to: receiver}", "meter: {}"
+    )
+    own = of_steps(placed.step for placed in parsed_procedure.walk())
     assert names(own) == ["b.meter_level", "b.x", "meter_level"]
-    filled = names(filled_by(placed.step for placed in made.walk()))
+    filled = names(filled_by(placed.step for placed in parsed_procedure.walk()))
     assert filled[-3:] == names(own)
     assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
     assert not {"ip_loss", "file_loss"} & set(filled)
-    plan = los_plan().model_copy(update={"procedure": made})
+    plan = los_plan().model_copy(update={"procedure": parsed_procedure})
     assert plan.table == (*trial_columns(), *own), "a plan of an earlier version, without columns"
 
 

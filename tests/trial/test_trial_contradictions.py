@@ -66,9 +66,9 @@ class Attempt:
     def packets(self, name: str) -> list[Packet]:
         data, at, packets = (self.folder / name).read_bytes(), 24, list[Packet]()
         while at < len(data):
-            seconds, micros, kept = struct.unpack_from("<3I", data, at)
-            packets.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + kept]))
-            at += 16 + kept
+            seconds, micros, captured_bytes = struct.unpack_from("<3I", data, at)
+            packets.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + captured_bytes]))
+            at += 16 + captured_bytes
         return packets
 
     def capture(self, role: str, change: Callable[[list[Packet]], Sequence[Packet]]) -> None:

@@ -18,7 +18,7 @@ from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
 EARLIER = "packets of an earlier attempt were still in transit"
 HEADS = 8
 """Offset of a record's lengths, after which its IP packet starts: the captures have link type RAW."""
-KEPT = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))
+REPEATS = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))
 
 Chosen = Callable[[bytes], bool]
 
@@ -48,9 +48,9 @@ def _left(packets: list[Packet], role: str, chosen: Chosen) -> list[Packet]:
     """Return the packets that the robot in `role` sent; the first of each capture is the sender's."""
     sender = packets[0][1][HEADS + 12 : HEADS + 16]
     return [
-        one
-        for one in packets
-        if (one[1][HEADS + 12 : HEADS + 16] == sender) == (role == "sender") and chosen(one[1][HEADS:])
+        packet
+        for packet in packets
+        if (packet[1][HEADS + 12 : HEADS + 16] == sender) == (role == "sender") and chosen(packet[1][HEADS:])
     ]
 
 
@@ -72,7 +72,7 @@ def _told(attempt: Attempt) -> list[str]:
     return [reason for reason in attempt.problems() if EARLIER in reason]
 
 
-@pytest.mark.parametrize("path", KEPT, ids=lambda path: f"{path.parents[1].name[:16]} {path.name}")
+@pytest.mark.parametrize("path", REPEATS, ids=lambda path: f"{path.parents[1].name[:16]} {path.name}")
 def test_stored_repeats_stay_valid(path: Path) -> None:
     assert problems(store.read_plan(path.parents[1]), Protocol(path.name.split("-")[0]), path) == ()
 
@@ -143,7 +143,7 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
 
         def carried(packets: list[Packet], role: str) -> list[Packet]:
             own = _left(packets, role, lambda _: True)
-            return [one for one in packets if one in own or chance.random() >= lost]
+            return [packet for packet in packets if packet in own or chance.random() >= lost]
 
         cut = chance.randrange(3)
         near = [*carried(near, "sender"), *aside[1:]]

@@ -30,9 +30,9 @@ def test_a_torn_journal_gives_every_complete_entry(
     journal.append(folder, *written)
     path = folder / journal.JOURNAL_FILE
     content = path.read_bytes()
-    torn = content[: max(0, len(content) - cut)]
-    path.write_bytes(torn)
-    complete = torn.count(b"\n")
+    truncated = content[: max(0, len(content) - cut)]
+    path.write_bytes(truncated)
+    complete = truncated.count(b"\n")
     read = journal.read(folder)
     # A last line that lost only its line end is still complete.
     assert read in (written[:complete], written[: complete + 1])

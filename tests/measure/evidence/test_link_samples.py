@@ -117,7 +117,7 @@ def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
     assert [item.utc_ns for item in cut] == [item.utc_ns for item in whole][: len(cut)]
     for item, other in zip(cut, whole, strict=False):
         for station in item.stations:
-            (same,) = (known for known in other.stations if known.station == station.station)
+            (same,) = (candidate for candidate in other.stations if candidate.station == station.station)
             present = {name: value for name, value in vars(station).items() if value is not None}
             later = {"tx_packets", "rx_packets", "signal_dbm", "tx_rate_bit_s"}  # `link` reports these first
             assert all(value == getattr(same, name) for name, value in present.items() if name not in later)

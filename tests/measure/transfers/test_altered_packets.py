@@ -131,12 +131,16 @@ def test_packets_captured_on_two_interfaces_are_reported(protocol: Protocol) -> 
 
 @pytest.mark.parametrize("end", ["sender", "receiver"])
 @pytest.mark.parametrize(
-    ("protocol", "kept"), [(Protocol.UDP, 2), (Protocol.UDP, 4), (Protocol.TCP, 2), (Protocol.TCP, 8)]
+    ("protocol", "snap_length"), [(Protocol.UDP, 2), (Protocol.UDP, 4), (Protocol.TCP, 2), (Protocol.TCP, 8)]
 )
-def test_a_snap_length_within_the_headers_does_not_appear_as_loss(protocol: Protocol, kept: int, end: str) -> None:
+def test_a_snap_length_within_the_headers_does_not_appear_as_loss(
+    protocol: Protocol, snap_length: int, end: str
+) -> None:
     """Without ports everything appears lost or never sent; without sequence numbers TCP has no payload."""
     sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
-    cut = [replace(packet, data=packet.data[: 20 + kept]) for packet in (sent if end == "sender" else received)]
+    cut = [
+        replace(packet, data=packet.data[: 20 + snap_length]) for packet in (sent if end == "sender" else received)
+    ]
     reason = _why((cut, received) if end == "sender" else (sent, cut), protocol)
     assert reason
     assert f"in the {end}'s capture were truncated in their TCP or UDP header" in reason

@@ -112,9 +112,11 @@ def _exchange(
     left_ms: list[float], delay_ms: list[float], wrong: Wrong, *, back_ms: float = 1.0
 ) -> tuple[Packets, Packets]:
     """A UDP transfer of unfragmented datagrams with ten pings after it; the sender has the true clock."""
-    there = [(ms, extra, datagram(n, 1000)[0]) for n, (ms, extra) in enumerate(zip(left_ms, delay_ms, strict=True))]
+    sent_packets = [
+        (ms, extra, datagram(n, 1000)[0]) for n, (ms, extra) in enumerate(zip(left_ms, delay_ms, strict=True))
+    ]
     asked_ms = [max(left_ms) + 10 * n for n in range(1, 11)]
-    there += [(ms, back_ms, ipv4(bytes(8), protocol=1, ip_id=60000 + n)) for n, ms in enumerate(asked_ms)]
+    sent_packets += [(ms, back_ms, ipv4(bytes(8), protocol=1, ip_id=60000 + n)) for n, ms in enumerate(asked_ms)]
     back = [
         (ms + 2 * back_ms, back_ms, ipv4(bytes(8), protocol=1, ip_id=n, src=RECEIVER, dst=SENDER))
         for n, ms in enumerate(asked_ms)
@@ -125,8 +127,10 @@ def _exchange(
             Frame(START_NS + round(ms * MILLISECOND_NS), data) for ms, data in sorted(items, key=lambda item: item[0])
         )
 
-    sender = capture([(ms, data) for ms, _, data in there] + [(ms + extra, data) for ms, extra, data in back])
-    receiver = capture([(ms + extra, data) for ms, extra, data in there] + [(ms, data) for ms, _, data in back])
+    sender = capture([(ms, data) for ms, _, data in sent_packets] + [(ms + extra, data) for ms, extra, data in back])
+    receiver = capture(
+        [(ms + extra, data) for ms, extra, data in sent_packets] + [(ms, data) for ms, _, data in back]
+    )
     return sender, _on_another_clock(receiver, *wrong)
 
 

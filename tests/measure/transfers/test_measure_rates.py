@@ -41,9 +41,9 @@ def of_udp(sent: list[Frame], received: list[Frame]) -> Rates:
 
 
 def of_tcp(sent: list[Frame], received: list[Frame]) -> Rates:
-    here, there, which = packets(sent), packets(received), transfer(Protocol.TCP)
-    crossing = tcp.match_transfer(here, there, which)
-    return rates.of_tcp(crossing, there, which, tcp.count(crossing))
+    sent_packets, received_packets, which = packets(sent), packets(received), transfer(Protocol.TCP)
+    crossing = tcp.match_transfer(sent_packets, received_packets, which)
+    return rates.of_tcp(crossing, received_packets, which, tcp.count(crossing))
 
 
 @given(sizes)

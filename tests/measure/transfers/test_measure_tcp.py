@@ -123,11 +123,11 @@ def _lengthless(seq: int, payload_bytes: int) -> bytes:
 
 def test_a_retransmission_is_spurious_only_if_an_earlier_copy_arrived() -> None:
     sent = [segment(0, 0, flags=SYN, ip_id=1), *(segment(1, 100, ip_id=number) for number in (2, 3, 4))]
-    for kept, spurious in (((1,), 2), ((2,), 1), ((3,), 0), ((1, 2, 3), 2), ((), 0)):
+    for arrived, spurious in (((1,), 2), ((2,), 1), ((3,), 0), ((1, 2, 3), 2), ((), 0)):
         counts = tcp.count(
-            tcp.match_transfer(packets(timed(sent)), packets(timed([sent[at] for at in kept])), TCP_TRANSFER)
+            tcp.match_transfer(packets(timed(sent)), packets(timed([sent[at] for at in arrived])), TCP_TRANSFER)
         )
-        assert (counts.retransmitted_frames, counts.spurious_frames) == (2, spurious), kept
+        assert (counts.retransmitted_frames, counts.spurious_frames) == (2, spurious), arrived
 
 
 def test_without_ids_time_shows_which_copy_of_a_byte_arrived() -> None:

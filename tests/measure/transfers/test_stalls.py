@@ -153,8 +153,8 @@ def test_datagrams_that_are_lost_make_a_gap_whole_or_in_fragments(lost: set[int]
     for number in range(100):
         stream.datagram(number, number * STEP_NS, size=size, arrives=number not in lost)
     result = measured(of_udp(*captured([stream])))
-    there = sorted(set(range(100)) - lost)
-    gaps_s = [(later - earlier) * 0.01 for earlier, later in pairwise(there)]
+    arrived = sorted(set(range(100)) - lost)
+    gaps_s = [(later - earlier) * 0.01 for earlier, later in pairwise(arrived)]
     assert result["stall_s"] == pytest.approx(max(gaps_s), abs=1e-5)
     assert result["stalls"] == sum(gap_s > 0.2001 for gap_s in gaps_s)
 

@@ -84,8 +84,8 @@ def test_the_columns_of_a_known_flight(tmp_path: Path, yaw_rad: float) -> None:
 
 def test_unknown_values_are_missing_with_a_reason(tmp_path: Path) -> None:
     assert fly_log.measure(None).missing.keys() == NAMES
-    torn = write_log(tmp_path, [{**LINE, "phase": "up"}], end='{"utc_ns": 1')
-    measured = fly_log.measure(fly_log.read(torn))
+    log = write_log(tmp_path, [{**LINE, "phase": "up"}], end='{"utc_ns": 1')
+    measured = fly_log.measure(fly_log.read(log))
     assert measured.missing.keys() == {"fly_height_median_m", "fly_speed_median_m_s", "fly_back_off_m"}
 
 

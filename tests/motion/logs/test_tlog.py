@@ -186,12 +186,12 @@ def _answered(data: bytes, question: Mapping[str, object]) -> object:
     return json.dumps(tlog_reader._summary(data, autopilot, 0, {}))
 
 
-SAID = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32": 2}}
+COUNTERS = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32": 2}}
 
 
 def test_the_summary_of_a_recorder(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
-    path.write_text(json.dumps(SAID), encoding="utf-8")
+    path.write_text(json.dumps(COUNTERS), encoding="utf-8")
     assert tlog.read_summary(path) == tlog.RecorderSummary(3, 0, 5, {32: 2})
 
 
@@ -206,7 +206,7 @@ WRONG: list[dict[str, object]] = [
 
 
 @pytest.mark.parametrize(
-    "recorder_summary", ["", "[]", "7", "[" * 5000, *(json.dumps({**SAID, **wrong}) for wrong in WRONG)]
+    "recorder_summary", ["", "[]", "7", "[" * 5000, *(json.dumps({**COUNTERS, **wrong}) for wrong in WRONG)]
 )
 def test_an_invalid_summary_is_refused(recorder_summary: str, tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
@@ -269,5 +269,5 @@ def test_random_loss_is_measured_even_if_a_router_filters_messages(share: float,
                 continue
             numbers.append((100_000 * slot, sent % 256))
             streams.setdefault(name, []).append(StreamMessage(100_000 * slot, 100 * slot, len(numbers) - 1))
-    came, lacking = periodic.lost(numbers, streams, 0)
-    assert (came, lacking) == (len(numbers), truth)
+    arrived, lacking = periodic.lost(numbers, streams, 0)
+    assert (arrived, lacking) == (len(numbers), truth)

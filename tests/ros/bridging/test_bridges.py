@@ -193,8 +193,8 @@ def test_a_wrong_profile_is_reported_with_its_location(text: str, output_text: s
 def test_a_robot_with_ros_2_needs_no_bridge(tmp_path: Path) -> None:
     own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     file = tmp_path / "own.yaml"
-    asks = f"ros:\n  variant: ros2\n  bridge: {{to: dds, topics: ['{SCAN}']}}\n"
-    file.write_text(own.replace("ros:\n  variant: ros1\n", asks))
+    configuration = f"ros:\n  variant: ros2\n  bridge: {{to: dds, topics: ['{SCAN}']}}\n"
+    file.write_text(own.replace("ros:\n  variant: ros1\n", configuration))
     with pytest.raises(ConfigurationError, match="needs no bridge"):
         schema.load(file, RobotProfile)
 

@@ -254,9 +254,9 @@ def test_different_runs_have_different_digests(setting: Setting, other: Setting)
     assert (first.digest == second.digest) == same
 
 
-HERE = State((0.0, 0.0, 0.0))
+ORIGIN = State((0.0, 0.0, 0.0))
 SENT = Packet(7, "a", "b", 10, ("a to b", 3), 100, 110, "udp")
-ARRIVED = Fate(SENT, (HERE, HERE), (HERE, HERE), arrived_ns=120, counted_ns=130)
+ARRIVED = Fate(SENT, (ORIGIN, ORIGIN), (ORIGIN, ORIGIN), arrived_ns=120, counted_ns=130)
 
 
 def digest(entered: Sequence[Fate], ended: Sequence[Fate], end_ns: int = 130) -> str:

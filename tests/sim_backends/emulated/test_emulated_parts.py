@@ -314,9 +314,9 @@ class TestSystem:
             cast_for(Topology.MASTER), Role.SENDER, ros=RosChoice.BUILTIN, login=keys[0], host_key=keys[1]
         )
         setup.write_text(rootfs.setup_script(spec, setup), encoding="utf-8")
-        shown = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
+        command = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
         result = subprocess.run(
-            ["/bin/sh", "-c", shown], capture_output=True, text=True, check=True, env={"PATH": "/bin"}
+            ["/bin/sh", "-c", command], capture_output=True, text=True, check=True, env={"PATH": "/bin"}
         )
         assert result.stdout == f"{setup.parent}/bin:/bin\nnoetic http://127.0.0.1:11311\n"
 

@@ -51,12 +51,12 @@ def ignore(name: str, expected_s: float | None) -> None:
     """Ignore a phase."""
 
 
-def run_and_view(step: AskStep, here: Path, operator: ScriptedOperator | None = None) -> View:
-    here.mkdir(parents=True)
+def run_and_view(step: AskStep, folder: Path, operator: ScriptedOperator | None = None) -> View:
+    folder.mkdir(parents=True)
     testbed = IdleTestbed()
     testbed.operator = operator or UNATTENDED
-    step.run(replace(SCENE, laptop_folder=here), testbed, ignore)
-    return View(SCENE, AttemptEvidence(here))
+    step.run(replace(SCENE, laptop_folder=folder), testbed, ignore)
+    return View(SCENE, AttemptEvidence(folder))
 
 
 @pytest.mark.parametrize(

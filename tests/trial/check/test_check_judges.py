@@ -228,15 +228,15 @@ LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 0
 
 
 def test_a_port_in_use_fails_on_the_receiver_only() -> None:
-    taken = CommandResult(LISTENER, 0)
-    finding = only(probed(Role.RECEIVER, listeners=taken), "port 1234")
+    port_in_use = CommandResult(LISTENER, 0)
+    finding = only(probed(Role.RECEIVER, listeners=port_in_use), "port 1234")
     assert finding.status is FAIL
     assert "1234" in finding.remedy
     assert (
         only(probed(Role.RECEIVER, listeners=CommandResult(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status
         is OK
     )
-    assert "port 1234" not in {finding.check for finding in probed(Role.SENDER, listeners=taken)}
+    assert "port 1234" not in {finding.check for finding in probed(Role.SENDER, listeners=port_in_use)}
 
 
 def test_a_low_battery_is_a_warning() -> None:
@@ -266,7 +266,7 @@ def test_an_error_of_an_hour_is_reported_in_hours() -> None:
 
 
 def installed(plan: Plan = PLAN) -> dict[str, CommandResult]:
-    asked = software.commands(plan, Role.SENDER)
+    commands = software.commands(plan, Role.SENDER)
     tools = "\n".join(
         f"==> {name} <==\n{text}\n==> exit 0 <=="
         for name, text in {
@@ -278,7 +278,7 @@ def installed(plan: Plan = PLAN) -> dict[str, CommandResult]:
             "recorder": "Usage: rosbag record TOPIC1 [TOPIC2 TOPIC3...]",
         }.items()
     )
-    return dict.fromkeys(asked, CommandResult("/usr/bin/it", 0)) | {
+    return dict.fromkeys(commands, CommandResult("/usr/bin/it", 0)) | {
         "tools": CommandResult(tools, 0),
         "ROS": CommandResult("noetic http://127.0.0.1:11311", 0),
     }
@@ -392,8 +392,8 @@ def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) ->
     refused = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
     sections = installed() | {"right to capture": refused, "interface": output_text(file, 1)}
     assert "right to capture" not in {finding.check for finding in judged(sections)}
-    there = judged(sections | {"interface": output_text("ip/6.1.0/up.txt")})
-    assert only(there, "right to capture").status is FAIL
+    findings = judged(sections | {"interface": output_text("ip/6.1.0/up.txt")})
+    assert only(findings, "right to capture").status is FAIL
 
 
 @pytest.mark.parametrize(

@@ -96,8 +96,8 @@ def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: P
 
 def moments(folder: Path, stride: int) -> Iterator[Path]:
     """Yield the trial's folder after a kill at every `stride`-th write while a repeat is run again."""
-    moment, kept = 1 - stride, folder.with_name("kept")
-    shutil.copytree(folder, kept)
+    moment, saved = 1 - stride, folder.with_name("kept")
+    shutil.copytree(folder, saved)
     while True:
         moment += stride
         pid = os.fork()
@@ -108,7 +108,7 @@ def moments(folder: Path, stride: int) -> Iterator[Path]:
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         yield folder
         shutil.rmtree(folder)
-        shutil.copytree(kept, folder)
+        shutil.copytree(saved, folder)
         if code == 0:
             return
         assert code == KILLED

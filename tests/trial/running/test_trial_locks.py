@@ -102,7 +102,7 @@ def test_only_one_of_many_simultaneous_laptops_locks_the_robot(robot: LocalShell
 
     for turn in range(3):
         with ThreadPoolExecutor(len(holders)) as pool:
-            won = [holder for holder, taken in zip(holders, pool.map(take, holders), strict=True) if taken]
+            won = [holder for holder, is_locked in zip(holders, pool.map(take, holders), strict=True) if is_locked]
         (winner,) = won
         assert record(robot)[:2] == ["held", winner.token]
         alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: in the next round, laptops compete to replace it
@@ -189,10 +189,10 @@ def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell)
         begin(robot, ANNA)
 
 
-@pytest.mark.parametrize("says", ["", "exit 1", "echo no zone", "echo no zone; echo 1800000000"])
-def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_path: Path, says: str) -> None:
+@pytest.mark.parametrize("output", ["", "exit 1", "echo no zone", "echo no zone; echo 1800000000"])
+def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_path: Path, output: str) -> None:
     (tmp_path / "bin" / "date").unlink(missing_ok=True)
-    (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{says}\n", encoding="ascii")
+    (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{output}\n", encoding="ascii")
     (tmp_path / "bin" / "date").chmod(0o755)
     with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: robot}, BERT, sink=quiet):
@@ -269,9 +269,9 @@ def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -
         alter(robot, (4, "1"))
         with locked({Role.SENDER: robot}, BERT, sink=quiet):
             for call in (jobs.start, jobs.run):
-                one = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
+                job = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
                 with pytest.raises(LockLostError, match=r"bert@two locked the robot at .* for trial-b"):
-                    call(robot, one)
+                    call(robot, job)
     assert not (robot.home / FOLDER / "started").exists()
 
 
@@ -367,9 +367,9 @@ def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Unr
     with ExitStack() as stack:
         stack.enter_context(locked(cast, ANNA, sink=lambda event: None))
         cast[Role.RECEIVER].left = 0
-        gone = LinkError("did not answer", where="eve")
-        ended = locks.abort({"abe": cast[Role.RECEIVER], "eve": gone, "zoe": cast[Role.SENDER]}, "bert@two")
-    assert {name: one.error is None for name, one in ended.items()} == {"abe": False, "eve": False, "zoe": True}
+        link_error = LinkError("did not answer", where="eve")
+        ended = locks.abort({"abe": cast[Role.RECEIVER], "eve": link_error, "zoe": cast[Role.SENDER]}, "bert@two")
+    assert {name: result.error is None for name, result in ended.items()} == {"abe": False, "eve": False, "zoe": True}
     assert record(cast[Role.SENDER])[:2] == ["aborted", "trial-a"]
 
 

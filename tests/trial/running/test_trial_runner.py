@@ -161,16 +161,18 @@ def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch:
         JournalEntry(2, repeat.protocol, 1, 1, Status.RUNNING),
         JournalEntry(3, repeat.protocol, 1, 1, Status.MEASURED),
     )
-    fetch, gone = Robots.fetch, "turtlebot-1: it has no folder .fieldkit/x/tcp-01-1 any more"
+    fetch, message = Robots.fetch, "turtlebot-1: it has no folder .fieldkit/x/tcp-01-1 any more"
 
     def gone_once(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
-        return [gone] if remote.endswith("tcp-01-1") else fetch(self, remote, into, clean=clean)
+        return [message] if remote.endswith("tcp-01-1") else fetch(self, remote, into, clean=clean)
 
     monkeypatch.setattr(Robots, "fetch", gone_once)
     resume_trial(folder, IdleTestbed(), lambda _: None)
     first = journal.ended(journal.read(folder))[0]
     assert (first.status, first.excused) == (Status.VOID, True)
-    assert first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {gone}"
+    assert (
+        first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {message}"
+    )
 
 
 def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
@@ -193,8 +195,8 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
         f"~/.fieldkit/{folder.name}/tcp-01-1, ~/.fieldkit/{folder.name}/tcp-01-2"
     )
     assert note in events
-    kept = folder / "repeats/tcp-01.void1" / unfetched_file(Role.SENDER)
-    assert "the link broke ?\nturtlebot-1 has it in ~/.fieldkit/" in kept.read_text(encoding="utf-8")
+    unfetched = folder / "repeats/tcp-01.void1" / unfetched_file(Role.SENDER)
+    assert "the link broke ?\nturtlebot-1 has it in ~/.fieldkit/" in unfetched.read_text(encoding="utf-8")
     events.clear()
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(folder, IdleTestbed(), events.append)
@@ -264,8 +266,8 @@ def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(
     folder = only(tmp_path)
     remote = f"~/.fieldkit/{folder.name}/tcp-01-1"
     for role in Robots(of_two(), IdleTestbed())._roles:
-        kept = folder / "repeats/tcp-01.void1" / unfetched_file(role)
-        assert kept.read_text(encoding="utf-8").startswith("interrupted\n")
+        unfetched = folder / "repeats/tcp-01.void1" / unfetched_file(role)
+        assert unfetched.read_text(encoding="utf-8").startswith("interrupted\n")
     for _ in range(2):
         notes = [event.text for event in events if isinstance(event, Note)]
         assert sum("was not fetched stays" in note and remote in note for note in notes) == 2

@@ -193,11 +193,11 @@ def test_an_absent_agent_is_no_obstacle(physics: str, path: Path) -> None:
 
 
 def test_a_run_with_lifetimes_can_be_recorded_and_replayed(path: Path) -> None:
-    ran = cosim(path.parent, "run", path.name, "--out", "run", "--format", "json")
-    assert ran.code == 0, ran.err
+    result = cosim(path.parent, "run", path.name, "--out", "run", "--format", "json")
+    assert result.code == 0, result.err
     replayed = cosim(path.parent, "replay", "run", "--format", "json")
     assert replayed.code == 0, replayed.err
-    assert json.loads(replayed.out) == json.loads(ran.out)
+    assert json.loads(replayed.out) == json.loads(result.out)
     assert {file.stem for file in (path.parent / "run" / "captures").iterdir()} == {"a", "b", "c"}
 
 
