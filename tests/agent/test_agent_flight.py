@@ -130,7 +130,7 @@ def test_sent_messages_are_those_of_pymavlink() -> None:
     ignored = {
         flag.name.removeprefix("POSITION_TARGET_TYPEMASK_") for bit, flag in flags.items() if mask & bit == bit
     }
-    rates = {f"{what}{axis}_IGNORE" for axis in "XYZ" for what in "VA"}
+    rates = {f"{kind}{axis}_IGNORE" for axis in "XYZ" for kind in "VA"}
     assert ignored == {*rates, "YAW_RATE_IGNORE"}
     assert (ask.param1, ask.param2) == (d.MAVLINK_MSG_ID_ATTITUDE, 100_000)
 

@@ -69,14 +69,14 @@ def test_messages_are_those_of_rosbags(names: tuple[str, str], cdr: bool) -> Non
 def test_invalid_odometry_is_none(data: bytes, cdr: bool) -> None:
     pose = drive.read_odometry(data, cdr=cdr)
     assert pose is None or all(map(math.isfinite, pose))
-    whole = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=cdr)
-    assert drive.read_odometry(whole[: min(len(data), 80)], cdr=cdr) is None
+    sample = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=cdr)
+    assert drive.read_odometry(sample[: min(len(data), 80)], cdr=cdr) is None
 
 
 def test_odometry_with_nan_is_none() -> None:
-    whole = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
-    at = whole.index(struct.pack("<d", 1.0))
-    assert drive.read_odometry(whole[:at] + struct.pack("<d", math.nan) + whole[at + 8 :], cdr=False) is None
+    sample = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
+    at = sample.index(struct.pack("<d", 1.0))
+    assert drive.read_odometry(sample[:at] + struct.pack("<d", math.nan) + sample[at + 8 :], cdr=False) is None
 
 
 class World:
@@ -149,9 +149,9 @@ def run(
         "orders": str(world.orders),
         "status": str(folder / "status"),
     }
-    ended = drive.drive(world, arguments, folder / "log", world)  # type: ignore[arg-type]
+    reason = drive.drive(world, arguments, folder / "log", world)  # type: ignore[arg-type]
     log = [json.loads(line) for line in (folder / "log").read_text(encoding="ascii").splitlines()]
-    return ended, log, json.loads((folder / "status").read_text(encoding="ascii"))
+    return reason, log, json.loads((folder / "status").read_text(encoding="ascii"))
 
 
 def test_drives_out_and_back_and_ends_with_zero_velocity(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

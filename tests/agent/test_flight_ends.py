@@ -26,13 +26,13 @@ HEIGHT_M = 0.6
 
 
 def plan(folder: Path, port: int) -> FlightPlan:
-    where, orders = f"udpout:127.0.0.1:{port}", str(folder / "orders")
-    return FlightPlan(where, orders, "land", 60.0, height_m=HEIGHT_M, ceiling_m=10.0, fence_m=20.0)
+    connection, orders = f"udpout:127.0.0.1:{port}", str(folder / "orders")
+    return FlightPlan(connection, orders, "land", 60.0, height_m=HEIGHT_M, ceiling_m=10.0, fence_m=20.0)
 
 
-def order(folder: Path, number: int, what: str) -> None:
+def order(folder: Path, number: int, command: str) -> None:
     beside = folder / "orders.new"
-    beside.write_text(f"{number} {what} 60\n", encoding="ascii")
+    beside.write_text(f"{number} {command} 60\n", encoding="ascii")
     beside.replace(folder / "orders")
 
 

@@ -75,6 +75,6 @@ def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
         # Equal to the serialization of ROS 2, except for the padding of the last word.
         assert republished.startswith(expected)
         assert len(republished) - len(expected) < 4
-    back = samples(received)
-    assert back
-    assert all(times[sequence] == sent_ns for sequence, sent_ns in back.items())
+    received_samples = samples(received)
+    assert received_samples
+    assert all(times[sequence] == sent_ns for sequence, sent_ns in received_samples.items())

@@ -34,8 +34,8 @@ while True:
 
 
 def plan(folder: Path, port: int) -> FlightPlan:
-    where = f"udpout:127.0.0.1:{port}"
-    return FlightPlan(where, "", "land", 0.0, rescues=True, liveness=str(folder / "liveness"))
+    connection = f"udpout:127.0.0.1:{port}"
+    return FlightPlan(connection, "", "land", 0.0, rescues=True, liveness=str(folder / "liveness"))
 
 
 @contextmanager

@@ -49,11 +49,11 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def running(
-    host: TestHost, program: Path, verb: str, what: dict[str, Any], log: Path
+    host: TestHost, program: Path, verb: str, arguments: dict[str, Any], log: Path
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run a publisher or subscriber while the body runs, in the folder of its log."""
-    python = PYTHONS[what["stream"]["over"]]
-    inside = ("env", "-C", str(log.parent), python, str(program), verb, json.dumps(what), str(log))
+    python = PYTHONS[arguments["stream"]["over"]]
+    inside = ("env", "-C", str(log.parent), python, str(program), verb, json.dumps(arguments), str(log))
     with host.start(inside) as process:
         assert process.stderr is not None
         # Fast DDS may print warnings about types of CycloneDDS before.
@@ -72,8 +72,8 @@ def exchange(program: Path, folder: Path) -> bool:
     with two_connected_hosts() as (near, far), ExitStack() as stack:
 
         def start(host: TestHost, over: str, verb: str, topic: str) -> subprocess.Popen[bytes]:
-            what = arguments(over, host, topic, SIZES[topic], durability="transient_local", depth=100)
-            return stack.enter_context(running(host, program, verb, what, folder / f"{topic}.{verb}"))
+            topic_arguments = arguments(over, host, topic, SIZES[topic], durability="transient_local", depth=100)
+            return stack.enter_context(running(host, program, verb, topic_arguments, folder / f"{topic}.{verb}"))
 
         subscribers = [start(far, "dds", "subscribe", "there"), start(near, "ros2", "subscribe", "back")]
         publishers = [start(far, "dds", "publish", "back"), start(near, "ros2", "publish", "there")]

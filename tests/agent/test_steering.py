@@ -236,7 +236,7 @@ def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("start", "last", "why"),
+    ("start", "last", "reason"),
     [
         ((6.0, 0.0, 0.0), None, "it is 6.00 m from its place, outside its fence of 5 m"),
         ((0.5, 0.0, 0.0), None, "it is 0.50 m and 0.00 rad from its place"),
@@ -245,11 +245,11 @@ def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
     ],
 )
 def test_robot_that_is_not_at_its_place_does_not_start(
-    start: tuple[float, float, float], last: tuple[float, float, float] | None, why: str
+    start: tuple[float, float, float], last: tuple[float, float, float] | None, reason: str
 ) -> None:
     driver = Driver(replace(TASK, origin=(0.0, 0.0, 0.0), last=last), 0.0)
     assert set(run(driver, Robot(OdometryPose(*start)))) == {ZERO_VELOCITY}
-    assert (driver.stop_reason, driver.refused) == (why, True)
+    assert (driver.stop_reason, driver.refused) == (reason, True)
 
 
 def test_later_repeats_use_the_heading_of_the_origin() -> None:

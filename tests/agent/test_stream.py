@@ -99,10 +99,10 @@ def logged(path: Path) -> list[tuple[int, int, int, int]]:
 
 
 def published(
-    tmp_path: Path, middleware: FakeMiddleware, what: Stream | None = None
+    tmp_path: Path, middleware: FakeMiddleware, task: Stream | None = None
 ) -> list[tuple[int, int, int, int]]:
     log = Log(str(tmp_path / "log"))
-    stream.publish(middleware, TOPIC, what or streamed(), log, threading.Event())
+    stream.publish(middleware, TOPIC, task or streamed(), log, threading.Event())
     log.end(1)
     return logged(tmp_path / "log")
 

@@ -26,9 +26,10 @@ def test_a_flag_needs_the_number_of_wilsons_formula(true: int, untrue: int, expe
     n = true + untrue
     p, z = true / n, scipy.stats.norm.ppf(0.975)
     total = next(
-        many
-        for many in count(n)
-        if z / (1 + z * z / many) * math.sqrt(p * (1 - p) / many + (z / many) ** 2 / 4) <= expected * (1 + 1e-9)
+        repeats
+        for repeats in count(n)
+        if z / (1 + z * z / repeats) * math.sqrt(p * (1 - p) / repeats + (z / repeats) ** 2 / 4)
+        <= expected * (1 + 1e-9)
     )
     assert additional_repeats(wilson(true, n), n, expected, Kind.FLAG) == total - n
 
@@ -39,9 +40,9 @@ def test_students_quantile_decreases_with_more_repeats(n: int, part: float) -> N
     interval = median(times)
     now = half(interval)
 
-    def expected(many: int) -> float:
-        quantile = scipy.stats.t.ppf(0.975, [many - 1, n - 1]) if n < 6 else (1, 1)
-        return float(now * quantile[0] / quantile[1] * math.sqrt(n / many))
+    def expected(repeats: int) -> float:
+        quantile = scipy.stats.t.ppf(0.975, [repeats - 1, n - 1]) if n < 6 else (1, 1)
+        return float(now * quantile[0] / quantile[1] * math.sqrt(n / repeats))
 
     total = next(many for many in count(n) if expected(many) <= part * now * (1 + 2e-4))
     assert interval is not None

@@ -137,10 +137,10 @@ def test_the_error_of_a_damaged_line_names_file_and_line(
 def test_a_table_truncated_in_its_last_line_is_refused_or_lacks_that_line(tmp_path: Path) -> None:
     """A truncated last cell of a row can be another valid number: 1533679 of 15336791.6."""
     path = write(tmp_path / "a", repeats(ROW, 2))
-    whole = path.read_bytes()
-    last = whole.rindex(b"\n", 0, -1) + 1
-    for end in range(last, len(whole)):
-        path.write_bytes(whole[:end])
+    content = path.read_bytes()
+    last = content.rindex(b"\n", 0, -1) + 1
+    for end in range(last, len(content)):
+        path.write_bytes(content[:end])
         if end == last:
             assert len(read([path], trial_columns())) == 1
             continue
@@ -204,11 +204,11 @@ def test_a_large_table_is_read_block_by_block_to_the_same_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table = write(tmp_path, [replace(ROW, repeat=1 + n, sender=f"robot {n}") for n in range(50)])
-    whole = read([table], trial_columns())
+    all_rows = read([table], trial_columns())
     monkeypatch.setattr(table_files, "_BATCH_BYTES", 1000)
     blocks = read([table], trial_columns())
-    assert same(blocks, whole)
-    assert (blocks.texts["source"] == whole.texts["source"]).all()
+    assert same(blocks, all_rows)
+    assert (blocks.texts["source"] == all_rows.texts["source"]).all()
 
 
 def test_a_damaged_line_of_a_large_table_has_its_number_in_the_whole_file(

@@ -146,8 +146,8 @@ def test_without_skewness_a_mean_has_students_interval() -> None:
 
 def test_a_mean_has_the_bootstrap_t_interval() -> None:
     """Computed here by resampling: the mean of each sample divided by its standard error."""
-    drawn = SKEWED[np.random.default_rng(4).integers(60, size=(40_000, 60))]
-    t = (drawn.mean(axis=1) - SKEWED.mean()) / scipy.stats.sem(drawn, axis=1)
+    samples = SKEWED[np.random.default_rng(4).integers(60, size=(40_000, 60))]
+    t = (samples.mean(axis=1) - SKEWED.mean()) / scipy.stats.sem(samples, axis=1)
     high, low = SKEWED.mean() - np.quantile(t, (0.025, 0.975)) * scipy.stats.sem(SKEWED)
     interval = not_none(mean(SKEWED))
     assert interval.value == SKEWED.mean()

@@ -37,14 +37,14 @@ def repeats_of(declared: Sequence[Column], **values: Sequence[OptionalValue]) ->
     return Repeats(numbers, texts, tuple(declared))
 
 
-def gaps(ended: Sequence[float], still_open: Sequence[float] = (), missing: int = 0) -> Cell:
+def gaps(closed: Sequence[float], still_open: Sequence[float] = (), missing: int = 0) -> Cell:
     """Return the cell of repeats with an ended, an open or no longest gap."""
     none = [None] * missing
     (cell,) = aggregate(
         repeats_of(
             GAP,
-            rtt_gap_s=[*ended, *(None for _ in still_open), *none],
-            rtt_gap_at_least_s=[*(None for _ in ended), *still_open, *none],
+            rtt_gap_s=[*closed, *(None for _ in still_open), *none],
+            rtt_gap_at_least_s=[*(None for _ in closed), *still_open, *none],
         ),
         BY,
     )
@@ -137,11 +137,11 @@ TEXTS = [
 
 @given(st.lists(DELAYS, max_size=12), st.lists(DELAYS, max_size=4), st.integers(0, 4), st.sampled_from(TEXTS))
 def test_no_expectation_holds_on_missing_or_open_repeats(
-    ended: list[float], still_open: list[float], missing: int, text: str
+    closed: list[float], still_open: list[float], missing: int, text: str
 ) -> None:
-    if not (ended or still_open or missing):
+    if not (closed or still_open or missing):
         return
-    result = judged(text, gaps(ended, still_open, missing))
+    result = judged(text, gaps(closed, still_open, missing))
     if still_open or missing:
         assert not result.holds
         assert "of" in result.why
@@ -153,7 +153,7 @@ def rtt(medians_s: Sequence[OptionalValue], of_sent_s: Sequence[OptionalValue]) 
 
 
 @pytest.mark.parametrize(
-    ("of_sent_s", "ruling", "why"),
+    ("of_sent_s", "ruling", "reason"),
     [
         ([0.1] * 10, Ruling.HOLDS, ""),
         ([0.15] * 10, Ruling.HOLDS, ""),
@@ -167,11 +167,11 @@ def rtt(medians_s: Sequence[OptionalValue], of_sent_s: Sequence[OptionalValue]) 
     ],
 )
 def test_a_median_rtt_of_the_answers_is_judged_over_all_requests(
-    of_sent_s: list[OptionalValue], ruling: Ruling, why: str
+    of_sent_s: list[OptionalValue], ruling: Ruling, reason: str
 ) -> None:
     cell = rtt([0.1] * 10, of_sent_s)
     result = judged("rtt_median_s < 200 ms", cell, RTT)
-    assert (result.ruling, result.why) == (ruling, why)
+    assert (result.ruling, result.why) == (ruling, reason)
     assert result.estimate is not None
     assert (result.estimate.value, result.estimate.high) == (0.1, 0.1), "the figure itself is unchanged"
     assert judged("rtt_median_s < 50 ms", cell, RTT).ruling is Ruling.FAILS

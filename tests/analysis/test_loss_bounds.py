@@ -41,9 +41,9 @@ def test_the_loss_is_garwoods_bound_with_the_worst_repeat_as_burst_length(lost: 
 @given(st.lists(st.tuples(st.integers(0, 500), st.integers(0, 500)), min_size=1, max_size=20), st.integers(500, 5000))
 def test_fewer_losses_never_make_the_bound_larger(pairs: list[tuple[int, int]], sent: int) -> None:
     fewer, more = ([pick(pair) for pair in pairs] for pick in (min, max))
-    each = [sent] * len(pairs)
-    assert one_sided_bounds.loss_high(fewer, each) <= one_sided_bounds.loss_high(more, each) * (1 + 1e-12)
-    assert one_sided_bounds.loss_high([0] * len(pairs), each) <= one_sided_bounds.loss_high(fewer, each)
+    sizes = [sent] * len(pairs)
+    assert one_sided_bounds.loss_high(fewer, sizes) <= one_sided_bounds.loss_high(more, sizes) * (1 + 1e-12)
+    assert one_sided_bounds.loss_high([0] * len(pairs), sizes) <= one_sided_bounds.loss_high(fewer, sizes)
 
 
 def test_duplicates_are_no_negative_losses() -> None:

@@ -55,8 +55,8 @@ def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) 
     campaign_plan, journal = begin(lawn)
     with journal.locked(campaign_plan):
         lawn.write_text(f"# dry grass\n{LAWN}", encoding="utf-8")
-    again, document = plan.make_plan(lawn, "field")
-    frozen = plan.started_plan(journal.folder, again, document)
+    new_plan, document = plan.make_plan(lawn, "field")
+    frozen = plan.started_plan(journal.folder, new_plan, document)
     assert frozen is not None
     assert frozen.order == campaign_plan.order
     assert frozen.trials() == campaign_plan.trials()
@@ -76,9 +76,9 @@ def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str,
     campaign_plan, journal = begin(lawn)
     with journal.locked(campaign_plan):
         lawn.write_text(LAWN.replace(old, new), encoding="utf-8")
-    again, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
+    new_plan, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
     with pytest.raises(ConfigurationError) as caught:
-        plan.started_plan(journal.folder, again, document)
+        plan.started_plan(journal.folder, new_plan, document)
     assert caught.value.what == f"changed since the campaign started: {named}"
     assert caught.value.where == f"{lawn}:{line}"
     assert "campaign.yaml" in caught.value.remedy
@@ -139,8 +139,8 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
         for trial in trials[:-1]:
             journal.add(trial, TrialProgress.ENDED, valid=1)
     path = journal.folder / JOURNAL_FILE
-    whole = path.read_bytes()
-    path.write_bytes(whole[: max(0, len(whole) - cut)])
+    content = path.read_bytes()
+    path.write_bytes(content[: max(0, len(content) - cut)])
     reopened = CampaignJournal(journal.folder)
     complete = len(reopened.ended())
     assert complete >= path.read_bytes().count(b"\n")
@@ -203,9 +203,9 @@ def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(
 def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> None:
     campaign_plan, journal = begin(lawn)
     backend = load_backend("emulated", None, None)
-    whole, failed, *_ = campaign_plan.trials()
+    complete, failed, *_ = campaign_plan.trials()
     with journal.locked(campaign_plan):
-        for trial, count in ((whole, 0), (failed, 2)):
+        for trial, count in ((complete, 0), (failed, 2)):
             journal.add(trial, TrialProgress.STARTED, trial=str(count))
             journal.add(trial, TrialProgress.ENDED, trial=str(count), failed=count)
     assert str(failed) not in planned(campaign_plan, journal, backend).trials
@@ -215,11 +215,11 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
     (event,) = events
     assert isinstance(event, CampaignPlanned)
     assert str(failed) in event.trials
-    assert str(whole) not in event.trials
+    assert str(complete) not in event.trials
     with journal.locked(campaign_plan):
         campaign._restart_failed()
     (journal.folder / "2").mkdir()
     (journal.folder / "2" / "trial.yaml").touch()
     for reopened in (journal, CampaignJournal(journal.folder)):
-        assert set(reopened.ended()) == {str(whole)}
+        assert set(reopened.ended()) == {str(complete)}
         assert reopened.interrupted(failed) == journal.folder / "2"

@@ -22,18 +22,18 @@ OPTIONS = ("--site", "my lab.yaml", "--backend", "field")
 def messages() -> Iterator[tuple[str, str, bool]]:
     """Yield the file, each text in the code except docstrings (`x` for values), and whether it is a command."""
     for path in sorted((*ROOT.glob("fieldkit/**/*.py"), *ROOT.glob("sim_backends/**/*.py"))):
-        where = str(path.relative_to(ROOT))
+        location = str(path.relative_to(ROOT))
         tree = ast.parse(path.read_text(encoding="utf-8"))
         excluded = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
         for node in ast.walk(tree):
             if isinstance(node, ast.JoinedStr):
                 excluded |= {id(part) for part in node.values}
                 parts = (part.value if isinstance(part, ast.Constant) else "x" for part in node.values)
-                yield where, "".join(map(str, parts)), False
+                yield location, "".join(map(str, parts)), False
             elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "typed":
-                yield where, shell_command(*(getattr(word, "value", "x") for word in node.args)), True
+                yield location, shell_command(*(getattr(word, "value", "x") for word in node.args)), True
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in excluded:
-                yield where, node.value, False
+                yield location, node.value, False
 
 
 def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
@@ -84,8 +84,8 @@ def test_hints_include_the_options_given(typed_before: str, hint: str, whole: st
         completed = hints.completed(hint)
     assert completed == whole.format(given=shlex.join(OPTIONS))
     if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
-        again = top.parse_args(shlex.split(completed)[1:])
-        assert getattr(again, "site", None) is None or str(again.site) == "my lab.yaml"
+        parsed = top.parse_args(shlex.split(completed)[1:])
+        assert getattr(parsed, "site", None) is None or str(parsed.site) == "my lab.yaml"
 
 
 def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture[str]) -> None:

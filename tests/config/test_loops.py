@@ -88,7 +88,7 @@ def test_file_without_loops_is_unchanged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "what", "line", "remedy"),
+    ("old", "new", "message", "line", "remedy"),
     [
         ('"p{bytes}"', '"p{size}"', "there is no variable size; the variables are: bytes", 4, "write {{size}} for"),
         ('"p{bytes}"', '"p{byte}"', "there is no variable byte; did you mean 'bytes'?", 4, "or use a variable"),
@@ -109,10 +109,10 @@ def test_file_without_loops_is_unchanged() -> None:
         ("8192]", "99999]", "Input should be less than or equal to 65507", 4, ""),
     ],
 )  # fmt: skip
-def test_error_in_a_loop_has_its_line_and_a_remedy(old: str, new: str, what: str, line: int, remedy: str) -> None:
+def test_error_in_a_loop_has_its_line_and_a_remedy(old: str, new: str, message: str, line: int, remedy: str) -> None:
     assert old in SWEEP
     error = error_of(SWEEP.replace(old, new))
-    assert what in error[0]
+    assert message in error[0]
     assert error[1] == line
     assert remedy in error[2]
 

@@ -35,7 +35,7 @@ def test_every_policy_has_a_row_and_exact_ones_have_no_error(lab: Path) -> None:
     for policy in POLICIES[:2]:
         exact = {name: float(value) for name, value in rows_by_policy[policy].items() if "error" in name}
         # Positions are those of the last step of the physics.
-        position_errors_m = [exact.pop(f"position_error_{what}_m") for what in ("mean", "p95", "max")]
+        position_errors_m = [exact.pop(f"position_error_{statistic}_m") for statistic in ("mean", "p95", "max")]
         assert set(exact.values()) == {0.0}
         assert 0 < position_errors_m[0] <= position_errors_m[2] <= 1.0 * 0.001 + 1e-9, "1 m/s for a step of 1 ms"
     # Half a window of 10 ms: arrivals anywhere in a window wait for its end.

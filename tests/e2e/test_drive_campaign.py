@@ -121,8 +121,8 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
         wait_for_end({process.pid}, within_s=60.0)
     lab.drive_forward(FENCE_M)
     since_ns = time.time_ns()
-    refused = campaign(lab, out, *site, *UNASKED, OPTION)
-    assert_unmoved(lab, refused, f"outside its fence of {FENCE_M:g} m", since_ns)
+    result = campaign(lab, out, *site, *UNASKED, OPTION)
+    assert_unmoved(lab, result, f"outside its fence of {FENCE_M:g} m", since_ns)
 
     # A person puts it back and confirms this: a new origin, which applies to both trials.
     lab.place_at("5m")

@@ -78,7 +78,7 @@ Linux, of a test of 5 s."""
 @pytest.mark.parametrize("name", FLOWS)
 def test_iperf3_and_captures_agree_on_the_throughput(flows: dict[str, dict[str, str]], name: str) -> None:
     row = flows[name]
-    own, captured = (float(row[f"iperf3_{what}_bit_s"]) for what in ("throughput", "captured"))
+    own, captured = (float(row[f"iperf3_{source}_bit_s"]) for source in ("throughput", "captured"))
     assert captured == pytest.approx(own, rel=0.02 + (RTO_SHARE if name == "tcp-lossy" else 0.0))
     if name == "tcp":
         assert own == pytest.approx(4e6, rel=0.05)

@@ -168,9 +168,9 @@ def test_gpx_of_an_accompanying_person_can_be_added_and_removed_later(lab: Path)
     trial = run_walk(lab)
     before, expected = tables(trial), true_separation(trial)
     assert_similar(separation_by_columns(trial), expected, within_m=1e-6)
-    where = track.read(trial / "repeats" / "udp-01" / "track.csv")
+    points = track.read(trial / "repeats" / "udp-01" / "track.csv")
     sender = f"sender={6 / EARTH_M[1]:.9f},{3 / EARTH_M[0]:.9f}"
-    gpx(lab / "walk.gpx", where, late_s=2.5)
+    gpx(lab / "walk.gpx", points, late_s=2.5)
 
     run = run_here(lab, "positions", str(trial), "receiver=walk.gpx", sender, "--offset", "2.5s")
     assert run.code == 0, run.err

@@ -139,8 +139,8 @@ def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy
     (trial / "summary.csv").write_text("", encoding="utf-8")
     assert run_here(lab, "rebuild", str(trial)).code == 0
     assert before == {name: (trial / name).read_bytes() for name in before}
-    again = run_here(lab, "rebuild", str(trial))
-    assert "the same bytes as before" in again.out
+    rebuilt = run_here(lab, "rebuild", str(trial))
+    assert "the same bytes as before" in rebuilt.out
     pcap = trial / "repeats" / "tcp-02" / "receiver.pcap"
     content = bytearray(pcap.read_bytes())
     content[-1] ^= 0x10

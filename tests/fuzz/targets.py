@@ -321,8 +321,8 @@ def _topic_logs() -> tuple[bytes, ...]:
         [*start_records, *samples, (5, 0, 0, 3, 0, start_ns), (7, 0, 0, 20, 0, start_ns)],
         [*start_records, *samples[::2]],
     )
-    whole, killed = (records.MAGIC + b"".join(records.RECORD.pack(*record) for record in log) for log in logs)
-    return whole, killed + bytes(500)
+    complete, killed = (records.MAGIC + b"".join(records.RECORD.pack(*record) for record in log) for log in logs)
+    return complete, killed + bytes(500)
 
 
 def _measure_tlog(path: Path) -> None:

@@ -67,8 +67,8 @@ def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShel
         lambda: halting.poll_states(robot, names, Deadline.after(30)).state is MotionState.LANDED, Deadline.after(60)
     )
     assert "record" in runs(robot), "it does not move the robot"
-    again = halting.halt(robot, "bert@two", Deadline.after(60))
-    assert (again.programs, again.state) == ((), MotionState.NOTHING)
+    second_result = halting.halt(robot, "bert@two", Deadline.after(60))
+    assert (second_result.programs, second_result.state) == ((), MotionState.NOTHING)
     with pytest.raises(RobotError, match=r"the jobs of .* were ended by bert@two"):
         start(robot, "later", "drive", DRIVE_SCRIPT)
     evidence.end_jobs(robot, FOLDER)

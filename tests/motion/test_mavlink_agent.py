@@ -131,14 +131,14 @@ def recording(program: Path, log: Path, connection: str, **arguments: object) ->
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stderr is not None
         assert process.stderr.readline().startswith(b"waiting for the heartbeat")
-        ended = Ended(-1, {}, log)
+        result = Ended(-1, {}, log)
         try:
             assert process.stderr.readline() == b"up, MAVLink\n"
-            yield ended
+            yield result
             process.send_signal(signal.SIGINT)
             output_text, errors = process.communicate(timeout=60)
             assert errors == b""
-            ended.code, ended.output_text = process.returncode, json.loads(output_text)
+            result.code, result.output_text = process.returncode, json.loads(output_text)
         finally:
             process.kill()
 
@@ -227,14 +227,14 @@ def over_a_serial_line() -> Iterator[str]:
 def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path, tmp_path: Path) -> None:
     with (
         connection_kind() as connection,
-        recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended,
+        recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as result,
     ):
-        wait_until_size(ended.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
-    assert ended.code == 0
-    types = kinds(ended.log)
-    read = tlog.read(ended.log, 0, ended.output_text["ended_us"])
-    assert ended.output_text["frames"] == read.frames == len(types)
-    assert (ended.output_text["refused"], ended.output_text["left_out"]) == ({}, 0)
+        wait_until_size(result.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
+    assert result.code == 0
+    types = kinds(result.log)
+    read = tlog.read(result.log, 0, result.output_text["ended_us"])
+    assert result.output_text["frames"] == read.frames == len(types)
+    assert (result.output_text["refused"], result.output_text["left_out"]) == ({}, 0)
     assert read.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
     assert read.values["mavlink_loss"] == 0
     assert types.count("LOCAL_POSITION_NED") > 3 * types.count("ATTITUDE")
@@ -390,12 +390,12 @@ def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
 ) -> None:
     damage = drones.damage_randomly(1)
     drone = drones.at_terminal(damage) if serial else drones.at_udp(damage)
-    with drone as where:
-        connection = f"{where}:115200" if serial else f"udpout:127.0.0.1:{where}"
-        with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended:
-            wait_until_size(ended.log, 12_000)
-    assert ended.code == 0
-    read = tlog.read(ended.log, drones.SYSTEM, ended.output_text["ended_us"])
-    assert read.frames == ended.output_text["frames"]
+    with drone as address:
+        connection = f"{address}:115200" if serial else f"udpout:127.0.0.1:{address}"
+        with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as result:
+            wait_until_size(result.log, 12_000)
+    assert result.code == 0
+    read = tlog.read(result.log, drones.SYSTEM, result.output_text["ended_us"])
+    assert read.frames == result.output_text["frames"]
     assert int(read.values["mavlink_damaged"]) > 10
     assert read.kinds["LOCAL_POSITION_NED"] > 5

@@ -58,11 +58,11 @@ def test_conflicts_of_robots_with_one_master(other: Robot, why: str | None) -> N
     assert reason == why if why is None else reason is not None and reason.startswith(why)
 
 
-@pytest.mark.parametrize(("domain", "alone"), [("", False), ("0", False), ("7", True)])
-def test_conflicts_of_robots_with_ros2_domains(domain: str, alone: bool) -> None:
+@pytest.mark.parametrize(("domain", "is_valid"), [("", False), ("0", False), ("7", True)])
+def test_conflicts_of_robots_with_ros2_domains(domain: str, is_valid: bool) -> None:
     reason = conflict(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
-    assert (reason is None) is alone
-    assert alone or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
+    assert (reason is None) is is_valid
+    assert is_valid or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
 
 
 def test_emulated_robots_implement_the_sections() -> None:

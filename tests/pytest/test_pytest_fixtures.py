@@ -202,14 +202,14 @@ def part(output_text: str, title: str) -> str:
 
 def test_tests_pass_fail_and_have_errors_of_the_lab(ran: SuiteRun) -> None:
     assert ran.code == 1
-    failed = {name for name, how in ran.results.items() if how == "failure"}
-    errors = {name.partition("[")[0] for name, how in ran.results.items() if how == "error"}
+    failed = {name for name, outcome in ran.results.items() if outcome == "failure"}
+    errors = {name.partition("[")[0] for name, outcome in ran.results.items() if outcome == "error"}
     assert failed == FAIL, ran.output
-    refused = ("test_uses_an_unknown", "test_uses_robots_missing", "test_passes_a_string")
-    assert errors == {name.partition("[")[0] for name in ran.results if name.startswith(refused)}
-    assert len(ran.results) == len(FAIL) + len([how for how in ran.results.values() if how == "error"]) + 10, (
-        ran.output
-    )
+    rejected = ("test_uses_an_unknown", "test_uses_robots_missing", "test_passes_a_string")
+    assert errors == {name.partition("[")[0] for name in ran.results if name.startswith(rejected)}
+    assert (
+        len(ran.results) == len(FAIL) + len([outcome for outcome in ran.results.values() if outcome == "error"]) + 10
+    ), ran.output
 
 
 def test_a_failure_is_reported_with_the_line_of_the_test(ran: SuiteRun) -> None:

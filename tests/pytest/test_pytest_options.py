@@ -116,7 +116,7 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
 
 
 @pytest.mark.parametrize(
-    ("words", "what", "remedy"),
+    ("words", "message", "remedy"),
     [
         (("--fieldkit-backend", "emulatd"), "there is no backend 'emulatd'", "did you mean 'emulated'?"),
         (("--fieldkit-site", "gone.yaml"), "gone.yaml", "remedy: "),
@@ -124,14 +124,14 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
     ],
 )
 def test_an_invalid_lab_is_an_error_of_set_up(
-    pytester: pytest.Pytester, words: tuple[str, ...], what: str, remedy: str
+    pytester: pytest.Pytester, words: tuple[str, ...], message: str, remedy: str
 ) -> None:
     suites.write(pytester.path, test_asks=TEST_WITH_ROBOTS)
     done = run(pytester, *words)
     assert (done.ret, done.parseoutcomes()) == (1, {"errors": 1})
     output_text = done.stdout.str()
     assert "ERROR at setup of test_asks" in output_text
-    assert what in output_text
+    assert message in output_text
     assert remedy in output_text
     assert "/fieldkit/" not in output_text, "no internals of fieldkit are shown"
 

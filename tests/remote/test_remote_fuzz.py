@@ -132,15 +132,15 @@ def test_any_archive_stays_in_its_folder(entries: list[bytes], tail: bytes) -> N
 def test_archive_arrives_completely_or_not_at_all(files: dict[str, bytes], data: st.DataObject) -> None:
     sums = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items())
     sent = [(".sums-1", sums.encode()), *files.items()]
-    whole = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
+    archive = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
     if files:
         with tempfile.TemporaryDirectory() as folder:
-            fetching.fetch(Sender(Path(folder), whole), "x", "sender", "lo", Path(folder))
+            fetching.fetch(Sender(Path(folder), archive), "x", "sender", "lo", Path(folder))
             assert {name: Path(folder, name).read_bytes() for name in files} == files
-    hurt = bytearray(whole)
-    place = data.draw(st.integers(0, len(whole) - 1))
+    hurt = bytearray(archive)
+    place = data.draw(st.integers(0, len(archive) - 1))
     hurt[place] ^= data.draw(st.integers(1, 255))
-    for sent_instead in (bytes(hurt), whole[:place]):
+    for sent_instead in (bytes(hurt), archive[:place]):
         assert fetched(sent_instead) in (None, files)
 
 

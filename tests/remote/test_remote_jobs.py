@@ -165,8 +165,8 @@ def test_limit_starts_when_the_job_is_ready(shell: LocalShell) -> None:
 
 def test_job_of_begin_reports_its_end_on_request_only(shell: LocalShell) -> None:
     pending = jobs.begin(shell, job("sh", "-c", "exit 3"))
-    ended = shell.home / FOLDER / ".jobs" / "job" / "exit"
-    wait_until(lambda: ended.exists() and ended.read_text(encoding="ascii") == "3\n", Deadline.after(30))
+    exit_file = shell.home / FOLDER / ".jobs" / "job" / "exit"
+    wait_until(lambda: exit_file.exists() and exit_file.read_text(encoding="ascii") == "3\n", Deadline.after(30))
     assert isinstance(pending.session, LocalSession)
     with pytest.raises(subprocess.TimeoutExpired):
         pending.session.process.wait(0.2)
@@ -381,8 +381,8 @@ def test_process_whose_folder_was_deleted_is_listed_and_stopped(shell: LocalShel
     pid = leader(shell)
     shutil.rmtree(shell.home / FOLDER)
     assert any(line.startswith(f"{FOLDER} {pid} ") for line in jobs.list_running(shell, Deadline.after(30)))
-    ended = jobs.abort(shell, "anna@one", Deadline.after(30)).jobs
-    assert any(line.startswith(FOLDER) and line.endswith("sleep 60") for line in ended)
+    jobs_ended = jobs.abort(shell, "anna@one", Deadline.after(30)).jobs
+    assert any(line.startswith(FOLDER) and line.endswith("sleep 60") for line in jobs_ended)
     assert pending.session.process.wait(30) == -signal.SIGKILL
     wait_until(lambda: group_is_gone(pid), Deadline.after(30))
 
@@ -735,8 +735,8 @@ def test_read_only_robot_is_reported_and_can_be_aborted(shell: LocalShell) -> No
     with pytest.raises(RobotError, match="Read-only file system") as caught:
         evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", need_kib=0)
     assert "a failing SD card" in caught.value.remedy
-    (ended,) = jobs.abort(robot, "anna@one", Deadline.after(30)).jobs
-    assert ended.endswith("sleep 60")
+    (job_ended,) = jobs.abort(robot, "anna@one", Deadline.after(30)).jobs
+    assert job_ended.endswith("sleep 60")
     jobs.install(shell, Deadline.after(30))
 
 

@@ -487,12 +487,12 @@ def test_command_whose_link_breaks_is_sent_again(
 def test_link_that_breaks_before_the_expected_output_is_not_an_end(
     shell: SshShell, line: CuttableLine, waiting: WaitingCommand, pool: ThreadPoolExecutor
 ) -> None:
-    begun = pool.submit(shell.begin, waiting.argv, deadline=soon(), until=b"part\nwhole\n")
+    command = pool.submit(shell.begin, waiting.argv, deadline=soon(), until=b"part\nwhole\n")
     waiting.wait_for_starts(1)
     line.cut()
     waiting.wait_for_starts(2)
     waiting.go.touch()
-    session = begun.result(SOON)
+    session = command.result(SOON)
     assert session.is_ready
     assert session.end(deadline=soon()).exit_code == 0
 

@@ -70,8 +70,8 @@ def test_void_failed_and_planned_conditions_are_counted() -> None:
 
 
 def test_void_attempt_of_a_repeated_repeat_is_not_missing() -> None:
-    again = lawns.row(1, attempt=2, started_utc_ns=1_795_262_500_000_000_000)
-    assert lines([lawns.row(1, status="void", reason="no capture"), again])["Repeats"] == ["1 of 1 valid"]
+    second_row = lawns.row(1, attempt=2, started_utc_ns=1_795_262_500_000_000_000)
+    assert lines([lawns.row(1, status="void", reason="no capture"), second_row])["Repeats"] == ["1 of 1 valid"]
 
 
 def test_value_of_only_some_repeats_shows_their_number() -> None:

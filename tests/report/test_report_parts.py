@@ -190,8 +190,8 @@ def test_empty_series_does_not_change_the_panel() -> None:
 
 def test_logarithmic_axis_is_labelled_with_powers_of_ten() -> None:
     series = Series("a", Style("blue", "o"), [1, 2], [3.0, 400.0])
-    drawn = figures.panel_svg(Panel("", "", "ms", [series], "", bottom=1.0, top=1000.0, log=True))
-    texts = re.findall(r"<text[^>]*>([^<]*)</text>", drawn)
+    figure = figures.panel_svg(Panel("", "", "ms", [series], "", bottom=1.0, top=1000.0, log=True))
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
     assert {"1", "10", "100", "1000"} <= set(texts)
     assert not {"200", "500"} & set(texts)
 

@@ -76,7 +76,7 @@ def test_soak_runs_around_the_steps_inside() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("text", "reason"),
     [
         ("iperf3: {from: sender, to: sender}", "sender cannot send to itself"),
         ("iperf3: {from: sender, to: receiver, size: 1MB, duration: 3s}", "leave one out"),
@@ -92,8 +92,8 @@ def test_soak_runs_around_the_steps_inside() -> None:
         ),
     ],
 )
-def test_invalid_keys_are_refused_with_line(text: str, why: str) -> None:
-    with pytest.raises(ConfigurationError, match=why) as caught:
+def test_invalid_keys_are_refused_with_line(text: str, reason: str) -> None:
+    with pytest.raises(ConfigurationError, match=reason) as caught:
         procedure(text)
     assert caught.value.where == "x.yaml:8"
 

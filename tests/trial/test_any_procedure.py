@@ -306,7 +306,9 @@ def test_enough_procedures_of_each_kind_were_tried(record_property: Any) -> None
     if not SEEN:
         pytest.fail("this runs behind the test above, in one process")
     record_property("result", f"random procedures: {dict(sorted(SEEN.items()))}")
-    assert min(SEEN[what] for what in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 20
-    assert min(SEEN[what] for what in ("valid, two pings or more", "valid, two transfers or more")) >= 8
-    assert min(SEEN[what] for what in ("valid, at the same time", "valid, iperf3 captured")) >= 10
+    assert (
+        min(SEEN[outcome] for outcome in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 20
+    )
+    assert min(SEEN[outcome] for outcome in ("valid, two pings or more", "valid, two transfers or more")) >= 8
+    assert min(SEEN[outcome] for outcome in ("valid, at the same time", "valid, iperf3 captured")) >= 10
     assert SEEN["valid, UDP of several to one"] >= 5

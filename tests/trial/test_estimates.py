@@ -119,6 +119,12 @@ def test_an_upper_end_is_never_below_what_is_expected(
     finished: list[tuple[str, Protocol, float]], distance: str, count: int
 ) -> None:
     estimate = of_repeats(
-        at(distance), TCP, count, [FinishedRepeat(at(where), what, took_s) for where, what, took_s in finished]
+        at(distance),
+        TCP,
+        count,
+        [
+            FinishedRepeat(at(trial_distance), trial_protocol, took_s)
+            for trial_distance, trial_protocol, took_s in finished
+        ],
     )
     assert 0 <= estimate.likely_s <= estimate.most_s * (1 + 1e-9)

@@ -49,10 +49,10 @@ PLANNED_M = math.dist(SCENE.places_m[Role.SENDER], SCENE.places_m[Role.RECEIVER]
 )
 def test_positions_in_metres_have_a_tolerance_of_two_metres(apart_m: float, agrees: bool, tmp_path: Path) -> None:
     """31 ft instead of 30 ft is a distance of 18.897 m between the stations."""
-    why = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
-    assert (why is None) is agrees
-    if why:
-        assert why.startswith("the sender and the receiver were placed 18.3 m apart, but by their recorded")
+    reason = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
+    assert (reason is None) is agrees
+    if reason:
+        assert reason.startswith("the sender and the receiver were placed 18.3 m apart, but by their recorded")
 
 
 @given(off_m=st.floats(-18, 300))

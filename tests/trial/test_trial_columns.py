@@ -185,7 +185,7 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
 
 
 @pytest.mark.parametrize(
-    ("steps", "what"),
+    ("steps", "message"),
     [
         (("meter: {measures: [rtt_sent]}",), "'rtt_sent' is one of fieldkit's"),
         (("meter: {measures: [status]}",), "'status' is one of fieldkit's"),
@@ -195,10 +195,10 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     ],
 )
 @pytest.mark.usefixtures("meters")
-def test_clashing_names_are_rejected_with_the_line_of_their_step(steps: Sequence[str], what: str) -> None:
-    with pytest.raises(ConfigurationError, match=what) as refused:
+def test_clashing_names_are_rejected_with_the_line_of_their_step(steps: Sequence[str], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         procedure(*steps)
-    assert refused.value.where == f"x.yaml:{7 + len(steps)}"
+    assert caught.value.where == f"x.yaml:{7 + len(steps)}"
 
 
 @pytest.mark.usefixtures("meters")
@@ -236,10 +236,10 @@ def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
 
 
 def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path: Path) -> None:
-    alone = write_trial(
+    table = write_trial(
         tmp_path, "one", (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS), with_plan=False
     )
-    actual = {column.name: column for column in tables.declared_in([alone])}
+    actual = {column.name: column for column in tables.declared_in([table])}
     for column in vendor_trials.NAMED_STEP_COLUMNS:
         assert actual[column.name] == column
     for column in vendor_trials.VENDOR_COLUMNS:
@@ -266,9 +266,9 @@ def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: P
 )
 def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path, other: Column) -> None:
     paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", [other])]
-    with pytest.raises(ConfigurationError, match=r"probe\.level is a different column here") as refused:
+    with pytest.raises(ConfigurationError, match=r"probe\.level is a different column here") as caught:
         tables.declared_in(paths)
-    assert refused.value.where == str(paths[1].with_name("trial.yaml"))
+    assert caught.value.where == str(paths[1].with_name("trial.yaml"))
 
 
 def test_plans_may_differ_in_meaning_and_bounds_of_a_column(tmp_path: Path) -> None:
@@ -303,11 +303,11 @@ def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns
     head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
     path.write_text(f"{head}columns:\n{columns}\n", encoding="utf-8")
     for read in (lambda: tables.declared_in([table]), lambda: store.read_plan(path.parent)):
-        with pytest.raises(ConfigurationError) as refused:
+        with pytest.raises(ConfigurationError) as caught:
             read()
-        assert refused.value.where is not None
-        assert refused.value.where.startswith(f"{path}:")
-        assert len(str(refused.value)) < 1000
+        assert caught.value.where is not None
+        assert caught.value.where.startswith(f"{path}:")
+        assert len(str(caught.value)) < 1000
 
 
 def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:

@@ -187,17 +187,19 @@ def demand_agreement(folder: Path) -> None:
 def demand_whole(out: Path) -> None:
     """Check the properties of every finished trial."""
     folder = trial_of(out)
-    ended = journal.ended(journal.read(folder))
+    entries = journal.ended(journal.read(folder))
     valid = Counter(
-        (attempt.repeat.protocol, attempt.repeat.number) for attempt in ended if attempt.status == "valid"
+        (attempt.repeat.protocol, attempt.repeat.number) for attempt in entries if attempt.status == "valid"
     )
     assert valid == {(Protocol.TCP, number + 1): 1 for number in range(REPEATS)}
-    assert all(attempt.reason for attempt in ended if attempt.status != "valid")
-    assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(attempt.folder for attempt in ended)
+    assert all(attempt.reason for attempt in entries if attempt.status != "valid")
+    assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(
+        attempt.folder for attempt in entries
+    )
     demand_agreement(folder)
     assert all(
         problems(plan(), attempt.repeat.protocol, folder / "repeats" / attempt.folder) == ()
-        for attempt in ended
+        for attempt in entries
         if attempt.status == "valid"
     )
 

@@ -121,14 +121,16 @@ def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pyte
 
 
 @pytest.mark.motion
-@pytest.mark.parametrize("how", ["changed", "gone", "unsummed"])
-def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.CaptureFixture[str], how: str) -> None:
+@pytest.mark.parametrize("change", ["changed", "gone", "unsummed"])
+def test_changed_position_files_prevent_a_rebuild(
+    trial: Path, capsys: pytest.CaptureFixture[str], change: str
+) -> None:
     walk(trial)
     assert output_text(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
     positions_file = trial / "positions-receiver.csv"
-    if how == "changed":
+    if change == "changed":
         positions_file.write_bytes(positions_file.read_bytes() + b"\n")
-    elif how == "gone":
+    elif change == "gone":
         positions_file.unlink()
     else:
         shutil.copy(positions_file, trial / "positions-sender.csv")

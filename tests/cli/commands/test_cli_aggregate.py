@@ -128,9 +128,9 @@ def test_csv_equals_the_summary_file(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_json_and_csv_agree(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = records(output_of(capsys, str(campaign), "--format", "csv"))
-    whole = json.loads(output_of(capsys, str(campaign), "--format", "json"))
-    assert whole["by"] == list(DEFAULT_BY)
-    estimates = [(cell, name, estimate) for cell in whole["cells"] for name, estimate in cell["estimates"].items()]
+    document = json.loads(output_of(capsys, str(campaign), "--format", "json"))
+    assert document["by"] == list(DEFAULT_BY)
+    estimates = [(cell, name, estimate) for cell in document["cells"] for name, estimate in cell["estimates"].items()]
     assert len(estimates) == len(lines)
     for line, (cell, name, estimate) in zip(lines, estimates, strict=True):
         assert (line["quantity"], line["n_void"]) == (name, str(cell["n_void"]))
@@ -171,8 +171,8 @@ def test_width_gives_the_number_of_repeats_needed(campaign: Path, capsys: pytest
         width = 0.01 if line["unit"] == "share" else 0.005
         assert line["more_wanted"] == str(additional_repeats(interval, int(line["n"]), width, Kind(line["estimate"])))
     assert {line["more_wanted"] == "0" for line in lines} == {True, False}
-    whole = json.loads(output_of(capsys, *words, "--format", "json"))
-    counts = [estimate["more_wanted"] for cell in whole["cells"] for estimate in cell["estimates"].values()]
+    document = json.loads(output_of(capsys, *words, "--format", "json"))
+    counts = [estimate["more_wanted"] for cell in document["cells"] for estimate in cell["estimates"].values()]
     assert [str(count) for count in counts] == [line["more_wanted"] for line in lines]
     (loss,) = (line for line in lines if line["quantity"] == "ip_loss")
     assert re.search(

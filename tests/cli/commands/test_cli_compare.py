@@ -114,15 +114,15 @@ def test_all_formats_agree(capsys: pytest.CaptureFixture[str]) -> None:
         assert compare(f"field sim --threshold ip_loss=2% --format {form}") == 1
         outputs[form] = capsys.readouterr().out
     (loss,) = (row for row in csv.DictReader(outputs["csv"].splitlines()) if row["quantity"] == "ip_loss")
-    whole = json.loads(outputs["json"])
-    (same,) = (row for row in whole["differences"] if row["quantity"] == "ip_loss")
-    assert whole["missed"] is True
+    document = json.loads(outputs["json"])
+    (same,) = (row for row in document["differences"] if row["quantity"] == "ip_loss")
+    assert document["missed"] is True
     assert float(loss["difference"]) == pytest.approx(same["difference"]) == pytest.approx(40 / 216)
     assert loss["within"] == "false"
     assert loss["verdict"] == same["verdict"]
     assert same["verdict"] in outputs["markdown"]
     assert same["verdict"] in outputs["table"]
-    for line in whole["conclusions"]:
+    for line in document["conclusions"]:
         assert line in outputs["markdown"]
         assert line in outputs["table"]
 
@@ -183,9 +183,10 @@ def test_runs_that_differ_only_in_distance_compare_by_protocol(
 ) -> None:
     far_away(lab, field, "far")
     assert compare("field far") == 2
-    refused = capsys.readouterr().err
+    error_text = capsys.readouterr().err
     assert (
-        "only distance_m differs; to compare one with the other: fieldkit compare field far --by protocol" in refused
+        "only distance_m differs; to compare one with the other: fieldkit compare field far --by protocol"
+        in error_text
     )
     assert compare("field far --by protocol") == 0
     output = capsys.readouterr()

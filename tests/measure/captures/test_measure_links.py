@@ -246,9 +246,9 @@ def test_the_length_of_an_ipv6_superframe_is_from_its_option_or_the_wire(
 
 
 def test_a_packet_truncated_in_its_headers_has_no_ports() -> None:
-    whole = segment(5, 0)
+    packet = segment(5, 0)
     for length, count, ported in ((19, 0, 0), (20, 1, 0), (23, 1, 0), (24, 1, 1), (39, 1, 1)):
-        packets = _of(whole[:length], wire=40)
+        packets = _of(packet[:length], wire=40)
         assert len(packets) == count
         assert (packets.dport != NO_PORT).sum() == ported
         assert not packets.tcp_seq.any()
@@ -264,9 +264,9 @@ def test_the_length_of_an_authentication_header_is_in_words() -> None:
 
 def test_an_ipv6_packet_truncated_in_its_extension_headers_has_no_ports() -> None:
     hops = IPv6ExtHdrHopByHop(options=[PadN(optdata=bytes(10))])
-    whole = bytes(IPv6(src=ADDRESS_A, dst=ADDRESS_B) / hops / UDP(sport=4, dport=5))
-    for length in range(len(whole)):
-        packets = _of(whole[:length], wire=len(whole))
+    packet = bytes(IPv6(src=ADDRESS_A, dst=ADDRESS_B) / hops / UDP(sport=4, dport=5))
+    for length in range(len(packet)):
+        packets = _of(packet[:length], wire=len(packet))
         assert len(packets) == (length >= 40)
         assert packets.protocol.tolist() == ([] if length < 40 else [17 if length >= 48 else 0])
         assert packets.dport.tolist() == ([] if length < 40 else [5 if length >= 60 else NO_PORT])

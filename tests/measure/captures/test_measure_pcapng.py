@@ -46,9 +46,9 @@ def test_every_block_type_that_contains_a_packet(order: str) -> None:
 
 
 def test_a_simple_packet_has_the_snap_length_of_its_interface() -> None:
-    whole = segment(7, 100)
+    packet = segment(7, 100)
     for snap, captured, ported in ((0, 40, True), (40, 40, True), (24, 24, True), (23, 23, False)):
-        data = section() + interface(snap=snap) + simple(Frame(0, whole[:captured], wire_bytes=40))
+        data = section() + interface(snap=snap) + simple(Frame(0, packet[:captured], wire_bytes=40))
         packets = pcap.parse(data, where="x").packets
         assert (packets.dport == 1234).tolist() == [ported]
         assert packets.tcp_seq.tolist() == [7 if captured == 40 else 0]
@@ -120,10 +120,10 @@ PACKET_ENDS = [ENDS[index] for index in (2, 3, 4, 8, 9, 11)]
 def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
     for size in range(28, len(VALID) + 1):
         capture = pcap.parse(VALID[:size], where="x")
-        whole = sum(end <= size for end in PACKET_ENDS)
-        assert capture.packets.tcp_seq.tolist() == list(range(whole))
+        complete = sum(end <= size for end in PACKET_ENDS)
+        assert capture.packets.tcp_seq.tolist() == list(range(complete))
         start = max(end for end in ENDS if end <= size)
-        inside = f"ends inside the block at byte {start}, after packet {whole}"
+        inside = f"ends inside the block at byte {start}, after packet {complete}"
         assert capture.damage == (None if size == start else inside)
 
 
@@ -207,10 +207,10 @@ def test_an_option_with_an_invalid_size_is_ignored() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**32 * 10**9 - 1), st.integers(0, 60), st.integers(0, 60)), max_size=12))
-def test_both_formats_give_the_same_columns(drawn: list[tuple[int, int, int]]) -> None:
+def test_both_formats_give_the_same_columns(records: list[tuple[int, int, int]]) -> None:
     frames = [
         Frame(time_ns, segment(index, size)[: 10 + captured], wire_bytes=140)
-        for index, (time_ns, size, captured) in enumerate(drawn)
+        for index, (time_ns, size, captured) in enumerate(records)
     ]
     for order in ("<", ">"):
         classic, blocks = (make(frames, order=order) for make in (file_bytes, file_of))

@@ -77,8 +77,8 @@ def test_an_incomplete_file_of_a_testbed_is_an_error(tmp_path: Path, damage: "ty
 
 def test_a_truncated_file_of_a_testbed_is_an_error_and_an_earlier_format_is_read(tmp_path: Path) -> None:
     samples = {Role.SENDER: [LinkSample(at_ns, noise_dbm=-95.0) for at_ns in range(3)]}
-    path, whole = tmp_path / link_samples.FILE, link_samples.text(samples)
-    count, *lines = whole.splitlines(keepends=True)
+    path, content = tmp_path / link_samples.FILE, link_samples.text(samples)
+    count, *lines = content.splitlines(keepends=True)
     path.write_text("".join([count, *lines[:-1]]), encoding="ascii")
     with pytest.raises(EvidenceError, match="has 2 lines of 3: truncated"):
         link_samples.read(path)
@@ -113,9 +113,9 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
 
 @given(st.integers(0, len(OWN)))
 def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
-    whole, cut = link_samples.parse(OWN), link_samples.parse(OWN[:at])
-    assert [item.utc_ns for item in cut] == [item.utc_ns for item in whole][: len(cut)]
-    for item, other in zip(cut, whole, strict=False):
+    complete, cut = link_samples.parse(OWN), link_samples.parse(OWN[:at])
+    assert [item.utc_ns for item in cut] == [item.utc_ns for item in complete][: len(cut)]
+    for item, other in zip(cut, complete, strict=False):
         for station in item.stations:
             (same,) = (candidate for candidate in other.stations if candidate.station == station.station)
             present = {name: value for name, value in vars(station).items() if value is not None}

@@ -103,9 +103,9 @@ def test_other_json_is_an_error(text: str) -> None:
 
 def test_omitted_intervals_are_not_counted() -> None:
     data = json.loads(output("3.12", "udp", "server"))
-    whole = iperf3.parse(json.dumps(data)).intervals
+    intervals = iperf3.parse(json.dumps(data)).intervals
     data["intervals"][0]["sum"]["omitted"] = True
-    assert iperf3.parse(json.dumps(data)).intervals == whole[1:]
+    assert iperf3.parse(json.dumps(data)).intervals == intervals[1:]
 
 
 def test_with_one_end_only_its_columns_have_values() -> None:

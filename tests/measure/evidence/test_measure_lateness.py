@@ -69,8 +69,8 @@ def test_packets_between_two_readings_are_written_and_read(
 @given(st.integers(0, 10**6))
 def test_a_truncated_file_is_refused(tmp_path_factory: pytest.TempPathFactory, at: int) -> None:
     lateness = Lateness(bound_ns=5000, packets={1000: 98, 6000: 1, 8000: 1})
-    whole = oracle_delays.lateness_text(Lateness(bound_ns=5000, packets={}), lateness).encode()
-    path = file(tmp_path_factory.getbasetemp(), whole[: at % len(whole)])
+    content = oracle_delays.lateness_text(Lateness(bound_ns=5000, packets={}), lateness).encode()
+    path = file(tmp_path_factory.getbasetemp(), content[: at % len(content)])
     with pytest.raises(EvidenceError):
         oracle_delays.read_lateness(path)
 

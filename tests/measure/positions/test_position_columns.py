@@ -114,25 +114,25 @@ def test_times_of_robots_are_converted_to_one_clock(
 
 
 @pytest.mark.parametrize(
-    ("begin_s", "end_s", "why"),
+    ("begin_s", "end_s", "reason"),
     [
         (-1, 2, "the positions of the receiver from /where begin 1.0 s too late"),
         (2, 6, "the positions of the receiver from /where end 2.0 s too early"),
     ],
 )
 def test_times_that_are_not_covered_are_missing_with_a_reason(
-    attempt: Path, begin_s: float, end_s: float, why: str
+    attempt: Path, begin_s: float, end_s: float, reason: str
 ) -> None:
     write_bag(attempt, AWAY)
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
-    assert mean_m(attempt, begin_s, end_s) == why
+    assert mean_m(attempt, begin_s, end_s) == reason
 
 
 def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
     write_bag(attempt, AWAY[:2] + AWAY[3:])
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
-    why = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
-    assert mean_m(attempt) == why
+    reason = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
+    assert mean_m(attempt) == reason
 
 
 def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt: Path) -> None:

@@ -292,11 +292,11 @@ WITHHELD: dict[str, Change] = {
 }
 
 
-@pytest.mark.parametrize("why", WITHHELD)
-def test_unknown_values_are_empty_with_a_reason(why: str) -> None:
+@pytest.mark.parametrize("reason", WITHHELD)
+def test_unknown_values_are_empty_with_a_reason(reason: str) -> None:
     sender, receiver = _exchange([0.0, 1.0, 2.0], [1.0, 1.0, 1.5], (12.0, 0))
-    measures = _measured(*WITHHELD[why](sender, receiver), transfer(Protocol.UDP))
-    assert measures.one_way_withheld == why
+    measures = _measured(*WITHHELD[reason](sender, receiver), transfer(Protocol.UDP))
+    assert measures.one_way_withheld == reason
     assert (
         measures.one_way_min_s
         is measures.one_way_median_s
@@ -304,7 +304,7 @@ def test_unknown_values_are_empty_with_a_reason(why: str) -> None:
         is measures.one_way_p95_s
         is None
     )
-    uncertain = why.startswith("the error")
+    uncertain = reason.startswith("the error")
     assert (measures.one_way_error_s is not None) == (measures.clock_offset_s is not None) == uncertain
     # Values that need no common clock are present if packets and times are and both clocks are steady.
-    assert (measures.jitter_s is None) == (why.startswith(("no packet of", "no offset")) or "times" in why)
+    assert (measures.jitter_s is None) == (reason.startswith(("no packet of", "no offset")) or "times" in reason)

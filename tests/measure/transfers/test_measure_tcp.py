@@ -117,8 +117,8 @@ def test_offload_alone_is_not_loss_retransmission_or_reordering(
 
 def _lengthless(seq: int, payload_bytes: int) -> bytes:
     """A frame whose IP length is 0, as above 64 KiB, so that only the length on the wire is known."""
-    whole = segment(seq, payload_bytes)
-    return whole[:2] + bytes(2) + whole[4:]
+    packet = segment(seq, payload_bytes)
+    return packet[:2] + bytes(2) + packet[4:]
 
 
 def test_a_retransmission_is_spurious_only_if_an_earlier_copy_arrived() -> None:
@@ -143,14 +143,14 @@ def test_without_ids_time_shows_which_copy_of_a_byte_arrived() -> None:
 
 
 def test_captures_that_started_late_or_ended_early() -> None:
-    whole = timed(_frames(2**32 - 1500, [(start, 1000) for start in range(0, 10_000, 1000)]))
-    late_receiver = tcp.count(tcp.match_transfer(packets(whole), packets(whole[4:-2]), TCP_TRANSFER))
+    frames = timed(_frames(2**32 - 1500, [(start, 1000) for start in range(0, 10_000, 1000)]))
+    late_receiver = tcp.count(tcp.match_transfer(packets(frames), packets(frames[4:-2]), TCP_TRANSFER))
     assert (late_receiver.received_bytes, late_receiver.lost_bytes) == (5000, 5000)
-    early_sender = tcp.count(tcp.match_transfer(packets(whole[:5]), packets(whole), TCP_TRANSFER))
+    early_sender = tcp.count(tcp.match_transfer(packets(frames[:5]), packets(frames), TCP_TRANSFER))
     assert (early_sender.sent_bytes, early_sender.received_bytes, early_sender.lost_bytes) == (4000, 4000, 0)
     assert early_sender.duplicated_bytes == 0
     # Without its SYN it is unknown to which transfer a connection belongs.
-    assert tcp.count(tcp.match_transfer(packets(whole[1:]), packets(whole), TCP_TRANSFER)).sent_bytes == 0
+    assert tcp.count(tcp.match_transfer(packets(frames[1:]), packets(frames), TCP_TRANSFER)).sent_bytes == 0
 
 
 def test_superframes_at_either_end_count_as_their_segments() -> None:

@@ -89,7 +89,7 @@ def test_packets_with_repeated_ids_are_distinguished_by_time(ids: int, rounds: i
     clock_ns = data.draw(st.integers(-(10**12), 10**12))
     sent: list[Frame] = []
     received: list[Frame] = []
-    whole = arrived = 0
+    complete = arrived = 0
     for turn in range(rounds):
         for ip_id in range(ids):
             at_ns = 10**15 + turn * 5 * 10**9 + ip_id * 10**6
@@ -101,7 +101,7 @@ def test_packets_with_repeated_ids_are_distinguished_by_time(ids: int, rounds: i
                 for frame, keep in zip(cut, fate, strict=True)
                 if keep
             ]
-            whole += all(fate)
+            complete += all(fate)
             arrived += sum(fate)
     # One datagram with a unique id arrives completely, which gives the clock offset.
     earlier = [Frame(10**15 - 10**7, packet, wire_bytes=2000) for packet in datagram(9999, 4000)]
@@ -111,7 +111,7 @@ def test_packets_with_repeated_ids_are_distinguished_by_time(ids: int, rounds: i
     counts = _count(sent, received)
 
     assert counts.packets_received == arrived + 3
-    assert counts.datagrams_received == whole + 1
+    assert counts.datagrams_received == complete + 1
 
 
 @given(st.integers(1, 40), st.data())
@@ -184,10 +184,10 @@ def test_the_papers_file_in_datagrams_fragmented_by_scapy() -> None:
     blocks = [8192] * 35 + [293_797 - 35 * 8192]
     sent: list[Frame] = []
     for number, size in enumerate(blocks):
-        whole = (
+        datagram = (
             IP(src=SENDER, dst=RECEIVER, id=65_520 + number & 0xFFFF) / UDP(sport=1, dport=PORT) / Raw(bytes(size))
         )
-        cut = fragment(whole, 1480)  # type: ignore[no-untyped-call]
+        cut = fragment(datagram, 1480)  # type: ignore[no-untyped-call]
         sent += [Frame(number * 10**6 + at, bytes(packet)) for at, packet in enumerate(cut)]
     lost = np.random.default_rng(1).random(len(sent)) < 0.1
     counts = _count(sent, [frame for frame, is_lost in zip(sent, lost, strict=True) if not is_lost])

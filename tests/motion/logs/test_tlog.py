@@ -114,17 +114,17 @@ def test_impossible_values_are_missing(tmp_path: Path) -> None:
     assert not {item for item in values if item.endswith(("_m", "_m_s", "_deg"))}
 
 
-@pytest.mark.parametrize("how", ["old", "signed"])
-def test_logs_of_mavlink_1_and_of_signed_frames(how: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("version", ["old", "signed"])
+def test_logs_of_mavlink_1_and_of_signed_frames(version: str, tmp_path: Path) -> None:
     sender = Sender()
-    if how == "signed":
+    if version == "signed":
         sender.link.signing.secret_key, sender.link.signing.sign_outgoing = b"k" * 32, True
     messages = [beat(), *(d.MAVLink_attitude_message(at, 0.5, 0, 0, 0, 0, 0) for at in range(5))]
     frames = []
     for number, message in enumerate(messages):
-        frames.append((number, bytes(message.pack(sender.link, force_mavlink1=how == "old"))))
+        frames.append((number, bytes(message.pack(sender.link, force_mavlink1=version == "old"))))
         sender.link.seq = number + 1
-    assert {item[0] for _, item in frames} == {0xFE if how == "old" else 0xFD}
+    assert {item[0] for _, item in frames} == {0xFE if version == "old" else 0xFD}
     values = measured(tmp_path, stamped(frames))
     assert (values["mavlink_messages"], values["mavlink_sent"], values["mavlink_damaged"]) == (6, 6, 0)
     assert values["mavlink_roll_max_deg"] == pytest.approx(28.65, abs=0.01)
@@ -249,8 +249,8 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path
 
 def test_moved_frames_are_detected(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.tlog"
-    whole = flight()
-    path.write_bytes(whole + whole)
+    content = flight()
+    path.write_bytes(content + content)
     log = tlog.read(path, 0, 0)
     (reason,) = tlog.contradictions(log, tlog.RecorderSummary(log.frames, 0, log.last_us, {}), 0, None)
     assert "a frame that is 10.001 s earlier than the previous one" in reason

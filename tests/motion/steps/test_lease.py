@@ -110,20 +110,20 @@ class Ending(Link):
 
 
 def test_body_is_aborted_when_program_ends() -> None:
-    ended = Event()
+    stop = Event()
 
     def wait() -> None:
-        assert ended.wait(60)
+        assert stop.wait(60)
         raise LinkError("the connection broke", where="r", remedy="wait")
 
     with keeper(Ending()) as lease:
         assert lease.end_reason == ""
-        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.run_while_leased(ended.set):
+        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.run_while_leased(stop.set):
             wait()
         assert "the connection broke" in str(caught.value.__cause__)
-        with pytest.raises(RobotError, match="ended with exit code 7"), lease.run_while_leased(ended.set):
+        with pytest.raises(RobotError, match="ended with exit code 7"), lease.run_while_leased(stop.set):
             pass
-        with pytest.raises(LockLostError), lease.run_while_leased(ended.set):
+        with pytest.raises(LockLostError), lease.run_while_leased(stop.set):
             raise LockLostError("aborted", where="r", remedy="ask")
 
 

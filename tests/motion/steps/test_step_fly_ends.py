@@ -72,7 +72,7 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 
 
 def fly(
-    shell: Shell, where: int | str, waits: str, begun: Callable[[], object], abort: OnAbort = OnAbort.LAND
+    shell: Shell, where: int | str, waits: str, is_begun: Callable[[], object], abort: OnAbort = OnAbort.LAND
 ) -> None:
     """Fly a drone at a UDP port or a connection; call `begun` when a step inside starts."""
     connection = where if isinstance(where, str) else f"udpout:127.0.0.1:{where}"
@@ -92,7 +92,7 @@ def fly(
 
     def announce(name: str, _: float | None) -> None:
         if name == "wait":
-            begun()
+            is_begun()
 
     schema.validate(schema.parse(step, source="x.yaml"), FlyStep).run(
         scene, IdleTestbed({Role.RECEIVER: shell}), announce

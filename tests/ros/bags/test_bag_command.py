@@ -301,9 +301,9 @@ def test_single_mcap_file_is_a_bag(
 
 
 def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = data_file(write_bag(tmp_path, BagFormat.SQLITE, expected(300)))
+    database = data_file(write_bag(tmp_path, BagFormat.SQLITE, expected(300)))
     cut = tmp_path / "cut.db3"
-    cut.write_bytes(whole.read_bytes()[:30_000])
+    cut.write_bytes(database.read_bytes()[:30_000])
     assert main(["bag", "check", str(cut)]) == EvidenceError.exit_code
     output_text = capsys.readouterr().err
     assert "there is no metadata.yaml" in output_text
@@ -317,10 +317,10 @@ def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_sparse_file_is_reported_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = data_file(in_chunks(tmp_path / "all", expected(300)))
-    with whole.open("r+b") as opened:
+    bag = data_file(in_chunks(tmp_path / "all", expected(300)))
+    with bag.open("r+b") as opened:
         opened.truncate(1 << 42)
-    assert main(["bag", "check", str(whole)]) == EvidenceError.exit_code
+    assert main(["bag", "check", str(bag)]) == EvidenceError.exit_code
     assert "can be recovered" in capsys.readouterr().err
 
 

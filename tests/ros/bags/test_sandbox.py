@@ -67,7 +67,7 @@ sandbox.serve(answer)
 
 
 @pytest.mark.parametrize(
-    ("signals", "why"),
+    ("signals", "reason"),
     [
         ([], None),
         ([signal.SIGKILL], None),  # as the kernel if memory is short
@@ -78,13 +78,13 @@ sandbox.serve(answer)
     ],
 )
 def test_a_reader_that_is_killed_externally_is_restarted_and_leaves_no_files(
-    unpacks: sandbox.SandboxedReader, tmp_path: Path, signals: list[signal.Signals], why: str | None
+    unpacks: sandbox.SandboxedReader, tmp_path: Path, signals: list[signal.Signals], reason: str | None
 ) -> None:
     question = {"signals": signals, "ended": str(tmp_path / "ended")}
-    if why is None:
+    if reason is None:
         assert unpacks.query(question, 1) == {"said": "whole"}
     else:
-        with pytest.raises(sandbox.ReaderError, match=why):
+        with pytest.raises(sandbox.ReaderError, match=reason):
             unpacks.query(question, 1)
     assert list((tmp_path / "tmp").iterdir()) == []
 

@@ -292,22 +292,22 @@ traffic:
 def publishing(*positions_m: tuple[float, float, float], losses: Sequence[SerializedEvent] = ()) -> Iterator[None]:
     """Publish path losses and locations of NEM 1, 2, ... repeatedly, with a malformed datagram before them."""
     publisher = EventPublisher(CHANNEL, "lo")
-    frame, ended = LocalFrame(TURIN), threading.Event()
+    frame, closed = LocalFrame(TURIN), threading.Event()
     velocity = EmaneVelocity(90.0, 0.0, 2.0)
     locations = [NemLocation(nem, *frame.geodetic(position), velocity) for nem, position in enumerate(positions_m, 1)]
 
     def publish() -> None:
-        while not ended.is_set():
+        while not closed.is_set():
             publisher.publish([SerializedEvent(ALL_NEMS, LOCATION, b"\x0a\x05")])
             publisher.publish([*losses, SerializedEvent(ALL_NEMS, LOCATION, encode_locations(locations))])
-            ended.wait(0.05)
+            closed.wait(0.05)
 
     thread = threading.Thread(target=publish)
     thread.start()
     try:
         yield
     finally:
-        ended.set()
+        closed.set()
         thread.join()
         publisher.close()
 

@@ -172,10 +172,10 @@ def test_lost_frames_are_sent_again_within_later_aggregates_and_arrive_in_order(
     arrived = [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
     attempts = [attempt for attempt in log if attempt.number]
     assert arrived == list(range(500))
-    again = [attempt for attempt in attempts if attempt.number > 1]
-    assert 0.02 < len(again) / len(attempts) < 0.5
+    retries = [attempt for attempt in attempts if attempt.number > 1]
+    assert 0.02 < len(retries) / len(attempts) < 0.5
     together = {attempt.start_ns for attempt in attempts if attempt.number == 1}
-    assert any(attempt.start_ns in together for attempt in again), "sent again together with new frames"
+    assert any(attempt.start_ns in together for attempt in retries), "sent again together with new frames"
 
 
 def test_frames_to_a_silent_receiver_are_given_up_after_the_retry_limit() -> None:

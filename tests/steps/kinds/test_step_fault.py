@@ -141,9 +141,9 @@ def test_steps_inside_a_fault_can_be_excluded() -> None:
 
 
 def test_two_faults_of_one_kind_are_refused() -> None:
-    again = NESTED + "  - fault: {robot: sender, kind: out-of-range, for: 1s}\n"
+    nested_twice = NESTED + "  - fault: {robot: sender, kind: out-of-range, for: 1s}\n"
     with pytest.raises(ConfigurationError, match="a fault out-of-range is defined twice"):
-        schema.validate(schema.parse(again, source="x"), Procedure)
+        schema.validate(schema.parse(nested_twice, source="x"), Procedure)
 
 
 def test_written_procedure_with_faults_is_read_unchanged() -> None:

@@ -330,7 +330,7 @@ def load(steps: str) -> Procedure:
 
 
 @pytest.mark.parametrize(
-    ("steps", "what", "line"),
+    ("steps", "message", "line"),
     [
         ("  - together: {during: [ping: {FLOW}]}", "at least 2 items", 1),
         (SAME_PORT, "port 1234 is used twice at the same time on receiver; give one another port", 4),
@@ -367,10 +367,10 @@ def load(steps: str) -> Procedure:
         ),
     ],
 )
-def test_steps_that_cannot_run_simultaneously_are_refused_with_line(steps: str, what: str, line: int) -> None:
+def test_steps_that_cannot_run_simultaneously_are_refused_with_line(steps: str, message: str, line: int) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(steps)
-    assert what in caught.value.what
+    assert message in caught.value.what
     assert caught.value.where == f"x.yaml:{(HEAD + RECORD).count(chr(10)) + line}"
 
 

@@ -204,8 +204,12 @@ def test_a_disk_with_unknown_space_fails() -> None:
 
 
 def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
-    whole = size.trial_bytes(PLAN)
-    for free, status in ((size.RESERVE_BYTES + whole, OK), (size.RESERVE_BYTES + whole - 1, WARN), (0, FAIL)):
+    size_bytes = size.trial_bytes(PLAN)
+    for free, status in (
+        (size.RESERVE_BYTES + size_bytes, OK),
+        (size.RESERVE_BYTES + size_bytes - 1, WARN),
+        (0, FAIL),
+    ):
         report = Report("laptop")
         system.judge_disk_space(PLAN, free, Path("/trials"), report)
         assert only(report.findings, "disk").status is status
@@ -330,9 +334,9 @@ def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, prog
 
 
 def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
-    refused = CommandResult("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
+    result = CommandResult("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
     (failed,) = [
-        finding for finding in judged(installed() | {"right to capture": refused}) if finding.status is not OK
+        finding for finding in judged(installed() | {"right to capture": result}) if finding.status is not OK
     ]
     assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
 
@@ -389,8 +393,8 @@ def test_the_route_of_ssh_is_detected(connection: str, control: Control, status:
 
 @pytest.mark.parametrize("file", ["ip/6.1.0/nope.txt", "busybox/1.35.0/ip-nope.txt"])
 def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
-    refused = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
-    sections = installed() | {"right to capture": refused, "interface": output_text(file, 1)}
+    result = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
+    sections = installed() | {"right to capture": result, "interface": output_text(file, 1)}
     assert "right to capture" not in {finding.check for finding in judged(sections)}
     findings = judged(sections | {"interface": output_text("ip/6.1.0/up.txt")})
     assert only(findings, "right to capture").status is FAIL

@@ -43,12 +43,12 @@ def begin(out: Path, repeats: int) -> tuple[Ledger, Plan, Path]:
 
 
 def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
-    begun = to.begin(repeat)
+    entry = to.begin(repeat)
     partial = store.open_attempt(folder, repeat)
     (partial / "ping.txt").write_text(PING, encoding="ascii")
-    to.measured(begun)
+    to.measured(entry)
     measured = gates.judge(plan, repeat, AttemptEvidence(partial)).measured
-    to.commit(partial, replace(begun, status=Status.VALID), measured)
+    to.commit(partial, replace(entry, status=Status.VALID), measured)
 
 
 @pytest.fixture
@@ -153,7 +153,7 @@ def rot(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("befalls", "what"),
+    ("befalls", "changes"),
     [
         (rot, {CHANGED: "changed"}),
         (Path.unlink, {CHANGED: "missing"}),
@@ -165,14 +165,14 @@ def rot(path: Path) -> None:
 def test_checksums_are_kept_and_differences_reported(
     trial: Path,
     befalls: Callable[[Path], object],
-    what: dict[str, str],
+    changes: dict[str, str],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
     befalls(trial / CHANGED)
-    output_text = [f"{name}: {kind}" for name, kind in what.items()]
+    output_text = [f"{name}: {kind}" for name, kind in changes.items()]
     to = again(trial)
-    assert to.differences == what
+    assert to.differences == changes
     to.summarize()
     assert set(output_text) <= set(manifest.verify(trial))
     with pytest.raises(EvidenceError, match="the tables are not changed") as caught:

@@ -167,9 +167,9 @@ def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell)
         for folder in (FOLDER, jobs.work_folder("older", "udp-03-1")):
             argv = ("sh", "-c", "trap '' INT; echo up; while :; do sleep 0.05; done")
             jobs.start(robot, Job(folder=folder, name="capture", argv=argv, limit_s=60, log="log", ready="log:up"))
-        (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
-        assert ended.error is None
-        assert [line.split()[0] for line in ended.jobs] == [
+        (aborted,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
+        assert aborted.error is None
+        assert [line.split()[0] for line in aborted.jobs] == [
             ".fieldkit/older/udp-03-1/capture",
             ".fieldkit/trial-a/tcp-01-1/capture",
         ]
@@ -197,7 +197,7 @@ def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_pat
     with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: robot}, BERT, sink=quiet):
             raise AssertionError("taken")
-        assert [ended.locked for ended in locks.abort({"turtlebot-1": robot}, "bert@two").values()] == [True]
+        assert [result.locked for result in locks.abort({"turtlebot-1": robot}, "bert@two").values()] == [True]
 
 
 def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
@@ -283,11 +283,11 @@ def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tm
         waits = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
         (tmp_path / "bin" / "df").write_text(waits, encoding="ascii")  # called after the lock was checked
         (tmp_path / "bin" / "df").chmod(0o755)
-        begun = pool.submit(begin, robot, ANNA)
+        submitted = pool.submit(begin, robot, ANNA)
         wait_until(called.exists, Deadline.after(30))
         assert locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
         go.touch()
-        begun.result(30)
+        submitted.result(30)
         with pytest.raises(LockLostError, match="the trial was aborted by bert@two"):
             jobs.run(robot, Job(folder=FOLDER, name="job", argv=("touch", "started"), limit_s=5, log="log"))
     assert not (robot.home / FOLDER / "started").exists()
@@ -295,8 +295,8 @@ def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tm
 
 def test_aborting_a_free_robot_reports_no_lock(robot: LocalShell) -> None:
     for _ in range(2):
-        (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
-        assert (ended.locked, ended.error) == (False, None)
+        (aborted,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
+        assert (aborted.locked, aborted.error) == (False, None)
     with locked({Role.SENDER: robot}, ANNA, sink=quiet):
         pass
     assert not locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
@@ -368,8 +368,12 @@ def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Unr
         stack.enter_context(locked(cast, ANNA, sink=lambda event: None))
         cast[Role.RECEIVER].left = 0
         link_error = LinkError("did not answer", where="eve")
-        ended = locks.abort({"abe": cast[Role.RECEIVER], "eve": link_error, "zoe": cast[Role.SENDER]}, "bert@two")
-    assert {name: result.error is None for name, result in ended.items()} == {"abe": False, "eve": False, "zoe": True}
+        results = locks.abort({"abe": cast[Role.RECEIVER], "eve": link_error, "zoe": cast[Role.SENDER]}, "bert@two")
+    assert {name: result.error is None for name, result in results.items()} == {
+        "abe": False,
+        "eve": False,
+        "zoe": True,
+    }
     assert record(cast[Role.SENDER])[:2] == ["aborted", "trial-a"]
 
 

@@ -54,18 +54,18 @@ class Recorder:
         self.events: list[Event] = []
         self.holder: Holder | None = None
 
-    def note(self, what: str) -> None:
-        self.done.append(what)
-        if what in self.failing:
-            raise self.failing[what]
+    def note(self, event: str) -> None:
+        self.done.append(event)
+        if event in self.failing:
+            raise self.failing[event]
 
     @contextmanager
-    def around(self, what: str) -> Iterator[None]:
-        self.note(what)
+    def around(self, event: str) -> Iterator[None]:
+        self.note(event)
         try:
             yield
         finally:
-            self.done.append(f"{what} ends")
+            self.done.append(f"{event} ends")
 
     def cast(self, topology: Topology) -> Cast:
         assert topology is Topology.MASTER
@@ -130,10 +130,10 @@ def test_trials_run_one_after_the_other_on_robots_opened_once(
     recorder: Callable[..., Recorder], tmp_path: Path
 ) -> None:
     recording, out = recorder(), tmp_path / "trials"
-    ended = recording.run(plans(), out)
-    begun = ["open", "meet", "hold", "run_10ft", "run_20ft", "run_30ft"]
-    assert recording.done == [*begun, "hold ends", "open ends"]
-    assert [outcome and outcome.valid for outcome in ended] == [2, 2, 2]
+    outcomes = recording.run(plans(), out)
+    events = ["open", "meet", "hold", "run_10ft", "run_20ft", "run_30ft"]
+    assert recording.done == [*events, "hold ends", "open ends"]
+    assert [outcome and outcome.valid for outcome in outcomes] == [2, 2, 2]
     assert recording.holder == Holder(plans()[0].session, runtime.user_at_host(), plans()[0].trial)
     assert out.is_dir()
     assert notes(recording) == []

@@ -45,7 +45,7 @@ def of_two() -> Plan:
     return plan().model_copy(update={"repeats": 2})
 
 
-def ended(events: list[Event]) -> list[RepeatEnded]:
+def repeat_ends(events: list[Event]) -> list[RepeatEnded]:
     return [event for event in events if isinstance(event, RepeatEnded)]
 
 
@@ -65,7 +65,7 @@ def test_the_remaining_time_is_estimated_from_finished_repeats(
     ticks = clock()
     monkeypatch.setattr("fieldkit.trial.running.runner.time.monotonic", lambda: next(ticks))
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    void, first, second = ended(events)
+    void, first, second = repeat_ends(events)
     assert (void.status, void.left_s) == (Status.VOID, 2 * of_two().procedure.expected_s(Protocol.TCP))
     assert first.status is Status.VALID
     assert first.left_s == first.left_most_s >= STEP_S, "the duration of the finished repeat with its void attempts"
@@ -84,7 +84,7 @@ def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
     monkeypatch.setattr(Robots, "fetch", asked)
     with pytest.raises(KeyboardInterrupt):
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append, stop)
-    assert [event.status for event in ended(events)] == [Status.VOID, Status.VALID]
+    assert [event.status for event in repeat_ends(events)] == [Status.VOID, Status.VALID]
 
 
 def test_after_an_abort_by_another_user_fetched_folders_are_deleted(
@@ -134,7 +134,7 @@ def test_the_remedy_of_a_failed_step_is_reported(
 
     monkeypatch.setattr(Robots, "measure", measure)
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    reasons_and_remedies = [(event.reason, event.remedy) for event in ended(events)]
+    reasons_and_remedies = [(event.reason, event.remedy) for event in repeat_ends(events)]
     assert reasons_and_remedies[0] == ("sending began too late", "a larger `idle` leaves it more time")
     assert not any(remedy for _, remedy in reasons_and_remedies[1:])
 
@@ -218,7 +218,7 @@ def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
 
     monkeypatch.setattr(gates, "judge", exhausted)
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    void, exhausting, *valid = ended(events)
+    void, exhausting, *valid = repeat_ends(events)
     assert exhausting.reason == "this machine has too little memory to measure it"
     assert [attempt.status for attempt in (void, exhausting, *valid)] == [
         Status.VOID,
@@ -364,11 +364,11 @@ def test_changed_evidence_is_reported_on_resume(tmp_path: Path, events: list[Eve
 def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun = of_two()
-    begun = begun.model_copy(update={"versions": {**begun.versions, "lab-steps": "1.0"}})
-    folder = store.create(tmp_path, begun)
+    trial = of_two()
+    trial = trial.model_copy(update={"versions": {**trial.versions, "lab-steps": "1.0"}})
+    folder = store.create(tmp_path, trial)
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.0", "fieldkit": "stale"})
-    assert resumable(folder) == begun
+    assert resumable(folder) == trial
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.1"})
     with pytest.raises(ConfigurationError, match=r"started by other code \(lab-steps 1\.0\)"):
         resumable(folder)

@@ -88,8 +88,8 @@ def work(task):
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_the_end_of_the_parent_ends_its_workers(how: signal.Signals, tmp_path: Path) -> None:
+@pytest.mark.parametrize("stop_signal", [signal.SIGINT, signal.SIGKILL])
+def test_the_end_of_the_parent_ends_its_workers(stop_signal: signal.Signals, tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS, encoding="utf-8")
     started = tmp_path / "started"
     started.mkdir()
@@ -103,8 +103,8 @@ def test_the_end_of_the_parent_ends_its_workers(how: signal.Signals, tmp_path: P
         stderr=subprocess.PIPE,
     ) as process:
         wait_until(lambda: len(list(started.iterdir())) == 2, Deadline.after(EXIT_S))
-        process.send_signal(how)
+        process.send_signal(stop_signal)
         _, stderr = process.communicate(timeout=EXIT_S)
-    assert process.returncode == -how
-    assert (b"KeyboardInterrupt" in stderr) == (how == signal.SIGINT)
+    assert process.returncode == -stop_signal
+    assert (b"KeyboardInterrupt" in stderr) == (stop_signal == signal.SIGINT)
     wait_until(lambda: not any(alive(int(path.name)) for path in started.iterdir()), Deadline.after(EXIT_S))
