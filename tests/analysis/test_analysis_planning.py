@@ -44,7 +44,7 @@ def test_students_quantile_decreases_with_more_repeats(n: int, part: float) -> N
         quantile = scipy.stats.t.ppf(0.975, [repeats - 1, n - 1]) if n < 6 else (1, 1)
         return float(now * quantile[0] / quantile[1] * math.sqrt(n / repeats))
 
-    total = next(many for many in count(n) if expected(many) <= part * now * (1 + 2e-4))
+    total = next(n_repeats for n_repeats in count(n) if expected(n_repeats) <= part * now * (1 + 2e-4))
     assert interval is not None
     assert additional_repeats(interval, n, part * now, Kind.MEDIAN) == pytest.approx(total - n, abs=1)
 

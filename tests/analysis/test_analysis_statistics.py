@@ -117,8 +117,8 @@ def test_bounds_of_a_share_enclose_it(some: list[tuple[int, int]]) -> None:
     lost, sent = np.array(some).T
     interval = not_none(share(lost, sent))
     assert 0 <= interval.low <= interval.value <= interval.high <= 1
-    kept = not_none(share(sent - lost, sent))
-    assert (1 - kept.high, 1 - kept.low) == pytest.approx((interval.low, interval.high), abs=1e-9)
+    bound = not_none(share(sent - lost, sent))
+    assert (1 - bound.high, 1 - bound.low) == pytest.approx((interval.low, interval.high), abs=1e-9)
 
 
 @pytest.mark.parametrize("lost", [7, 15])

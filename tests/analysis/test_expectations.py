@@ -208,8 +208,8 @@ def test_the_measured_value_is_shown_for_each_scope() -> None:
 
 def test_only_one_protocol_is_judged_and_a_missing_figure_is_undecided() -> None:
     cells = [cell("tcp", estimate(RTT, 0.002, 0.001, 0.003)), cell("udp")]
-    (alone,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", QUANTITIES)], cells)
-    assert alone.holds
+    (single,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", QUANTITIES)], cells)
+    assert single.holds
     both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", QUANTITIES)], cells)
     assert [item.ruling for item in both] == [Ruling.HOLDS, Ruling.OPEN]
     assert [wording.judgement_texts(item)[1:] for item in both] == [

@@ -52,7 +52,7 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
 
 
 @pytest.mark.parametrize(
-    ("typed_before", "hint", "whole"),
+    ("typed_before", "hint", "expected"),
     [
         ("check los", "fieldkit abort", "fieldkit abort --site 'my lab.yaml' --backend field"),
         ("check los", "fieldkit enroll a --replace", "fieldkit enroll --site 'my lab.yaml' a --replace"),
@@ -77,12 +77,12 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
         ("lab up", "fieldkit lab down", "fieldkit lab down"),
     ],
 )
-def test_hints_include_the_options_given(typed_before: str, hint: str, whole: str) -> None:
+def test_hints_include_the_options_given(typed_before: str, hint: str, expected: str) -> None:
     top = parser()
     with hints.completing(top) as options:
         options.read(top.parse_args((*typed_before.split(), *OPTIONS)))
         completed = hints.completed(hint)
-    assert completed == whole.format(given=shlex.join(OPTIONS))
+    assert completed == expected.format(given=shlex.join(OPTIONS))
     if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
         parsed = top.parse_args(shlex.split(completed)[1:])
         assert getattr(parsed, "site", None) is None or str(parsed.site) == "my lab.yaml"

@@ -198,9 +198,9 @@ def test_quantities_of_one_distance_do_not_displace_curves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    many = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
+    many_columns = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
     last = Column("b.level", "V", "Voltage.", figure=Figure("b: level", Kind.MEDIAN))
-    for (distance, metres), columns in zip(DISTANCES.items(), ((*many, last), (last,)), strict=True):
+    for (distance, metres), columns in zip(DISTANCES.items(), ((*many_columns, last), (last,)), strict=True):
         plan = vendor_trials.plan(distance, distance=distance, metres=metres, columns=columns)
         vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, repeats=2))
     output_of(capsys, "report", ".", "-o", "page.html")

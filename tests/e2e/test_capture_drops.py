@@ -49,8 +49,8 @@ def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journ
     assert run.code == 0, run.out + run.err
     trial = only_trial(home)
     plan = store.read_plan(trial)
-    (ended,) = journal.ended(journal.history(trial, plan))
-    return plan, store.attempt_folder(trial, ended.folder), ended
+    (entry,) = journal.ended(journal.history(trial, plan))
+    return plan, store.attempt_folder(trial, entry.folder), entry
 
 
 def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tuple[tuple[str, ...], Measured]:

@@ -144,10 +144,10 @@ def test_satellite_positions_equal_the_true_positions(lab: Path) -> None:
     )
 
 
-def gpx(path: Path, where: tuple[TrackPoint, ...], late_s: float) -> None:
+def gpx(path: Path, places: tuple[TrackPoint, ...], late_s: float) -> None:
     """Write the path of the receiver like the phone of an accompanying person, whose clock is late."""
     points = []
-    for point, following in pairwise(point for point in where if point.role is Role.RECEIVER):
+    for point, following in pairwise(point for point in places if point.role is Role.RECEIVER):
         assert point.position_m is not None
         place = f'lat="{point.position_m[1] / EARTH_M[1]:.9f}" lon="{point.position_m[0] / EARTH_M[0]:.9f}"'
         for utc_ns in (*range(point.utc_ns, following.utc_ns - 1_000_000, 200_000_000), following.utc_ns - 1_000_000):

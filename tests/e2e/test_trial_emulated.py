@@ -155,8 +155,13 @@ def test_a_masterless_trial_behind_the_wall_prints_one_json_object_per_line(tmp_
     words = ("--topology", "masterless", "--repeats", "1", "--record", "1s", "--protocol", "tcp", "--json")
     run = run_here(tmp_path, "trial", "nlos", "5m", *words)
     assert run.code == 0, run.err
-    (ended,) = run.events("repeat_ended")
-    assert (ended["repeat"], ended["status"], ended["done"], ended["total"]) == ("tcp-01", "valid", 1, 1)
+    (event_data,) = run.events("repeat_ended")
+    assert (event_data["repeat"], event_data["status"], event_data["done"], event_data["total"]) == (
+        "tcp-01",
+        "valid",
+        1,
+        1,
+    )
     (over,) = run.events("trial_ended")
     assert Path(tmp_path / over["folder"]) == only_trial(tmp_path)
     assert {event["name"] for event in run.events("phase_started")} >= {"record", "transfer", "ping"}

@@ -326,8 +326,8 @@ def test_added_positions_replace_the_testbeds_track(trial: Path) -> None:
 
 def test_link_samples_have_a_channel_per_robot(trial: Path) -> None:
     folder = trial / "repeats" / "udp-01"
-    known = StationSample("turtlebot-2", -51.25, 65_000_000, None, 7, 5, 1, 0)
-    samples = [LinkSample(BEGIN_NS, (known,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]
+    station_sample = StationSample("turtlebot-2", -51.25, 65_000_000, None, 7, 5, 1, 0)
+    samples = [LinkSample(BEGIN_NS, (station_sample,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]
     (folder / link_samples.FILE).write_text(link_samples.text({Role.SENDER: samples}), encoding="ascii")
     (sample,) = of(messages(exported(trial)), "/sender/link")
     jsonschema.validate(sample.content, sample.schema)

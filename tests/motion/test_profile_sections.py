@@ -41,7 +41,7 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
 
 
 @pytest.mark.parametrize(
-    ("other", "why"),
+    ("other", "expected_reason"),
     [
         (robot("other"), None),
         (robot("other", master="10.42.0.4"), None),
@@ -53,9 +53,13 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
         (robot("one", master=MASTER), None),
     ],
 )
-def test_conflicts_of_robots_with_one_master(other: Robot, why: str | None) -> None:
+def test_conflicts_of_robots_with_one_master(other: Robot, expected_reason: str | None) -> None:
     reason = conflict(robot("one", master=MASTER), [other])
-    assert reason == why if why is None else reason is not None and reason.startswith(why)
+    assert (
+        reason == expected_reason
+        if expected_reason is None
+        else reason is not None and reason.startswith(expected_reason)
+    )
 
 
 @pytest.mark.parametrize(("domain", "is_valid"), [("", False), ("0", False), ("7", True)])

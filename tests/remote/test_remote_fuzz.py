@@ -266,9 +266,9 @@ def test_events_write_only_printable_characters_to_the_terminal(text: str) -> No
         RepeatEnded("udp-01", 1, Status.VOID, reason=text, summary=text, done=1, total=2, left_s=1),
     ]
     for event in events:
-        shown = display.event_text(event)
-        assert shown is not None
-        assert shown.plain.replace("\n", "").replace("\N{NO-BREAK SPACE}", "").isprintable()
+        printed = display.event_text(event)
+        assert printed is not None
+        assert printed.plain.replace("\n", "").replace("\N{NO-BREAK SPACE}", "").isprintable()
 
 
 @pytest.mark.parametrize("show", [display.show_error, lambda text: display.table(["x"], [[text]])])

@@ -57,9 +57,9 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    made = Clock()
-    monkeypatch.setattr("fieldkit.core.deadline.time", made)
-    return made
+    fake_clock = Clock()
+    monkeypatch.setattr("fieldkit.core.deadline.time", fake_clock)
+    return fake_clock
 
 
 class HaltingServer(paramiko.ServerInterface):
@@ -423,9 +423,9 @@ def notices() -> list[str]:
 
 @pytest.fixture
 def shell(server: Server, line: CuttableLine, notices: list[str]) -> Iterator[SshShell]:
-    made = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append)
-    yield made
-    made.close()
+    test_shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append)
+    yield test_shell
+    test_shell.close()
 
 
 def is_up(shell: SshShell) -> bool:
@@ -436,8 +436,8 @@ def is_up(shell: SshShell) -> bool:
 
 @pytest.fixture
 def pool() -> Iterator[ThreadPoolExecutor]:
-    with ThreadPoolExecutor(2) as made:
-        yield made
+    with ThreadPoolExecutor(2) as new_pool:
+        yield new_pool
 
 
 class WaitingCommand:

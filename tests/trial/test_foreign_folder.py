@@ -234,9 +234,9 @@ def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Pat
     with journal.locked(folder):
         ledger = Ledger(plan, folder, Stop())
         repeat = RepeatId(Protocol.UDP, 1)
-        begun = ledger.begin(repeat)
+        entry = ledger.begin(repeat)
         reason = "cannot read \udcff\ud800.bag"
-        ledger.commit(store.open_attempt(folder, repeat), replace(begun, status=VOID, reason=reason), Measured())
+        ledger.commit(store.open_attempt(folder, repeat), replace(entry, status=VOID, reason=reason), Measured())
         ledger.summarize()
         (attempt,) = journal.ended(journal.history(folder, plan))
         assert attempt.reason == "cannot read ??.bag"

@@ -47,8 +47,8 @@ def declared_columns(draw: st.DrawFn) -> Column:
 @st.composite
 def tables_of_columns(draw: st.DrawFn) -> tuple[list[Column], dict[str, Value]]:
     """Columns of one trial, and a value for each."""
-    drawn = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
-    columns = [column for column in drawn if column.name not in EVERYWHERE]
+    drawn_columns = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
+    columns = [column for column in drawn_columns if column.name not in EVERYWHERE]
     return columns, {column.name: draw(values(column)) for column in columns}
 
 

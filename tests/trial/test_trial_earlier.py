@@ -134,10 +134,12 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as place:
         attempt = of(protocol, Path(place))
-        aside = [_changed(one, 24, b"\x12\x34") for one in _waiting(attempt, "sender", _is_echo)]
+        aside = [
+            _changed(changed_packet, 24, b"\x12\x34") for changed_packet in _waiting(attempt, "sender", _is_echo)
+        ]
         strays = [
-            _changed(one, 20, b"\x04\x00")
-            for one in _waiting(attempt, "sender", lambda packet: not _is_icmp(packet) and not _is_load(packet))
+            _changed(packet, 20, b"\x04\x00")
+            for packet in _waiting(attempt, "sender", lambda packet: not _is_icmp(packet) and not _is_load(packet))
         ] if protocol is Protocol.TCP else []  # fmt: skip
         near, far = (attempt.packets(f"{role}.pcap") for role in ("sender", "receiver"))
 
@@ -151,7 +153,9 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
         replies = _left(far, "receiver", _is_icmp)
         late = replies[len(replies) - cut :]
         attempt.capture("sender", lambda _: near)
-        attempt.capture("receiver", lambda _: [one for one in far if one not in late])
+        attempt.capture(
+            "receiver", lambda _: [changed_packet for changed_packet in far if changed_packet not in late]
+        )
         assert _told(attempt) == []
 
 

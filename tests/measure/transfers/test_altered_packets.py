@@ -80,10 +80,10 @@ def _reason(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> st
 @pytest.mark.parametrize("protocol", Protocol)
 @pytest.mark.parametrize("what", WAYS)
 def test_a_translated_address_or_port_is_reported(what: str, protocol: Protocol) -> None:
-    change, why = WAYS[what]
+    change, expected_reason = WAYS[what]
     reason = _reason(_udp(change) if protocol is Protocol.UDP else _tcp(change), protocol)
     assert reason
-    assert reason.endswith(why)
+    assert reason.endswith(expected_reason)
     assert f"as {SENDER}:40000 > {RECEIVER}:{PORT} and reached the receiver as " in reason
     assert not what.endswith("port") or ":55555 > " in reason
 

@@ -86,13 +86,13 @@ CHANGES: Mapping[str, Any] = {
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_changed_line_is_detected(name: str, tmp_path: Path) -> None:
-    change, why = CHANGES[name]
+    change, expected_reason = CHANGES[name]
     entries = lines()
     for field, by in change.items():
         entries[45] = {**entries[45], field: entries[45][field] + by}
     if "driven_m" in change:
         entries = [{**line, "driven_m": line["driven_m"] + (at > 45)} for at, line in enumerate(entries)]
-    assert any(why in reason for reason in reasons(write_log(tmp_path, entries)))
+    assert any(expected_reason in reason for reason in reasons(write_log(tmp_path, entries)))
 
 
 def test_a_deviation_from_the_planned_path_is_detected(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def test_a_log_without_its_end_is_detected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "by", "why"),
+    ("field", "by", "expected_reason"),
     [
         ("ahead_m", 200.0, "two consecutive positions are farther apart"),
         ("up_m", 50.0, "two consecutive positions are farther apart"),
@@ -81,11 +81,11 @@ def test_a_log_without_its_end_is_detected(tmp_path: Path) -> None:
         ("at_s", 0.05, ""),
     ],
 )
-def test_a_changed_line_is_detected(field: str, by: float, why: str, tmp_path: Path) -> None:
+def test_a_changed_line_is_detected(field: str, by: float, expected_reason: str, tmp_path: Path) -> None:
     entries = lines()
     entries[80] = {**entries[80], field: entries[80][field] + by}
     contradictions = reasons(write_log(tmp_path, entries))
-    assert any(why in reason for reason in contradictions) if why else contradictions == []
+    assert any(expected_reason in reason for reason in contradictions) if expected_reason else contradictions == []
 
 
 @given(

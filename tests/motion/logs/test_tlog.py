@@ -222,7 +222,7 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path
     recorder_summary = tlog.RecorderSummary(log.frames, 0, log.last_us + 5, {}, tlog.crc32_of(path))
     window = log.first_us * 1000, log.last_us * 1000 + 999
     assert list(tlog.contradictions(log, recorder_summary, tlog.crc32_of(path), window)) == []
-    for other, total, around, why in (
+    for other, total, around, expected_reason in (
         (recorder_summary, 7, window, "its checksum differs"),
         (
             replace(recorder_summary, ended_us=log.last_us - 10**6),
@@ -244,7 +244,7 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path
         ),
     ):
         (reason,) = tlog.contradictions(log, other, total, around)
-        assert why in reason
+        assert expected_reason in reason
 
 
 def test_moved_frames_are_detected(tmp_path: Path) -> None:

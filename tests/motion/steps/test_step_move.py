@@ -160,9 +160,9 @@ def test_move_within_limits_is_reduced_to_speed_and_fence() -> None:
     drone = resolved_move(f"robot: relay, {path}, within_limits: true, {PING}")
     assert drone.motion == model.Move(Role.RELAY, (Leg(60.0),), 2.0), "within the limits of the drone"
     assert not slow.within_limits, "the plan has the actual motion"
-    refused = resolved_move(f"robot: receiver, {path}, {PING}")
-    assert refused.motion.speed_m_s == 2.0
-    assert [refusal.what for refusal in refused.refusals(SCENE)] == [
+    refusals = resolved_move(f"robot: receiver, {path}, {PING}")
+    assert refusals.motion.speed_m_s == 2.0
+    assert [refusal.what for refusal in refusals.refusals(SCENE)] == [
         "its top speed is 0.22 m/s, but the move needs 2 m/s"
     ]
 

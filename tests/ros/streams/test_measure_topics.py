@@ -70,9 +70,9 @@ def measured(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> d
 
 @given(st.sets(st.integers(0, 49)), st.lists(st.integers(0, 49), max_size=5))
 def test_losses_are_samples_that_never_arrived(lost: set[int], again: list[int]) -> None:
-    there = [number for number in range(50) if number not in lost]
+    arrived_numbers = [number for number in range(50) if number not in lost]
     repeated = [number for number in again if number not in lost]
-    result = measured(published(50), arrived([*there, *repeated]))
+    result = measured(published(50), arrived([*arrived_numbers, *repeated]))
     assert (result["topic_sent"], result["topic_received"]) == (50, 50 - len(lost))
     assert result["topic_loss"] == pytest.approx(len(lost) / 50)
     assert result["topic_repeated"] == len(repeated)

@@ -113,7 +113,7 @@ def other_sending(place: int, row: Row) -> Row:
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    ("change", "expected_reason"),
     [
         (other_numbers, "numbers that the publisher's log does not have"),
         (other_sizes, "with a size other than 1016 bytes"),
@@ -122,15 +122,15 @@ def other_sending(place: int, row: Row) -> Row:
 )
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_subscribers_log_with_one_wrong_field_is_noticed(
-    kind: str, change: Callable[[int, Row], Row], why: str, tmp_path: Path
+    kind: str, change: Callable[[int, Row], Row], expected_reason: str, tmp_path: Path
 ) -> None:
     attempt = replace(KINDS[kind], received=with_samples(KINDS[kind].received, change))
     reasons, _ = topic_attempts.judge_attempt(attempt, tmp_path)
-    assert any(why in reason for reason in reasons)
+    assert any(expected_reason in reason for reason in reasons)
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    ("change", "expected_reason"),
     [
         (other_numbers, "does not number its samples from 0 on"),
         (other_sizes, "the publisher's log has 1 sample with a size other"),
@@ -139,11 +139,11 @@ def test_a_subscribers_log_with_one_wrong_field_is_noticed(
     ],
 )
 def test_a_publishers_log_with_one_wrong_field_is_noticed(
-    change: Callable[[int, Row], Row | None], why: str, tmp_path: Path
+    change: Callable[[int, Row], Row | None], expected_reason: str, tmp_path: Path
 ) -> None:
     attempt = KINDS["best effort with losses"]
     reasons, _ = topic_attempts.judge_attempt(replace(attempt, sent=with_samples(attempt.sent, change)), tmp_path)
-    assert any(why in reason for reason in reasons)
+    assert any(expected_reason in reason for reason in reasons)
 
 
 def test_the_same_change_in_both_logs_is_noticed_by_the_captures(tmp_path: Path) -> None:

@@ -122,20 +122,20 @@ SCENARIOS = st.fixed_dictionaries(
 def test_any_scenario_runs_or_is_refused_with_its_place_and_a_remedy(tmp_path: Path, data: dict[str, Any]) -> None:
     path = tmp_path / "any.yaml"
     path.write_text(json.dumps(data, indent=1), encoding="utf-8")
-    refused: ConfigurationError | None = None
+    caught: ConfigurationError | None = None
     try:
         scenario = load_scenario(path)
         runs = [build(scenario).run(UNTIL_NS) for _ in range(2)]
     except ConfigurationError as error:
-        refused = error
-    if refused is None:
+        caught = error
+    if caught is None:
         event("runs")
         assert runs[0].windows_ns[-1] == UNTIL_NS
         assert runs[0].digest == runs[1].digest
-    elif isinstance(refused, PolicyError):
+    elif isinstance(caught, PolicyError):
         event("the rule as printed stops")
         assert scenario.policy.name == "velocity_aware_raw"
     else:
-        event(re.sub(r"[0-9.]+", "N", refused.what)[:70])
-        assert refused.where.startswith(f"{path}:")
-        assert refused.remedy
+        event(re.sub(r"[0-9.]+", "N", caught.what)[:70])
+        assert caught.where.startswith(f"{path}:")
+        assert caught.remedy
