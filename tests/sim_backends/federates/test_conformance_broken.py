@@ -432,7 +432,7 @@ NETWORK_CASES = [
     Broken(
         "exactly_once",
         physics(net(lambda _, arrived, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
-        "the fate of packet 99 was reported, which it never got",
+        "the fate of packet 99 was reported, but it was not sent to the network",
     ),
     Broken("exactly_once", physics(net(lambda _, arrived, drops, to_ns: (arrived[::-1], drops))), "order of time"),
     Broken("exactly_once", physics(AnnouncesTooLate), "before the announced next event"),
